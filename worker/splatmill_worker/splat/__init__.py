@@ -1,0 +1,1 @@
+"""Gaussian splats: parameters, rendering, training, evaluation, files. Knows kernels and scenes only."""

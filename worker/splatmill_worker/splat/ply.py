@@ -1,0 +1,142 @@
+"""The standard 3D Gaussian `.ply`: one fixed layout written, any tool's file read by property name."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from splatmill_worker.splat.gaussians import Gaussians
+
+MIN_OPACITY = 1.0 / 255.0
+"""An opacity under this adds nothing to an 8-bit image, and every renderer skips it."""
+
+_DEGREE_OF_REST = {0: 0, 9: 1, 24: 2, 45: 3}
+
+
+class PlyUnreadableError(ValueError):
+    """The file is no 3D Gaussian `.ply`; the message says what was found and what was expected."""
+
+
+def property_names(degree: int) -> list[str]:
+    """Vertex properties of the standard layout at an SH degree, in file order."""
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    return [
+        *("x", "y", "z", "nx", "ny", "nz"),
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(rest)),
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
+
+
+def write(
+    path: Path, gaussians: Gaussians, *, degree: int | None = None, comments: tuple[str, ...] = ()
+) -> int:
+    """Write `gaussians` as binary little-endian float32 and return how many were written.
+
+    Left out are rows with a non-finite parameter and those with an opacity under 1/255; quaternions become
+    unit length. `degree` pads or cuts the SH coefficients (3 is what some viewers insist on); None keeps them.
+    The file appears whole or not at all: it is written beside `path`, synced and renamed.
+    """
+    if degree is not None:
+        gaussians = gaussians.padded(degree)
+    gaussians = gaussians.map(lambda value: value.detach().to("cpu", torch.float32))
+    gaussians = gaussians.select(
+        gaussians.finite() & (torch.sigmoid(gaussians.logit_opacities) >= MIN_OPACITY)
+    )
+    n = gaussians.count
+    quats = torch.nn.functional.normalize(gaussians.quats.double(), dim=1, eps=0.0).float()
+    columns = torch.cat(
+        [
+            gaussians.means,
+            torch.zeros(n, 3),
+            gaussians.sh[:, 0],
+            gaussians.sh[:, 1:]
+            .transpose(1, 2)
+            .reshape(n, -1),  # channel-major: all R, then all G, then all B
+            gaussians.logit_opacities[:, None],
+            gaussians.log_scales,
+            quats,
+        ],
+        dim=1,
+    )
+    names = property_names(gaussians.degree)
+    table = (
+        np.ascontiguousarray(columns.numpy(), dtype="<f4").view([(name, "<f4") for name in names]).reshape(n)
+    )
+    document = PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=list(comments))
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            document.write(stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    return n
+
+
+def read(path: Path) -> Gaussians:
+    """Read any tool's 3D Gaussian `.ply` (binary of either byte order, or text) as float32 tensors.
+
+    Properties are found by name; unknown ones are ignored, as are normals. Rows that hold a non-finite value
+    are dropped. Raises PlyUnreadableError for anything that is no such file.
+    """
+    try:
+        document = PlyData.read(str(path))
+    except FileNotFoundError:
+        raise
+    except (PlyParseError, ValueError, UnicodeDecodeError, OSError) as error:
+        raise PlyUnreadableError(f"{path.name} could not be read as a .ply file: {error}") from error
+    elements = {element.name: element for element in document.elements}
+    if "chunk" in elements:
+        raise PlyUnreadableError(
+            f"{path.name} is a packed (quantised) splat .ply; convert it to the standard float layout first."
+        )
+    if "vertex" not in elements:
+        raise PlyUnreadableError(
+            f"{path.name} has no vertex element (found: {', '.join(elements) or 'none'})."
+        )
+    vertex = elements["vertex"]
+    present = [p.name for p in vertex.properties]
+    rest = sum(name.startswith("f_rest_") for name in present)
+    if rest not in _DEGREE_OF_REST:
+        raise PlyUnreadableError(
+            f"{path.name} has {rest} f_rest properties; 0, 9, 24 or 45 are needed (SH degree 0 to 3)."
+        )
+    degree = _DEGREE_OF_REST[rest]
+    wanted = [name for name in property_names(degree) if name not in ("nx", "ny", "nz")]
+    missing = [name for name in wanted if name not in present]
+    if missing:
+        raise PlyUnreadableError(
+            f"{path.name} is no 3D Gaussian .ply: it lacks the properties {', '.join(missing)}."
+        )
+
+    def columns(*names: str) -> torch.Tensor:
+        if not names:
+            return torch.zeros(vertex.count, 0)
+        return torch.from_numpy(
+            np.stack([np.asarray(vertex[name], dtype=np.float32) for name in names], axis=1)
+        )
+
+    rest_columns = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(vertex.count, 3, rest // 3)
+    gaussians = Gaussians(
+        means=columns("x", "y", "z"),
+        log_scales=columns("scale_0", "scale_1", "scale_2"),
+        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        logit_opacities=columns("opacity")[:, 0].contiguous(),
+        sh=torch.cat([columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest_columns.transpose(1, 2)], dim=1),
+    )
+    keep = gaussians.finite()
+    return gaussians if bool(keep.all()) else gaussians.select(keep)
