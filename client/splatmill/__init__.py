@@ -1,0 +1,60 @@
+"""Splatmill: photos in, Gaussian splats out. The SDK, the wire schema and the command line.
+
+`from splatmill import Client` is the whole beginning. Names are loaded when they are first used, so that
+`import splatmill` (which the server and the worker do as well, for the schema) costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from splatmill.aio import AsyncClient, AsyncJobHandle, AsyncModelHandle
+    from splatmill.client import Client, JobHandle, ModelHandle
+    from splatmill.errors import JobCancelled, JobFailed, SplatmillError
+    from splatmill.schema import CameraSpec, OrbitRequest, RenderRequest, TrainOptions
+
+_HOMES = {
+    "AsyncClient": "splatmill.aio",
+    "AsyncJobHandle": "splatmill.aio",
+    "AsyncModelHandle": "splatmill.aio",
+    "CameraSpec": "splatmill.schema",
+    "Client": "splatmill.client",
+    "JobCancelled": "splatmill.errors",
+    "JobFailed": "splatmill.errors",
+    "JobHandle": "splatmill.client",
+    "ModelHandle": "splatmill.client",
+    "OrbitRequest": "splatmill.schema",
+    "RenderRequest": "splatmill.schema",
+    "SplatmillError": "splatmill.errors",
+    "TrainOptions": "splatmill.schema",
+}
+
+__all__ = [
+    "AsyncClient",
+    "AsyncJobHandle",
+    "AsyncModelHandle",
+    "CameraSpec",
+    "Client",
+    "JobCancelled",
+    "JobFailed",
+    "JobHandle",
+    "ModelHandle",
+    "OrbitRequest",
+    "RenderRequest",
+    "SplatmillError",
+    "TrainOptions",
+    "__version__",
+]
+
+
+def __getattr__(name: str) -> Any:
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module 'splatmill' has no attribute {name!r}")
+    return getattr(import_module(home), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

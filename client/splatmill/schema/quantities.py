@@ -1,0 +1,76 @@
+"""Durations and byte sizes as people write them: `90s`, `5m`, `1h30m`, `1.5GB`."""
+
+import re
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator
+
+_SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+_DURATION = re.compile(r"(?:(?:\d+(?:\.\d+)?)[smhd])+", re.ASCII)
+_DURATION_PART = re.compile(r"(\d+(?:\.\d+)?)([smhd])", re.ASCII)
+
+_BYTES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
+_BYTES_BINARY = {"k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
+_SIZE = re.compile(r"(\d+(?:\.\d+)?) ?([kmgt]?)(i?)b?", re.ASCII | re.IGNORECASE)
+_PLAIN = re.compile(r"\d+(?:\.\d+)?", re.ASCII)
+
+
+def parse_duration(value: Any) -> Any:
+    """Seconds of `"90s"`, `"5m"`, `"1h30m"`, `"2.5"` or a number; other types are left to pydantic.
+
+    Raises ValueError with the accepted forms for a text that is none of them.
+    """
+    if not isinstance(value, str):
+        return value
+    text = value.strip().lower().replace(" ", "")
+    if _PLAIN.fullmatch(text):
+        return float(text)
+    if not _DURATION.fullmatch(text):
+        raise ValueError(f"{value!r} is no duration; write seconds (90), or 90s, 5m, 1h30m")
+    return sum(float(number) * _SECONDS[unit] for number, unit in _DURATION_PART.findall(text))
+
+
+def parse_bytes(value: Any) -> Any:
+    """Bytes of `"500MB"`, `"1.5GB"`, `"2GiB"` or a number; other types are left to pydantic.
+
+    Raises ValueError with the accepted forms for a text that is none of them.
+    """
+    if not isinstance(value, str):
+        return value
+    match = _SIZE.fullmatch(value.strip())
+    if match is None:
+        raise ValueError(f"{value!r} is no size; write bytes (500000000), or 500MB, 1.5GB, 2GiB")
+    number, unit, binary = match.groups()
+    if binary and not unit:
+        raise ValueError(f"{value!r} is no size; write bytes (500000000), or 500MB, 1.5GB, 2GiB")
+    factor = _BYTES_BINARY[unit.lower()] if binary else _BYTES[unit.lower()]
+    return round(float(number) * factor)
+
+
+def format_duration(seconds: float) -> str:
+    """`4.2s`, `1m05s`, `2h03m`: for people, not for parsing back exactly."""
+    if seconds < 9.95:
+        return f"{seconds:.1f}s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole}s"
+    if whole < 3600:
+        return f"{whole // 60}m{whole % 60:02d}s"
+    minutes = round(seconds / 60)
+    return f"{minutes // 60}h{minutes % 60:02d}m"
+
+
+def format_bytes(count: float) -> str:
+    """`512 B`, `1.5 MB`, `23.0 GB` (decimal units, as disks and downloads are sold)."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 999.5:
+            return f"{count:.0f} B" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.1f} TB"
+
+
+Duration = Annotated[float, BeforeValidator(parse_duration)]
+"""Seconds; a text such as `5m` is accepted."""
+
+ByteSize = Annotated[int, BeforeValidator(parse_bytes)]
+"""Bytes; a text such as `1.5GB` is accepted."""
