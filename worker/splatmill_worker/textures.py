@@ -1,0 +1,128 @@
+"""Painted textures with structure at every scale, and their mip-mapped look-up, for the synthetic scene."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFilter
+
+_PALETTE = np.array(
+    [
+        (231, 111, 81), (244, 162, 97), (233, 196, 106), (42, 157, 143), (38, 70, 83),
+        (240, 236, 226), (120, 86, 140), (200, 70, 90), (90, 150, 200), (60, 60, 64),
+    ]
+)  # fmt: skip
+
+
+class MipMap:
+    """A square RGB texture that repeats, with its halvings, looked up by texture coordinates and footprint."""
+
+    def __init__(self, image: np.ndarray) -> None:
+        """`image` is uint8 [S, S, 3] with S a power of two."""
+        level = torch.from_numpy(image.astype(np.float32) / 255)
+        levels, starts, sizes, start = [], [], [], 0
+        while True:
+            size = len(level)
+            levels.append(level.reshape(-1, 3))
+            starts.append(start)
+            sizes.append(size)
+            start += size * size
+            if size == 1:
+                break
+            level = level.reshape(size // 2, 2, size // 2, 2, 3).mean((1, 3))
+        self._texels = torch.cat(levels)
+        self._starts = torch.tensor(starts)
+        self._sizes = torch.tensor(sizes)
+
+    def sample(self, uv: torch.Tensor, footprint: torch.Tensor) -> torch.Tensor:
+        """Bilinear colours [N, 3] at `uv` [N, 2] (period 1), from the level with texels as wide as `footprint` [N]."""
+        level = torch.log2((footprint * self._sizes[0]).clamp(min=1)).round().long()
+        level = level.clamp(max=len(self._sizes) - 1)
+        size, start = self._sizes[level], self._starts[level]
+        x = uv[:, 0] * size - 0.5
+        y = uv[:, 1] * size - 0.5
+        x0, y0 = torch.floor(x), torch.floor(y)
+        fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+        left, top = x0.long() % size, y0.long() % size
+        right, bottom = (left + 1) % size, (top + 1) % size
+        upper = torch.lerp(self._at(start, top, left, size), self._at(start, top, right, size), fx)
+        lower = torch.lerp(self._at(start, bottom, left, size), self._at(start, bottom, right, size), fx)
+        return torch.lerp(upper, lower, fy)
+
+    def _at(
+        self, start: torch.Tensor, row: torch.Tensor, column: torch.Tensor, size: torch.Tensor
+    ) -> torch.Tensor:
+        return self._texels[start + row * size + column]
+
+
+def painted(rng: np.random.Generator, size: int, density: int) -> np.ndarray:
+    """Discs, bars and triangles of a warm palette over soft noise; uint8 [size, size, 3]."""
+    base = _PALETTE[rng.integers(len(_PALETTE))] * 0.5 + 90
+    canvas = Image.fromarray((base + 26 * _noise(rng, size)[..., None]).clip(0, 255).astype(np.uint8))
+    draw = ImageDraw.Draw(canvas)
+    for _ in range(density):
+        color = tuple(
+            int(c) for c in (_PALETTE[rng.integers(len(_PALETTE))] * rng.uniform(0.7, 1.1)).clip(0, 255)
+        )
+        x, y = rng.uniform(0, size, 2)
+        r = size * 0.008 * rng.pareto(2.2) + size * 0.006
+        r = min(r, size * 0.09)
+        kind = rng.integers(3)
+        if kind == 0:
+            draw.ellipse([x - r, y - r, x + r, y + r], fill=color)
+        elif kind == 1:
+            draw.rectangle([x - r, y - 0.4 * r, x + r, y + 0.4 * r], fill=color)
+        else:
+            corners = [(x + r * np.cos(a), y + r * np.sin(a)) for a in rng.uniform(0, 2 * np.pi, 3)]
+            draw.polygon(corners, fill=color)
+    return _grain(rng, canvas)
+
+
+def planks(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Floor boards with grain along them; uint8 [size, size, 3]."""
+    grain = np.repeat(_noise(rng, size)[:, :: size // 64], size // 64, axis=1)
+    canvas = np.array([150.0, 110.0, 76.0]) + 16 * grain[..., None] + 9 * _noise(rng, size)[..., None]
+    boards = 8
+    for board in range(boards):
+        rows = slice(board * size // boards, (board + 1) * size // boards)
+        canvas[rows] *= rng.uniform(0.8, 1.15)
+        canvas[rows.start : rows.start + size // 256] *= 0.45
+        joint = int(rng.integers(size))
+        canvas[rows, joint : joint + size // 256] *= 0.45
+    return _grain(rng, Image.fromarray(canvas.clip(0, 255).astype(np.uint8)))
+
+
+def sky(rng: np.random.Generator, size: int) -> np.ndarray:
+    """The dome by longitude (columns) and latitude (rows): distant hills, haze and clouds; uint8 [size, size, 3]."""
+    latitude = ((np.arange(size) + 0.5) / size)[:, None]
+    # Row v holds latitude pi*v for v in [-1/2, 1/2), wrapped: the upper half of the sky is rows 0 .. size/2.
+    up = np.where(latitude < 0.5, latitude * 2, 0.0)[..., None]
+    noise = _noise(rng, size)
+    clouds = np.clip(noise, 0, 1.5)[..., None]
+    image = np.array([205.0, 220.0, 232.0]) * (1 - up) + np.array([92.0, 140.0, 200.0]) * up
+    image = image + clouds * 38
+    ridge = 0.035 + 0.02 * noise[size // 3]
+    hills = (latitude < ridge[None, :]) | (latitude > 0.5)
+    rock = np.array([88.0, 104.0, 92.0]) + 22 * noise[::-1, :, None]
+    dome: np.ndarray = np.where(hills[..., None], rock, image).clip(0, 255).astype(np.uint8)
+    return dome
+
+
+def _grain(rng: np.random.Generator, canvas: Image.Image) -> np.ndarray:
+    """Soften drawn edges by a texel, then add fine grain, so that no scale is empty."""
+    soft = np.asarray(canvas.filter(ImageFilter.GaussianBlur(0.7)), np.float32)
+    return (soft + rng.normal(0, 7, soft.shape[:2])[..., None]).clip(0, 255).astype(np.uint8)
+
+
+def _noise(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Seamless noise of six octaves, about unit variance; float64 [size, size]."""
+    total = np.zeros((size, size))
+    for octave in range(2, 8):
+        cells = 2**octave
+        coarse = rng.normal(size=(cells, cells)).astype(np.float32)
+        wide = np.pad(coarse, 2, mode="wrap")
+        step = size // cells
+        image = Image.fromarray(wide).resize(((cells + 4) * step,) * 2, Image.Resampling.BICUBIC)
+        total += np.asarray(image)[2 * step : 2 * step + size, 2 * step : 2 * step + size] * 0.62**octave
+    seamless: np.ndarray = total / total.std()
+    return seamless
