@@ -1,0 +1,63 @@
+# Splatmill. `make` alone lists what there is.
+SHELL := /bin/bash
+PYTHON ?= python3
+# A folder of photos, a zip, a video or a posed data set; empty: the built-in synthetic scene.
+PHOTOS ?=
+# Extra arguments of pip, e.g. PIP_ARGS="--extra-index-url ..." to choose another build of torch.
+PIP_ARGS ?=
+VENV := .venv
+BIN := $(VENV)/bin
+KERNELS := $(shell find worker/splatmill_worker/kernels/cpu -name '*.[ch]pp' 2>/dev/null) worker/CMakeLists.txt
+PARTS := constraints.txt client/pyproject.toml server/pyproject.toml worker/pyproject.toml
+
+.PHONY: help install demo test check bench serve sanitize clean
+
+help: ## list the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+install: $(VENV)/.installed ## set up .venv with the three parts and the compiled kernels
+
+demo: install ## photos in, splats out, into demo/ (PHOTOS=path takes your own)
+	@$(BIN)/python examples/demo.py $(if $(PHOTOS),"$(PHOTOS)") --out demo
+
+test: $(VENV)/.installed-dev ## run all tests
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+check: $(VENV)/.installed-dev ## ruff, mypy, import rules
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: install ## error against run time: kernels, stability, SfM, training (takes a while)
+	for name in kernels stability sfm train; do $(BIN)/splatmill bench $$name || exit 1; done
+
+serve: install ## the whole service on this machine; Ctrl-C ends it
+	@$(BIN)/splatmill up
+
+sanitize: $(VENV)/.installed-dev ## the kernels' tests under AddressSanitizer and UBSan
+	worker/sanitize/run
+
+clean: ## remove what the other targets made, except demo/ and your data
+	rm -rf $(VENV) worker/build client/*.egg-info server/*.egg-info
+
+$(VENV)/.prerequisites:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "Splatmill needs Python 3.11 or newer; '$(PYTHON)' is $$($(PYTHON) -V 2>&1 || true)." \
+	       "Install one (Debian: apt-get install python3 python3-venv) or name it: make PYTHON=python3.12 ..."; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { \
+	  echo "Python's venv module is missing. Install it (Debian: apt-get install python3-venv)."; exit 1; }
+	@command -v $${CXX:-c++} >/dev/null || { \
+	  echo "A C++17 compiler is missing: '$${CXX:-c++}' was not found." \
+	       "Install one (Debian: apt-get install g++; macOS: xcode-select --install)."; exit 1; }
+	@$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/.installed: $(VENV)/.prerequisites $(PARTS) $(KERNELS)
+	$(BIN)/python -m pip install -q $(PIP_ARGS) -U pip
+	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt -e ./client -e './server[embedded]' -e ./worker
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed pyproject.toml
+	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --group dev
+	@touch $@
