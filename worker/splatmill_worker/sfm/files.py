@@ -1,0 +1,85 @@
+"""Finds the photo that a camera file means, whatever folders its author kept it in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif")
+MASK_FOLDERS = ("masks", "mask")
+
+
+@dataclass(frozen=True)
+class ImageFiles:
+    """The photos of a capture by relative name, and the masks beside them."""
+
+    root: Path
+    photos: dict[str, Path]
+    masks: dict[str, Path]
+
+    @staticmethod
+    def under(directory: Path) -> ImageFiles:
+        """All photos under `directory`/images, or under `directory` itself where there is no such folder."""
+        root = directory / "images" if (directory / "images").is_dir() else directory
+        masks = next((directory / name for name in MASK_FOLDERS if (directory / name).is_dir()), None)
+        found = {
+            path.relative_to(root).as_posix(): path
+            for path in sorted(root.rglob("*"))
+            if path.suffix.lower() in SUFFIXES and path.is_file()
+        }
+        if masks is not None and masks.is_relative_to(root):
+            inner = masks.relative_to(root).as_posix() + "/"
+            found = {name: path for name, path in found.items() if not name.startswith(inner)}
+        return ImageFiles(root, found, masks_under(masks) if masks is not None else {})
+
+    def photo(self, name: str) -> tuple[str, Path] | None:
+        """The photo meant by `name` (its relative name here, and its path); None where it is not there.
+
+        Matched on as many trailing path components as agree; a name without extension matches any image
+        type. A name that fits several photos equally well means none of them.
+        """
+        wanted = [
+            part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in (".", "..", "/")
+        ]
+        best: list[str] = []
+        best_length = 0
+        for candidate in self._by_last_part(wanted[-1] if wanted else ""):
+            parts = PurePosixPath(candidate).parts
+            length = 1
+            while length < min(len(parts), len(wanted)) and parts[-1 - length] == wanted[-1 - length]:
+                length += 1
+            if length > best_length:
+                best, best_length = [candidate], length
+            elif length == best_length:
+                best.append(candidate)
+        exact = "/".join(wanted)
+        if exact in best:
+            best = [exact]
+        return (best[0], self.photos[best[0]]) if len(best) == 1 else None
+
+    def mask(self, name: str) -> Path | None:
+        """The mask of the photo with this relative name: name.jpg.png, name.png or name.jpg."""
+        return mask_of(name, self.masks)
+
+    def _by_last_part(self, last: str) -> list[str]:
+        names = [name for name in self.photos if PurePosixPath(name).name == last]
+        if not names:
+            stem = last if PurePosixPath(last).suffix.lower() not in SUFFIXES else PurePosixPath(last).stem
+            names = [name for name in self.photos if PurePosixPath(name).stem == stem]
+        return names
+
+
+def masks_under(directory: Path) -> dict[str, Path]:
+    """Mask files by relative name."""
+    return {
+        path.relative_to(directory).as_posix(): path
+        for path in sorted(directory.rglob("*"))
+        if path.suffix.lower() in SUFFIXES and path.is_file()
+    }
+
+
+def mask_of(name: str, masks: dict[str, Path]) -> Path | None:
+    """The mask for the photo `name`, by COLMAP's convention (name.jpg.png) or the same stem."""
+    stem = str(PurePosixPath(name).with_suffix(""))
+    candidates = [f"{name}.png", f"{stem}.png", name, *(f"{stem}{suffix}" for suffix in SUFFIXES)]
+    return next((masks[candidate] for candidate in candidates if candidate in masks), None)
