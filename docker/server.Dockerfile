@@ -1,0 +1,26 @@
+# The REST API. Build from the repository's root: docker build -f docker/server.Dockerfile -t splatmill-server .
+FROM debian:bookworm-slim AS build
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends python3 python3-venv ca-certificates \
+    && rm -rf /var/lib/apt/lists/*
+RUN python3 -m venv /opt/splatmill
+ENV PATH=/opt/splatmill/bin:$PATH PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
+WORKDIR /src
+COPY constraints.txt ./
+COPY client client
+COPY server server
+RUN pip install -q -c constraints.txt -U pip setuptools && pip install -q -c constraints.txt ./client ./server
+
+FROM debian:bookworm-slim
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends python3 ca-certificates \
+    && rm -rf /var/lib/apt/lists/* \
+    && useradd --system --uid 10001 --create-home splatmill \
+    && install -d -o splatmill -g splatmill /data
+COPY --from=build /opt/splatmill /opt/splatmill
+ENV PATH=/opt/splatmill/bin:$PATH PYTHONUNBUFFERED=1 SPLATMILL_DATA=/data SPLATMILL_STORAGE=file:///data/storage
+USER splatmill
+EXPOSE 8080
+HEALTHCHECK --interval=10s --timeout=5s --start-period=20s \
+    CMD ["python", "-c", "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8080/readyz', timeout=4)"]
+CMD ["python", "-m", "splatmill_server", "--host", "0.0.0.0", "--port", "8080"]
