@@ -1,0 +1,33 @@
+"""What the ops hand to one another: the two records that every backend fills the same way."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+TILE = 16  # side of a tile in pixels; lists are made per tile, row by row
+
+ALPHA_MIN = 1.0 / 255.0  # below this a splat cannot change an 8-bit pixel, and is skipped
+ALPHA_MAX = 0.999  # keeps 1 - alpha away from 0, so that what lies behind still gets a gradient
+TRANSMITTANCE_MIN = 1e-4  # a splat that would bring the transmittance to this or below ends the pixel
+BLUR = 0.3  # added to both variances of a projected splat, pixels^2
+COMPENSATION_MIN = 2.5e-5  # floor of det / det' under antialiasing
+
+
+class Projected(NamedTuple):
+    """One row per Gaussian. A culled one has extents 0 and every other field exactly 0."""
+
+    means2d: Tensor  # [N,2] pixels; the centre of pixel (0, 0) is (0.5, 0.5)
+    conics: Tensor  # [N,3] upper triangle a, b, c of the inverse 2-D covariance, 1/pixels^2
+    opacities: Tensor  # [N] after the sigmoid (and the antialiasing compensation)
+    colors: Tensor  # [N,3] spherical harmonics seen from the camera, clamped at 0 below
+    depths: Tensor  # [N] camera z
+    extents: Tensor  # [N,2] half sides in pixels of the box around the exact 1/255 ellipse; no gradient
+
+
+class Bins(NamedTuple):
+    """For every tile, row-major, the Gaussians whose 1/255 ellipse reaches one of its pixel centres."""
+
+    offsets: Tensor  # int64 [tiles + 1]
+    ids: Tensor  # int32 [pairs], front to back inside a tile, ties by index

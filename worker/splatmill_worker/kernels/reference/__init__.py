@@ -1,0 +1,11 @@
+"""The definition of every op in plain torch, in any dtype; slow, differentiated by autograd, and what all
+backends are held to."""
+
+from .adam import adam_, catch_up_
+from .bin import bin
+from .composite import composite
+from .knn import knn
+from .loss import PhotoStats, loss, photo_stats
+from .project import project
+
+__all__ = ["PhotoStats", "adam_", "bin", "catch_up_", "composite", "knn", "loss", "photo_stats", "project"]

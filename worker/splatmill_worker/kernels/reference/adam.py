@@ -1,0 +1,98 @@
+"""Adam over all parameter groups of a scene, dense or for the visible Gaussians only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
+MEMORY = 256  # steps of drift a catch-up replays: (0.9 / sqrt 0.999)^256 = 2e-12, below float32's resolution
+
+
+@torch.no_grad()
+def adam_(
+    params: Sequence[Tensor],
+    grads: Sequence[Tensor],
+    exp_avg: Sequence[Tensor],
+    exp_avg_sq: Sequence[Tensor],
+    rates: Sequence[float],
+    *,
+    step: int,
+    visible: Tensor | None = None,
+    last_step: Tensor | None = None,
+) -> int:
+    """One Adam step in place (Kingma & Ba 2015; betas 0.9, 0.999, eps 1e-15) on groups [N, ...] with a rate
+    each.
+
+    step counts from 1. With visible [N] (bool) only those rows move; last_step int32 [N] says up to which
+    step each row is current, and a row that missed steps is first brought to what dense Adam with zero
+    gradients would have left (`catch_up_`). A gradient that is not finite, or whose square is not, leaves its
+    entry as it was; the number of such entries is returned, so that the caller can name the failure.
+
+    float32 state does not underflow: eps dominates the root of the second moment below 1e-15, that is v <
+    1e-30, while float32 holds v down to 1e-38. A gradient whose square vanishes moves its parameter by less
+    than rate * 1e-3.
+    """
+    if visible is not None:
+        if last_step is None:
+            raise ValueError("last_step: needed with visible, to know how many steps a row missed")
+        catch_up_(params, exp_avg, exp_avg_sq, rates, step=step - 1, rows=visible, last_step=last_step)
+        last_step[visible] = step
+    size, root = 1 / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step)
+    refused = 0
+    for p, g, m, v, rate in zip(params, grads, exp_avg, exp_avg_sq, rates, strict=True):
+        good = torch.isfinite(g * g)
+        if visible is not None:
+            rows = visible.reshape(-1, *[1] * (g.dim() - 1))
+            refused += int((rows & ~good).sum())
+            good = good & rows
+        else:
+            refused += int((~good).sum())
+        g = torch.where(good, g, 0.0)
+        m_new, v_new = BETA1 * m + (1 - BETA1) * g, BETA2 * v + (1 - BETA2) * g * g
+        moved = p - rate * size * m_new / (root * v_new.sqrt() + EPS)
+        for old, new in ((m, m_new), (v, v_new), (p, moved)):
+            old.copy_(torch.where(good, new, old))
+    return refused
+
+
+@torch.no_grad()
+def catch_up_(
+    params: Sequence[Tensor],
+    exp_avg: Sequence[Tensor],
+    exp_avg_sq: Sequence[Tensor],
+    rates: Sequence[float],
+    *,
+    step: int,
+    rows: Tensor,
+    last_step: Tensor,
+) -> None:
+    """Bring rows [N] (bool) from their last_step to step as dense Adam with zero gradients would have.
+
+    Moments decay by powers of the betas. The parameter drifts by rate * m / sqrt(v) times a sum that depends
+    on the two step numbers only (`drift`), so it is a table look-up; eps is left out of it, which changes
+    nothing while sqrt(v) >> 1e-15.
+    """
+    missed = torch.where(rows, step - last_step, 0).clamp_min(0)
+    table = {int(k): drift(step - int(k), step) for k in torch.unique(missed)}
+    travel = torch.tensor([table[int(k)] for k in missed.tolist()], dtype=torch.float64)
+    for p, m, v, rate in zip(params, exp_avg, exp_avg_sq, rates, strict=True):
+        shape = (-1, *[1] * (p.dim() - 1))
+        ratio = torch.where(v > 0, m / v.sqrt(), 0.0)
+        p -= (rate * travel.to(p)).reshape(shape) * ratio
+        m *= (BETA1 ** missed.to(p.dtype)).reshape(shape)
+        v *= (BETA2 ** missed.to(p.dtype)).reshape(shape)
+    last_step[rows] = step
+
+
+def drift(last: int, step: int) -> float:
+    """Sum over steps s = last + j, last < s <= step, of beta1^j / (1 - beta1^s) * sqrt((1 - beta2^s) /
+    beta2^j)."""
+    total = 0.0
+    for j in range(1, min(step - last, MEMORY) + 1):
+        s = last + j
+        total += BETA1**j / (1 - BETA1**s) * math.sqrt((1 - BETA2**s) / BETA2**j)
+    return total
