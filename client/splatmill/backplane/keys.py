@@ -8,9 +8,6 @@ PREFIX = "splatmill:"
 JOBS = PREFIX + "jobs"
 """Sorted set of job ids, scored by creation time in milliseconds: the order of the list endpoint."""
 
-LEASES = PREFIX + "leases"
-"""Hash of singleton duties (the reaper) to the process that holds them, when several API processes run."""
-
 
 def job(job_id: str) -> str:
     """Hash: the job row. Only the server writes it."""

@@ -52,6 +52,10 @@ Standing = Literal["waiting", "running", "finished", "failed", "stopped", "absen
 """What the queue knows of a generation: `failed` means its tries are used up, `stopped` that it was killed on
 request or taken out of the queue and no process of it is left, `absent` that RQ has no record."""
 
+_OUR_LOCK = 30
+_RQ_LOCK = 899
+"""Seconds after which our lock on cleaning a queue, and RQ's own, expire."""
+
 _STANDINGS: dict[JobStatus, Standing] = {
     JobStatus.QUEUED: "waiting",
     JobStatus.DEFERRED: "waiting",
@@ -161,7 +165,16 @@ def reclaim(connection: redis.Redis) -> None:
     A busy worker never does this for a crashed neighbour; the API process calls it every few seconds.
     """
     for name in QUEUES:
-        open_queue(connection, name).started_job_registry.cleanup()
+        queue = open_queue(connection, name)
+        # The lock that idle workers clean under: two cleaners at once would requeue an attempt twice.
+        if connection.set(queue.registry_cleaning_key, 1, nx=True, ex=_OUR_LOCK):
+            try:
+                queue.started_job_registry.cleanup()
+            finally:
+                queue.release_maintenance_lock()
+        elif _OUR_LOCK < connection.ttl(queue.registry_cleaning_key) < _RQ_LOCK - _OUR_LOCK:
+            # Held for longer than any cleaning takes: its worker was killed while it cleaned.
+            queue.release_maintenance_lock()
 
 
 def waiting(connection: redis.Redis) -> dict[str, int]:
