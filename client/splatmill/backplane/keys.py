@@ -29,6 +29,11 @@ def attempts(job_id: str) -> str:
     return f"{PREFIX}job:{job_id}:attempts"
 
 
+def lock(job_id: str) -> str:
+    """Hash: the process that works on a job now. Only workers write it."""
+    return f"{PREFIX}job:{job_id}:lock"
+
+
 def idempotency(key_digest: str) -> str:
     """String: what an `Idempotency-Key` was first used for. Holds the job id and the digest of the body."""
     return f"{PREFIX}idempotency:{key_digest}"
@@ -36,4 +41,4 @@ def idempotency(key_digest: str) -> str:
 
 def of_job(job_id: str) -> tuple[str, ...]:
     """Every key that belongs to one job, for deletion."""
-    return job(job_id), states(job_id), progress(job_id), attempts(job_id)
+    return job(job_id), states(job_id), progress(job_id), attempts(job_id), lock(job_id)
