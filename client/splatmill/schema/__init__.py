@@ -33,7 +33,7 @@ from splatmill.schema.captures import (
     CreateCapture,
     FileName,
     Role,
-    UnsafeNameError,
+    UnsafeName,
     safe_name,
 )
 from splatmill.schema.events import (
@@ -183,7 +183,7 @@ __all__ = [
     "Switch",
     "Time",
     "TrainOptions",
-    "UnsafeNameError",
+    "UnsafeName",
     "WorkerInfo",
     "code_for_status",
     "describe_options",

@@ -21,7 +21,7 @@ _STAGED = re.compile(r"#\d+\Z", re.ASCII)
 _DRIVE = re.compile(r"[A-Za-z]:", re.ASCII)
 
 
-class UnsafeNameError(ValueError):
+class UnsafeName(ValueError):
     """A file name that is not accepted; the text says why."""
 
 
@@ -31,37 +31,35 @@ def safe_name(name: str) -> str:
     Nothing is rewritten beyond NFC (two spellings of one accent would be two files), so that a client finds
     its files under the names it gave.
 
-    Raises UnsafeNameError for an empty or over-long name, an absolute path or drive, `.` or `..` or an empty
+    Raises UnsafeName for an empty or over-long name, an absolute path or drive, `.` or `..` or an empty
     part, a backslash, a control character, a part with blanks at its ends, and an ending of `#` and digits.
     """
     shown = ascii(name if len(name) <= 80 else name[:77] + "...")
     name = unicodedata.normalize("NFC", name)
     if not name:
-        raise UnsafeNameError("A file name is empty; give every file a name.")
+        raise UnsafeName("A file name is empty; give every file a name.")
     if any(unicodedata.category(char) in ("Cc", "Cs") for char in name):
-        raise UnsafeNameError(f"The file name {shown} holds a control character; rename the file.")
+        raise UnsafeName(f"The file name {shown} holds a control character; rename the file.")
     if "\\" in name:
-        raise UnsafeNameError(f"The file name {shown} holds a backslash; separate folders with '/'.")
+        raise UnsafeName(f"The file name {shown} holds a backslash; separate folders with '/'.")
     if name.startswith("/") or _DRIVE.match(name):
-        raise UnsafeNameError(f"The file name {shown} is absolute; names are relative to the capture.")
+        raise UnsafeName(f"The file name {shown} is absolute; names are relative to the capture.")
     if len(name.encode()) > MAX_NAME_BYTES:
-        raise UnsafeNameError(f"The file name {shown} is longer than {MAX_NAME_BYTES} bytes; shorten it.")
+        raise UnsafeName(f"The file name {shown} is longer than {MAX_NAME_BYTES} bytes; shorten it.")
     parts = name.split("/")
     if len(parts) > MAX_PARTS:
-        raise UnsafeNameError(f"The file name {shown} has more than {MAX_PARTS} levels of folders.")
+        raise UnsafeName(f"The file name {shown} has more than {MAX_PARTS} levels of folders.")
     for part in parts:
         if part in ("", ".", ".."):
-            raise UnsafeNameError(
+            raise UnsafeName(
                 f"The file name {shown} has the part {part!r}; names must not climb or skip folders."
             )
         if part != part.strip():
-            raise UnsafeNameError(f"The file name {shown} has blanks at the ends of {part!r}.")
+            raise UnsafeName(f"The file name {shown} has blanks at the ends of {part!r}.")
         if len(part.encode()) > MAX_PART_BYTES:
-            raise UnsafeNameError(
-                f"The file name {shown} has a part over {MAX_PART_BYTES} bytes; shorten it."
-            )
+            raise UnsafeName(f"The file name {shown} has a part over {MAX_PART_BYTES} bytes; shorten it.")
     if _STAGED.search(name):
-        raise UnsafeNameError(f"The file name {shown} ends in '#' and digits, which is reserved; rename it.")
+        raise UnsafeName(f"The file name {shown} ends in '#' and digits, which is reserved; rename it.")
     return name
 
 

@@ -1,8 +1,8 @@
 """Jobs: what is asked for, and what a client sees of it."""
 
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from splatmill.schema.base import Request, Response, Time
 from splatmill.schema.events import JobState, LogEvent, Progress
@@ -21,6 +21,13 @@ class CreateJob(Request):
     options: TrainOptions = Field(default_factory=TrainOptions)
 
 
+def _known_options(value: Any) -> Any:
+    # A newer server may have settings that this version does not know; reading its jobs must not fail.
+    if isinstance(value, dict):
+        return {name: kept for name, kept in value.items() if name in TrainOptions.model_fields}
+    return value
+
+
 class Job(Response):
     """A job as a client sees it: the request, the wishes, and what the attempts told."""
 
@@ -28,7 +35,7 @@ class Job(Response):
     capture: str
     name: str | None = None
     state: JobState
-    options: TrainOptions
+    options: Annotated[TrainOptions, BeforeValidator(_known_options)]
     created_at: Time
     started_at: Time | None = None
     finished_at: Time | None = None

@@ -139,7 +139,7 @@ class Problem(Response):
 
 def code_for_status(status: int) -> str:
     """The general code for a bare HTTP status, for answers that no code of ours was raised for."""
-    general = {
+    general: dict[int, str] = {
         HTTPStatus.BAD_REQUEST: "malformed_body",
         HTTPStatus.UNAUTHORIZED: "unauthorized",
         HTTPStatus.FORBIDDEN: "forbidden",
@@ -154,4 +154,4 @@ def code_for_status(status: int) -> str:
         HTTPStatus.GATEWAY_TIMEOUT: "render_timeout",
         HTTPStatus.INSUFFICIENT_STORAGE: "storage_full",
     }
-    return general.get(HTTPStatus(status), "invalid_request" if status < 500 else "internal_error")
+    return general.get(status, "invalid_request" if status < 500 else "internal_error")

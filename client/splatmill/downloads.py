@@ -1,0 +1,139 @@
+"""Downloading a file so that it is there whole or not at all, going on where an earlier try stopped."""
+
+import asyncio
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+
+from splatmill.connection import Connection, pause
+from splatmill.errors import DownloadFailed, InvalidRequest, Unavailable
+from splatmill.schema.captures import SHA256_HEADER
+
+OnBytes = Callable[[int, int | None], None]
+"""Called with the bytes that are there and the size of the whole, where it is known."""
+
+
+def target_of(path: str | os.PathLike[str], name: str) -> Path:
+    """Where `name` is written: `path` itself, or inside it where it is a folder (or ends in a separator)."""
+    target = Path(path).expanduser()
+    if target.is_dir() or os.fspath(path).endswith(("/", os.sep)):
+        target = target / name
+    return target
+
+
+async def download(
+    connection: Connection,
+    address: str,
+    target: Path,
+    *,
+    sha256: str | None = None,
+    on_bytes: OnBytes | None = None,
+) -> Path:
+    """Write the file at `address` to `target`.
+
+    Bytes collect in `target.part` with the file's ETag beside it; a later call goes on there if the ETag still
+    fits. `target` appears only when the size and, where the server or the caller names one, the SHA-256 agree.
+
+    Raises DownloadFailed when they do not, ConnectionFailed or `Refused`, OSError when the disk refuses.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = _Part(target)
+    tries = 0
+    while True:
+        tries += 1
+        before = part.size
+        try:
+            announced = await _fetch(connection, address, part, on_bytes)
+            break
+        except (httpx.TransportError, Unavailable) as error:
+            if part.size > before:
+                tries = 1  # it moves: only tries without a byte count
+            if tries > connection.retries:
+                raise connection.lost(error) if isinstance(error, httpx.TransportError) else error from error
+            await asyncio.sleep(pause(tries))
+        except InvalidRequest as error:
+            # All bytes were there already and only the renaming was missing, or the file changed: begin anew.
+            if error.problem.status != 416 or not before:
+                raise
+            part.discard()
+    expected = sha256 or announced
+    if expected is not None:
+        seen = await asyncio.to_thread(part.digest)
+        if seen != expected:
+            part.discard()
+            raise DownloadFailed(
+                f"{target.name} arrived with SHA-256 {seen[:12]}... instead of {expected[:12]}...",
+                "The partial file was removed; download it again.",
+            )
+    part.finish()
+    return target
+
+
+class _Part:
+    """The unfinished file and the ETag of what it is a part of."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+        self.path = target.with_name(target.name + ".part")
+        self.etag_path = target.with_name(target.name + ".part.etag")
+
+    @property
+    def size(self) -> int:
+        """Bytes that can be gone on after; 0 without an ETag, since nothing would prove them to fit."""
+        return self.path.stat().st_size if self.path.exists() and self.etag is not None else 0
+
+    @property
+    def etag(self) -> str | None:
+        return self.etag_path.read_text() if self.etag_path.exists() else None
+
+    def begin(self, etag: str | None) -> None:
+        self.discard()
+        # A weak ETag does not promise the same bytes.
+        if etag and not etag.startswith("W/"):
+            self.etag_path.write_text(etag)
+        self.path.touch()
+
+    def digest(self) -> str:
+        with self.path.open("rb") as source:
+            return hashlib.file_digest(source, "sha256").hexdigest()
+
+    def discard(self) -> None:
+        self.path.unlink(missing_ok=True)
+        self.etag_path.unlink(missing_ok=True)
+
+    def finish(self) -> None:
+        with self.path.open("rb") as written:
+            os.fsync(written.fileno())
+        self.path.replace(self.target)
+        self.etag_path.unlink(missing_ok=True)
+
+
+async def _fetch(connection: Connection, address: str, part: _Part, on_bytes: OnBytes | None) -> str | None:
+    """One try: append what is missing, and return the announced SHA-256."""
+    headers = {"Accept-Encoding": "identity"}
+    if part.size and part.etag:
+        headers |= {"Range": f"bytes={part.size}-", "If-Range": part.etag}
+    async with connection.stream("GET", address, headers=headers) as response:
+        if response.status_code != 206:
+            part.begin(response.headers.get("ETag"))
+        start = part.path.stat().st_size
+        if response.status_code == 206 and not response.headers.get("Content-Range", "").startswith(
+            f"bytes {start}-"
+        ):
+            part.discard()
+            raise httpx.RemoteProtocolError("the server answered with another range than the one asked for")
+        length = response.headers.get("Content-Length")
+        total = start + int(length) if length is not None else None
+        with part.path.open("ab") as sink:
+            async for chunk in response.aiter_bytes():
+                sink.write(chunk)
+                if on_bytes is not None:
+                    on_bytes(sink.tell(), total)
+            size = sink.tell()
+        if total is not None and size != total:
+            raise httpx.RemoteProtocolError(f"{size} of {total} bytes arrived")
+        digest: str | None = response.headers.get(SHA256_HEADER)
+        return digest

@@ -1,0 +1,154 @@
+"""What a path given by a person contains: photos, masks, poses, a video or an archive."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatmill.errors import NothingToUpload
+from splatmill.schema.captures import Role, UnsafeName, safe_name
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
+ARCHIVE_SUFFIXES = frozenset({".zip"})
+
+MODEL_SUFFIXES = frozenset({".bin", ".txt"})
+MODEL_STEMS = frozenset({"cameras", "images", "points3D", "rigs", "frames"})
+# Where tools put a COLMAP model; the first folder that has one wins.
+MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
+MASK_FOLDERS = ("masks", "mask")
+
+
+@dataclass(frozen=True)
+class LocalFile:
+    """A file to upload: what it is for, its name in the capture, and where it lies."""
+
+    role: Role
+    name: str
+    path: Path
+    size: int
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a path contains. `ignored` are relative names of files that are no part of a capture."""
+
+    files: tuple[LocalFile, ...]
+    ignored: tuple[str, ...] = ()
+
+    def count(self, role: Role) -> int:
+        """How many files have this role."""
+        return sum(file.role is role for file in self.files)
+
+    @property
+    def bytes(self) -> int:
+        """Size of all files together."""
+        return sum(file.size for file in self.files)
+
+
+def find_files(path: str | os.PathLike[str]) -> Found:
+    """The files of the capture at `path`: a photo, a video, a zip, a folder of photos, or a posed data set.
+
+    In a folder, photos are those under `images/` with names relative to it, or, without such a folder, all photos
+    with names relative to the folder itself (so that `train/r_0.png` keeps the name a `transforms_train.json`
+    calls it by). Masks are those under `masks/`; poses are `transforms*.json` and a COLMAP model. Hidden files and
+    folders are passed over. A video or zip in a folder counts only where there are no photos.
+
+    Raises NothingToUpload where the path does not exist, cannot be read, or holds nothing of that kind, and where
+    a file's name is not accepted by the service.
+    """
+    root = Path(path).expanduser()
+    if not root.exists():
+        raise NothingToUpload(f"{root} does not exist.", "Give a folder of photos, a zip or a video.")
+    if root.is_file():
+        return _single(root)
+    try:
+        names = _walk(root)
+    except OSError as error:
+        raise NothingToUpload(f"{error.filename} cannot be read: {error.strerror}.") from error
+
+    photo_root = "images/" if any(name.startswith("images/") and _is_image(name) for name in names) else ""
+    mask_root = next(
+        (f"{top}/" for top in MASK_FOLDERS if any(name.startswith(f"{top}/") for name in names)), None
+    )
+    poses = _poses(names)
+    files: list[LocalFile] = []
+    ignored: list[str] = []
+    for name in names:
+        if name in poses:
+            files.append(_local(Role.poses, poses[name], root / name))
+        elif mask_root and name.startswith(mask_root):
+            if _is_image(name):
+                files.append(_local(Role.masks, name.removeprefix(mask_root), root / name))
+        elif name.startswith(photo_root) and _is_image(name):
+            files.append(_local(Role.images, name.removeprefix(photo_root), root / name))
+        else:
+            ignored.append(name)
+    if not any(file.role is Role.images for file in files):
+        whole = [name for name in ignored if _suffix(name) in VIDEO_SUFFIXES | ARCHIVE_SUFFIXES]
+        files += [_local(Role.images, name, root / name) for name in whole]
+        ignored = [name for name in ignored if name not in whole]
+        if not whole:
+            kinds = ", ".join(sorted(suffix.removeprefix(".") for suffix in IMAGE_SUFFIXES))
+            raise NothingToUpload(
+                f"{root} holds no photos, no video and no zip.", f"Photos are {kinds} files."
+            )
+    return Found(tuple(files), tuple(ignored))
+
+
+def _single(path: Path) -> Found:
+    if _suffix(path.name) not in IMAGE_SUFFIXES | VIDEO_SUFFIXES | ARCHIVE_SUFFIXES:
+        raise NothingToUpload(
+            f"{path.name} is neither a photo, nor a video, nor a zip.",
+            "Give a folder of photos, a zip or a video.",
+        )
+    return Found((_local(Role.images, path.name, path),))
+
+
+def _walk(root: Path) -> list[str]:
+    """Relative names of all files under `root`, sorted, hidden ones left out."""
+
+    def fail(error: OSError) -> None:
+        raise error
+
+    names: list[str] = []
+    for folder, subfolders, files in os.walk(root, onerror=fail, followlinks=False):
+        subfolders[:] = [name for name in subfolders if not name.startswith((".", "__MACOSX"))]
+        inside = Path(folder).relative_to(root)
+        names += [(inside / name).as_posix() for name in files if not name.startswith(".")]
+    return sorted(names)
+
+
+def _poses(names: list[str]) -> dict[str, str]:
+    """Local name of each pose file, and the name it gets in the capture."""
+    found = {
+        name: name
+        for name in names
+        if "/" not in name and name.startswith("transforms") and name.endswith(".json")
+    }
+    for folder in MODEL_FOLDERS:
+        prefix = "" if folder == "." else f"{folder}/"
+        inside = [name for name in names if name.startswith(prefix) and "/" not in name.removeprefix(prefix)]
+        if any(name.removeprefix(prefix) in ("cameras.bin", "cameras.txt") for name in inside):
+            model = [
+                name for name in inside if Path(name).stem in MODEL_STEMS and _suffix(name) in MODEL_SUFFIXES
+            ]
+            # One place for the worker to look, wherever the tool had put it.
+            return found | {name: f"sparse/0/{name.removeprefix(prefix)}" for name in model}
+    return found
+
+
+def _local(role: Role, name: str, path: Path) -> LocalFile:
+    try:
+        return LocalFile(role, safe_name(name), path, path.stat().st_size)
+    except UnsafeName as error:
+        raise NothingToUpload(str(error)) from error
+    except OSError as error:
+        raise NothingToUpload(f"{path} cannot be read: {error.strerror}.") from error
+
+
+def _is_image(name: str) -> bool:
+    return _suffix(name) in IMAGE_SUFFIXES
+
+
+def _suffix(name: str) -> str:
+    return os.path.splitext(name)[1].lower()

@@ -1,0 +1,93 @@
+"""An event loop on a thread of its own, so that the synchronous client is the asynchronous one, waited for."""
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from concurrent.futures import Future
+from queue import SimpleQueue
+from typing import Any, Final, TypeVar
+
+from splatmill.schema.events import Progress
+
+T = TypeVar("T")
+
+_DONE: Final = object()
+
+
+class BackgroundLoop:
+    """Runs coroutines on its thread. The thread is a daemon: a program that forgets to close still ends."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._serve, name="splatmill", daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        self._loop.run_forever()
+
+    def run(self, work: Coroutine[Any, Any, T]) -> T:
+        """The result of `work`; an interruption here (Ctrl-C) cancels it there."""
+        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            return future.result()
+        except BaseException:
+            future.cancel()
+            raise
+
+    def run_reporting(
+        self,
+        work: Callable[[Callable[[Progress], None]], Coroutine[Any, Any, T]],
+        on_progress: Callable[[Progress], None] | None,
+    ) -> T:
+        """The result of `work(report)`; what it reports is handed to `on_progress` on the caller's own thread."""
+        if on_progress is None:
+            return self.run(work(lambda _: None))
+        reports: SimpleQueue[Any] = SimpleQueue()
+        future: Future[T] = asyncio.run_coroutine_threadsafe(work(reports.put), self._loop)
+        future.add_done_callback(lambda _: reports.put(_DONE))
+        try:
+            while (report := reports.get()) is not _DONE:
+                on_progress(report)
+            return future.result()
+        except BaseException:
+            future.cancel()
+            raise
+
+    def iterate(self, items: AsyncIterator[T]) -> Iterator[T]:
+        """The items of an asynchronous generator; it is closed when the iteration is left."""
+
+        async def advance() -> T | object:
+            return await anext(items, _DONE)
+
+        async def leave() -> None:
+            close = getattr(items, "aclose", None)
+            if close is not None:
+                await close()
+
+        try:
+            while (item := self.run(advance())) is not _DONE:
+                yield item  # type: ignore[misc]  # anext's default widens the type; _DONE was ruled out
+        finally:
+            self.run(leave())
+
+    @property
+    def closed(self) -> bool:
+        """Whether `close` was called."""
+        return self._loop.is_closed()
+
+    def close(self) -> None:
+        """End what still runs, and the thread."""
+        self.run(_cancel_others())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+
+async def _cancel_others() -> None:
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in others:
+        task.cancel()
+    await asyncio.gather(*others, return_exceptions=True)
+    await asyncio.get_running_loop().shutdown_asyncgens()
+    await asyncio.get_running_loop().shutdown_default_executor()
