@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from splatmill_worker.images.masks import mask_of, masks_under
+
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif")
 MASK_FOLDERS = ("masks", "mask")
 
@@ -58,7 +60,7 @@ class ImageFiles:
         return (best[0], self.photos[best[0]]) if len(best) == 1 else None
 
     def mask(self, name: str) -> Path | None:
-        """The mask of the photo with this relative name: name.jpg.png, name.png or name.jpg."""
+        """The mask of the photo with this relative name; None where it has none."""
         return mask_of(name, self.masks)
 
     def _by_last_part(self, last: str) -> list[str]:
@@ -67,19 +69,3 @@ class ImageFiles:
             stem = last if PurePosixPath(last).suffix.lower() not in SUFFIXES else PurePosixPath(last).stem
             names = [name for name in self.photos if PurePosixPath(name).stem == stem]
         return names
-
-
-def masks_under(directory: Path) -> dict[str, Path]:
-    """Mask files by relative name."""
-    return {
-        path.relative_to(directory).as_posix(): path
-        for path in sorted(directory.rglob("*"))
-        if path.suffix.lower() in SUFFIXES and path.is_file()
-    }
-
-
-def mask_of(name: str, masks: dict[str, Path]) -> Path | None:
-    """The mask for the photo `name`, by COLMAP's convention (name.jpg.png) or the same stem."""
-    stem = str(PurePosixPath(name).with_suffix(""))
-    candidates = [f"{name}.png", f"{stem}.png", name, *(f"{stem}{suffix}" for suffix in SUFFIXES)]
-    return next((masks[candidate] for candidate in candidates if candidate in masks), None)

@@ -1,0 +1,92 @@
+"""Zips of photos, unpacked without trusting them: names stay inside, sizes stay bounded."""
+
+from __future__ import annotations
+
+import stat
+import zipfile
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+MAX_ENTRIES = 20_000
+MAX_FILE_BYTES = 2 * 2**30
+MAX_TOTAL_BYTES = 16 * 2**30
+MAX_RATIO = 100  # photos and videos hardly deflate; a bomb does by a thousand
+RATIO_FLOOR = 2**20  # bytes below which the ratio of a file says nothing
+CHUNK = 2**20
+
+
+class UnsafeArchive(ValueError):
+    """The archive is refused as a whole; the message says for what."""
+
+
+def unpack(path: Path, target: Path, cancelled: Callable[[], bool] = lambda: False) -> list[Path]:
+    """Writes the archive's files under `target` and returns them, in the archive's order.
+
+    Sizes are checked as declared before anything is written, and as they really are while writing. Hidden
+    files and macOS' resource forks are left out. Raises UnsafeArchive for absolute names, `..`, links,
+    encryption, bombs, too many files, and files that are no zip.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+            _check_declared(entries)
+            written: list[Path] = []
+            total = 0
+            for entry in entries:
+                name = PurePosixPath(entry.filename)
+                if any(part.startswith((".", "__MACOSX")) for part in name.parts):
+                    continue
+                place = target / name
+                place.parent.mkdir(parents=True, exist_ok=True)
+                total = _write(archive, entry, place, total, cancelled)
+                written.append(place)
+            return written
+    except (zipfile.BadZipFile, NotImplementedError, EOFError) as error:
+        raise UnsafeArchive(f"it is not a whole zip file ({error})") from error
+
+
+def _check_declared(entries: list[zipfile.ZipInfo]) -> None:
+    if len(entries) > MAX_ENTRIES:
+        raise UnsafeArchive(f"it holds {len(entries)} files; at most {MAX_ENTRIES} are unpacked")
+    seen: set[str] = set()
+    for entry in entries:
+        name = entry.filename
+        windows = PureWindowsPath(name)
+        if PurePosixPath(name).is_absolute() or windows.drive or windows.root or ".." in windows.parts:
+            raise UnsafeArchive(f"the name {name!r} points outside the archive")
+        if "\x00" in name or not name.strip("/. "):
+            raise UnsafeArchive(f"the name {name!r} is not a file name")
+        if stat.S_IFMT(entry.external_attr >> 16) not in (0, stat.S_IFREG):
+            raise UnsafeArchive(f"{name!r} is a link or a device, not a file")
+        if entry.flag_bits & 1:
+            raise UnsafeArchive(f"{name!r} is encrypted")
+        if name in seen:
+            raise UnsafeArchive(f"two files are called {name!r}")
+        seen.add(name)
+        if entry.file_size > MAX_FILE_BYTES:
+            raise UnsafeArchive(
+                f"{name!r} would be {entry.file_size} bytes; at most {MAX_FILE_BYTES} are unpacked"
+            )
+        if entry.file_size > RATIO_FLOOR and entry.file_size > MAX_RATIO * max(entry.compress_size, 1):
+            ratio = entry.file_size // max(entry.compress_size, 1)
+            raise UnsafeArchive(f"{name!r} is compressed {ratio} to 1, as no photo is: a zip bomb")
+    total = sum(entry.file_size for entry in entries)
+    if total > MAX_TOTAL_BYTES:
+        raise UnsafeArchive(f"its files would be {total} bytes; at most {MAX_TOTAL_BYTES} are unpacked")
+
+
+def _write(
+    archive: zipfile.ZipFile, entry: zipfile.ZipInfo, place: Path, total: int, cancelled: Callable[[], bool]
+) -> int:
+    """Streams one entry to `place` and returns the bytes written so far, which headers cannot understate."""
+    size = 0
+    with archive.open(entry) as source, place.open("wb") as sink:
+        while chunk := source.read(CHUNK):
+            if cancelled():
+                raise InterruptedError(f"Unpacking {entry.filename} was cancelled.")
+            size += len(chunk)
+            total += len(chunk)
+            if size > entry.file_size or size > MAX_FILE_BYTES or total > MAX_TOTAL_BYTES:
+                raise UnsafeArchive(f"{entry.filename!r} is larger than its header says: a zip bomb")
+            sink.write(chunk)
+    return total

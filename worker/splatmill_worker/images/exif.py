@@ -1,0 +1,91 @@
+"""What a photo's EXIF says that structure from motion can use: the camera, its focal length, the place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from PIL import Image
+
+MAKE, MODEL, EXIF_IFD, GPS_IFD = 0x010F, 0x0110, 0x8769, 0x8825
+FOCAL_LENGTH, FOCAL_LENGTH_35MM, LENS_MODEL = 0x920A, 0xA405, 0xA434
+FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # mm; the equivalent focal length is defined by the diagonal
+
+
+@dataclass(frozen=True)
+class Exif:
+    """Absent fields are None. focal_length in mm; `focal_in_diagonals`: focal length over the photo's diagonal.
+
+    latitude, longitude in degrees (north and east positive), altitude in metres above sea level.
+    """
+
+    make: str | None = None
+    model: str | None = None
+    lens: str | None = None
+    focal_length: float | None = None
+    focal_in_diagonals: float | None = None
+    latitude: float | None = None
+    longitude: float | None = None
+    altitude: float | None = None
+
+
+def read(image: Image.Image) -> Exif:
+    """The fields of an opened image; broken EXIF counts as none."""
+    try:
+        tags = image.getexif()
+        details, gps = tags.get_ifd(EXIF_IFD), tags.get_ifd(GPS_IFD)
+    except (OSError, ValueError, SyntaxError, KeyError, TypeError):
+        return Exif()
+    equivalent = _positive(details.get(FOCAL_LENGTH_35MM))
+    latitude, longitude = (
+        _degrees(gps.get(2), gps.get(1), "S", 90.0),
+        _degrees(gps.get(4), gps.get(3), "W", 180.0),
+    )
+    # Exactly 0, 0 is what devices write that had no fix.
+    if latitude is None or longitude is None or (latitude == 0.0 and longitude == 0.0):
+        latitude = longitude = None
+    altitude = _number(gps.get(6))
+    if altitude is not None and gps.get(5) in (1, b"\x01"):
+        altitude = -altitude
+    return Exif(
+        make=_text(tags.get(MAKE)),
+        model=_text(tags.get(MODEL)),
+        lens=_text(details.get(LENS_MODEL)),
+        focal_length=_positive(details.get(FOCAL_LENGTH)),
+        focal_in_diagonals=None if equivalent is None else equivalent / FULL_FRAME_DIAGONAL,
+        latitude=latitude,
+        longitude=longitude,
+        altitude=altitude,
+    )
+
+
+def _text(value: Any) -> str | None:
+    text = str(value).strip("\x00 ") if value is not None else ""
+    return text or None
+
+
+def _number(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _positive(value: Any) -> float | None:
+    number = _number(value)
+    return number if number is not None and number > 0.0 else None
+
+
+def _degrees(value: Any, side: Any, negative: str, bound: float) -> float | None:
+    """Degrees, minutes and seconds as one signed number; None where they make none."""
+    if not isinstance(value, tuple | list) or len(value) != 3:
+        return None
+    parts = [_number(part) for part in value]
+    if any(part is None for part in parts):
+        return None
+    degrees = sum((part or 0.0) / 60.0**index for index, part in enumerate(parts))
+    if not degrees <= bound:
+        return None
+    return -degrees if _text(side) == negative else degrees
