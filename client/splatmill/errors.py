@@ -140,5 +140,5 @@ def invalid(error: "ValidationError", code: str = "invalid_request") -> InvalidR
         else:
             seen = f" (got {entry['input']!r})" if isinstance(entry["input"], str | int | float) else ""
             clauses.append(f"{place}: {message}{seen}" if place else message)
-    detail = "; ".join(clauses)
-    return InvalidRequest(Problem.of(code, detail[:1].upper() + detail[1:] + "."))
+    text = "; ".join(clauses).removesuffix(".")
+    return InvalidRequest(Problem.of(code, f"{text}."))

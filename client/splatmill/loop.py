@@ -12,6 +12,7 @@ from splatmill.schema.events import Progress
 T = TypeVar("T")
 
 _DONE: Final = object()
+ENDING = 5.0  # seconds that cancelled work may take to clean up
 
 
 class BackgroundLoop:
@@ -28,11 +29,21 @@ class BackgroundLoop:
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
         """The result of `work`; an interruption here (Ctrl-C) cancels it there."""
-        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        ended = threading.Event()
+
+        async def watched() -> T:
+            try:
+                return await work
+            finally:
+                ended.set()
+
+        future = asyncio.run_coroutine_threadsafe(watched(), self._loop)
         try:
             return future.result()
         except BaseException:
-            future.cancel()
+            # What comes next (closing a generator, say) must not meet it half-way through its own ending.
+            if future.cancel():
+                ended.wait(ENDING)
             raise
 
     def run_reporting(

@@ -106,6 +106,15 @@ class CameraSpec(Request):
         assert self.cy is not None
         return self.fx, self.fy, self.cx, self.cy
 
+    def scaled_to(self, width: int) -> Self:
+        """The same view at another width in pixels; the height follows the proportions."""
+        factor = width / self.width
+        fields = self.model_dump() | {"width": width, "height": max(1, round(self.height * factor))}
+        if self.fov_y_deg is None:
+            fx, fy, cx, cy = self.pinhole()
+            fields |= {"fx": fx * factor, "fy": fy * factor, "cx": cx * factor, "cy": cy * factor}
+        return type(self).model_validate(fields)
+
 
 class Output(StrEnum):
     color = "color"

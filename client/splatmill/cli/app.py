@@ -1,0 +1,82 @@
+"""The commands by name. Each lives in a module of its own, which is imported when its command is run or listed."""
+
+from importlib import import_module
+from typing import Annotated, Any
+
+import typer
+import typer.main
+from typer.core import TyperGroup
+
+from splatmill import __version__
+
+# Command, and the module and function that are it.
+COMMANDS = {
+    "train": ("splatmill.cli.train", "train"),
+    "up": ("splatmill.cli.service", "up"),
+    "jobs": ("splatmill.cli.jobs", "jobs"),
+    "status": ("splatmill.cli.jobs", "status"),
+    "cancel": ("splatmill.cli.jobs", "cancel"),
+    "download": ("splatmill.cli.models", "download"),
+    "render": ("splatmill.cli.models", "render"),
+    "orbit": ("splatmill.cli.models", "orbit"),
+    "options": ("splatmill.cli.jobs", "options"),
+    "doctor": ("splatmill.cli.service", "doctor"),
+    "bench": ("splatmill.cli.service", "bench"),
+}
+
+# What these take is read by the program they start.
+PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+
+
+class Commands(TyperGroup):
+    """The group that loads its commands, and tells their errors as sentences."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name not in COMMANDS:
+            return None
+        module, function = COMMANDS[cmd_name]
+        single = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+        settings = PASSED_ON if cmd_name in ("up", "doctor", "bench") else None
+        single.command(cmd_name, context_settings=settings)(getattr(import_module(module), function))
+        return typer.main.get_command(single)
+
+    def invoke(self, ctx: Any) -> Any:
+        from splatmill.errors import SplatmillError
+
+        try:
+            return super().invoke(ctx)
+        except (SplatmillError, OSError) as error:
+            if isinstance(error, BrokenPipeError):
+                raise  # `splatmill jobs | head`: the runner ends quietly
+            from splatmill.cli.exits import tell
+
+            raise typer.Exit(tell(error)) from error
+        except KeyboardInterrupt:
+            raise typer.Exit(130) from None
+
+
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"splatmill {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def splatmill(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Photos in, Gaussian splats out."""

@@ -1,0 +1,101 @@
+"""`splatmill jobs`, `status`, `cancel` and `options`: what the server knows."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from splatmill.cli.servers import Server, connect
+
+if TYPE_CHECKING:
+    from splatmill.schema import Job
+
+JobId = Annotated[str, typer.Argument(metavar="JOB", help="The job's id.", show_default=False)]
+
+
+def jobs(
+    server: Server = None,
+    limit: Annotated[int, typer.Option("-n", "--limit", min=1, help="Show at most this many.")] = 20,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per job.")] = False,
+) -> None:
+    """List the jobs, newest first."""
+    with connect(server) as client:
+        found = list(client.jobs(limit=limit))
+    if as_json:
+        for job in found:
+            typer.echo(job.model_dump_json(exclude_none=True))
+        return
+    if not found:
+        typer.echo("There are no jobs yet. Start one with: splatmill train PHOTOS --server URL")
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("job", "name", "state", "progress", "created", box=None, pad_edge=False)
+    for job in found:
+        created = job.created_at.astimezone().strftime("%Y-%m-%d %H:%M")
+        table.add_row(job.id, job.name or "", job.state.value, _progress(job), created)
+    Console().print(table)
+
+
+def status(
+    job_id: JobId,
+    server: Server = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the job as JSON.")] = False,
+) -> None:
+    """Show a job: its state, progress, plan and problem."""
+    with connect(server) as client:
+        job = client.job(job_id).job
+    if as_json:
+        typer.echo(job.model_dump_json(indent=2, exclude_none=True))
+        return
+    from splatmill.cli.plan import plan_lines
+
+    typer.echo(f"job       {job.id}" + (f" ({job.name})" if job.name else ""))
+    typer.echo(f"state     {job.state.value}" + (" (cancel requested)" if _dying(job) else ""))
+    typer.echo(f"attempt   {job.attempt}")
+    typer.echo(f"created   {job.created_at.astimezone():%Y-%m-%d %H:%M:%S}")
+    if job.started_at and job.finished_at:
+        from splatmill.schema import format_duration
+
+        typer.echo(f"took      {format_duration((job.finished_at - job.started_at).total_seconds())}")
+    if job.progress:
+        typer.echo(f"progress  {_progress(job)}")
+    if job.problem:
+        typer.echo(f"problem   {job.problem.sentence}")
+    for line in plan_lines(job.plan or {}):
+        typer.echo(f"plan      {line}")
+
+
+def cancel(job_id: JobId, server: Server = None) -> None:
+    """Cancel a job, and wait until it has ended."""
+    with connect(server) as client:
+        handle = client.job(job_id)
+        handle.cancel()
+        for _ in handle.events():
+            pass
+        state = handle.refresh().state
+    typer.echo(f"The job {job_id} is {state.value}.")
+
+
+def options() -> None:
+    """List every training option with its default, range and help."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from splatmill.schema import describe_options
+
+    table = Table("option", "default", "range", "help", box=None, pad_edge=False)
+    for option in describe_options():
+        default = "decided" if option.default is None else str(option.default)
+        table.add_row(option.flag, default, option.range_text.replace("|", " "), option.help)
+    Console().print(table)
+
+
+def _dying(job: "Job") -> bool:
+    return job.cancel_requested and not job.state.final
+
+
+def _progress(job: "Job") -> str:
+    from splatmill.cli.progress import progress_text
+
+    return progress_text(job.progress) if job.progress else ""

@@ -1,0 +1,128 @@
+"""`splatmill download`, `render` and `orbit`: what a finished model gives."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from splatmill.cli.servers import Server, connect
+
+if TYPE_CHECKING:
+    from splatmill.client import ModelHandle
+    from splatmill.schema import CameraSpec
+
+ModelId = Annotated[
+    str, typer.Argument(metavar="MODEL", help="The model's id, that of its job.", show_default=False)
+]
+
+FILES = ("model.ply", "report.json", "report.png", "report.html", "cameras.json")
+"""What `train` and `download` leave in the output folder; preview.jpg comes along where there is one."""
+
+
+def download_files(model: "ModelHandle", folder: Path) -> list[Path]:
+    """Write the model's files into `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    stored = {entry.name for entry in model.model.files}
+    wanted = [name for name in (*FILES, "preview.jpg") if name in stored or not stored]
+    return [model.download(folder / name, file=name) for name in wanted]
+
+
+def download(
+    model_id: ModelId,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write to.")] = Path("splat"),
+    server: Server = None,
+) -> None:
+    """Fetch a finished model with its report."""
+    with connect(server) as client:
+        for path in download_files(client.model(model_id), out):
+            typer.echo(path)
+
+
+def render(
+    model_id: ModelId,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Picture to write; its ending says the format.")
+    ] = Path("view.png"),
+    view: Annotated[
+        str | None,
+        typer.Option(help="A photo's name: render from its camera. Left out: the first held-out photo."),
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(exists=True, dir_okay=False, help="A JSON file with a camera as the API takes it."),
+    ] = None,
+    width: Annotated[int | None, typer.Option(min=1, max=8192, help="Pixels; the height follows.")] = None,
+    output: Annotated[Literal["color", "depth", "alpha"], typer.Option(help="What to render.")] = "color",
+    background: Annotated[
+        Literal["black", "white", "transparent"], typer.Option(help="What shows where the model is not.")
+    ] = "black",
+    server: Server = None,
+) -> None:
+    """Render a picture of a model."""
+    from splatmill.aio import write_whole
+    from splatmill.schema import Format
+
+    suffixes = {
+        ".png": Format.png,
+        ".jpg": Format.jpeg,
+        ".jpeg": Format.jpeg,
+        ".webp": Format.webp,
+        ".npy": Format.npy,
+    }
+    if out.suffix.lower() not in suffixes:
+        raise typer.BadParameter(f"{out} must end in one of {', '.join(suffixes)}.", param_hint="--out")
+    if camera is not None and view is not None:
+        raise typer.BadParameter("Give --view or --camera, not both.", param_hint="--view")
+    with connect(server) as client:
+        model = client.model(model_id)
+        chosen = _read_camera(camera) if camera is not None else _camera_of_view(model, view)
+        if width is not None:
+            chosen = chosen.scaled_to(width)
+        picture = model.render(
+            chosen, output=output, background=background, format=suffixes[out.suffix.lower()]
+        )
+    typer.echo(write_whole(out, picture))
+
+
+def orbit(
+    model_id: ModelId,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Video to write.")] = Path("orbit.mp4"),
+    seconds: Annotated[float, typer.Option(min=0.5, max=60, help="Length of the video.")] = 6.0,
+    fps: Annotated[int, typer.Option(min=1, max=60, help="Frames per second.")] = 24,
+    width: Annotated[int, typer.Option(min=16, max=3840, help="Pixels, an even number.")] = 640,
+    height: Annotated[int, typer.Option(min=16, max=2160, help="Pixels, an even number.")] = 480,
+    server: Server = None,
+) -> None:
+    """Render a video that circles the scene."""
+    with connect(server) as client:
+        model = client.model(model_id)
+        typer.echo(model.orbit(out, seconds=seconds, fps=fps, width=width, height=height))
+
+
+def _camera_of_view(model: "ModelHandle", name: str | None) -> "CameraSpec":
+    cameras = model.cameras()
+    if name is not None:
+        found = [entry for entry in cameras if entry.name == name]
+        if not found:
+            raise typer.BadParameter(
+                f"The model has no camera called {name!r}; it has {', '.join(c.name for c in cameras[:8])}, ...",
+                param_hint="--view",
+            )
+        return found[0].camera
+    if not cameras:
+        raise typer.BadParameter(
+            "The model came without cameras; give one with --camera.", param_hint="--view"
+        )
+    return next((entry for entry in cameras if entry.split == "test"), cameras[0]).camera
+
+
+def _read_camera(path: Path) -> "CameraSpec":
+    from pydantic import ValidationError
+
+    from splatmill.errors import invalid
+    from splatmill.schema import CameraSpec
+
+    try:
+        return CameraSpec.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise invalid(error, "camera_invalid") from error

@@ -1,0 +1,158 @@
+"""`splatmill train`: photos to splats in one command, on a server or on this machine."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+
+from splatmill.cli.embedded import embedded_service
+from splatmill.cli.exits import Exit
+from splatmill.cli.models import download_files
+from splatmill.cli.progress import Display, make_display, show
+from splatmill.cli.schema_options import with_training_options
+from splatmill.cli.servers import connect
+from splatmill.client import Client, JobHandle, ModelHandle
+from splatmill.layout import Found, find_files
+from splatmill.schema import Role, TrainOptions, format_bytes
+
+
+@with_training_options
+def train(
+    path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PATH", help="Photos, a zip, a video or a posed data set.", show_default=False
+        ),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for the results.")] = Path(
+        "splat"
+    ),
+    server: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL",
+            envvar="SPLATMILL_SERVER",
+            help="Train there instead of on this machine. The API key is read from SPLATMILL_API_KEY.",
+        ),
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="A name for the job.", show_default=False)] = None,
+    detach: Annotated[
+        bool, typer.Option("--detach", help="With --server: start the job, print its id, and leave it.")
+    ] = False,
+    orbit: Annotated[
+        bool, typer.Option("--orbit", help="Also leave a video that circles the scene.")
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option("-v", "--verbose", help="Show the plan and all log lines.")
+    ] = False,
+    **options: Any,
+) -> None:
+    """Train Gaussian splats from photos; leaves model.ply and its report in DIR."""
+    from splatmill.aio import train_options
+
+    checked = train_options(
+        {key: value for key, value in options.items() if value is not None and value != []}
+    )
+    found = find_files(path)
+    if detach and server is None:
+        raise typer.BadParameter("Without --server the job ends with this call.", param_hint="--detach")
+    out.mkdir(parents=True, exist_ok=True)
+    _announce(found)
+    with _sigterm_as_interrupt(), _client(server, out) as client:
+        job = _start(client, path, name or path.expanduser().resolve().name, checked)
+        if detach:
+            typer.echo(job.id)
+            return
+        model = _follow(job, verbose)
+        written = download_files(model, out)
+        if orbit:
+            written.append(model.orbit(out / "orbit.mp4"))
+    _summary(model, written)
+
+
+def _announce(found: Found) -> None:
+    photos, poses, masks = (found.count(role) for role in (Role.images, Role.poses, Role.masks))
+    extra = "".join(f", {count} {kind}" for count, kind in ((masks, "masks"), (poses, "pose files")) if count)
+    typer.echo(f"{photos} photos{extra}, {format_bytes(found.bytes)}")
+    if found.ignored:
+        shown = ", ".join(found.ignored[:5]) + (", ..." if len(found.ignored) > 5 else "")
+        typer.echo(f"passed over: {shown}")
+
+
+@contextmanager
+def _client(server: str | None, out: Path) -> Iterator[Client]:
+    if server is not None:
+        with connect(server) as client:
+            yield client
+        return
+    with (
+        embedded_service(out / ".splatmill") as service,
+        Client(service.url, api_key=service.api_key) as client,
+    ):
+        yield client
+
+
+def _start(client: Client, path: Path, name: str, options: TrainOptions) -> JobHandle:
+    given = options.model_dump(exclude_unset=True)
+    try:
+        with make_display() as display:
+            job = client.train(path, name=name, on_progress=display.progress, **given)
+    except KeyboardInterrupt:
+        typer.echo("Stopped before the job began.", err=True)
+        raise typer.Exit(Exit.cancelled) from None
+    for photo, problem in job.refused:
+        typer.echo(f"left out: {photo}: {problem.detail}", err=True)
+    return job
+
+
+def _follow(job: JobHandle, verbose: bool) -> ModelHandle:
+    """Show the job until its end; Ctrl-C cancels it, a second Ctrl-C does not wait for that."""
+    try:
+        with make_display() as display:
+            for record in job.events():
+                show(record, display, verbose=verbose)
+        return job.result()
+    except KeyboardInterrupt:
+        with make_display() as display:
+            _cancel(job, display)
+        raise typer.Exit(Exit.cancelled) from None
+
+
+def _cancel(job: JobHandle, display: Display) -> None:
+    display.say(f"Cancelling the job {job.id} ...")
+    try:
+        job.cancel()
+        for _ in job.events():
+            pass
+    except KeyboardInterrupt:
+        display.say("Not waiting for the cancellation; the service is ended.")
+        return
+    display.say(f"The job {job.id} is {job.state.value}.")
+
+
+def _summary(model: ModelHandle, written: list[Path]) -> None:
+    record = model.model
+    quality = f", held-out PSNR {record.psnr:.2f} dB" if record.psnr is not None else ""
+    quality += f", SSIM {record.ssim:.3f}" if record.ssim is not None else ""
+    typer.echo(f"{record.gaussians:,} Gaussians, {format_bytes(record.bytes)}{quality}")
+    for path in written:
+        typer.echo(f"  {path}")
+    typer.echo("Drop model.ply on https://superspl.at/editor, or open it in any viewer for Gaussian splats.")
+
+
+@contextmanager
+def _sigterm_as_interrupt() -> Iterator[None]:
+    """A polite end (`kill`, a stopped container) cancels the job just as Ctrl-C does."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
