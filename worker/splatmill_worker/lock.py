@@ -39,7 +39,9 @@ redis.call('HSET', KEYS[1], 'seen', now[1] * 1000 + math.floor(now[2] / 1000))
 return 1
 """
 
-_RELEASE = "if redis.call('HGET', KEYS[1], 'token') == ARGV[1] then return redis.call('DEL', KEYS[1]) end return 0"
+_RELEASE = (
+    "if redis.call('HGET', KEYS[1], 'token') == ARGV[1] then return redis.call('DEL', KEYS[1]) end return 0"
+)
 
 
 class Held(Enum):
@@ -79,7 +81,7 @@ class JobLock:
         fields = cast(dict[bytes, bytes], self._connection.hgetall(self._key))
         if not fields:
             return None
-        seconds, micros = cast(tuple[int, int], self._connection.time())
+        seconds, micros = self._connection.time()
         return Holder(
             token=fields[b"token"].decode(),
             process=ProcessIdentity.load(json.loads(fields[b"holder"])),

@@ -1,0 +1,120 @@
+"""A small pipeline with the real one's contract, whose stages can be held, crashed and slowed from outside.
+
+It checkpoints every step and goes on from there, so that a test can tell a resumed attempt from a new one. The
+capture's text files steer it: `steps` how many, `pause` seconds per step, `crash` what to do at which step.
+"""
+
+import json
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from splatmill.schema import (
+    Event,
+    JobState,
+    LogEvent,
+    MetricEvent,
+    PlanEvent,
+    PreviewEvent,
+    ProgressEvent,
+    StateEvent,
+    TrainOptions,
+)
+
+PROPERTIES = [
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+]
+
+
+def run(
+    capture: Path,
+    workdir: Path,
+    options: TrainOptions,
+    emit: Callable[[Event], None],
+    cancelled: Callable[[], bool],
+) -> None:
+    """Photos are not looked at; the model is a ball of Gaussians."""
+    script = json.loads((capture / "images" / "script.json").read_text())
+    workdir.mkdir(parents=True, exist_ok=True)
+    checkpoint = workdir / "checkpoints" / "state.json"
+    diary = Path(script["diary"])
+    with diary.open("a") as file:
+        file.write(json.dumps({"pid": os.getpid(), "begin": time.time(), "from": _step(checkpoint)}) + "\n")
+    emit(StateEvent(state=JobState.sfm))
+    emit(ProgressEvent(stage="features", done=1, total=1))
+    emit(StateEvent(state=JobState.training))
+    emit(PlanEvent(plan={"steps": {"value": script["steps"], "because": "the script says so"}}))
+    for step in range(_step(checkpoint) + 1, script["steps"] + 1):
+        _act(script, step)
+        time.sleep(script.get("pause", 0.0))
+        _save(checkpoint, step)
+        emit(ProgressEvent(stage="training", done=step, total=script["steps"], step=step, loss=1 / step))
+        if cancelled():
+            emit(LogEvent(message=f"saved at step {step}"))
+            return
+    (workdir / "preview.jpg").write_bytes(b"\xff\xd8 no picture \xff\xd9")
+    emit(PreviewEvent(path="preview.jpg", step=script["steps"]))
+    emit(MetricEvent(seconds=1.0, step=script["steps"], psnr=30.0, ssim=0.9, gaussians=len(ball())))
+    emit(StateEvent(state=JobState.exporting))
+    out = workdir / "out"
+    out.mkdir(exist_ok=True)
+    write_ply(out / "model.ply")
+    (out / "report.json").write_text(
+        json.dumps({"curve": [{"seconds": 1.0, "step": 1, "psnr": 30.0, "gaussians": 100}], "seconds": {}})
+    )
+    (out / "cameras.json").write_text(json.dumps({"cameras": []}))
+    with diary.open("a") as file:
+        file.write(json.dumps({"pid": os.getpid(), "end": time.time()}) + "\n")
+
+
+def ball(count: int = 400) -> np.ndarray:
+    """Gaussians on a unit ball, red where x is positive, in the standard property order [count, 17]."""
+    rng = np.random.default_rng(0)
+    means = rng.normal(size=(count, 3))
+    means /= np.linalg.norm(means, axis=1, keepdims=True)
+    rows = np.zeros((count, len(PROPERTIES)), dtype="<f4")
+    rows[:, :3] = means
+    rows[:, 6:9] = np.where(means[:, :1] > 0, [[1.7, -1.7, -1.7]], [[-1.7, -1.7, 1.7]])
+    rows[:, 9] = 4.0
+    rows[:, 10:13] = -2.2
+    rows[:, 13] = 1.0
+    return rows
+
+
+def write_ply(path: Path) -> None:
+    """The ball as a binary `.ply`."""
+    rows = ball()
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [f"property float {name}" for name in PROPERTIES] + ["end_header", ""]
+    path.write_bytes("\n".join(header).encode() + rows.tobytes())
+
+
+def _step(checkpoint: Path) -> int:
+    return int(json.loads(checkpoint.read_text())["step"]) if checkpoint.is_file() else 0
+
+
+def _save(checkpoint: Path, step: int) -> None:
+    checkpoint.parent.mkdir(exist_ok=True)
+    part = checkpoint.with_suffix(".part")
+    part.write_text(json.dumps({"step": step}))
+    part.replace(checkpoint)
+
+
+def _act(script: dict[str, object], step: int) -> None:
+    """Fail at a step as the script asks: once per marker file, or each time."""
+    if script.get("at") != step:
+        return
+    match script.get("do"):
+        case "raise":
+            raise RuntimeError("the stand-in was told to fail")
+        case "memory":
+            raise MemoryError("the stand-in was told to run out of memory")
+        case "segv":
+            os.kill(os.getpid(), signal.SIGSEGV)
+        case "native":
+            # One call that never comes back to the interpreter, as a mapper's does for seconds.
+            np.linalg.svd(np.random.default_rng(0).normal(size=(6000, 6000)))

@@ -1,0 +1,96 @@
+"""`python -m splatmill_worker train | renderer | doctor | bench NAME`."""
+
+import argparse
+import importlib.util
+import sys
+import time
+from pathlib import Path
+
+from splatmill_worker import places
+
+REDIS_PATIENCE = 60.0
+"""Seconds a starting worker waits for Redis, which may be starting beside it."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one of the worker's programs; returns its exit status."""
+    parser = argparse.ArgumentParser(prog="python -m splatmill_worker", description=__doc__)
+    programs = parser.add_subparsers(dest="program", required=True)
+    train = programs.add_parser(
+        "train", help="take jobs from the queue (REDIS_URL, SPLATMILL_STORAGE, SPLATMILL_DATA)"
+    )
+    train.add_argument(
+        "--stop-grace", type=float, help="seconds a job has to save its state when told to stop"
+    )
+    renderer = programs.add_parser("renderer", help="render stored models over HTTP")
+    renderer.add_argument("--host", default="127.0.0.1")
+    renderer.add_argument("--port", type=int, default=8090)
+    renderer.add_argument("--uds", type=Path, help="listen on this unix socket instead of host and port")
+    doctor = programs.add_parser("doctor", help="check this machine and say what to do")
+    doctor.add_argument("--json", action="store_true", help="one JSON document instead of lines")
+    bench = programs.add_parser("bench", help="run worker/bench/NAME.py (source tree only)")
+    bench.add_argument("name")
+    bench.add_argument("arguments", nargs=argparse.REMAINDER)
+    chosen = parser.parse_args(argv)
+    if chosen.program == "train":
+        return _train(chosen.stop_grace)
+    if chosen.program == "renderer":
+        from splatmill_worker.renderer import serve
+
+        return serve(chosen.host, chosen.port, chosen.uds)
+    if chosen.program == "doctor":
+        from splatmill_worker.doctor import report
+
+        return report(as_json=chosen.json)
+    return _bench(chosen.name, chosen.arguments)
+
+
+def _train(stop_grace: float | None) -> int:
+    # The imports of this process are those of every attempt it forks: nothing with threads of its own.
+    import redis
+
+    from splatmill.backplane.connection import connect
+    from splatmill_worker.rq_worker import STOP_GRACE, AttemptWorker
+
+    url = places.redis_url()
+    connection = connect(url)
+    deadline = time.monotonic() + REDIS_PATIENCE
+    while True:
+        try:
+            connection.ping()
+            break
+        except redis.exceptions.ConnectionError as error:
+            if time.monotonic() > deadline:
+                print(
+                    f"Redis cannot be reached at {url}: {error}. Start it, or set REDIS_URL.", file=sys.stderr
+                )
+                return 1
+            time.sleep(0.05)
+    AttemptWorker(connection, stop_grace=STOP_GRACE if stop_grace is None else stop_grace).work()
+    return 0
+
+
+def _bench(name: str, arguments: list[str]) -> int:
+    folder = Path(__file__).resolve().parent.parent / "bench"
+    script = folder / f"{name}.py"
+    if not script.is_file():
+        known = sorted(path.stem for path in folder.glob("*.py") if not path.stem.startswith("_"))
+        print(
+            f"There is no benchmark {name!r}; there are {', '.join(known)}."
+            if known
+            else "Benchmarks are no part of the installed package: run this from a source tree.",
+            file=sys.stderr,
+        )
+        return 2
+    sys.path.insert(0, str(folder))
+    spec = importlib.util.spec_from_file_location(f"bench_{name}", script)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return int(module.main(arguments) or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
