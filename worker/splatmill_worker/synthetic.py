@@ -7,6 +7,7 @@ units of about a table's half width, and cameras in OpenCV axes (x right, y down
 
 from __future__ import annotations
 
+import argparse
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -307,3 +308,20 @@ def _lit(
         mirrored = rays - 2 * (rays * normal).sum(-1, keepdim=True) * normal
         color = color + shine * ((mirrored @ light).clamp(min=0) ** 24 * sun)[:, None]
     return color
+
+
+def main() -> None:
+    """`python -m splatmill_worker.synthetic DIR`: photograph the still life into a folder."""
+    parser = argparse.ArgumentParser(prog="python -m splatmill_worker.synthetic", description=main.__doc__)
+    parser.add_argument("directory", type=Path)
+    parser.add_argument("--count", type=int, default=40)
+    parser.add_argument("--width", type=int, default=640)
+    parser.add_argument("--height", type=int, default=480)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    capture(given.directory, given.count, given.width, given.height, given.seed)
+    print(f"{given.count} photos of the built-in still life are in {given.directory}")
+
+
+if __name__ == "__main__":
+    main()
