@@ -1,0 +1,64 @@
+"""The SDK's errors: each problem becomes the error its status calls for, and each reads as sentences.
+
+Does not prove that the server answers with these problems; the server's tests do.
+"""
+
+import pytest
+from pydantic import ValidationError
+
+from splatmill import errors
+from splatmill.aio import train_options
+from splatmill.schema import PROBLEMS, CameraSpec, Problem
+
+
+@pytest.mark.parametrize("code", sorted(PROBLEMS))
+def test_every_problem_has_its_error(code: str):
+    status = PROBLEMS[code].status
+    error = errors.refused(Problem.of(code, "It was so.", advice="Do that."))
+    expected = {
+        401: errors.Unauthorized,
+        403: errors.Unauthorized,
+        404: errors.NotFound,
+        409: errors.Conflict,
+        429: errors.Unavailable,
+        500: errors.ServerError,
+        503: errors.Unavailable,
+        504: errors.Unavailable,
+        507: errors.Unavailable,
+    }.get(status, errors.InvalidRequest)
+    assert type(error) is expected
+    assert error.code == code
+    assert str(error) == "It was so. Do that."
+
+
+def test_the_tree_drawn_at_the_top_is_the_tree():
+    drawn = [
+        line.replace("│", " ").split("── ")[1].split()[0]
+        for line in (errors.__doc__ or "").splitlines()
+        if "── " in line
+    ]
+    real = {
+        name
+        for name, value in vars(errors).items()
+        if isinstance(value, type) and issubclass(value, errors.SplatmillError) and name != "SplatmillError"
+    }
+    assert set(drawn) == real
+    assert len(drawn) == len(real)
+
+
+def test_several_wrong_options_are_told_at_once():
+    with pytest.raises(errors.InvalidRequest) as refused:
+        train_options({"steps": 0, "holdout": "many", "colour": 1})
+    text = str(refused.value)
+    assert "steps: Input should be greater than or equal to 1 (got 0)" in text
+    assert "there is no setting 'colour'" in text
+    assert refused.value.code == "unknown_option"
+
+
+def test_a_rule_of_ours_is_told_without_pydantic_words():
+    with pytest.raises(ValidationError) as wrong:
+        CameraSpec.model_validate(
+            {"camera_to_world": [[1, 0, 0, 0]] * 4, "width": 8, "height": 8, "fov_y_deg": 40}
+        )
+    text = str(errors.invalid(wrong.value))
+    assert text == "The last row of camera_to_world is [1.0, 0.0, 0.0, 0.0]; it must be [0, 0, 0, 1]."

@@ -1,0 +1,130 @@
+"""Event streams: parsing is independent of how the bytes are cut, and a broken stream is taken up where it broke.
+
+Does not prove that the server keeps its events; the server's tests do.
+"""
+
+import asyncio
+import itertools
+import json
+from collections.abc import AsyncIterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from splatmill import Client
+from splatmill.errors import ConnectionFailed, NotFound
+from splatmill.schema import EventRecord, LogEvent, StateEvent
+from splatmill.sse import Message, read_messages
+
+SSE = {"Content-Type": "text/event-stream"}
+
+
+def parse(chunks: list[bytes]) -> list[Message]:
+    async def source() -> AsyncIterator[bytes]:
+        for chunk in chunks:
+            yield chunk
+
+    async def collect() -> list[Message]:
+        return [message async for message in read_messages(source())]
+
+    return asyncio.run(collect())
+
+
+@given(
+    st.lists(
+        st.text(st.characters(exclude_characters="\r\n", exclude_categories=["Cs"]), max_size=12), max_size=6
+    ),
+    st.sampled_from(["\n", "\r\n", "\r"]),
+    st.lists(st.integers(0, 200), max_size=8),
+)
+def test_cutting_the_bytes_changes_nothing(texts: list[str], end: str, cuts: list[int]):
+    stream = "".join(
+        f": beat{end}id: {n}{end}data: {text}{end}{end}" for n, text in enumerate(texts)
+    ).encode()
+    # A lone CR at the very end may be half of a CRLF, so the last message shows once something follows.
+    stream += f": end{end}".encode()
+    places = sorted({min(cut, len(stream)) for cut in cuts} | {0, len(stream)})
+    chunks = [stream[a:b] for a, b in itertools.pairwise(places)]
+    assert parse(chunks) == [Message(str(n), text) for n, text in enumerate(texts)]
+
+
+def test_fields_of_the_standard():
+    stream = b"data: one\ndata:two\n\nevent: x\nretry: 5\n\nid: 7\ndata\n\ndata: \xe2\x80\xa8kept\n\ndata: unfinished\n"
+    assert parse([stream]) == [Message(None, "one\ntwo"), Message("7", ""), Message("7", "\u2028kept")]
+
+
+def message(number: int, event: StateEvent | LogEvent) -> bytes:
+    record = EventRecord(id=f"{number}-0", attempt=1, at="2026-01-01T00:00:00Z", event=event)
+    return f"id: {number}-0\ndata: {record.model_dump_json()}\n\n".encode()
+
+
+def job(state: str) -> bytes:
+    entry = {"id": "j1", "capture": "c1", "state": state, "options": {}, "created_at": "2026-01-01T00:00:00Z"}
+    return json.dumps(entry).encode()
+
+
+def test_a_broken_stream_goes_on_after_the_last_event(peer, reply):
+    parts = [message(n, LogEvent(message=f"line {n}")) for n in range(4)]
+    streams = iter(
+        [
+            reply(body=parts[0] + parts[1] + parts[2], cut=len(parts[2]) + 3, headers=SSE),  # breaks inside 1
+            reply(dropped=True),
+            reply(status=503),
+            reply(body=parts[1] + b"data: {}\n\n" + parts[2], headers=SSE),  # ends although the job runs
+            reply(body=parts[3], headers=SSE),
+        ]
+    )
+    states = iter(["training", "training", "succeeded"])
+    peer.answer = lambda seen: (
+        next(streams) if seen.path.endswith("/events") else reply(body=job(next(states)))
+    )
+    with Client(peer.url) as client:
+        handle = client.job("j1")
+        records = list(handle.events())
+    assert [record.event.message for record in records] == ["line 0", "line 1", "line 2", "line 3"]
+    asked = [seen.headers.get("last-event-id") for seen in peer.seen if seen.path.endswith("/events")]
+    assert asked == [None, "0-0", "0-0", "0-0", "2-0"]
+    assert handle.job.state.final
+
+
+def test_a_job_that_is_gone_ends_the_following(peer, reply):
+    peer.answer = lambda seen: (
+        reply(status=404) if seen.path.endswith("/events") else reply(body=job("queued"))
+    )
+    with Client(peer.url) as client, pytest.raises(NotFound):
+        list(client.job("j1").events())
+
+
+def test_patience_has_an_end(peer, reply, monkeypatch):
+    from splatmill.connection import Connection
+    from splatmill.sse import follow
+
+    peer.answer = lambda _: reply(dropped=True)
+
+    async def run() -> None:
+        connection = Connection(peer.url)
+        try:
+            async for _ in follow(connection, "/v1/jobs/j1/events", patience=0.05):
+                pass
+        finally:
+            await connection.close()
+
+    with pytest.raises(ConnectionFailed, match="was lost"):
+        asyncio.run(run())
+    assert len(peer.seen) > 1
+
+
+def test_leaving_the_loop_early_closes_the_stream(peer, reply):
+    parts = b"".join(message(n, LogEvent(message=str(n))) for n in range(3))
+    peer.answer = lambda seen: (
+        reply(body=parts + b" " * 10, cut=0, headers=SSE)
+        if seen.path.endswith("/events")
+        else reply(body=job("training"))
+    )
+    with Client(peer.url) as client:
+        handle = client.job("j1")
+        for record in handle.events():
+            assert record.event.message == "0"
+            break
+        assert handle.refresh().state == "training"
