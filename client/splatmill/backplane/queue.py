@@ -171,10 +171,10 @@ def reclaim(connection: redis.Redis) -> None:
             try:
                 queue.started_job_registry.cleanup()
             finally:
-                queue.release_maintenance_lock()
+                connection.delete(queue.registry_cleaning_key)
         elif _OUR_LOCK < connection.ttl(queue.registry_cleaning_key) < _RQ_LOCK - _OUR_LOCK:
             # Held for longer than any cleaning takes: its worker was killed while it cleaned.
-            queue.release_maintenance_lock()
+            connection.delete(queue.registry_cleaning_key)
 
 
 def waiting(connection: redis.Redis) -> dict[str, int]:

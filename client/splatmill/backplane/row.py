@@ -27,8 +27,7 @@ class Verdict(BaseModel):
 class JobRow(BaseModel):
     """One job's request and the server's decisions about it.
 
-    `generation` grows with each restart. `version` grows with each change a client can see, so that a reader of
-    events notices it. `verdict` and `cancel_requested_at` belong to the current generation.
+    `generation` grows with each restart; `queued_at`, `cancel_requested_at` and `verdict` belong to it.
     """
 
     id: str
@@ -38,7 +37,6 @@ class JobRow(BaseModel):
     created_at: Time
     queued_at: Time
     generation: int = 1
-    version: int = 1
     cancel_requested_at: Time | None = None
     verdict: Verdict | None = None
 

@@ -1,0 +1,276 @@
+"""Captures: their record, their files, and the rule that a name belongs to the first bytes stored under it."""
+
+import asyncio
+import hashlib
+import secrets
+import shutil
+from collections.abc import AsyncIterator, Sequence
+from datetime import UTC, datetime
+
+from starlette.concurrency import run_in_threadpool
+
+from splatmill.backplane import layout
+from splatmill.backplane.storage import Entry, Storage
+from splatmill.schema import Capture, CaptureFile, CapturePage, Role, format_bytes, safe_name
+from splatmill_server.metrics import Metrics
+from splatmill_server.paging import read_cursor, write_cursor
+from splatmill_server.problems import ProblemError
+from splatmill_server.settings import Settings
+
+_PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif")
+_READS_AT_ONCE = 32
+_COUNTED_CAPTURES = 1000
+
+
+class Captures:
+    """Captures live in storage alone, so they outlast Redis."""
+
+    def __init__(self, storage: Storage, settings: Settings, metrics: Metrics) -> None:
+        self.storage = storage
+        self.settings = settings
+        self.metrics = metrics
+        # Files per capture as this process last saw it: listing a folder for each of its uploads would be quadratic.
+        self._counts: dict[str, int] = {}
+
+    def create(self, name: str | None = None) -> Capture:
+        """A new, empty capture."""
+        capture = Capture(id=secrets.token_hex(8), name=name, created_at=datetime.now(UTC))
+        self.storage.put(
+            layout.capture_record(capture.id), capture.model_dump_json(exclude={"files"}).encode()
+        )
+        return capture
+
+    def record(self, capture_id: str) -> Capture:
+        """The record without the files. Raises a 404 problem."""
+        if layout.is_id(capture_id):
+            try:
+                return Capture.model_validate_json(self.storage.get(layout.capture_record(capture_id)))
+            except FileNotFoundError:
+                pass
+        raise ProblemError(
+            "capture_not_found",
+            f"There is no capture {capture_id[:80]!r}.",
+            advice="GET /v1/captures lists them; POST /v1/captures makes one.",
+        )
+
+    async def read(self, capture_id: str) -> Capture:
+        """The record with every file and its digest."""
+        capture = await run_in_threadpool(self.record, capture_id)
+        folder = layout.capture_files(capture_id)
+        found = await run_in_threadpool(lambda: list(self.storage.entries(folder)))
+        gate = asyncio.Semaphore(_READS_AT_ONCE)
+
+        async def describe(entry: Entry) -> CaptureFile | None:
+            role, _, name = entry.path[len(folder) + 1 :].partition("/")
+            async with gate:
+                digest = await run_in_threadpool(self._digest, capture_id, Role(role), name)
+            return CaptureFile(role=Role(role), name=name, size=entry.size, sha256=digest) if digest else None
+
+        files = await asyncio.gather(*(describe(entry) for entry in found))
+        return capture.model_copy(update={"files": [file for file in files if file is not None]})
+
+    def page(self, cursor: str | None, limit: int) -> CapturePage:
+        """Captures, newest first."""
+        records = []
+        for capture_id in self.storage.children(layout.captures()):
+            try:
+                records.append(self.record(capture_id))
+            except ProblemError:
+                continue  # Being made or being deleted.
+        keyed = sorted(((int(c.created_at.timestamp() * 1000), c.id, c) for c in records), reverse=True)
+        if cursor is not None:
+            after = read_cursor(cursor)
+            keyed = [entry for entry in keyed if entry[:2] < after]
+        page = keyed[:limit]
+        following = write_cursor(*page[-1][:2]) if len(keyed) > limit else None
+        return CapturePage(captures=[capture for _, _, capture in page], cursor=following)
+
+    def delete(self, capture_id: str) -> None:
+        """Remove a capture and all its files. The record goes first, so that no half capture is ever seen."""
+        self.record(capture_id)
+        self.storage.delete(layout.capture_record(capture_id))
+        self.storage.delete_prefix(layout.capture(capture_id))
+        self._counts.pop(capture_id, None)
+
+    def check_trainable(self, capture_id: str) -> None:
+        """Refuse what cannot become a scene whatever the photos show. Raises 404 or 422 problems."""
+        self.record(capture_id)
+        images = list(self.storage.entries(layout.capture_files(capture_id, Role.images)))
+        if not images:
+            raise ProblemError(
+                "no_images",
+                "The capture holds no images.",
+                advice="Upload photos, a video or a zip with PUT /v1/captures/{id}/images/{name} first.",
+            )
+        photos = all(entry.path.lower().endswith(_PHOTO_SUFFIXES) for entry in images)
+        if len(images) == 1 and photos:
+            raise ProblemError(
+                "too_few_images",
+                "The capture holds one photo; depth cannot be recovered from a single view.",
+                advice="Take 20 or more photos from different places, each overlapping the next by two thirds.",
+                facts={"images": 1},
+            )
+
+    async def store(
+        self,
+        capture_id: str,
+        role: Role,
+        name: str,
+        chunks: AsyncIterator[bytes],
+        *,
+        announced_sha256: str | None = None,
+        announced_size: int | None = None,
+    ) -> tuple[CaptureFile, bool]:
+        """Store a file as it streams in; True when it is new, False when the same bytes were there already.
+
+        Raises UnsafeName, and problems for other bytes under the name (409), a digest that does not fit (422), an
+        empty file (422), one too large (413), too many files (413) or no room (507). After any of them, and after
+        a connection that broke off, storage holds what it held before.
+        """
+        name = safe_name(name)
+        await run_in_threadpool(self._check_room, capture_id, announced_size)
+        taken = await run_in_threadpool(self._taken, capture_id, role, name)
+        body = _Counted(chunks, self.settings.max_file_bytes)
+        incoming = layout.capture_incoming(capture_id, secrets.token_hex(8))
+        if not await body.begin():
+            _check_whole(body, announced_sha256, announced_size)
+        try:
+            if taken is None:
+                await self.storage.stream_put(incoming, body)
+            else:
+                async for _ in body:
+                    pass
+            _check_whole(body, announced_sha256, announced_size)
+            file = CaptureFile(role=role, name=name, size=body.size, sha256=body.digest.hexdigest())
+            new = taken is None and await run_in_threadpool(self._claim, capture_id, file, incoming)
+        finally:
+            if taken is None:
+                await run_in_threadpool(self.storage.delete, incoming)
+        owner = file.sha256 if new else await run_in_threadpool(self._digest, capture_id, role, name)
+        if owner != file.sha256:
+            raise ProblemError(
+                "name_taken",
+                f"The capture already holds other bytes under {role.value}/{name}; they stay as they were.",
+                advice="Upload this file under another name.",
+                facts={"stored_sha256": owner, "sent_sha256": file.sha256},
+            )
+        if new:
+            self.metrics.uploaded.inc(file.size)
+            self._counts[capture_id] = self._counts.get(capture_id, 0) + 1
+        return file, new
+
+    def _claim(self, capture_id: str, file: CaptureFile, incoming: str) -> bool:
+        """Make an upload the owner of its name. The digest is written first and only once, so that of two uploads at
+        the same moment one wins; the other learns it by comparing digests."""
+        digest_path = layout.capture_digest(capture_id, file.role, file.name)
+        target = layout.capture_file(capture_id, file.role, file.name)
+        if not self.storage.put_new(digest_path, file.sha256.encode()):
+            if self.storage.exists(target):
+                return False
+            # A server that died between digest and file left a name that nobody owns.
+            self.storage.put(digest_path, file.sha256.encode())
+        self.storage.rename(incoming, target)
+        return True
+
+    def _taken(self, capture_id: str, role: Role, name: str) -> str | None:
+        """The digest of the file under a name, or None when the name is free."""
+        digest = self._digest(capture_id, role, name)
+        return digest if digest and self.storage.exists(layout.capture_file(capture_id, role, name)) else None
+
+    def _digest(self, capture_id: str, role: Role, name: str) -> str | None:
+        try:
+            return self.storage.get(layout.capture_digest(capture_id, role, name)).decode()
+        except FileNotFoundError:
+            return None
+
+    def _check_room(self, capture_id: str, announced_size: int | None) -> None:
+        self.record(capture_id)
+        limit = self.settings.max_files_per_capture
+        if capture_id not in self._counts:
+            if len(self._counts) >= _COUNTED_CAPTURES:
+                self._counts.clear()
+            self._counts[capture_id] = sum(1 for _ in self.storage.entries(layout.capture_files(capture_id)))
+        if self._counts[capture_id] >= limit:
+            raise ProblemError(
+                "body_too_large",
+                f"The capture already holds {limit} files, which is the limit.",
+                facts={"limit": limit},
+            )
+        if announced_size is not None and announced_size > self.settings.max_file_bytes:
+            raise _too_large(announced_size, self.settings.max_file_bytes)
+        if self.storage.root is not None:
+            free = shutil.disk_usage(self.storage.root).free
+            needed = (announced_size or 0) + self.settings.min_free_bytes
+            if free < needed:
+                raise ProblemError(
+                    "storage_full",
+                    f"The disk has {format_bytes(free)} left; this upload would need {format_bytes(needed)} "
+                    "with the reserve that is kept.",
+                    advice="Delete captures or jobs that are no longer needed, or give the storage more room.",
+                    facts={"free": free, "needed": needed},
+                )
+
+
+class _Counted:
+    """Passes chunks on while it counts and hashes them; ends with 413 once they are too many."""
+
+    def __init__(self, chunks: AsyncIterator[bytes], limit: int) -> None:
+        self._chunks = chunks
+        self._limit = limit
+        self._first: bytes | None = None
+        self.size = 0
+        self.digest = hashlib.sha256()
+
+    async def begin(self) -> bool:
+        """Wait for the first bytes; False when there are none. Not every store takes an upload without parts."""
+        async for chunk in self._chunks:
+            if chunk:
+                self._first = chunk
+                return True
+        return False
+
+    def __aiter__(self) -> "_Counted":
+        return self
+
+    async def __anext__(self) -> bytes:
+        chunk, self._first = self._first, None
+        while not chunk:  # Starlette ends a body with an empty one, and storage takes no empty parts.
+            chunk = await anext(self._chunks)
+        self.size += len(chunk)
+        if self.size > self._limit:
+            raise _too_large(self.size, self._limit)
+        self.digest.update(chunk)
+        return chunk
+
+
+def _too_large(size: int, limit: int) -> ProblemError:
+    return ProblemError(
+        "body_too_large",
+        f"The file has {format_bytes(size)} or more; at most {format_bytes(limit)} are taken.",
+        advice="Split a video, or raise SPLATMILL_MAX_FILE_BYTES.",
+        facts={"limit": limit},
+    )
+
+
+def _check_whole(body: _Counted, sha256: str | None, size: int | None) -> None:
+    if size is not None and body.size != size:
+        raise ProblemError(
+            "body_cut_off",
+            f"{body.size} of {size} bytes arrived; nothing was stored.",
+            advice="Send the file again.",
+            facts={"received": body.size, "announced": size},
+        )
+    if body.size == 0:
+        raise ProblemError("file_empty", "The file has no bytes; nothing was stored.")
+    if sha256 is not None and body.digest.hexdigest() != sha256.strip().lower():
+        raise ProblemError(
+            "digest_mismatch",
+            "The bytes that arrived do not have the SHA-256 announced for them; nothing was stored.",
+            advice="Send the file again.",
+            facts={"announced": sha256[:100], "received": body.digest.hexdigest()},
+        )
+
+
+def names(files: Sequence[CaptureFile]) -> list[str]:
+    """What identifies a set of files: role, name and digest of each, sorted."""
+    return sorted(f"{file.role.value}/{file.name} {file.sha256}" for file in files)

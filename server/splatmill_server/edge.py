@@ -1,0 +1,125 @@
+"""What stands before every endpoint: request id, API key, size of the body, metrics and the access log.
+
+Plain ASGI, because Starlette's BaseHTTPMiddleware would hold back streams.
+"""
+
+import hmac
+import time
+import uuid
+from collections.abc import Awaitable, Callable
+
+import structlog
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from splatmill.schema import Problem, format_bytes
+from splatmill_server.metrics import Metrics
+from splatmill_server.problems import ProblemError, ProblemResponse
+from splatmill_server.settings import Settings
+
+log = structlog.get_logger()
+
+OPEN_PATHS = frozenset({"/healthz", "/readyz", "/openapi.json", "/docs"})
+"""What a probe or a browser may see without a key: nothing of it belongs to a user."""
+
+
+class Edge:
+    """Wraps the whole app."""
+
+    def __init__(self, app: ASGIApp, settings: Settings, metrics: Metrics) -> None:
+        self.app = app
+        self.key = settings.api_key.get_secret_value().encode() if settings.api_key else None
+        self.max_body = settings.max_json_bytes
+        self.metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        begun, status = time.perf_counter(), 500
+        headers = Headers(scope=scope)
+        request_id = headers.get("x-request-id", "")
+        if not (request_id.isascii() and request_id.isprintable() and 0 < len(request_id) <= 64):
+            request_id = uuid.uuid4().hex[:16]
+
+        async def send_marked(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                marked = MutableHeaders(scope=message)
+                marked["X-Request-ID"] = request_id
+                marked["X-Content-Type-Options"] = "nosniff"
+            await send(message)
+
+        try:
+            with structlog.contextvars.bound_contextvars(request=request_id):
+                refused = self._refusal(scope, headers)
+                if refused is not None:
+                    response = ProblemResponse(
+                        refused,
+                        scope["path"],
+                        {"WWW-Authenticate": "Bearer"} if refused.status == 401 else None,
+                    )
+                    await response(scope, receive, send_marked)
+                else:
+                    await self.app(scope, self._bounded(scope, headers, receive), send_marked)
+        finally:
+            seconds = time.perf_counter() - begun
+            # The template, not the path: ids would make a new time series each.
+            route = getattr(scope.get("route"), "path", None) or "other"
+            self.metrics.requests.labels(scope["method"], route, str(status)).inc()
+            self.metrics.seconds.labels(route).observe(seconds)
+            log.debug(
+                "request",
+                method=scope["method"],
+                path=scope["path"],
+                status=status,
+                seconds=round(seconds, 4),
+            )
+
+    def _refusal(self, scope: Scope, headers: Headers) -> Problem | None:
+        if self.key is not None and scope["path"] not in OPEN_PATHS:
+            scheme, _, given = headers.get("authorization", "").partition(" ")
+            if scheme.lower() != "bearer" or not hmac.compare_digest(given.strip().encode(), self.key):
+                return Problem.of(
+                    "unauthorized",
+                    "This service asks for an API key and got none, or a wrong one.",
+                    advice="Send the header 'Authorization: Bearer KEY'. Keys in the address are not read.",
+                )
+        length = headers.get("content-length", "0")
+        if not _streams(scope, headers) and length.isdigit() and int(length) > self.max_body:
+            return self._too_large(int(length))
+        return None
+
+    def _bounded(self, scope: Scope, headers: Headers, receive: Receive) -> Callable[[], Awaitable[Message]]:
+        """`receive`, ending with 413 once a body without an announced length grows too large."""
+        if _streams(scope, headers):
+            return receive
+        seen = 0
+
+        async def bounded() -> Message:
+            nonlocal seen
+            message = await receive()
+            seen += len(message.get("body", b""))
+            if seen > self.max_body:
+                problem = self._too_large(seen)
+                raise ProblemError(problem.code, problem.detail, advice=problem.advice, facts=problem.facts)
+            return message
+
+        return bounded
+
+    def _too_large(self, size: int) -> Problem:
+        return Problem.of(
+            "body_too_large",
+            f"The body has {format_bytes(size)} or more; at most {format_bytes(self.max_body)} are taken here.",
+            advice="Upload photos one by one with PUT /v1/captures/{id}/images/{name}.",
+            facts={"limit": self.max_body},
+        )
+
+
+def _streams(scope: Scope, headers: Headers) -> bool:
+    """Whether the endpoint passes the body on as it comes, with limits of its own per file."""
+    multipart = headers.get("content-type", "").lower().startswith("multipart/form-data")
+    return (scope["method"] == "PUT" and scope["path"].startswith("/v1/captures/")) or (
+        scope["method"] == "POST" and scope["path"] == "/v1/jobs" and multipart
+    )

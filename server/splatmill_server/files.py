@@ -1,0 +1,95 @@
+"""Stored files over HTTP: ETag, If-None-Match, Range, HEAD (RFC 9110), streamed and never whole in memory."""
+
+from collections.abc import AsyncIterator
+from datetime import UTC
+from email.utils import format_datetime
+from urllib.parse import quote
+
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import Response, StreamingResponse
+
+from splatmill.backplane.storage import Entry, Storage
+from splatmill_server.problems import ProblemError
+
+
+async def file_response(
+    request: Request,
+    storage: Storage,
+    path: str,
+    media_type: str,
+    *,
+    download_name: str | None = None,
+) -> Response:
+    """The file at `path`, or the part of it that was asked for.
+
+    `download_name` makes browsers save it under that name. Raises a 404 problem when there is no such file, and a
+    416 problem for a range that lies outside of it.
+    """
+    entry = await run_in_threadpool(storage.head, path)
+    if entry is None:
+        raise ProblemError("file_not_found", f"There is no file at {request.url.path}.")
+    etag = f'"{entry.etag}"'
+    headers = {
+        "ETag": etag,
+        "Accept-Ranges": "bytes",
+        "Cache-Control": "private, no-cache",  # Always asked for again, answered with 304 when unchanged.
+        "Last-Modified": format_datetime(entry.modified.astimezone(UTC), usegmt=True),
+        "Content-Type": media_type,
+    }
+    if download_name is not None:
+        headers["Content-Disposition"] = f"attachment; filename*=UTF-8''{quote(download_name)}"
+    if media_type.startswith("text/html"):
+        # A report is a page of ours with a stranger's file names in it: it gets no rights on this origin.
+        headers["Content-Security-Policy"] = "sandbox allow-scripts"
+    if _matches(request.headers.get("if-none-match"), etag):
+        return Response(status_code=304, headers=headers)
+    wanted = None
+    if request.headers.get("if-range", etag) == etag:
+        wanted = _range(request.headers.get("range"), entry, headers)
+    start, end = wanted or (0, entry.size)
+    headers["Content-Length"] = str(end - start)
+    if wanted is not None:
+        headers["Content-Range"] = f"bytes {start}-{end - 1}/{entry.size}"
+    status = 200 if wanted is None else 206
+    if request.method == "HEAD" or start == end:
+        return Response(status_code=status, headers=headers)
+    return StreamingResponse(_read(storage, entry, start, end), status, headers)
+
+
+async def _read(storage: Storage, entry: Entry, start: int, end: int) -> AsyncIterator[bytes]:
+    whole = start == 0 and end == entry.size
+    async for chunk in storage.stream_get(entry.path, start, None if whole else end):
+        yield chunk
+
+
+def _matches(header: str | None, etag: str) -> bool:
+    if header is None:
+        return False
+    tags = [tag.strip().removeprefix("W/") for tag in header.split(",")]
+    return "*" in tags or etag in tags
+
+
+def _range(header: str | None, entry: Entry, headers: dict[str, str]) -> tuple[int, int] | None:
+    """The bytes [start, end) of a single range; None for none, for several, and for one that makes no sense, which
+    RFC 9110 lets a server ignore."""
+    unit, _, spec = (header or "").partition("=")
+    first, dash, last = spec.strip().partition("-")
+    digits = all(not part or (part.isascii() and part.isdigit() and len(part) < 20) for part in (first, last))
+    if unit.strip().lower() != "bytes" or not dash or not digits or not (first or last):
+        return None
+    size = entry.size
+    if first:
+        start, end = int(first), min(int(last) + 1, size) if last else size
+        if last and int(last) < start:
+            return None
+    else:
+        start, end = max(size - int(last), 0), size
+    if start >= size or start >= end:
+        raise ProblemError(
+            "range_not_satisfiable",
+            f"The range {header!r} lies outside the file, which has {size} bytes.",
+            facts={"size": size},
+            headers={"Content-Range": f"bytes */{size}", "ETag": headers["ETag"]},
+        )
+    return start, end

@@ -1,0 +1,305 @@
+"""Job records: the only code that writes job rows.
+
+Each change is one optimistic transaction on the row, and on the states stream where the change depends on it, so
+that several API processes and the workers never overwrite one another.
+"""
+
+import hashlib
+import json
+import secrets
+from collections.abc import Callable, Iterable
+from typing import Any, cast
+
+import redis
+
+from splatmill.backplane import events, keys, layout, queue, row
+from splatmill.backplane.fold import fold
+from splatmill.backplane.row import JobRow, Verdict
+from splatmill.backplane.storage import Storage
+from splatmill.schema import CreateJob, Job, JobPage, JobState, Problem
+from splatmill_server.metrics import Metrics
+from splatmill_server.paging import read_cursor, write_cursor
+from splatmill_server.problems import ProblemError
+
+IDEMPOTENCY_DAYS = 7
+_TIES = 16
+"""Jobs that may share one millisecond of creation without disturbing a page."""
+
+
+class Jobs:
+    """Every operation on jobs. Methods raise ProblemError, and redis.RedisError when Redis is away."""
+
+    def __init__(self, connection: redis.Redis, storage: Storage, metrics: Metrics) -> None:
+        self.connection = connection
+        self.storage = storage
+        self.metrics = metrics
+
+    def create(self, request: CreateJob, *, key: str | None = None, body: str = "") -> tuple[Job, bool]:
+        """A new job, or with a known `Idempotency-Key` the one it made; True when it is new.
+
+        `body` is what identifies the request; the same key with another body is a 409 problem.
+        """
+        job_id = secrets.token_hex(8)
+        if key is not None:
+            job_id = self._claim_key(key, hashlib.sha256(body.encode()).hexdigest(), job_id)
+            if (known := row.read(self.connection, job_id)) is not None:
+                return self._see(known), False
+        moment = row.now()
+        new = JobRow(
+            id=job_id,
+            capture=request.capture,
+            name=request.name,
+            options=request.options,
+            created_at=moment,
+            queued_at=moment,
+        )
+        with self.connection.pipeline(transaction=True) as pipe:
+            pipe.hset(keys.job(job_id), mapping=cast(Any, new.fields()))
+            pipe.zadd(keys.JOBS, {job_id: int(moment.timestamp() * 1000)})
+            pipe.execute()
+        # A crash right here leaves a row without a place in the queue; the reaper enqueues it.
+        queue.enqueue(self.connection, job_id, new.generation)
+        self.metrics.created.inc()
+        return self._see(new), True
+
+    def known(self, key: str) -> str | None:
+        """The job an `Idempotency-Key` was first used for, if any."""
+        stored = cast(bytes | None, self.connection.get(keys.idempotency(_digest(key))))
+        return cast(str, json.loads(stored)["job"]) if stored else None
+
+    def row(self, job_id: str) -> JobRow:
+        """The row. Raises a 404 problem when Redis has none."""
+        found = row.read(self.connection, job_id) if layout.is_id(job_id) else None
+        if found is None:
+            raise ProblemError(
+                "job_not_found", f"There is no job {job_id[:80]!r}.", advice="GET /v1/jobs lists them."
+            )
+        return found
+
+    def get(self, job_id: str) -> Job:
+        """The job as a client sees it. A finished one is found in storage even when Redis has lost it."""
+        try:
+            return self._see(self.row(job_id))
+        except ProblemError:
+            if (stored := self.stored(job_id)) is not None:
+                return stored
+            raise
+
+    def stored(self, job_id: str) -> Job | None:
+        """The job in `job.json` beside its model, or None."""
+        if not layout.is_id(job_id):
+            return None
+        try:
+            return with_links(Job.model_validate_json(self.storage.get(layout.job_record(job_id))))
+        except (FileNotFoundError, ValueError):
+            return None
+
+    def page(self, cursor: str | None, limit: int, state: JobState | None = None) -> JobPage:
+        """Jobs, newest first; with `state`, those in it."""
+        found: list[tuple[int, Job]] = []
+        after = read_cursor(cursor) if cursor is not None else None
+        while len(found) <= limit:
+            batch = self._ids(after, limit + 1)
+            if not batch:
+                break
+            after = batch[-1]
+            for (moment, _), job in zip(batch, self.see([job_id for _, job_id in batch]), strict=True):
+                if job is not None and (state is None or job.state is state):
+                    found.append((moment, job))
+            if len(batch) <= limit:
+                break
+        page = found[:limit]
+        following = write_cursor(page[-1][0], page[-1][1].id) if len(found) > limit else None
+        return JobPage(jobs=[job for _, job in page], cursor=following)
+
+    def see(self, job_ids: Iterable[str]) -> list[Job | None]:
+        """Several jobs at once, None for those that are gone."""
+        wanted = list(job_ids)
+        with self.connection.pipeline(transaction=False) as pipe:
+            for job_id in wanted:
+                pipe.hgetall(keys.job(job_id))
+                pipe.xrange(keys.states(job_id))
+            replies = pipe.execute()
+        jobs: list[Job | None] = []
+        for index, job_id in enumerate(wanted):
+            found = JobRow.of(replies[2 * index])
+            states = events.decode(replies[2 * index + 1])
+            latest = events.last_progress(self.connection, job_id) if found is not None else None
+            jobs.append(with_links(fold(found, states, latest)) if found is not None else None)
+        return jobs
+
+    def active(self) -> list[JobRow]:
+        """The rows of all jobs that have not ended."""
+        ids = [entry.decode() for entry in cast(list[bytes], self.connection.zrange(keys.JOBS, 0, -1))]
+        return [self.row(job.id) for job in self.see(ids) if job is not None and not job.state.final]
+
+    def uses(self, capture_id: str) -> str | None:
+        """The id of an unfinished job on a capture, if there is one."""
+        return next((found.id for found in self.active() if found.capture == capture_id), None)
+
+    def cancel(self, job_id: str) -> Job:
+        """Note the wish to cancel. The reaper then kills the process and gives the verdict."""
+
+        def wish(found: JobRow, job: Job) -> dict[str, str] | None:
+            if job.state is JobState.cancelled or found.cancel_requested_at is not None:
+                return None
+            if job.state.final:
+                raise ProblemError(
+                    "job_finished",
+                    f"The job has already ended: it {_ended(job)}.",
+                    advice="Delete it with DELETE /v1/jobs/{id} if it is not needed.",
+                    facts={"state": job.state.value},
+                )
+            return {"cancel_requested_at": row.now().isoformat()}
+
+        return self._change(job_id, wish)
+
+    def restart(self, job_id: str) -> Job:
+        """Queue a job that has ended as a new generation; it goes on from its checkpoint where there is one."""
+
+        def anew(found: JobRow, job: Job) -> dict[str, str] | None:
+            if job.state is JobState.queued and found.cancel_requested_at is None:
+                return None  # Wishing twice is wishing once.
+            if not job.state.final:
+                raise ProblemError(
+                    "job_running",
+                    f"The job has not ended; it is {job.state.value}.",
+                    advice="Cancel it first, or wait for its end.",
+                    facts={"state": job.state.value},
+                )
+            if not self.storage.exists(layout.capture_record(found.capture)):
+                raise ProblemError(
+                    "capture_not_found",
+                    f"The job's capture {found.capture} was deleted.",
+                    advice="Upload the photos again and create a new job.",
+                )
+            return {
+                "generation": str(found.generation + 1),
+                "queued_at": row.now().isoformat(),
+                "cancel_requested_at": "",
+                "verdict": "",
+            }
+
+        job = self._change(job_id, anew)
+        queue.enqueue(self.connection, job_id, self.row(job_id).generation)
+        return job
+
+    def delete(self, job_id: str) -> None:
+        """Remove an ended job, its work files and its model."""
+        try:
+            found = self.row(job_id)
+        except ProblemError:
+            if self.stored(job_id) is None:
+                raise
+        else:
+            job = self._see(found)
+            if not job.state.final:
+                raise ProblemError(
+                    "job_running",
+                    f"The job has not ended; it is {job.state.value}.",
+                    advice="Cancel it with POST /v1/jobs/{id}/cancel first.",
+                    facts={"state": job.state.value},
+                )
+            for generation in range(1, found.generation + 1):
+                queue.forget(self.connection, job_id, generation)
+        # The record of the model goes first: from then on nobody sees a model with files missing.
+        self.storage.delete(layout.job_record(job_id))
+        self.storage.delete_prefix(layout.model(job_id))
+        self.storage.delete_prefix(layout.job(job_id))
+        with self.connection.pipeline(transaction=True) as pipe:
+            pipe.delete(*keys.of_job(job_id))
+            pipe.zrem(keys.JOBS, job_id)
+            pipe.execute()
+
+    def end(self, expected: JobRow, state: str, problem: Problem | None = None) -> bool:
+        """Give the server's verdict on a generation, unless it has ended or changed meanwhile."""
+        given = False
+
+        def verdict(found: JobRow, job: Job) -> dict[str, str] | None:
+            nonlocal given
+            given = not job.state.final and found.generation == expected.generation
+            if not given:
+                return None
+            last = cast(list[Any], self.connection.xrevrange(keys.states(found.id), count=1))
+            after = last[0][0].decode() if last else events.START
+            ending = Verdict(state=cast(Any, state), at=row.now(), after=after, problem=problem)
+            return {"verdict": ending.model_dump_json(exclude_none=True)}
+
+        self._change(expected.id, verdict)
+        return given
+
+    def _see(self, found: JobRow) -> Job:
+        states = events.read_states(self.connection, found.id)
+        return with_links(fold(found, states, events.last_progress(self.connection, found.id)))
+
+    def _change(self, job_id: str, decide: Callable[[JobRow, Job], dict[str, str] | None]) -> Job:
+        """Apply what `decide` says of the row and the job; nothing when it says None. Empty values remove a field.
+
+        Runs again when the row or the states changed while it decided.
+        """
+
+        def attempt(pipe: Any) -> None:
+            found = self.row(job_id)
+            changes = decide(found, self._see(found))
+            pipe.multi()
+            if changes is None:
+                return
+            kept = {name: value for name, value in changes.items() if value}
+            gone = [name for name, value in changes.items() if not value]
+            pipe.hset(keys.job(job_id), mapping=kept)
+            if gone:
+                pipe.hdel(keys.job(job_id), *gone)
+
+        self.connection.transaction(attempt, keys.job(job_id), keys.states(job_id))
+        return self._see(self.row(job_id))
+
+    def _ids(self, after: tuple[int, str] | None, count: int) -> list[tuple[int, str]]:
+        """Up to `count` (moment, id) of jobs older than `after`, newest first."""
+        top = "+inf" if after is None else str(after[0])
+        reply = self.connection.zrevrangebyscore(
+            keys.JOBS, top, "-inf", start=0, num=count + _TIES, withscores=True
+        )
+        pairs = [(int(score), member.decode()) for member, score in cast(list[tuple[bytes, float]], reply)]
+        return [pair for pair in pairs if after is None or pair < after][:count]
+
+    def _claim_key(self, key: str, body: str, job_id: str) -> str:
+        name = keys.idempotency(_digest(key))
+        value = json.dumps({"job": job_id, "body": body})
+        if self.connection.set(name, value, nx=True, ex=IDEMPOTENCY_DAYS * 86400):
+            return job_id
+        known = json.loads(cast(bytes, self.connection.get(name)) or value)
+        if known["body"] != body:
+            raise ProblemError(
+                "idempotency_conflict",
+                "This Idempotency-Key was already used for a request with another body.",
+                advice="Use a new key for a new request, and the same key only to repeat one.",
+                facts={"job": known["job"]},
+            )
+        return cast(str, known["job"])
+
+
+def with_links(job: Job) -> Job:
+    """The job with the addresses of what belongs to it."""
+    base = f"/v1/jobs/{job.id}"
+    links = {"self": base, "events": f"{base}/events", "logs": f"{base}/logs", "preview": f"{base}/preview"}
+    links["capture"] = f"/v1/captures/{job.capture}"
+    if job.state.final:
+        links["restart"] = f"{base}/restart"
+    else:
+        links["cancel"] = f"{base}/cancel"
+    if job.model is not None:
+        links |= {"report": f"{base}/report", "model": f"/v1/models/{job.model}"}
+    return job.model_copy(update={"links": links})
+
+
+def last_stage(job: Job) -> str | None:
+    """Where a job was when it was last heard of."""
+    return job.progress.stage if job.progress is not None else None
+
+
+def _ended(job: Job) -> str:
+    return "was cancelled" if job.state is JobState.cancelled else job.state.value
+
+
+def _digest(key: str) -> str:
+    return hashlib.sha256(key.encode()).hexdigest()

@@ -1,0 +1,158 @@
+"""Finished models: read from storage alone, so that they are listed even when Redis has lost everything."""
+
+import re
+from typing import Any
+
+from pydantic import ValidationError
+
+from splatmill.backplane import layout
+from splatmill.backplane.storage import Entry, Storage
+from splatmill.schema import Job, JobState, Model, ModelCameras, ModelFile, ModelPage, Report
+from splatmill_server.jobs import Jobs
+from splatmill_server.paging import read_cursor, write_cursor
+from splatmill_server.problems import ProblemError
+
+_HEADER_BYTES = 8192
+_VERTICES = re.compile(rb"^element vertex (\d+)\s*$", re.MULTILINE)
+_REST = re.compile(rb"^property float f_rest_\d+\s*$", re.MULTILINE)
+_DEGREE = {0: 0, 9: 1, 24: 2, 45: 3}
+"""Spherical-harmonics degree by the number of `f_rest` properties: 3 colours x ((degree + 1)^2 - 1)."""
+
+
+class Models:
+    """A model exists when its `job.json` does: the worker writes that last."""
+
+    def __init__(self, storage: Storage, jobs: Jobs) -> None:
+        self.storage = storage
+        self.jobs = jobs
+
+    def check(self, model_id: str) -> None:
+        """Raise the problem that says why there is no such model: unknown (404), or not finished yet (409)."""
+        if layout.is_id(model_id) and self.storage.exists(layout.job_record(model_id)):
+            return
+        job = None
+        try:
+            job = self.jobs.get(model_id)
+        except ProblemError as error:
+            if error.problem.code != "job_not_found":
+                raise
+        if job is not None and not job.state.final:
+            raise ProblemError(
+                "model_not_ready",
+                f"The model is not finished yet; its job is {job.state.value}.",
+                advice=f"Follow /v1/jobs/{job.id}/events, or ask again later.",
+                facts={"job": job.id, "state": job.state.value},
+            )
+        if job is not None and job.state is not JobState.succeeded:
+            raise ProblemError(
+                "model_not_found",
+                f"The job {job.id} ended as {job.state.value} and left no model.",
+                facts={"job": job.id, "state": job.state.value},
+            )
+        raise ProblemError(
+            "model_not_found", f"There is no model {model_id[:80]!r}.", advice="GET /v1/models lists them."
+        )
+
+    def get(self, model_id: str) -> Model:
+        """One model with its files. Raises 404, 409, or 500 when what is stored cannot be read."""
+        self.check(model_id)
+        files = {
+            entry.path.rsplit("/", 1)[-1]: entry for entry in self.storage.entries(layout.model(model_id))
+        }
+        try:
+            job = Job.model_validate_json(self.storage.get(layout.job_record(model_id)))
+            gaussians, degree = self._header(model_id, files["model.ply"])
+        except (KeyError, ValueError, FileNotFoundError) as error:
+            raise ProblemError(
+                "model_corrupt",
+                f"The stored model {model_id} cannot be read: {error}.",
+                advice=f"Restart its job with POST /v1/jobs/{model_id}/restart.",
+            ) from error
+        base = f"/v1/models/{model_id}"
+        psnr, ssim = self._quality(model_id)
+        return Model(
+            id=model_id,
+            job=model_id,
+            name=job.name,
+            created_at=job.finished_at or files["job.json"].modified,
+            gaussians=gaussians,
+            bytes=files["model.ply"].size,
+            sh_degree=degree,
+            psnr=psnr,
+            ssim=ssim,
+            files=[
+                ModelFile(name=name, size=entry.size, media_type=layout.MODEL_FILES[name])
+                for name, entry in sorted(files.items())
+                if name in layout.MODEL_FILES
+            ],
+            links={
+                "self": base,
+                "job": f"/v1/jobs/{model_id}",
+                "cameras": f"{base}/cameras",
+                "render": f"{base}/render",
+                "orbit": f"{base}/orbit",
+                "ply": f"{base}/files/model.ply",
+                "report": f"{base}/files/report.html",
+            },
+        )
+
+    def page(self, cursor: str | None, limit: int) -> ModelPage:
+        """Models, newest first by when they were stored."""
+        records = [
+            entry for entry in self.storage.entries(layout.models()) if entry.path.endswith("/job.json")
+        ]
+        keyed = sorted(
+            ((int(entry.modified.timestamp() * 1000), entry.path.split("/")[1]) for entry in records),
+            reverse=True,
+        )
+        if cursor is not None:
+            after = read_cursor(cursor)
+            keyed = [entry for entry in keyed if entry < after]
+        page, models = keyed[:limit], []
+        for _, model_id in page:
+            try:
+                models.append(self.get(model_id))
+            except ProblemError:
+                continue  # Deleted meanwhile, or unreadable: one bad model must not hide the others.
+        return ModelPage(models=models, cursor=write_cursor(*page[-1]) if len(keyed) > limit else None)
+
+    def file(self, model_id: str, name: str) -> Entry:
+        """The entry of a model's file. Raises 404 or 409 problems."""
+        self.check(model_id)
+        entry = self.storage.head(layout.model_file(model_id, name)) if name in layout.MODEL_FILES else None
+        if entry is None:
+            raise ProblemError(
+                "file_not_found",
+                f"The model {model_id} has no file {name[:80]!r}.",
+                advice=f"It may have: {', '.join(sorted(layout.MODEL_FILES))}.",
+            )
+        return entry
+
+    def cameras(self, model_id: str) -> ModelCameras:
+        """The cameras of the capture in the model's world."""
+        self.file(model_id, "cameras.json")
+        stored = self.storage.get(layout.model_file(model_id, "cameras.json"))
+        try:
+            return ModelCameras.model_validate_json(stored)
+        except ValidationError as error:
+            raise ProblemError(
+                "model_corrupt", f"cameras.json of {model_id} cannot be read: {error}."
+            ) from error
+
+    def _header(self, model_id: str, entry: Entry) -> tuple[int, int]:
+        """Number of Gaussians and SH degree, from the head of the .ply alone."""
+        end = min(entry.size, _HEADER_BYTES)
+        head, marker, _ = self.storage.get(entry.path, 0, end).partition(b"end_header")
+        count = _VERTICES.search(head)
+        if not marker or count is None:
+            raise ValueError(f"model.ply of {model_id} does not begin with the header of a .ply")
+        return int(count[1]), _DEGREE.get(len(_REST.findall(head)), 0)
+
+    def _quality(self, model_id: str) -> tuple[Any, Any]:
+        """PSNR (dB) and SSIM of the last measured point of the curve, None where nothing was held out."""
+        try:
+            report = Report.model_validate_json(self.storage.get(layout.model_file(model_id, "report.json")))
+        except (FileNotFoundError, ValidationError):
+            return None, None
+        measured = [point for point in report.curve if point.psnr is not None]
+        return (measured[-1].psnr, measured[-1].ssim) if measured else (None, None)

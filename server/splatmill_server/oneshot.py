@@ -1,0 +1,78 @@
+"""One request that uploads photos and starts a job: `POST /v1/jobs` with a form."""
+
+import json
+
+from fastapi.exceptions import RequestValidationError
+from pydantic import ValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+
+from splatmill.schema import CaptureFile, CreateJob, Job, Role
+from splatmill_server.captures import names
+from splatmill_server.multipart import Part, read_parts
+from splatmill_server.problems import ProblemError
+from splatmill_server.service import Service
+
+_FIELDS = ("name", "options")
+
+
+async def create_from_form(service: Service, request: Request, key: str | None) -> tuple[Job, bool]:
+    """Store the files of a form in a new capture and start a job on it; True when the job is new.
+
+    Files are the parts `images` (and `masks`, `poses`), each under its file name; `options` is JSON, `name` text.
+    When anything about the form is refused, nothing of it stays.
+    """
+    capture = await run_in_threadpool(service.captures.create)
+    kept = False
+    try:
+        files, fields = await _receive(service, request, capture.id)
+        create = _request(capture.id, fields)
+        await run_in_threadpool(service.captures.check_trainable, capture.id)
+        described = create.model_dump_json(exclude={"capture"}) + "\n".join(names(files))
+        job, new = await run_in_threadpool(lambda: service.jobs.create(create, key=key, body=described))
+        kept = job.capture == capture.id
+        return job, new
+    finally:
+        if not kept:
+            await run_in_threadpool(service.captures.delete, capture.id)
+
+
+async def _receive(
+    service: Service, request: Request, capture_id: str
+) -> tuple[list[CaptureFile], dict[str, str]]:
+    files: list[CaptureFile] = []
+    fields: dict[str, str] = {}
+    async for part in read_parts(request):
+        if part.filename is not None and part.name in Role.__members__:
+            files.append(await _store(service, capture_id, part, part.filename))
+        elif part.filename is None and part.name in _FIELDS:
+            fields[part.name] = await part.text()
+        else:
+            kind = "file" if part.filename is not None else "field"
+            raise ProblemError(
+                "invalid_request",
+                f"The form holds a {kind} {part.name[:80]!r}, which is not known.",
+                advice="Files are 'images', 'masks' and 'poses'; fields are 'options' (JSON) and 'name'.",
+            )
+    return files, fields
+
+
+async def _store(service: Service, capture_id: str, part: Part, filename: str) -> CaptureFile:
+    if not filename:
+        raise ProblemError("name_invalid", f"A file of {part.name} in the form has no name.")
+    file, _ = await service.captures.store(capture_id, Role(part.name), filename, part.chunks)
+    return file
+
+
+def _request(capture_id: str, fields: dict[str, str]) -> CreateJob:
+    try:
+        options = json.loads(fields.get("options") or "{}")
+    except ValueError as error:
+        raise ProblemError(
+            "malformed_body", f"The field 'options' is not JSON: {error}.", advice='Write {"steps": 1000}.'
+        ) from error
+    body = {"capture": capture_id, "options": options, "name": fields.get("name") or None}
+    try:
+        return CreateJob.model_validate(body)
+    except ValidationError as error:
+        raise RequestValidationError(error.errors()) from error

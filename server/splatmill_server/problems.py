@@ -1,0 +1,131 @@
+"""Every error leaves as an RFC 9457 problem document with a code from `splatmill.schema.PROBLEMS`."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import redis
+import structlog
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+from starlette.responses import Response
+
+from splatmill.backplane.storage import StorageError, StorageFullError
+from splatmill.schema import PROBLEM_MEDIA_TYPE, PROBLEMS, Problem, UnsafeName, code_for_status
+from splatmill_server.validation import problem_of_validation
+
+log = structlog.get_logger()
+
+
+class ProblemError(HTTPException):
+    """Raised anywhere below an endpoint to answer with a problem.
+
+    It is an HTTPException because FastAPI lets those pass through its own reading of a body, and no others.
+    """
+
+    def __init__(
+        self,
+        code: str,
+        detail: str,
+        *,
+        advice: str | None = None,
+        facts: Mapping[str, Any] | None = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(PROBLEMS[code].status, detail, headers)
+        self.problem = Problem.of(code, detail, facts=dict(facts or {}), advice=advice)
+
+
+class ProblemResponse(Response):
+    """A problem document; `instance` is the path it happened at."""
+
+    media_type = PROBLEM_MEDIA_TYPE
+
+    def __init__(self, problem: Problem, instance: str, headers: Mapping[str, str] | None = None) -> None:
+        named = problem.model_copy(update={"instance": problem.instance or instance})
+        super().__init__(named.model_dump_json(exclude_none=True), problem.status, headers)
+
+
+def install(app: FastAPI) -> None:
+    """Register a handler for everything that can go wrong below an endpoint."""
+
+    @app.exception_handler(HTTPException)
+    def on_http(request: Request, error: HTTPException) -> Response:
+        if isinstance(error, ProblemError):
+            return ProblemResponse(error.problem, request.url.path, error.headers)
+        code, path = code_for_status(error.status_code), request.url.path
+        match error.status_code:
+            case 404:
+                detail = f"There is nothing at {path}."
+                advice = "The addresses are listed at /docs and in /openapi.json."
+            case 405:
+                allowed = (error.headers or {}).get("allow") or (error.headers or {}).get("Allow", "another")
+                detail = f"{request.method} is not possible at {path}."
+                advice = f"Use {allowed}."
+            case 400:
+                detail = "The body could not be read as what its Content-Type says."
+                advice = "Send valid JSON in UTF-8."
+            case _:
+                detail, advice = str(error.detail), ""
+        problem = Problem.of(code, detail, advice=advice or None).model_copy(
+            update={"status": error.status_code}
+        )
+        return ProblemResponse(problem, path, error.headers)
+
+    @app.exception_handler(RequestValidationError)
+    def on_validation(request: Request, error: RequestValidationError) -> Response:
+        return ProblemResponse(problem_of_validation(error.errors()), request.url.path)
+
+    @app.exception_handler(UnsafeName)
+    def on_name(request: Request, error: UnsafeName) -> Response:
+        return ProblemResponse(Problem.of("name_invalid", str(error)), request.url.path)
+
+    @app.exception_handler(redis.RedisError)
+    def on_redis(request: Request, error: redis.RedisError) -> Response:
+        log.warning("queue unavailable", error=str(error), path=request.url.path)
+        problem = Problem.of(
+            "queue_unavailable",
+            "The job queue (Redis) cannot be reached right now; nothing that is stored is lost.",
+            advice="Try again in a few seconds; if it lasts, check that Redis runs and REDIS_URL is right.",
+        )
+        return ProblemResponse(problem, request.url.path, {"Retry-After": "5"})
+
+    @app.exception_handler(StorageError)
+    def on_storage(request: Request, error: StorageError) -> Response:
+        log.warning("storage error", error=str(error), path=request.url.path)
+        return ProblemResponse(problem_of_storage(error), request.url.path)
+
+    @app.exception_handler(ClientDisconnect)
+    def on_disconnect(request: Request, _: ClientDisconnect) -> Response:
+        # Nobody reads this answer when the connection is gone; a proxy in front of us may.
+        return ProblemResponse(body_cut_off(), request.url.path)
+
+    @app.exception_handler(Exception)
+    def on_mistake(request: Request, error: Exception) -> Response:
+        problem = Problem.of(
+            "internal_error",
+            f"The service made a mistake while it answered {request.method} {request.url.path}.",
+            advice="The server's log has the details; please report it.",
+            facts={"kind": type(error).__name__},
+        )
+        return ProblemResponse(problem, request.url.path)
+
+
+def problem_of_storage(error: StorageError) -> Problem:
+    """Full, not writable, or not reachable: three things an operator mends differently."""
+    text = str(error)
+    if isinstance(error, StorageFullError):
+        advice = "Delete captures or jobs that are no longer needed, or give the storage more room."
+        return Problem.of("storage_full", text, advice=advice)
+    if "Permission denied" in text or "os error 13" in text or "os error 30" in text:
+        advice = "Let the user the server runs as write to the storage folder."
+        return Problem.of("storage_unwritable", text, advice=advice)
+    return Problem.of("storage_unavailable", text, advice="Check SPLATMILL_STORAGE and try again.")
+
+
+def body_cut_off(seen: int | None = None, announced: int | None = None) -> Problem:
+    """The connection ended before the body did. Nothing of it is kept."""
+    facts = {} if seen is None else {"received": seen, "announced": announced}
+    detail = "The body ended before its announced length; nothing was stored."
+    return Problem.of("body_cut_off", detail, advice="Send the request again.", facts=facts)

@@ -1,0 +1,134 @@
+"""`/v1/captures`: photos, masks and poses that belong together."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Body, Header, Path, Request
+from starlette.responses import JSONResponse, Response
+
+from splatmill.schema import SHA256_HEADER, Capture, CaptureFile, CapturePage, CreateCapture, Role
+from splatmill_server.paging import DEFAULT_LIMIT
+from splatmill_server.problems import ProblemError
+from splatmill_server.routes.documented import CAPTURE_EXAMPLE, answer, example, problems
+from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit
+from splatmill_server.service import Shared
+
+router = APIRouter(prefix="/v1/captures", tags=["captures"])
+
+CaptureId = Annotated[str, Path(description="The capture's id.")]
+
+_ACCEPTED = {
+    Role.images: ("image/", "video/", "application/zip", "application/x-zip", "application/octet-stream"),
+    Role.masks: ("image/", "application/octet-stream"),
+    Role.poses: ("application/json", "text/plain", "application/octet-stream"),
+}
+
+
+@router.post(
+    "",
+    status_code=201,
+    responses=problems("unsupported_media_type", "malformed_body", "body_too_large", "storage_full")
+    | example(201, CAPTURE_EXAMPLE | {"files": []}, "The capture, empty so far"),
+    dependencies=[JSON_ONLY],
+)
+def create_capture(
+    service: Shared,
+    response: Response,
+    request: Annotated[CreateCapture | None, Body(examples=[{"name": "fox"}])] = None,
+) -> Capture:
+    """Begin a capture. Its files follow one by one."""
+    capture = service.captures.create(request.name if request is not None else None)
+    response.headers["Location"] = f"/v1/captures/{capture.id}"
+    return capture
+
+
+@router.get("", responses=problems("cursor_invalid"))
+def list_captures(service: Shared, cursor: Cursor = None, limit: Limit = DEFAULT_LIMIT) -> CapturePage:
+    """Captures, newest first, without their files."""
+    return service.captures.page(cursor, limit)
+
+
+@router.get(
+    "/{capture_id}",
+    responses=problems("capture_not_found") | example(200, CAPTURE_EXAMPLE, "The capture with its files"),
+)
+async def get_capture(service: Shared, capture_id: CaptureId) -> Capture:
+    """A capture with every file and its digest."""
+    return await service.captures.read(capture_id)
+
+
+@router.delete("/{capture_id}", status_code=204, responses=problems("capture_not_found", "capture_in_use"))
+def delete_capture(service: Shared, capture_id: CaptureId) -> Response:
+    """Remove a capture and its files, unless a job that has not ended uses it."""
+    service.captures.record(capture_id)
+    if (job_id := service.jobs.uses(capture_id)) is not None:
+        raise ProblemError(
+            "capture_in_use",
+            f"The job {job_id} uses this capture and has not ended.",
+            advice=f"Cancel it with POST /v1/jobs/{job_id}/cancel, or wait for its end.",
+            facts={"job": job_id},
+        )
+    service.captures.delete(capture_id)
+    return Response(status_code=204)
+
+
+@router.put(
+    "/{capture_id}/{role}/{name:path}",
+    status_code=201,
+    response_model=CaptureFile,
+    responses=answer(200, "The same bytes were there already", model=CaptureFile)
+    | problems(
+        "capture_not_found",
+        "name_taken",
+        "name_invalid",
+        "file_empty",
+        "digest_mismatch",
+        "body_cut_off",
+        "body_too_large",
+        "unsupported_media_type",
+        "storage_full",
+    ),
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "description": "The file's bytes, as they are.",
+            "content": {
+                name: {"schema": {"type": "string", "format": "binary"}}
+                for name in ("application/octet-stream", "image/jpeg", "image/png")
+            },
+        }
+    },
+)
+async def put_file(
+    service: Shared,
+    request: Request,
+    capture_id: CaptureId,
+    role: Role,
+    name: Annotated[str, Path(description="Relative path with '/', unique within the role.")],
+    digest: Annotated[
+        str | None,
+        Header(alias=SHA256_HEADER, description="Hex SHA-256 of the bytes; checked when given."),
+    ] = None,
+) -> Response:
+    """Store a file. Sending the same bytes again changes nothing; other bytes under a taken name are refused."""
+    media_type = (
+        request.headers.get("content-type", "application/octet-stream").partition(";")[0].strip().lower()
+    )
+    if not media_type.startswith(_ACCEPTED[role]):
+        raise ProblemError(
+            "unsupported_media_type",
+            f"A file of {role.value} cannot have the content type {media_type[:80]!r}.",
+            advice="Send the file's bytes as they are, with Content-Type: application/octet-stream.",
+            facts={"accepted": list(_ACCEPTED[role])},
+        )
+    length = request.headers.get("content-length", "")
+    file, new = await service.captures.store(
+        capture_id,
+        role,
+        name,
+        request.stream(),
+        announced_sha256=digest,
+        announced_size=int(length) if length.isdigit() else None,
+    )
+    return JSONResponse(
+        file.model_dump(mode="json"), 201 if new else 200, headers={SHA256_HEADER: file.sha256}
+    )

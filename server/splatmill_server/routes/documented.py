@@ -1,0 +1,79 @@
+"""What the OpenAPI document says besides the schema: the problems an endpoint answers with, and examples."""
+
+from typing import Any
+
+from splatmill.schema import PROBLEM_MEDIA_TYPE, PROBLEMS, Problem
+
+Responses = dict[int | str, dict[str, Any]]
+
+CAPTURE_ID = "9f2b6c1d04e8a735"
+JOB_ID = "4c7d10aa83f25e96"
+
+CAPTURE_EXAMPLE = {
+    "id": CAPTURE_ID,
+    "name": "fox",
+    "created_at": "2026-01-15T09:30:00Z",
+    "files": [{"role": "images", "name": "0001.jpg", "size": 183402, "sha256": "5d" * 32}],
+}
+JOB_REQUESTS = {
+    "defaults": {"summary": "Let the photos decide", "value": {"capture": CAPTURE_ID}},
+    "budget": {
+        "summary": "Five minutes, at most 300,000 Gaussians",
+        "value": {"capture": CAPTURE_ID, "options": {"time_budget": "5m", "max_gaussians": 300_000}},
+    },
+}
+CAMERA = {
+    "camera_to_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -4], [0, 0, 0, 1]],
+    "width": 640,
+    "height": 480,
+    "fov_y_deg": 50,
+}
+RENDER_REQUESTS = {
+    "color": {"summary": "A colour picture", "value": {"camera": CAMERA}},
+    "depth": {
+        "summary": "Depth in 16 bit, scale in a header",
+        "value": {"camera": CAMERA, "output": "depth", "format": "png"},
+    },
+}
+
+
+def problems(*codes: str) -> Responses:
+    """The `responses` of an endpoint for these codes; those with one status share an entry."""
+    by_status: dict[int, list[str]] = {}
+    for code in ("unauthorized", "invalid_request", "queue_unavailable", *codes):
+        by_status.setdefault(PROBLEMS[code].status, []).append(code)
+    return {
+        status: {
+            "description": "; ".join(f"`{code}`: {PROBLEMS[code].title}" for code in named),
+            "content": {
+                PROBLEM_MEDIA_TYPE: {
+                    "schema": {"$ref": "#/components/schemas/Problem"},
+                    "examples": {
+                        code: {
+                            "value": Problem.of(code, PROBLEMS[code].title + ".").model_dump(
+                                exclude_none=True
+                            )
+                        }
+                        for code in named
+                    },
+                }
+            },
+        }
+        for status, named in by_status.items()
+    }
+
+
+def example(status: int, value: Any, description: str) -> Responses:
+    """A successful answer with an example."""
+    return {status: {"description": description, "content": {"application/json": {"example": value}}}}
+
+
+def answer(status: int, description: str, **more: Any) -> Responses:
+    """Any other answer."""
+    return {status: {"description": description, **more}}
+
+
+def binary(description: str, *media_types: str) -> Responses:
+    """A successful answer that is a file."""
+    schema = {"type": "string", "format": "binary"}
+    return {200: {"description": description, "content": {name: {"schema": schema} for name in media_types}}}

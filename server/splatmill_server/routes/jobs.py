@@ -1,0 +1,160 @@
+"""`/v1/jobs`: from a capture to a model."""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Path, Query, Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import ValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import JSONResponse, Response
+
+from splatmill.schema import IDEMPOTENCY_HEADER, CreateJob, Job, JobPage, JobState
+from splatmill_server.oneshot import create_from_form
+from splatmill_server.paging import DEFAULT_LIMIT
+from splatmill_server.problems import ProblemError
+from splatmill_server.routes.documented import JOB_REQUESTS, answer, problems
+from splatmill_server.routes.requests import Cursor, Limit
+from splatmill_server.service import Service, Shared
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+
+JobId = Annotated[str, Path(description="The job's id.")]
+
+_LOCATION = {"Location": {"schema": {"type": "string"}, "description": "The job's address."}}
+_FORM = {
+    "type": "object",
+    "required": ["images"],
+    "properties": {
+        "images": {"type": "array", "items": {"type": "string", "format": "binary"}},
+        "masks": {"type": "array", "items": {"type": "string", "format": "binary"}},
+        "poses": {"type": "array", "items": {"type": "string", "format": "binary"}},
+        "options": {"type": "string", "description": "`TrainOptions` as JSON."},
+        "name": {"type": "string"},
+    },
+}
+
+
+@router.post(
+    "",
+    status_code=202,
+    response_model=Job,
+    responses=answer(202, "The job, queued", headers=_LOCATION)
+    | problems(
+        "malformed_body",
+        "body_cut_off",
+        "capture_not_found",
+        "no_images",
+        "too_few_images",
+        "unknown_option",
+        "option_out_of_range",
+        "idempotency_conflict",
+        "body_too_large",
+        "unsupported_media_type",
+        "storage_full",
+    ),
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {
+                "application/json": {
+                    "schema": {"$ref": "#/components/schemas/CreateJob"},
+                    "examples": JOB_REQUESTS,
+                },
+                "multipart/form-data": {"schema": _FORM},
+            },
+        }
+    },
+)
+async def create_job(
+    service: Shared,
+    request: Request,
+    key: Annotated[
+        str | None,
+        Header(
+            alias=IDEMPOTENCY_HEADER,
+            min_length=1,
+            max_length=200,
+            description="Requests with one key make one job; repeat a request with its key when its answer was lost.",
+        ),
+    ] = None,
+) -> Response:
+    """Train a capture, or upload photos as a form and train them in one request."""
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media_type == "multipart/form-data":
+        job, new = await create_from_form(service, request, key)
+    elif media_type == "application/json" or media_type.endswith("+json"):
+        job, new = await _create_from_json(service, await request.body(), key)
+    else:
+        raise ProblemError(
+            "unsupported_media_type",
+            f"A job is made from JSON or from a form; the content type is {media_type[:80] or 'missing'!r}.",
+            advice="Send application/json with a capture, or multipart/form-data with images.",
+        )
+    headers = {"Location": f"/v1/jobs/{job.id}"} | ({} if new else {"Idempotency-Replayed": "true"})
+    return JSONResponse(job.model_dump(mode="json"), 202, headers)
+
+
+async def _create_from_json(service: Service, body: bytes, key: str | None) -> tuple[Job, bool]:
+    try:
+        create = CreateJob.model_validate_json(body)
+    except ValidationError as error:
+        raise RequestValidationError(_located(error)) from error
+
+    def make() -> tuple[Job, bool]:
+        # A repeated request is answered with its job even if its capture is gone by now.
+        if key is None or service.jobs.known(key) is None:
+            service.captures.check_trainable(create.capture)
+        return service.jobs.create(create, key=key, body=create.model_dump_json())
+
+    return await run_in_threadpool(make)
+
+
+def _located(error: ValidationError) -> list[Any]:
+    return [{**found, "loc": ("body", *found["loc"])} for found in error.errors()]
+
+
+@router.get("", responses=problems("cursor_invalid"))
+def list_jobs(
+    service: Shared,
+    cursor: Cursor = None,
+    limit: Limit = DEFAULT_LIMIT,
+    state: Annotated[JobState | None, Query(description="Only jobs in this state.")] = None,
+) -> JobPage:
+    """Jobs, newest first."""
+    return service.jobs.page(cursor, limit, state)
+
+
+@router.get("/{job_id}", responses=problems("job_not_found"))
+def get_job(service: Shared, job_id: JobId) -> Job:
+    """A job as it stands now."""
+    return service.jobs.get(job_id)
+
+
+@router.delete("/{job_id}", status_code=204, responses=problems("job_not_found", "job_running"))
+def delete_job(service: Shared, job_id: JobId) -> Response:
+    """Remove an ended job with its model. Its capture stays."""
+    service.jobs.delete(job_id)
+    return Response(status_code=204)
+
+
+@router.post("/{job_id}/cancel", status_code=202, responses=problems("job_not_found", "job_finished"))
+async def cancel_job(service: Shared, job_id: JobId) -> Job:
+    """Ask for a job's end. It is `cancelled` once its process is gone; until then `cancel_requested` is true."""
+    job = await run_in_threadpool(service.jobs.cancel, job_id)
+    if not job.state.final:
+        # The first push now, so that a job that only waits is cancelled in this very answer.
+        row = await run_in_threadpool(service.jobs.row, job_id)
+        await run_in_threadpool(service.reaper.cancel, row)
+        service.reaper.wake()
+        job = await run_in_threadpool(service.jobs.get, job_id)
+    return job
+
+
+@router.post(
+    "/{job_id}/restart",
+    status_code=202,
+    responses=problems("job_not_found", "job_running", "capture_not_found"),
+)
+def restart_job(service: Shared, job_id: JobId) -> Job:
+    """Run an ended job once more; it goes on from its last checkpoint where there is one."""
+    return service.jobs.restart(job_id)

@@ -1,0 +1,157 @@
+"""`/v1/models`: finished scenes, their files and cameras, and pictures of them."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Body, Path, Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import ValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import Response
+
+from splatmill.backplane import layout, rendering
+from splatmill.schema import Model, ModelCameras, ModelPage, OrbitRequest, RenderRequest
+from splatmill_server.files import file_response
+from splatmill_server.forward import forward
+from splatmill_server.paging import DEFAULT_LIMIT
+from splatmill_server.routes.documented import CAMERA, RENDER_REQUESTS, answer, binary, problems
+from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit
+from splatmill_server.service import Shared
+
+router = APIRouter(prefix="/v1/models", tags=["models"])
+
+ModelId = Annotated[str, Path(description="The model's id, which is that of its job.")]
+
+_RENDERED = binary("The picture", "image/png", "image/jpeg", "image/webp", "application/x-npy") | {
+    304: {"description": "The picture with the ETag in `If-None-Match` is still right."}
+}
+_RENDER_PROBLEMS = problems(
+    "model_not_found",
+    "model_not_ready",
+    "camera_invalid",
+    "size_out_of_range",
+    "model_corrupt",
+    "renderer_unavailable",
+    "render_timeout",
+)
+_CAMERA_QUERY = [
+    {
+        "name": "camera_to_world",
+        "in": "query",
+        "required": True,
+        "description": "16 numbers, row by row, separated by commas.",
+        "schema": {"type": "string"},
+        "example": ",".join(str(x) for row in CAMERA["camera_to_world"] for x in row),  # type: ignore[attr-defined]
+    },
+    *(
+        {"name": name, "in": "query", "required": name in ("width", "height"), "schema": {"type": kind}}
+        for name, kind in (
+            ("width", "integer"),
+            ("height", "integer"),
+            ("fov_y_deg", "number"),
+            ("fx", "number"),
+            ("fy", "number"),
+            ("cx", "number"),
+            ("cy", "number"),
+            ("convention", "string"),
+            ("output", "string"),
+            ("format", "string"),
+            ("background", "string"),
+            ("quality", "integer"),
+        )
+    ),
+]
+
+
+@router.get("", responses=problems("cursor_invalid"))
+def list_models(service: Shared, cursor: Cursor = None, limit: Limit = DEFAULT_LIMIT) -> ModelPage:
+    """Models, newest first. They are read from storage, whatever became of their jobs."""
+    return service.models.page(cursor, limit)
+
+
+@router.get("/{model_id}", responses=problems("model_not_found", "model_not_ready", "model_corrupt"))
+def get_model(service: Shared, model_id: ModelId) -> Model:
+    """A model with its files."""
+    return service.models.get(model_id)
+
+
+@router.head("/{model_id}/files/{name}", include_in_schema=False)
+@router.get(
+    "/{model_id}/files/{name}",
+    response_class=Response,
+    responses=binary(
+        "The file, or with `Range` a part of it (206)", *sorted(set(layout.MODEL_FILES.values()))
+    )
+    | answer(206, "The part that was asked for")
+    | answer(304, "Unchanged")
+    | problems("model_not_found", "file_not_found", "model_not_ready", "range_not_satisfiable"),
+)
+async def get_file(service: Shared, model_id: ModelId, name: str, request: Request) -> Response:
+    """One file of a model: `model.ply`, `report.json`, `report.png`, `report.html`, `cameras.json`, ..."""
+    entry = await run_in_threadpool(service.models.file, model_id, name)
+    download = f"{model_id}.ply" if name == "model.ply" else None
+    return await file_response(
+        request, service.storage, entry.path, layout.MODEL_FILES[name], download_name=download
+    )
+
+
+@router.get(
+    "/{model_id}/cameras",
+    responses=problems("model_not_found", "model_not_ready", "file_not_found", "model_corrupt"),
+)
+def get_cameras(service: Shared, model_id: ModelId) -> ModelCameras:
+    """The cameras of the photos in the model's world, held-out ones marked `test`."""
+    return service.models.cameras(model_id)
+
+
+@router.post(
+    "/{model_id}/render",
+    response_class=Response,
+    responses=_RENDERED | _RENDER_PROBLEMS | problems("unsupported_media_type", "body_too_large"),
+    dependencies=[JSON_ONLY],
+)
+async def render(
+    service: Shared,
+    model_id: ModelId,
+    request: Request,
+    wish: Annotated[RenderRequest, Body(openapi_examples=RENDER_REQUESTS)],
+) -> Response:
+    """A picture of the model from a camera: colour, depth or coverage."""
+    await run_in_threadpool(service.models.check, model_id)
+    return await forward(service.renderer, request, rendering.render_path(model_id), wish)
+
+
+@router.get(
+    "/{model_id}/render",
+    response_class=Response,
+    responses=_RENDERED | _RENDER_PROBLEMS,
+    openapi_extra={"parameters": _CAMERA_QUERY},
+)
+async def render_cacheable(service: Shared, model_id: ModelId, request: Request) -> Response:
+    """The same picture at an address that browsers and proxies can keep."""
+    try:
+        wish = RenderRequest.from_query(request.query_params)
+    except ValidationError as error:
+        located = [{**found, "loc": ("query", *found["loc"])} for found in error.errors()]
+        raise RequestValidationError(located) from error
+    await run_in_threadpool(service.models.check, model_id)
+    return await forward(service.renderer, request, rendering.render_path(model_id), wish)
+
+
+@router.post(
+    "/{model_id}/orbit",
+    response_class=Response,
+    responses=binary("The video", "video/mp4")
+    | answer(304, "Unchanged")
+    | _RENDER_PROBLEMS
+    | problems("unsupported_media_type", "body_too_large", "size_out_of_range"),
+    dependencies=[JSON_ONLY],
+)
+async def orbit(
+    service: Shared,
+    model_id: ModelId,
+    request: Request,
+    wish: Annotated[OrbitRequest | None, Body(examples=[{"seconds": 4, "width": 480, "height": 360}])] = None,
+) -> Response:
+    """A video that circles the scene once."""
+    await run_in_threadpool(service.models.check, model_id)
+    return await forward(service.renderer, request, rendering.orbit_path(model_id), wish or OrbitRequest())

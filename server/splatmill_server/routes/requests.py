@@ -1,0 +1,29 @@
+"""Parameters that several endpoints share."""
+
+from typing import Annotated, Any
+
+from fastapi import Depends, Query, Request
+
+from splatmill_server.paging import DEFAULT_LIMIT, MAX_LIMIT
+from splatmill_server.problems import ProblemError
+
+Cursor = Annotated[
+    str | None,
+    Query(max_length=200, description="The `cursor` of the previous page; left out for the first."),
+]
+Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description=f"Entries per page (usually {DEFAULT_LIMIT}).")]
+
+
+def _json_only(request: Request) -> None:
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    has_body = request.headers.get("content-length", "0") != "0" or "transfer-encoding" in request.headers
+    if has_body and media_type != "application/json" and not media_type.endswith("+json"):
+        raise ProblemError(
+            "unsupported_media_type",
+            f"This address takes JSON; the content type is {media_type[:80] or 'missing'!r}.",
+            advice="Send the header 'Content-Type: application/json'.",
+        )
+
+
+JSON_ONLY: Any = Depends(_json_only)
+"""A dependency that refuses a body which is not JSON with 415, before it is looked into."""

@@ -1,0 +1,144 @@
+"""What the service says of itself: options, info, health, metrics."""
+
+from datetime import UTC, datetime
+
+import redis
+from fastapi import APIRouter
+from rq import Worker
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import JSONResponse, Response
+
+import splatmill
+from splatmill.backplane import queue, rendering
+from splatmill.backplane.storage import StorageError
+from splatmill.schema import (
+    MAX_PIXELS,
+    Health,
+    Info,
+    Limits,
+    OptionList,
+    Ready,
+    WorkerInfo,
+    describe_options,
+)
+from splatmill_server import metrics
+from splatmill_server.routes.documented import problems
+from splatmill_server.service import Service, Shared
+
+router = APIRouter(tags=["service"])
+
+MAX_IMAGE_PIXELS = 400_000_000
+"""Photos with more pixels are left out by the worker, from their header alone."""
+
+
+@router.get("/v1/options", responses=problems())
+def get_options() -> OptionList:
+    """Every setting of a training run with type, default, range and help."""
+    return OptionList(options=describe_options())
+
+
+@router.get("/v1/info", responses=problems())
+def get_info(service: Shared) -> Info:
+    """Version, limits, the workers and how many jobs wait."""
+    return Info(
+        version=splatmill.__version__,
+        storage="file" if service.storage.root is not None else "s3",
+        workers=_workers(service),
+        queued=sum(queue.waiting(service.redis).values()),
+        limits=Limits(
+            max_file_bytes=service.settings.max_file_bytes,
+            max_files_per_capture=service.settings.max_files_per_capture,
+            max_image_pixels=MAX_IMAGE_PIXELS,
+            max_render_pixels=MAX_PIXELS,
+        ),
+        details={"renderer": service.renderer is not None},
+    )
+
+
+@router.get("/healthz")
+async def healthz() -> Health:
+    """The process answers."""
+    return Health()
+
+
+@router.get(
+    "/readyz",
+    response_model=Ready,
+    responses={503: {"model": Ready, "description": "A part that jobs need is not there"}},
+)
+async def readyz(service: Shared) -> Response:
+    """Whether jobs can be taken and run. A missing renderer is named, but does not stop jobs."""
+    checks = {
+        "redis": await run_in_threadpool(_redis_check, service),
+        "storage": await run_in_threadpool(_storage_check, service),
+        "renderer": await _renderer_check(service),
+    }
+    ready = checks["redis"] == checks["storage"] == "ok"
+    return JSONResponse(Ready(ready=ready, checks=checks).model_dump(), 200 if ready else 503)
+
+
+@router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
+def get_metrics(service: Shared) -> Response:
+    """Prometheus metrics."""
+    gauges = service.metrics
+    try:
+        for name, count in queue.waiting(service.redis).items():
+            gauges.waiting.labels(name).set(count)
+        gauges.workers.clear()
+        for worker in _workers(service):
+            gauges.workers.labels(worker.state).inc()
+        gauges.redis_up.set(1)
+    except redis.RedisError:
+        gauges.redis_up.set(0)
+    return Response(gauges.text(), media_type=metrics.MEDIA_TYPE)
+
+
+def _workers(service: Service) -> list[WorkerInfo]:
+    found = Worker.all(connection=service.redis, serializer=queue.SERIALIZER)
+    return [
+        WorkerInfo(
+            name=worker.name,
+            queues=worker.queue_names(),
+            state=str(getattr(worker.get_state(), "value", worker.get_state())),
+            job=_job_of(worker.get_current_job_id()),
+            last_heartbeat=_aware(worker.last_heartbeat),
+        )
+        for worker in found
+    ]
+
+
+def _job_of(rq_id: str | None) -> str | None:
+    try:
+        return queue.split_rq_id(rq_id)[0] if rq_id else None
+    except ValueError:
+        return rq_id
+
+
+def _aware(moment: datetime | None) -> datetime | None:
+    return moment.replace(tzinfo=UTC) if moment is not None and moment.tzinfo is None else moment
+
+
+def _redis_check(service: Service) -> str:
+    try:
+        service.redis.ping()
+    except redis.RedisError as error:
+        return f"Redis cannot be reached: {error}"
+    return "ok"
+
+
+def _storage_check(service: Service) -> str:
+    try:
+        service.storage.check()
+    except StorageError as error:
+        return str(error)
+    return "ok"
+
+
+async def _renderer_check(service: Service) -> str:
+    if service.renderer is None:
+        return "none is configured"
+    try:
+        answer = await service.renderer.get(rendering.HEALTH, timeout=2.0)
+    except Exception as error:
+        return f"it cannot be reached: {type(error).__name__}"
+    return "ok" if answer.is_success else f"it answers {answer.status_code}"

@@ -1,0 +1,83 @@
+"""What the endpoints share: the connections, and the records they lead to. One per app, made by `create_app`."""
+
+import asyncio
+from dataclasses import dataclass, field
+from typing import Annotated, cast
+
+import httpx
+from fastapi import Depends, Request
+from redis import Redis
+from redis.asyncio import Redis as AsyncRedis
+
+from splatmill.backplane import rendering
+from splatmill.backplane.connection import connect, connect_async
+from splatmill.backplane.storage import Storage
+from splatmill_server.captures import Captures
+from splatmill_server.jobs import Jobs
+from splatmill_server.metrics import Metrics
+from splatmill_server.models import Models
+from splatmill_server.reaper import Reaper
+from splatmill_server.settings import Settings
+
+
+@dataclass
+class Service:
+    """Connections are opened when they are first used, so that an app can be made while Redis is away."""
+
+    settings: Settings
+    redis: Redis
+    redis_async: AsyncRedis
+    storage: Storage
+    renderer: httpx.AsyncClient | None
+    metrics: Metrics
+    captures: Captures
+    jobs: Jobs
+    models: Models
+    reaper: Reaper
+    closing: asyncio.Event = field(default_factory=asyncio.Event)
+    """Set when the server is asked to stop, so that event streams end instead of holding it up."""
+
+    @classmethod
+    def of(cls, settings: Settings) -> "Service":
+        """Raises StorageError when the storage cannot be opened."""
+        storage = Storage(settings.storage)
+        connection = connect(settings.redis_url, timeout=settings.redis_timeout, retries=1)
+        metrics = Metrics()
+        jobs = Jobs(connection, storage, metrics)
+        return cls(
+            settings=settings,
+            redis=connection,
+            redis_async=connect_async(settings.redis_url),
+            storage=storage,
+            renderer=_renderer(settings),
+            metrics=metrics,
+            captures=Captures(storage, settings, metrics),
+            jobs=jobs,
+            models=Models(storage, jobs),
+            reaper=Reaper(connection, jobs, metrics, settings),
+        )
+
+    async def close(self) -> None:
+        """Close every connection."""
+        await self.redis_async.aclose()
+        self.redis.close()
+        if self.renderer is not None:
+            await self.renderer.aclose()
+
+
+def _renderer(settings: Settings) -> httpx.AsyncClient | None:
+    if settings.renderer_url is None:
+        return None
+    base, socket = rendering.address(settings.renderer_url)
+    # The renderer is one of ours on a private address: a proxy meant for the outside world must not come between.
+    transport = httpx.AsyncHTTPTransport(uds=socket) if socket else None
+    timeout = httpx.Timeout(settings.render_timeout, connect=5.0)
+    return httpx.AsyncClient(base_url=base, transport=transport, timeout=timeout, trust_env=False)
+
+
+def _service(request: Request) -> Service:
+    return cast(Service, request.app.state.service)
+
+
+Shared = Annotated[Service, Depends(_service)]
+"""An endpoint's parameter through which it gets at the service."""

@@ -1,0 +1,75 @@
+"""From pydantic's list of errors to one problem document: the most telling code, and every error as a fact."""
+
+import difflib
+from collections.abc import Sequence
+from typing import Any
+
+from splatmill.schema import MAX_PIXELS, MAX_SIDE, Problem, TrainOptions
+
+_RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_equal", "enum", "literal_error"}
+_RANGE |= {"too_short", "too_long", "finite_number", "multiple_of"}
+_SIZES = {"width", "height"}
+_LENS = {"camera", "camera_to_world", "convention", "fx", "fy", "cx", "cy", "fov_y_deg"}
+
+
+def problem_of_validation(errors: Sequence[Any]) -> Problem:
+    """The problem for a request that does not fit the schema. `errors` is `RequestValidationError.errors()`."""
+    facts: dict[str, Any] = {"errors": [_fact(error) for error in errors[:20]]}
+    if any(error["type"] == "json_invalid" for error in errors):
+        where = errors[0]["loc"][-1]
+        detail = (
+            f"The body is not JSON: {errors[0].get('ctx', {}).get('error', 'it breaks off')} (at {where})."
+        )
+        return Problem.of("malformed_body", detail, advice="Send one JSON object.", facts=facts)
+    for error in errors:
+        if (found := _named(error)) is not None:
+            code, detail, advice = found
+            return Problem.of(code, detail, advice=advice, facts=facts)
+    shown = "; ".join(f"{_path(error)}: {error['msg']}" for error in errors[:3])
+    return Problem.of("invalid_request", f"The request does not fit the schema: {shown}.", facts=facts)
+
+
+def _named(error: Any) -> tuple[str, str, str | None] | None:
+    """Code, sentence and advice for the errors that have a code of their own."""
+    loc = [str(part) for part in error["loc"] if part != "body"]
+    field, kind, given = (loc[-1] if loc else ""), error["type"], error.get("input")
+    if loc[:1] == ["options"] and len(loc) > 1:
+        if kind == "extra_forbidden":
+            near = difflib.get_close_matches(field, TrainOptions.model_fields, n=1)
+            advice = f"Did you mean {near[0]!r}?" if near else None
+            return "unknown_option", f"There is no option {field!r}.", advice or "GET /v1/options lists them."
+        if kind in _RANGE:
+            detail = f"The option {loc[1]!r} cannot be {_short(given)}: {_sentence(error)}"
+            return "option_out_of_range", detail, "GET /v1/options lists every range."
+        return None
+    if field in _SIZES and kind != "missing":
+        detail = f"The picture's {field} cannot be {_short(given)}: {_sentence(error)}"
+        return "size_out_of_range", detail, f"Sides are 1 to {MAX_SIDE} pixels, {MAX_PIXELS} pixels in all."
+    if isinstance(given, dict) and kind == "value_error" and _pixels(given) > MAX_PIXELS:
+        return "size_out_of_range", _sentence(error), "Ask for a smaller picture."
+    if _LENS & set(loc):
+        return "camera_invalid", f"The camera cannot be rendered from: {_sentence(error)}", None
+    return None
+
+
+def _pixels(camera: dict[Any, Any]) -> float:
+    sides = [camera.get("width"), camera.get("height")]
+    return sides[0] * sides[1] if all(isinstance(side, int) for side in sides) else 0  # type: ignore[operator]
+
+
+def _path(error: Any) -> str:
+    return ".".join(str(part) for part in error["loc"] if part != "body") or "body"
+
+
+def _sentence(error: Any) -> str:
+    text = str(error["msg"]).removeprefix("Value error, ").strip()
+    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "?", "!")) else ".")
+
+
+def _fact(error: Any) -> dict[str, Any]:
+    return {"where": _path(error), "what": _sentence(error), "given": _short(error.get("input"))}
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
