@@ -1,0 +1,188 @@
+"""Front-to-back alpha compositing, one program per tile; leaves the checkpoints that the backward pass starts from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ..records import TILE, Bins, Projected
+from . import device, record
+from .blend import PIXELS, STRIDE, TRANSMITTANCE_MIN, alphas, exponents, tile_pixels
+from .tuning import COMPOSITE, autotune
+
+SEGMENT = 128
+"""Splats between two checkpoints, and what one program of the backward pass walks: short enough that long lists spread over the
+chip, long enough that the 5 KB of a checkpoint are little beside the 128 records read."""
+
+
+@autotune(COMPOSITE, key=["DEPTH", "CHECKPOINTS"])
+@triton.jit
+def composite_kernel(
+    records, offsets, ids, background, color, transmittance, depth, checkpoints, first_segment, segment_tile,
+    width, height, columns,
+    BACKGROUND: tl.constexpr, DEPTH: tl.constexpr, CHECKPOINTS: tl.constexpr, SEGMENT: tl.constexpr,
+    BATCH: tl.constexpr, EXPONENT: tl.constexpr,
+):  # fmt: skip
+    tile = tl.program_id(0)
+    left, top, column, row = tile_pixels(tile, columns)
+    x = column.to(tl.float32) + 0.5
+    y = row.to(tl.float32) + 0.5
+    inside = (column < width) & (row < height)
+    start = tl.load(offsets + tile)
+    count = (tl.load(offsets + tile + 1) - start).to(tl.int32)
+    lane = tl.arange(0, BATCH)
+    pixel = tl.arange(0, PIXELS)
+
+    # `through` also counts the splat that ends a pixel, so it stays at or below the stop; `left_over` is what the pixel keeps.
+    through = tl.where(inside, 1.0, 0.0)
+    left_over = through
+    red = tl.zeros([PIXELS], tl.float32)
+    green = tl.zeros([PIXELS], tl.float32)
+    blue = tl.zeros([PIXELS], tl.float32)
+    deep = tl.zeros([PIXELS], tl.float32)
+    done = 0
+    most = tl.max(through, 0)
+    while (done < count) & (most > TRANSMITTANCE_MIN):
+        if CHECKPOINTS:
+            if done % SEGMENT == 0:
+                segment = tl.load(first_segment + tile) + done // SEGMENT
+                tl.store(segment_tile + segment, tile)
+                place = checkpoints + segment * (5 * PIXELS) + pixel
+                tl.store(place, red)
+                tl.store(place + PIXELS, green)
+                tl.store(place + 2 * PIXELS, blue)
+                tl.store(place + 3 * PIXELS, through)
+                if DEPTH:
+                    tl.store(place + 4 * PIXELS, deep)
+        here = done + lane
+        splat = tl.load(ids + start + here, mask=here < count, other=0)
+        source = records + splat.to(tl.int64) * STRIDE
+        opacity = tl.load(source + 5, mask=here < count, other=0.0)
+        sigma = exponents(
+            tl.load(source), tl.load(source + 1), tl.load(source + 2), tl.load(source + 3), tl.load(source + 4),
+            x, y, left, top, EXPONENT, BATCH,
+        )  # fmt: skip
+        alpha = alphas(sigma, opacity)
+        after = through[None, :] * tl.cumprod(1.0 - alpha, axis=0)
+        kept = after > TRANSMITTANCE_MIN
+        # One rounding from the product before this splat; nothing accumulates, unlike walking a list back by division.
+        weight = tl.where(kept, alpha * (after / (1.0 - alpha)), 0.0)
+        red += tl.sum(weight * tl.load(source + 6)[:, None], axis=0)
+        green += tl.sum(weight * tl.load(source + 7)[:, None], axis=0)
+        blue += tl.sum(weight * tl.load(source + 8)[:, None], axis=0)
+        if DEPTH:
+            deep += tl.sum(weight * tl.load(source + 9)[:, None], axis=0)
+        left_over = tl.minimum(left_over, tl.min(tl.where(kept, after, 1.0), axis=0))
+        through = tl.min(after, axis=0)
+        most = tl.max(through, 0)
+        done += BATCH
+
+    out = row * width + column
+    if BACKGROUND:
+        red += left_over * tl.load(background)
+        green += left_over * tl.load(background + 1)
+        blue += left_over * tl.load(background + 2)
+    tl.store(color + out * 3, red, mask=inside)
+    tl.store(color + out * 3 + 1, green, mask=inside)
+    tl.store(color + out * 3 + 2, blue, mask=inside)
+    tl.store(transmittance + out, left_over, mask=inside)
+    if DEPTH:
+        tl.store(depth + out, deep, mask=inside)
+
+
+@dataclass(frozen=True)
+class Blended:
+    """One view's image and what the backward pass needs of the walk that made it."""
+
+    color: Tensor  # [H, W, 3], background blended in
+    transmittance: (
+        Tensor  # [H, W]: what is left; kept apart because 1 - alpha has no digits where it is small
+    )
+    depth: Tensor | None  # [H, W]
+    checkpoints: (
+        Tensor | None
+    )  # [segments, 5, 256]: red, green, blue, transmittance, depth before the segment
+    first_segment: Tensor | None  # int32 [tiles + 1]
+    segment_tile: (
+        Tensor | None
+    )  # int32 [segments]; -1 where the walk stopped before, or no such segment exists
+
+
+def blend(
+    records: Tensor,
+    bins: Bins,
+    width: int,
+    height: int,
+    background: Tensor | None,
+    *,
+    depth: bool,
+    checkpoints: bool,
+) -> Blended:
+    """Composite records [N, 12]. The buffers are sized by the room in `bins.ids`, so that nothing waits for the device."""
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    tiles = columns * rows
+    like = {"device": records.device, "dtype": torch.float32}
+    index = {"device": records.device, "dtype": torch.int32}
+    color = torch.empty(height, width, 3, **like)
+    transmittance = torch.empty(height, width, **like)
+    deep = torch.empty(height, width, **like) if depth else None
+    saved = first = owner = None
+    if checkpoints:
+        lengths = bins.offsets[1:] - bins.offsets[:-1]
+        first = torch.zeros(tiles + 1, **index)
+        first[1:] = torch.cumsum(torch.div(lengths + (SEGMENT - 1), SEGMENT, rounding_mode="floor"), 0)
+        segments = bins.ids.shape[0] // SEGMENT + tiles  # each tile's last segment may be short
+        owner = torch.full((segments,), -1, **index)
+        saved = torch.empty(segments, 5, 256, **like)
+    composite_kernel[(tiles,)](
+        records, bins.offsets, bins.ids, background, color, transmittance, deep, saved, first, owner,
+        width, height, columns,
+        BACKGROUND=background is not None, DEPTH=depth, CHECKPOINTS=checkpoints, SEGMENT=SEGMENT,
+    )  # fmt: skip
+    return Blended(color, transmittance, deep, saved, first, owner)
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, depths: Tensor, extents: Tensor,
+        background: Tensor | None, bins: Bins, width: int, height: int,
+    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+        records = record.pack(Projected(means2d, conics, opacities, colors, depths, extents))
+        training = any(ctx.needs_input_grad[:7])
+        made = blend(records, bins, width, height, background, depth=True, checkpoints=training)
+        ctx.made, ctx.bins, ctx.size = made, bins, (width, height)
+        ctx.save_for_backward(records, background)
+        assert made.depth is not None
+        return made.color.clone() if training else made.color, 1.0 - made.transmittance, made.depth
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, d_color: Tensor, d_alpha: Tensor, d_depth: Tensor) -> tuple[Tensor | None, ...]:
+        from .composite_backward import blend_backward
+
+        records, background = ctx.saved_tensors
+        gradient = blend_backward(
+            records, ctx.bins, ctx.made, *ctx.size, background, d_color, d_alpha=d_alpha, d_depth=d_depth
+        )
+        d_background = None
+        if background is not None and ctx.needs_input_grad[6]:
+            d_background = (ctx.made.transmittance[..., None] * d_color).sum((0, 1))
+        g = gradient
+        return g[:, 0:2], g[:, 2:5], g[:, 5], g[:, 6:9], g[:, 9], None, d_background, None, None, None
+
+
+def composite(
+    projected: Projected, bins: Bins, width: int, height: int, *, background: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Blend the lists into color [H,W,3], alpha [H,W] and depth [H,W] = sum w_i z_i, as `reference.composite` defines it."""
+    device.require(projected.means2d)
+    background = None if background is None else background.to(projected.means2d).contiguous()
+    color, alpha, depth = _Composite.apply(*projected, background, bins, width, height)
+    return color, alpha, depth

@@ -1,0 +1,257 @@
+"""L1 plus D-SSIM from the 8-bit photo, value and gradient in four kernels: the window across, then down, and both again.
+
+The 11-tap window is separable, and its eleven shifted reads fall into the first-level cache; what goes to memory between the
+kernels is three planes per channel. Everything is float32: the variance is a difference of nearly equal windows, and SSIM
+divides by it plus 9e-4.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ..reference.loss import C1, C2, SIGMA, WINDOW, PhotoStats
+from . import device
+from .constant import constant
+from .tuning import LOSS, SMALLEST_LOSS_BLOCK, autotune
+
+REACH = constant(WINDOW // 2)
+TAPS = constant(WINDOW)
+S1, S2 = constant(C1), constant(C2)
+
+
+@triton.jit
+def load_pair(color, photo, mask, place, channel, inside, MASK: tl.constexpr):
+    """Rendered and seen values of one channel, both 0 where not `inside` and not under the mask, and where they are used."""
+    used = inside
+    if MASK:
+        used = inside & (tl.load(mask + place, mask=inside, other=0) != 0)
+    x = tl.load(color + place * 3 + channel, mask=used, other=0.0)
+    y = tl.load(photo + place * 3 + channel, mask=used, other=0).to(tl.float32) / 255.0
+    return x, y, used
+
+
+@autotune(LOSS, key=["MASK", "STATS"])
+@triton.jit
+def across_kernel(
+    color, photo, mask, taps, planes, width, height,
+    MASK: tl.constexpr, STATS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """x, x^2, xy, and without the photo's own part also y, y^2, windowed along rows: planes [3 or 5, 3, H, W]."""
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    channel = tl.program_id(1)
+    plane = width * height
+    here = p < plane
+    column = p % width
+    x1 = tl.zeros([BLOCK], tl.float32)
+    xx, xy, y1, yy = x1, x1, x1, x1
+    for k in tl.static_range(TAPS):
+        shift = k - REACH
+        tap = tl.load(taps + k)
+        inside = here & (column + shift >= 0) & (column + shift < width)
+        x, y, _ = load_pair(color, photo, mask, p + shift, channel, inside, MASK)
+        x1 += tap * x
+        xx += tap * x * x
+        xy += tap * x * y
+        if not STATS:
+            y1 += tap * y
+            yy += tap * y * y
+    out = planes + channel * plane + p
+    tl.store(out, x1, mask=here)
+    tl.store(out + 3 * plane, xx, mask=here)
+    tl.store(out + 6 * plane, xy, mask=here)
+    if not STATS:
+        tl.store(out + 9 * plane, y1, mask=here)
+        tl.store(out + 12 * plane, yy, mask=here)
+
+
+@triton.jit
+def down(planes, taps, p, row, here, width, height):
+    """One plane windowed along columns."""
+    total = tl.zeros_like(p).to(tl.float32)
+    for k in tl.static_range(TAPS):
+        shift = k - REACH
+        inside = here & (row + shift >= 0) & (row + shift < height)
+        total += tl.load(taps + k) * tl.load(planes + p + shift * width, mask=inside, other=0.0)
+    return total
+
+
+@autotune(LOSS, key=["MASK", "STATS"])
+@triton.jit
+def value_kernel(
+    color, photo, mask, mean, variance, taps, planes, slopes, sums, width, height,
+    MASK: tl.constexpr, STATS: tl.constexpr, SLOPES: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Sums of |x - y| and of SSIM per program, and SSIM's derivatives by the windowed x, x^2 and xy (slopes [3, 3, H, W])."""
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    channel = tl.program_id(1)
+    plane = width * height
+    here = p < plane
+    row = p // width
+    source = planes + channel * plane
+    mu1 = down(source, taps, p, row, here, width, height)
+    var1 = down(source + 3 * plane, taps, p, row, here, width, height) - mu1 * mu1
+    both = down(source + 6 * plane, taps, p, row, here, width, height)
+    if STATS:
+        mu2 = tl.load(mean + p * 3 + channel, mask=here, other=0.0)
+        var2 = tl.load(variance + p * 3 + channel, mask=here, other=0.0)
+    else:
+        mu2 = down(source + 9 * plane, taps, p, row, here, width, height)
+        var2 = down(source + 12 * plane, taps, p, row, here, width, height) - mu2 * mu2
+    x, y, used = load_pair(color, photo, mask, p, channel, here, MASK)
+    a1, a2 = 2.0 * mu1 * mu2 + S1, 2.0 * (both - mu1 * mu2) + S2
+    b1, b2 = mu1 * mu1 + mu2 * mu2 + S1, var1 + var2 + S2
+    ssim = (a1 * a2) / (b1 * b2)
+    if SLOPES:
+        by_variance = -ssim / b2
+        by_covariance = 2.0 * a1 / (b1 * b2)
+        by_mean = 2.0 * mu2 * a2 / (b1 * b2) - 2.0 * mu1 * ssim / b1
+        by_mean = by_mean - mu2 * by_covariance - 2.0 * mu1 * by_variance
+        out = slopes + channel * plane + p
+        tl.store(out, tl.where(used, by_mean, 0.0), mask=here)
+        tl.store(out + 3 * plane, tl.where(used, by_variance, 0.0), mask=here)
+        tl.store(out + 6 * plane, tl.where(used, by_covariance, 0.0), mask=here)
+    place = sums + 2 * (tl.program_id(0) * 3 + channel)
+    tl.store(place, tl.sum(tl.where(used, tl.abs(x - y), 0.0), axis=0))
+    tl.store(place + 1, tl.sum(tl.where(used, ssim, 0.0), axis=0))
+
+
+@autotune(LOSS, key=[])
+@triton.jit
+def slopes_kernel(slopes, taps, planes, width, height, BLOCK: tl.constexpr):
+    """The nine planes of slopes windowed along columns, one per second index of the grid."""
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    plane = width * height
+    here = p < plane
+    source = tl.program_id(1) * plane
+    tl.store(planes + source + p, down(slopes + source, taps, p, p // width, here, width, height), mask=here)
+
+
+@autotune(LOSS, key=["MASK"])
+@triton.jit
+def gradient_kernel(
+    color, photo, mask, taps, planes, used_pixels, d_color, width, height, weight,
+    MASK: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """The slopes windowed along rows and put on the pixels, plus the sign of L1; 0 where a pixel is not used."""
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    channel = tl.program_id(1)
+    plane = width * height
+    here = p < plane
+    column = p % width
+    by_mean = tl.zeros([BLOCK], tl.float32)
+    by_variance, by_covariance = by_mean, by_mean
+    for k in tl.static_range(TAPS):
+        shift = k - REACH
+        tap = tl.load(taps + k)
+        inside = here & (column + shift >= 0) & (column + shift < width)
+        source = planes + channel * plane + p + shift
+        by_mean += tap * tl.load(source, mask=inside, other=0.0)
+        by_variance += tap * tl.load(source + 3 * plane, mask=inside, other=0.0)
+        by_covariance += tap * tl.load(source + 6 * plane, mask=inside, other=0.0)
+    x, y, used = load_pair(color, photo, mask, p, channel, here, MASK)
+    share = 1.0 / (3.0 * tl.maximum(tl.load(used_pixels), 1.0))
+    slope = by_mean + 2.0 * x * by_variance + y * by_covariance
+    sign = tl.where(x > y, 1.0, tl.where(x < y, -1.0, 0.0))
+    value = share * ((1.0 - weight) * sign - weight * slope)
+    tl.store(d_color + p * 3 + channel, tl.where(used, value, 0.0), mask=here)
+
+
+@lru_cache(maxsize=4)
+def window_taps(where: torch.device) -> Tensor:
+    """The eleven taps, made once per device: a copy from the host in every step would wait for it."""
+    x = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
+    taps = torch.exp(-x * x / (2 * SIGMA * SIGMA))
+    return (taps / taps.sum()).to(where, torch.float32)
+
+
+def loss_and_gradient(
+    color: Tensor,
+    photo: Tensor,
+    *,
+    dssim_weight: float,
+    mask: Tensor | None,
+    stats: PhotoStats | None,
+    gradient: bool = True,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The loss and its L1 part as 0-d tensors on the device, and d loss / d color [H, W, 3] or None. Waits for nothing."""
+    height, width = color.shape[:2]
+    pixels = height * width
+    if pixels * 15 >= 2**31:
+        raise ValueError(f"an image of {width}x{height}: offsets into its planes are 32-bit; use fewer than 143 megapixels")
+    like = {"device": color.device, "dtype": torch.float32}
+    if mask is not None:
+        mask = mask.to(torch.uint8).contiguous()
+        count = torch.count_nonzero(mask).to(torch.float32)
+    else:
+        count = torch.full((), float(pixels), **like)
+    taps = window_taps(color.device)
+    planes = torch.empty(3 if stats is not None else 5, 3, height, width, **like)
+    slopes = torch.empty(3, 3, height, width, **like) if gradient else None
+    sums = torch.zeros(triton.cdiv(pixels, SMALLEST_LOSS_BLOCK) * 3, 2, **like)
+    masked = mask is not None
+
+    def grid(meta: dict[str, Any]) -> tuple[int, int]:
+        return triton.cdiv(pixels, meta["BLOCK"]), 3
+
+    across_kernel[grid](color, photo, mask, taps, planes, width, height, MASK=masked, STATS=stats is not None)
+    mean, variance = (None, None) if stats is None else (stats.mean.contiguous(), stats.variance.contiguous())
+    value_kernel[grid](
+        color, photo, mask, mean, variance, taps, planes, slopes, sums, width, height,
+        MASK=masked, STATS=stats is not None, SLOPES=gradient,
+    )  # fmt: skip
+    off, similar = sums.sum(0) / (3 * count.clamp_min(1))
+    # With no used pixel both sums are 0, and so is the loss.
+    value = (1 - dssim_weight) * off + dssim_weight * ((count > 0).float() - similar)
+    if slopes is None:
+        return value, off, None
+    slopes_kernel[lambda meta: (triton.cdiv(pixels, meta["BLOCK"]), 9)](slopes, taps, planes, width, height)
+    d_color = torch.empty_like(color)
+    gradient_kernel[grid](
+        color, photo, mask, taps, planes, count, d_color, width, height, dssim_weight, MASK=masked
+    )
+    return value, off, d_color
+
+
+class _Loss(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        color: Tensor,
+        photo: Tensor,
+        dssim_weight: float,
+        mask: Tensor | None,
+        stats: PhotoStats | None,
+    ) -> Tensor:
+        value, _, d_color = loss_and_gradient(
+            color.contiguous(), photo.contiguous(), dssim_weight=dssim_weight, mask=mask, stats=stats,
+            gradient=ctx.needs_input_grad[0],
+        )  # fmt: skip
+        ctx.save_for_backward(d_color)
+        return value
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, d_value: Tensor) -> tuple[Tensor | None, ...]:
+        (d_color,) = ctx.saved_tensors
+        return d_value * d_color, None, None, None, None
+
+
+def loss(
+    color: Tensor,
+    photo: Tensor,
+    *,
+    dssim_weight: float = 0.2,
+    mask: Tensor | None = None,
+    stats: PhotoStats | None = None,
+) -> Tensor:
+    """(1 - w) mean |color - photo/255| + w (1 - mean SSIM), as `reference.loss` defines it, differentiable by color."""
+    device.require(color)
+    value: Tensor = _Loss.apply(color, photo, dssim_weight, mask, stats)
+    return value

@@ -1,0 +1,235 @@
+"""The gradient of projection: from a view's gradient records to the five parameter groups and the camera."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from . import record
+from .constant import constant
+from .harmonics import at, basis, shade, slope
+from .projection import (
+    covariance,
+    load3,
+    load4,
+    load_camera,
+    normalised,
+    rotation,
+    slope_row,
+    through,
+)
+from .tuning import PROJECT_BACKWARD, autotune
+
+STRIDE = constant(record.WIDTH)
+GRADIENT_STRIDE = constant(record.GRADIENT_WIDTH)
+COMPENSATION_MIN = constant(2.5e-5)
+
+
+@triton.jit
+def store3(pointer, i, here, stride, x, y, z, PLANAR: tl.constexpr):
+    tl.store(at(pointer, i, 0, stride, 3, PLANAR), x, mask=here)
+    tl.store(at(pointer, i, 1, stride, 3, PLANAR), y, mask=here)
+    tl.store(at(pointer, i, 2, stride, 3, PLANAR), z, mask=here)
+
+
+@triton.jit
+def add_row(pointer, x, y, z, t):
+    """Add one row of the camera's gradient, summed over the block."""
+    tl.atomic_add(pointer, tl.sum(x, axis=0))
+    tl.atomic_add(pointer + 1, tl.sum(y, axis=0))
+    tl.atomic_add(pointer + 2, tl.sum(z, axis=0))
+    tl.atomic_add(pointer + 3, tl.sum(t, axis=0))
+
+
+@autotune(PROJECT_BACKWARD, key=["USED", "PLANAR", "VIEWMAT"], reset=["d_viewmat"])
+@triton.jit
+def project_backward_kernel(
+    means, log_scales, quats, logit_opacities, sh, viewmat, K, records, gradient,
+    d_means, d_log_scales, d_quats, d_logits, d_sh, d_viewmat, count, stride, width, height,
+    COEFFICIENTS: tl.constexpr, USED: tl.constexpr, PLANAR: tl.constexpr, ANTIALIAS: tl.constexpr, VIEWMAT: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = i < count
+    row = records + i.to(tl.int64) * STRIDE
+    seen = here & (tl.load(row + 10, mask=here, other=0.0) > 0.0)
+    w00, w01, w02, w10, w11, w12, w20, w21, w22, t0, t1, t2, fx, fy, cx, cy = load_camera(viewmat, K)
+    # Culled Gaussians are not read: what they hold (NaN, say) cannot come back as a gradient.
+    m0, m1, m2 = load3(means, i, seen, stride, PLANAR)
+    l0, l1, l2 = load3(log_scales, i, seen, stride, PLANAR)
+    qw, qx, qy, qz = load4(quats, i, seen, stride, PLANAR)
+    logit = tl.load(logit_opacities + i, mask=seen, other=0.0)
+    grow = gradient + i.to(tl.int64) * GRADIENT_STRIDE
+    g_mx = tl.load(grow, mask=seen, other=0.0)
+    g_my = tl.load(grow + 1, mask=seen, other=0.0)
+    g_a = tl.load(grow + 2, mask=seen, other=0.0)
+    g_b = 0.5 * tl.load(grow + 3, mask=seen, other=0.0)
+    g_c = tl.load(grow + 4, mask=seen, other=0.0)
+    g_o = tl.load(grow + 5, mask=seen, other=0.0)
+    g_red = tl.load(grow + 6, mask=seen, other=0.0)
+    g_green = tl.load(grow + 7, mask=seen, other=0.0)
+    g_blue = tl.load(grow + 8, mask=seen, other=0.0)
+    g_z = tl.load(grow + 9, mask=seen, other=0.0)
+
+    # The forward pass again: cheaper than keeping it. A row that is not seen gets z = 1 and stays finite.
+    z = tl.where(seen, w20 * m0 + w21 * m1 + w22 * m2 + t2, 1.0)
+    u = (w00 * m0 + w01 * m1 + w02 * m2 + t0) / z
+    v = (w10 * m0 + w11 * m1 + w12 * m2 + t1) / z
+    low_u, high_u = -(0.15 * width + cx) / fx, (1.15 * width - cx) / fx
+    low_v, high_v = -(0.15 * height + cy) / fy, (1.15 * height - cy) / fy
+    limited_u = tl.minimum(tl.maximum(u, low_u), high_u)
+    limited_v = tl.minimum(tl.maximum(v, low_v), high_v)
+    a0, a1, a2 = slope_row(fx, z, limited_u, w00, w01, w02, w20, w21, w22)
+    b0, b1, b2 = slope_row(fy, z, limited_v, w10, w11, w12, w20, w21, w22)
+    nw, nx, ny, nz, norm = normalised(qw, qx, qy, qz)
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(nw, nx, ny, nz)
+    s0, s1, s2 = tl.exp(l0), tl.exp(l1), tl.exp(l2)
+    p0, p1, p2 = through(a0, a1, a2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+    q0, q1, q2 = through(b0, b1, b2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+    p0, p1, p2, q0, q1, q2 = p0 * s0, p1 * s1, p2 * s2, q0 * s0, q1 * s1, q2 * s2  # rows of M
+    a, b, c, sharp, det = covariance(p0, p1, p2, q0, q1, q2)
+
+    # Opacity.
+    sigmoid = 1.0 / (1.0 + tl.exp(-logit))
+    d_logit = g_o * sigmoid * (1.0 - sigmoid)
+    if ANTIALIAS:
+        d_logit = d_logit * tl.sqrt_rn(tl.maximum(sharp / det, COMPENSATION_MIN))
+    tl.store(d_logits + i, d_logit, mask=here)
+
+    # Conic X = Sigma^-1: dSigma = -X dX X; then M.
+    x00, x01, x11 = c / det, -b / det, a / det
+    y00 = x00 * g_a + x01 * g_b
+    y01 = x00 * g_b + x01 * g_c
+    y10 = x01 * g_a + x11 * g_b
+    y11 = x01 * g_b + x11 * g_c
+    da = -(y00 * x00 + y01 * x01)
+    db = -(y00 * x01 + y01 * x11) - (y10 * x00 + y11 * x01)
+    dc = -(y10 * x01 + y11 * x11)
+    dp0, dp1, dp2 = 2.0 * da * p0 + db * q0, 2.0 * da * p1 + db * q1, 2.0 * da * p2 + db * q2
+    dq0, dq1, dq2 = 2.0 * dc * q0 + db * p0, 2.0 * dc * q1 + db * p1, 2.0 * dc * q2 + db * p2
+    store3(
+        d_log_scales, i, here, stride, p0 * dp0 + q0 * dq0, p1 * dp1 + q1 * dq1, p2 * dp2 + q2 * dq2, PLANAR
+    )
+    dp0, dp1, dp2, dq0, dq1, dq2 = dp0 * s0, dp1 * s1, dp2 * s2, dq0 * s0, dq1 * s1, dq2 * s2
+
+    # Rotation, through the unit quaternion, to the one of any norm.
+    e00, e01, e02 = a0 * dp0 + b0 * dq0, a0 * dp1 + b0 * dq1, a0 * dp2 + b0 * dq2
+    e10, e11, e12 = a1 * dp0 + b1 * dq0, a1 * dp1 + b1 * dq1, a1 * dp2 + b1 * dq2
+    e20, e21, e22 = a2 * dp0 + b2 * dq0, a2 * dp1 + b2 * dq1, a2 * dp2 + b2 * dq2
+    hw = 2.0 * (nz * (e10 - e01) + ny * (e02 - e20) + nx * (e21 - e12))
+    hx = 2.0 * (ny * (e01 + e10) + nz * (e02 + e20) - 2.0 * nx * (e11 + e22) + nw * (e21 - e12))
+    hy = 2.0 * (nx * (e01 + e10) + nz * (e12 + e21) - 2.0 * ny * (e00 + e22) + nw * (e02 - e20))
+    hz = 2.0 * (nx * (e02 + e20) + ny * (e12 + e21) - 2.0 * nz * (e00 + e11) + nw * (e10 - e01))
+    along = nw * hw + nx * hx + ny * hy + nz * hz
+    tl.store(at(d_quats, i, 0, stride, 4, PLANAR), (hw - nw * along) / norm, mask=here)
+    tl.store(at(d_quats, i, 1, stride, 4, PLANAR), (hx - nx * along) / norm, mask=here)
+    tl.store(at(d_quats, i, 2, stride, 4, PLANAR), (hy - ny * along) / norm, mask=here)
+    tl.store(at(d_quats, i, 3, stride, 4, PLANAR), (hz - nz * along) / norm, mask=here)
+
+    # Rows of J W: focal / z (W_row - limited W_2), and the mean on the image.
+    ga0 = r00 * dp0 + r01 * dp1 + r02 * dp2
+    ga1 = r10 * dp0 + r11 * dp1 + r12 * dp2
+    ga2 = r20 * dp0 + r21 * dp1 + r22 * dp2
+    gb0 = r00 * dq0 + r01 * dq1 + r02 * dq2
+    gb1 = r10 * dq0 + r11 * dq1 + r12 * dq2
+    gb2 = r20 * dq0 + r21 * dq1 + r22 * dq2
+    ku, kv = fx / z, fy / z
+    free_u = tl.where((u >= low_u) & (u <= high_u), 1.0, 0.0)
+    free_v = tl.where((v >= low_v) & (v <= high_v), 1.0, 0.0)
+    du = fx * g_mx - free_u * ku * (ga0 * w20 + ga1 * w21 + ga2 * w22)
+    dv = fy * g_my - free_v * kv * (gb0 * w20 + gb1 * w21 + gb2 * w22)
+    dz = g_z - (ga0 * a0 + ga1 * a1 + ga2 * a2 + gb0 * b0 + gb1 * b1 + gb2 * b2 + u * du + v * dv) / z
+    dx, dy = du / z, dv / z
+
+    # Colour: coefficients, and the direction mean - camera centre.
+    d0 = m0 + w00 * t0 + w10 * t1 + w20 * t2
+    d1 = m1 + w01 * t0 + w11 * t1 + w21 * t2
+    d2 = m2 + w02 * t0 + w12 * t1 + w22 * t2
+    length = tl.sqrt_rn(d0 * d0 + d1 * d1 + d2 * d2)
+    # A row that is not seen may sit on the camera centre; it gets direction 0 and no gradient.
+    length = tl.where(length > 0.0, length, 1.0)
+    d0, d1, d2 = d0 / length, d1 / length, d2 / length
+    red, green, blue, _ = shade(sh, i, seen, stride, d0, d1, d2, COEFFICIENTS, USED, PLANAR)
+    g_red = tl.where(red >= 0.0, g_red, 0.0)
+    g_green = tl.where(green >= 0.0, g_green, 0.0)
+    g_blue = tl.where(blue >= 0.0, g_blue, 0.0)
+    n0, n1, n2 = tl.zeros_like(d0), tl.zeros_like(d0), tl.zeros_like(d0)
+    for k in tl.static_range(COEFFICIENTS):
+        if k < USED:
+            value = basis(d0, d1, d2, k)
+            tl.store(at(d_sh, i, 3 * k, stride, 3 * COEFFICIENTS, PLANAR), value * g_red, mask=here)
+            tl.store(at(d_sh, i, 3 * k + 1, stride, 3 * COEFFICIENTS, PLANAR), value * g_green, mask=here)
+            tl.store(at(d_sh, i, 3 * k + 2, stride, 3 * COEFFICIENTS, PLANAR), value * g_blue, mask=here)
+            if k > 0:
+                r = tl.load(at(sh, i, 3 * k, stride, 3 * COEFFICIENTS, PLANAR), mask=seen, other=0.0)
+                g = tl.load(at(sh, i, 3 * k + 1, stride, 3 * COEFFICIENTS, PLANAR), mask=seen, other=0.0)
+                bl = tl.load(at(sh, i, 3 * k + 2, stride, 3 * COEFFICIENTS, PLANAR), mask=seen, other=0.0)
+                pulled = r * g_red + g * g_green + bl * g_blue
+                sx, sy, sz = slope(d0, d1, d2, k)
+                n0 += pulled * sx
+                n1 += pulled * sy
+                n2 += pulled * sz
+        else:
+            tl.store(at(d_sh, i, 3 * k, stride, 3 * COEFFICIENTS, PLANAR), tl.zeros_like(d0), mask=here)
+            tl.store(at(d_sh, i, 3 * k + 1, stride, 3 * COEFFICIENTS, PLANAR), tl.zeros_like(d0), mask=here)
+            tl.store(at(d_sh, i, 3 * k + 2, stride, 3 * COEFFICIENTS, PLANAR), tl.zeros_like(d0), mask=here)
+    along = n0 * d0 + n1 * d1 + n2 * d2
+    n0, n1, n2 = (n0 - d0 * along) / length, (n1 - d1 * along) / length, (n2 - d2 * along) / length
+    store3(
+        d_means, i, here, stride,
+        w00 * dx + w10 * dy + w20 * dz + n0, w01 * dx + w11 * dy + w21 * dz + n1, w02 * dx + w12 * dy + w22 * dz + n2,
+        PLANAR,
+    )  # fmt: skip
+
+    if VIEWMAT:
+        # Of p = W m + t, of J W, and of the direction m + W^T t.
+        add_row(
+            d_viewmat,
+            dx * m0 + ku * ga0 + t0 * n0, dx * m1 + ku * ga1 + t0 * n1, dx * m2 + ku * ga2 + t0 * n2,
+            dx + w00 * n0 + w01 * n1 + w02 * n2,
+        )  # fmt: skip
+        add_row(
+            d_viewmat + 4,
+            dy * m0 + kv * gb0 + t1 * n0, dy * m1 + kv * gb1 + t1 * n1, dy * m2 + kv * gb2 + t1 * n2,
+            dy + w10 * n0 + w11 * n1 + w12 * n2,
+        )  # fmt: skip
+        lu, lv = ku * limited_u, kv * limited_v
+        add_row(
+            d_viewmat + 8,
+            dz * m0 - lu * ga0 - lv * gb0 + t2 * n0, dz * m1 - lu * ga1 - lv * gb1 + t2 * n1,
+            dz * m2 - lu * ga2 - lv * gb2 + t2 * n2, dz + w20 * n0 + w21 * n1 + w22 * n2,
+        )  # fmt: skip
+
+
+def project_backward(
+    groups: tuple[Tensor, ...],
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    records: Tensor,
+    gradient: Tensor,
+    *,
+    degree: int,
+    antialias: bool,
+    with_viewmat: bool = False,
+    planar: int | None = None,
+    into: tuple[Tensor, ...] | None = None,
+) -> tuple[tuple[Tensor, ...], Tensor | None]:
+    """Gradients of the five groups, shaped and laid out like them (written to `into` if given), and of viewmat [4,4] or None.
+
+    gradient [N, 16] as `composite_backward` fills it. Culled rows get exactly zero.
+    """
+    count = records.shape[0]
+    grads = tuple(torch.empty_like(x) for x in groups) if into is None else into
+    d_viewmat = torch.zeros(4, 4, device=records.device) if with_viewmat else None
+    coefficients = 16 if planar is not None else groups[4].shape[1]
+    if count:
+        project_backward_kernel[lambda meta: (triton.cdiv(count, meta["BLOCK"]),)](
+            *groups, viewmat, K, records, gradient, *grads, d_viewmat, count, planar or 0, width, height,
+            COEFFICIENTS=coefficients, USED=(degree + 1) ** 2, PLANAR=planar is not None, ANTIALIAS=antialias,
+            VIEWMAT=with_viewmat,
+        )  # fmt: skip
+    return grads, d_viewmat

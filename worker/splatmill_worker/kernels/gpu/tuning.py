@@ -1,0 +1,43 @@
+"""Launch settings: what the autotuner may choose from, measured once per kernel and card and kept in Triton's cache on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import triton
+
+from .device import interpreting
+
+PROJECT = [triton.Config({"BLOCK": block}, num_warps=warps) for block, warps in ((128, 4), (64, 2), (256, 8))]
+PROJECT_BACKWARD = [
+    triton.Config({"BLOCK": block}, num_warps=warps) for block, warps in ((64, 2), (128, 4), (32, 1))
+]
+COMPOSITE = [
+    triton.Config({"BATCH": batch, "EXPONENT": "fma"}, num_warps=warps, num_stages=1)
+    for batch, warps in ((8, 4), (16, 4), (16, 8), (4, 2))
+]
+COMPOSITE_BACKWARD = [
+    triton.Config({"BATCH": batch, "EXPONENT": "fma", "SUMS": sums}, num_warps=warps, num_stages=1)
+    for batch, warps, sums in ((8, 4, "tree"), (4, 4, "tree"), (8, 8, "tree"), (16, 8, "dot"))
+]
+SMALLEST_LOSS_BLOCK = 128
+LOSS = [triton.Config({"BLOCK": block}, num_warps=block // 64) for block in (256, 128, 512)]
+
+
+def autotune(
+    configs: Sequence[triton.Config], key: Sequence[str], *, reset: Sequence[str] = ()
+) -> Callable[[Any], Any]:
+    """Triton's autotuner with its results on disk; `reset` names accumulators (or None) to zero between trials.
+
+    Under the interpreter timing means nothing, and the first setting is taken. `reset` must not name an array whose contents
+    before the launch matter: the tuner zeroes it also before the launch that counts.
+    """
+
+    def zero(arguments: Mapping[str, Any], reset_only: bool = False) -> None:
+        for name in reset:
+            if arguments[name] is not None:
+                arguments[name].zero_()
+
+    choices = [configs[0]] if interpreting() else list(configs)
+    return triton.autotune(configs=choices, key=list(key), pre_hook=zero, cache_results=True)
