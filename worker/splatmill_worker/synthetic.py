@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +26,7 @@ _FAR = 1e9
 _LIGHT = np.array([0.45, -0.35, 0.82])
 _AMBIENT = 0.42
 _DOME_RADIUS = 40.0
+_RAYS_AT_ONCE = 16384  # a band of the picture whose intermediate results stay in the cache
 
 
 @dataclass(frozen=True)
@@ -218,13 +220,16 @@ def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, focal:
 
 def photograph(scene: StillLife, camera: Camera, samples: int = 2) -> tuple[np.ndarray, np.ndarray]:
     """What `camera` sees: colour, uint8 [H, W, 3], and camera-space depth at pixel centres, float32 [H, W]."""
-    color = torch.zeros(camera.height, camera.width, 3)
-    for i in range(samples):
-        for j in range(samples):
-            color += _cast(scene, camera, (i + 0.5) / samples, (j + 0.5) / samples)[0]
-    depth = _cast(scene, camera, 0.5, 0.5, shade=False)[1]
-    rgb = (color / samples**2).clamp(0, 1) * 255 + 0.5
-    return rgb.to(torch.uint8).numpy(), depth.numpy()
+    rgb = np.empty((camera.height, camera.width, 3), np.uint8)
+    depth = np.empty((camera.height, camera.width), np.float32)
+    offsets = [(k + 0.5) / samples for k in range(samples)]
+    band = max(1, _RAYS_AT_ONCE // camera.width)
+    for top in range(0, camera.height, band):
+        rows = slice(top, min(top + band, camera.height))
+        shaded = torch.stack([_cast(scene, camera, rows, u, v)[0] for u in offsets for v in offsets])
+        rgb[rows] = (shaded.mean(0).clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+        depth[rows] = _cast(scene, camera, rows, 0.5, 0.5, shade=False)[1].numpy()
+    return rgb, depth
 
 
 def capture(
@@ -233,28 +238,37 @@ def capture(
     """Photograph the still life: `count` JPEGs with EXIF under `directory`; returns the true camera of each name."""
     directory.mkdir(parents=True, exist_ok=True)
     scene = still_life(seed)
-    cameras = {}
-    for k, camera in enumerate(orbit(count, width, height, seed)):
-        name = f"still_{k + 1:04d}.jpg"
+    cameras = {f"still_{k + 1:04d}.jpg": c for k, c in enumerate(orbit(count, width, height, seed))}
+
+    def shoot(name: str) -> None:
+        camera = cameras[name]
         rgb, _ = photograph(scene, camera, samples)
         exif = Image.Exif()
         exif[0x010F], exif[0x0110] = "Splatmill", "Ray caster"
         # 35 mm equivalent over the longer side, which is how SfM reads it back into pixels.
         exif.get_ifd(0x8769)[0xA405] = round(35 * camera.fx / max(width, height))
         Image.fromarray(rgb).save(directory / name, quality=95, exif=exif)
-        cameras[name] = camera
+
+    # One photo a thread: bands are too small for torch's own threads to pay.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(shoot, cameras))
+    finally:
+        torch.set_num_threads(threads)
     return cameras
 
 
 def _cast(
-    scene: StillLife, camera: Camera, du: float, dv: float, shade: bool = True
+    scene: StillLife, camera: Camera, rows: slice, du: float, dv: float, shade: bool = True
 ) -> tuple[Tensor, Tensor]:
-    """One ray a pixel through (column + du, row + dv): colour [H, W, 3] and depth [H, W]."""
+    """One ray a pixel of `rows` through (column + du, row + dv): colour [rows, W, 3] and depth [rows, W]."""
     rotation = torch.from_numpy(camera.viewmat[:3, :3].astype(np.float32))
     eye = torch.from_numpy((-camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]).astype(np.float32))
     x = (torch.arange(camera.width) + du - camera.cx) / camera.fx
-    y = (torch.arange(camera.height) + dv - camera.cy) / camera.fy
-    grid = torch.stack([x.expand(camera.height, -1), y[:, None].expand(-1, camera.width)], -1)
+    y = (torch.arange(rows.start, rows.stop) + dv - camera.cy) / camera.fy
+    grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)
     local = torch.cat([grid, torch.ones_like(grid[..., :1])], -1).reshape(-1, 3)
     length = local.norm(dim=-1)
     rays = (local @ rotation) / length[:, None]
@@ -268,7 +282,7 @@ def _cast(
         closer = t < nearest
         nearest = torch.where(closer, t, nearest)
         which = torch.where(closer, k, which)
-    shape = (camera.height, camera.width)
+    shape = (len(y), len(x))
     depth = (nearest / length).reshape(shape)
     if not shade:
         return torch.empty(0), depth
