@@ -39,7 +39,8 @@ def hand_back(worker: "AttemptWorker", job: Job, queue: Queue) -> None:
     """Put an interrupted job at the head of its queue without spending one of its tries."""
     with worker.connection.pipeline() as pipeline:
         worker.cleanup_execution(job, pipeline=pipeline)
-        queue.enqueue_job(job, pipeline=pipeline, at_front=True)
+        # The public enqueue_job begins a transaction of its own, which this one would not hold.
+        queue._enqueue_job(job, pipeline=pipeline, at_front=True)
         pipeline.execute()
 
 
@@ -54,7 +55,7 @@ def adopt(worker: "AttemptWorker") -> None:
     others = [key for key in get_keys(queue) if key != worker.key]
     dead = {key for key in others if _dead(worker.connection, key)}
     for rq_job_id, execution_id in queue.started_job_registry.get_job_and_execution_ids(cleanup=False):
-        _adopt_started(worker, queue, rq_job_id, execution_id, dead)
+        _adopt_started(worker, queue, rq_job_id, execution_id)
     if set(others) == dead:
         # A worker may have died between taking a job and registering it; no living one can be doing so now.
         for rq_job_id in queue.intermediate_queue.get_job_ids():
@@ -76,16 +77,14 @@ def _dead(connection: redis.Redis, worker_key: str) -> bool:
     return ProcessIdentity.load(json.loads(signed)).dead()
 
 
-def _adopt_started(
-    worker: "AttemptWorker", queue: Queue, rq_job_id: str, execution_id: str, dead: set[str]
-) -> None:
+def _adopt_started(worker: "AttemptWorker", queue: Queue, rq_job_id: str, execution_id: str) -> None:
     connection = worker.connection
     job_id, generation = split_rq_id(rq_job_id)
     lock = JobLock(connection, job_id, token="")
     holder = lock.holder()
     try:
         owner = Execution.fetch(execution_id, rq_job_id, connection).worker_name
-        orphaned = worker.redis_worker_namespace_prefix + owner in dead
+        orphaned = _dead(connection, worker.redis_worker_namespace_prefix + owner)
     except ValueError:
         # The execution's record expired; the lock's does not, and names the process.
         orphaned = holder is not None and holder.process.visible() and holder.process.dead()

@@ -119,6 +119,11 @@ class AttemptWorker(Worker):
         self._kill_at = time.monotonic()
         self.kill_horse()
 
+    def unsubscribe(self) -> None:
+        """RQ waits a second for its listening thread, which ends with this process anyway."""
+        if self.pubsub_thread:
+            self.pubsub_thread.stop()
+
     # One attempt
 
     def execute_job(self, job: Job, queue: Queue) -> None:

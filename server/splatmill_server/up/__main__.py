@@ -1,0 +1,108 @@
+"""`python -m splatmill_server.up`, which is what `splatmill up` runs."""
+
+import argparse
+import errno
+import ipaddress
+import json
+import os
+import socket
+import sys
+from pathlib import Path
+
+from splatmill_server.up.folder import DataFolder, UpError
+from splatmill_server.up.service import Service
+
+PORT = 8080
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the service until Ctrl-C; returns the exit status."""
+    chosen = _parser().parse_args(argv)
+    key = os.environ.get("SPLATMILL_API_KEY") or None
+    try:
+        with _listen(chosen.host, chosen.port, key) as listener:
+            folder = DataFolder(chosen.data)
+            try:
+                url = _url(chosen.host, listener.getsockname()[1])
+                service = Service(folder, listener, _say)
+
+                def ready() -> None:
+                    if chosen.json_ready:
+                        print(json.dumps({"url": url, "api_key": key}), flush=True)
+                    else:
+                        _say(
+                            f"Splatmill is ready at {url}\nData: {folder.path}\nCtrl-C ends it; nothing is lost."
+                        )
+
+                service.run(ready, until_closed=sys.stdin.fileno() if chosen.json_ready else None)
+            finally:
+                folder.close()
+    except UpError as error:
+        _say(str(error))
+        return 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="splatmill up", description="Run the whole service on this machine."
+    )
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
+    parser.add_argument("--port", type=int, default=PORT, help="0 takes any free one (default %(default)s)")
+    parser.add_argument(
+        "--data",
+        type=Path,
+        default=Path(os.environ.get("SPLATMILL_DATA") or "splatmill-data"),
+        help="folder for everything that is kept (default: SPLATMILL_DATA, else splatmill-data)",
+    )
+    parser.add_argument(
+        "--json-ready",
+        action="store_true",
+        help="for programs: print one line of JSON (url, api_key) when ready, and end when standard input closes",
+    )
+    return parser
+
+
+def _listen(host: str, port: int, key: str | None) -> socket.socket:
+    """The listening socket. Raises UpError for a port in use, and for an open door without a key."""
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    except (OSError, OverflowError) as error:
+        raise UpError(f"Cannot listen on {host}:{port}: {error}. Choose another --host or --port.") from error
+    family, kind, protocol, _, address = found[0]
+    if key is None and not _loopback(str(address[0])):
+        raise UpError(
+            f"Listening on {host} lets other machines in, which needs an API key: set SPLATMILL_API_KEY to a "
+            "secret of your own, or listen on 127.0.0.1."
+        )
+    listener = socket.socket(family, kind, protocol)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind(address)
+        listener.listen(128)
+    except (OSError, OverflowError) as error:
+        listener.close()
+        if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
+            raise UpError(
+                f"Port {port} on {host} is in use by another program. Choose another with --port "
+                "(--port 0 takes any free one)."
+            ) from error
+        raise UpError(f"Cannot listen on {host}:{port}: {error}. Choose another --host or --port.") from error
+    return listener
+
+
+def _loopback(address: str) -> bool:
+    return ipaddress.ip_address(address.partition("%")[0]).is_loopback
+
+
+def _url(host: str, port: int) -> str:
+    shown = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    return f"http://[{shown}]:{port}" if ":" in shown else f"http://{shown}:{port}"
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

