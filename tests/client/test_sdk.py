@@ -1,0 +1,197 @@
+"""The SDK against the real server and a real Redis: the whole life of a job as a program sees it.
+
+Does not prove that the worker keeps its side: here the test itself appends a worker's events and stores its model.
+"""
+
+import asyncio
+import hashlib
+import random
+import struct
+import threading
+from pathlib import Path
+
+import httpx
+import pytest
+from pydantic import SecretStr
+
+from splatmill import AsyncClient, Client, JobCancelled, JobFailed
+from splatmill.errors import Conflict, InvalidRequest, NotFound, Unauthorized
+from splatmill.schema import (
+    JobState,
+    LogEvent,
+    PlanEvent,
+    Problem,
+    Progress,
+    ProgressEvent,
+    StateEvent,
+    describe_options,
+)
+from splatmill_server.app import create_app
+
+PROPERTIES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+PROPERTIES += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+LINES = [f"property float {name}" for name in PROPERTIES]
+HEADER = "\n".join(["ply", "format binary_little_endian 1.0", "element vertex 1", *LINES, "end_header\n"])
+PLY = HEADER.encode() + struct.pack(f"<{len(PROPERTIES)}f", *range(len(PROPERTIES)))
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "my photos"
+    folder.mkdir()
+    generator = random.Random(1)
+    for n in range(5):
+        (folder / f"IMG {n} é.jpg").write_bytes(generator.randbytes(50_000 + n))
+    return folder
+
+
+def test_the_life_of_a_job(service, photos, tmp_path):
+    with Client(service.url) as client:
+        sent: list[Progress] = []
+        job = client.train(photos, name="tea", steps=10, time_budget="2m", on_progress=sent.append)
+        assert job.state is JobState.queued
+        assert (job.job.options.steps, job.job.options.time_budget) == (10, 120)
+        assert job.job.name == "tea"
+        assert sent[-1].done == sent[-1].total
+        stored = {file.name: file.sha256 for file in client.capture(job.job.capture).files}
+        assert stored == {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in photos.iterdir()}
+        with pytest.raises(Conflict, match="queued"):
+            job.result()
+
+        service.begin(job.id)
+        steps = [ProgressEvent(stage="training", done=n, total=3, step=n, loss=1 / n) for n in (1, 2, 3)]
+        service.say(job.id, StateEvent(state=JobState.training), PlanEvent(plan={"sh_degree": 2}), *steps)
+        threading.Timer(0.2, service.finish, [job.id, PLY]).start()
+        heard: list[tuple[Progress, threading.Thread]] = []
+        model = job.wait(lambda progress: heard.append((progress, threading.current_thread())))
+        assert [progress.step for progress, _ in heard] == [1, 2, 3]
+        assert {thread for _, thread in heard} == {threading.current_thread()}
+        assert model.model.gaussians == 1
+        assert job.refresh().plan == {"sh_degree": 2}
+        assert job.report().curve[0].psnr == 25
+
+        for name, start in (("model.ply", b"ply"), ("report.html", b"<p>")):
+            assert model.download(tmp_path, file=name).read_bytes().startswith(start)
+        assert (tmp_path / "model.ply").read_bytes() == PLY
+        assert [camera.split for camera in model.cameras()] == ["test"]
+        assert [entry.id for entry in client.models()] == [job.id]
+        job.delete()
+        with pytest.raises(NotFound):
+            client.model(job.id)
+
+
+def test_a_lost_server_does_not_lose_the_job(service, photos):
+    with Client(service.url) as client:
+        job = client.train(photos)
+        service.begin(job.id)
+        service.say(job.id, *(LogEvent(message=f"before {n}") for n in range(3)))
+        said = []
+        for record in job.events():
+            if isinstance(record.event, LogEvent):
+                said.append(record.event.message)
+            if said == ["before 0", "before 1", "before 2"]:
+                service.stop()
+                service.say(job.id, *(LogEvent(message=f"meanwhile {n}") for n in range(2)))
+                service.start()
+                service.finish(job.id, PLY)
+        assert said == ["before 0", "before 1", "before 2", "meanwhile 0", "meanwhile 1"]
+        assert job.state is JobState.succeeded
+
+
+def test_a_failed_job_says_why(service, photos):
+    with Client(service.url) as client:
+        job = client.train(photos)
+        service.begin(job.id)
+        problem = Problem.of(
+            "sfm_too_few_registered",
+            "Registered 2 of 5 images.",
+            facts={"registered": 2},
+            advice="Overlap more.",
+        )
+        service.fail(job.id, problem)
+        with pytest.raises(JobFailed, match=r"Registered 2 of 5 images\. Overlap more\.") as failed:
+            job.wait()
+        assert failed.value.code == "sfm_too_few_registered"
+        assert failed.value.problem.facts == {"registered": 2}
+        with pytest.raises(NotFound):
+            client.model(job.id)
+        assert job.restart().state is JobState.queued
+
+
+def test_cancelling(service, photos):
+    with Client(service.url) as client:
+        job = client.train(photos)
+        job.cancel()
+        with pytest.raises(JobCancelled, match=job.id):
+            job.wait()
+        assert job.cancel().state is JobState.cancelled, "wishing twice is wishing once"
+
+
+def test_all_jobs_page_by_page(service, photos):
+    with Client(service.url) as client:
+        capture, _ = client.upload(photos)
+        made = [client.submit(capture.id, name=str(n)).id for n in range(5)]
+        assert [job.id for job in client.jobs()] == made[::-1]
+        assert [job.id for job in client.jobs(limit=2)] == made[:2:-1]
+        assert list(client.jobs(limit=0)) == []
+
+
+def test_uploading_again_into_a_capture_stores_nothing_twice(service, photos):
+    with Client(service.url) as client:
+        capture, first = client.upload(photos)
+        again, second = client.upload(photos, capture=capture.id)
+        assert again.id == capture.id
+        assert {f.sha256 for f in first.files} == {f.sha256 for f in second.files}
+        assert len(client.capture(capture.id).files) == 5
+        (photos / "IMG 0 é.jpg").write_bytes(b"other bytes")
+        with pytest.raises(Conflict) as error:
+            client.upload(photos, capture=capture.id)
+        assert error.value.code == "name_taken"
+
+
+def test_what_cannot_be_trained_is_refused(service, tmp_path):
+    (tmp_path / "only.jpg").write_bytes(b"x" * 100)
+    with Client(service.url) as client:
+        with pytest.raises(InvalidRequest) as error:
+            client.train(tmp_path)
+        assert error.value.code == "too_few_images"
+        with pytest.raises(NotFound):
+            client.submit("0123456789abcdef")
+
+
+def test_what_the_server_says_of_itself(service):
+    with Client(service.url) as client:
+        assert client.options() == describe_options()
+        assert client.info().limits.max_render_pixels > 0
+        ready = client.ready()
+        assert set(ready.checks) >= {"storage"}
+
+
+def test_a_key_is_asked_for_and_given(settings, monkeypatch):
+    app = create_app(settings.model_copy(update={"api_key": SecretStr("s3cret")}))
+
+    async def info(key: str | None) -> str:
+        transport = httpx.ASGITransport(app)
+        async with AsyncClient("http://splatmill", api_key=key, transport=transport) as client:
+            return (await client.info()).version
+
+    with pytest.raises(Unauthorized):
+        asyncio.run(info(None))
+    with pytest.raises(Unauthorized):
+        asyncio.run(info("wrong"))
+    assert asyncio.run(info("s3cret"))
+
+
+def test_several_jobs_on_one_loop(service, photos):
+    async def follow(client: AsyncClient) -> JobState:
+        job = await client.train(photos)
+        service.begin(job.id)
+        service.finish(job.id, PLY)
+        model = await job.wait()
+        return (await client.job(model.id)).state
+
+    async def main() -> list[JobState]:
+        async with AsyncClient(service.url) as client:
+            return await asyncio.gather(*(follow(client) for _ in range(3)))
+
+    assert asyncio.run(main()) == [JobState.succeeded] * 3
