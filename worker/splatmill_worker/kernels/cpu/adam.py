@@ -1,0 +1,31 @@
+"""Adam over all parameter groups on the CPU, in one parallel pass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from splatmill_worker.kernels import cpu
+
+
+def adam_(
+    params: Sequence[Tensor],
+    grads: Sequence[Tensor],
+    exp_avg: Sequence[Tensor],
+    exp_avg_sq: Sequence[Tensor],
+    rates: Sequence[float],
+    *,
+    step: int,
+    visible: Tensor | None = None,
+    last_step: Tensor | None = None,
+) -> int:
+    """One Adam step in place; the definition, and what is returned, are `reference.adam_`'s. float32, contiguous."""
+
+    def rows(tensors: Sequence[Tensor]) -> list[Tensor]:
+        return [t.detach().view(t.shape[0], -1) for t in tensors]
+
+    refused: int = cpu.engine.adam(
+        rows(params), rows(grads), rows(exp_avg), rows(exp_avg_sq), list(rates), step, visible, last_step
+    )
+    return refused
