@@ -60,8 +60,11 @@ def variants() -> Iterator[Variant]:
     flat = {"COEFFICIENTS": 16, "USED": 16, "ANTIALIAS": False}
     for planar in (True, False):
         yield Variant(project.project_kernel, {**flat, "PLANAR": planar})
-    yield Variant(project_backward.project_backward_kernel, {**flat, "PLANAR": True, "VIEWMAT": False, "d_viewmat": None})
-    yield Variant(project_backward.project_backward_kernel, {**flat, "PLANAR": False, "VIEWMAT": True})
+    coefficients = {"COEFFICIENTS": 16, "USED": 16, "PLANAR": True}
+    yield Variant(project_backward.color_backward_kernel, coefficients)
+    shape = {"ANTIALIAS": False}
+    yield Variant(project_backward.shape_backward_kernel, {**shape, "PLANAR": True, "VIEWMAT": False, "d_viewmat": None})
+    yield Variant(project_backward.shape_backward_kernel, {**shape, "PLANAR": False, "VIEWMAT": True})
     lists = {"BLOCK": bin.BLOCK, "LANES": bin.LANES}
     warps = (triton.Config({}, num_warps=4),)
     yield Variant(bin.pairs_kernel, {**lists, "WRITE": False, "ends": None, "keys": None, "ids": None}, settings=warps)

@@ -43,14 +43,64 @@ def add_row(pointer, x, y, z, t):
     tl.atomic_add(pointer + 3, tl.sum(t, axis=0))
 
 
-@autotune(PROJECT_BACKWARD, key=["USED", "PLANAR", "VIEWMAT"], reset=["d_viewmat"])
+@autotune(PROJECT_BACKWARD, key=["USED", "PLANAR"])
 @triton.jit
-def project_backward_kernel(
-    means, log_scales, quats, logit_opacities, sh, viewmat, K, records, gradient,
-    d_means, d_log_scales, d_quats, d_logits, d_sh, d_viewmat, count, stride, width, height,
-    COEFFICIENTS: tl.constexpr, USED: tl.constexpr, PLANAR: tl.constexpr, ANTIALIAS: tl.constexpr, VIEWMAT: tl.constexpr,
-    BLOCK: tl.constexpr,
+def color_backward_kernel(
+    means, sh, viewmat, K, records, gradient, d_means, d_sh, count, stride,
+    COEFFICIENTS: tl.constexpr, USED: tl.constexpr, PLANAR: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
+    """From colour to the SH coefficients, and by the direction to the mean: that part alone is left in d_means."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = i < count
+    seen = here & (tl.load(records + i.to(tl.int64) * STRIDE + 10, mask=here, other=0.0) > 0.0)
+    w00, w01, w02, w10, w11, w12, w20, w21, w22, t0, t1, t2, _, _, _, _ = load_camera(viewmat, K)
+    m0, m1, m2 = load3(means, i, seen, stride, PLANAR)
+    grow = gradient + i.to(tl.int64) * GRADIENT_STRIDE
+    g_red = tl.load(grow + 6, mask=seen, other=0.0)
+    g_green = tl.load(grow + 7, mask=seen, other=0.0)
+    g_blue = tl.load(grow + 8, mask=seen, other=0.0)
+    d0 = m0 + w00 * t0 + w10 * t1 + w20 * t2
+    d1 = m1 + w01 * t0 + w11 * t1 + w21 * t2
+    d2 = m2 + w02 * t0 + w12 * t1 + w22 * t2
+    length = tl.sqrt_rn(d0 * d0 + d1 * d1 + d2 * d2)
+    # A row that is not seen may sit on the camera centre; it gets direction 0 and no gradient.
+    length = tl.where(length > 0.0, length, 1.0)
+    d0, d1, d2 = d0 / length, d1 / length, d2 / length
+    red, green, blue, _ = shade(sh, i, seen, stride, d0, d1, d2, COEFFICIENTS, USED, PLANAR)
+    g_red = tl.where(red >= 0.0, g_red, 0.0)
+    g_green = tl.where(green >= 0.0, g_green, 0.0)
+    g_blue = tl.where(blue >= 0.0, g_blue, 0.0)
+    n0 = tl.zeros_like(d0)
+    n1, n2 = n0, n0
+    for k in tl.static_range(USED):
+        value = basis(d0, d1, d2, k)
+        tl.store(at(d_sh, i, 3 * k, stride, 3 * COEFFICIENTS, PLANAR), value * g_red, mask=here)
+        tl.store(at(d_sh, i, 3 * k + 1, stride, 3 * COEFFICIENTS, PLANAR), value * g_green, mask=here)
+        tl.store(at(d_sh, i, 3 * k + 2, stride, 3 * COEFFICIENTS, PLANAR), value * g_blue, mask=here)
+    for k in tl.static_range(1, USED):
+        r = tl.load(at(sh, i, 3 * k, stride, 3 * COEFFICIENTS, PLANAR), mask=seen, other=0.0)
+        g = tl.load(at(sh, i, 3 * k + 1, stride, 3 * COEFFICIENTS, PLANAR), mask=seen, other=0.0)
+        b = tl.load(at(sh, i, 3 * k + 2, stride, 3 * COEFFICIENTS, PLANAR), mask=seen, other=0.0)
+        pulled = r * g_red + g * g_green + b * g_blue
+        sx, sy, sz = slope(d0, d1, d2, k)
+        n0 += pulled * sx
+        n1 += pulled * sy
+        n2 += pulled * sz
+    along = n0 * d0 + n1 * d1 + n2 * d2
+    store3(
+        d_means, i, here, stride,
+        (n0 - d0 * along) / length, (n1 - d1 * along) / length, (n2 - d2 * along) / length, PLANAR,
+    )  # fmt: skip
+
+
+@autotune(PROJECT_BACKWARD, key=["PLANAR", "VIEWMAT"], reset=["d_viewmat"], keep=["d_means"])
+@triton.jit
+def shape_backward_kernel(
+    means, log_scales, quats, logit_opacities, viewmat, K, records, gradient,
+    d_means, d_log_scales, d_quats, d_logits, d_viewmat, count, stride, width, height,
+    PLANAR: tl.constexpr, ANTIALIAS: tl.constexpr, VIEWMAT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """From mean, conic, opacity and depth on the image to the mean, shape and opacity in the world, and to the camera."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     row = records + i.to(tl.int64) * STRIDE
@@ -68,9 +118,6 @@ def project_backward_kernel(
     g_b = 0.5 * tl.load(grow + 3, mask=seen, other=0.0)
     g_c = tl.load(grow + 4, mask=seen, other=0.0)
     g_o = tl.load(grow + 5, mask=seen, other=0.0)
-    g_red = tl.load(grow + 6, mask=seen, other=0.0)
-    g_green = tl.load(grow + 7, mask=seen, other=0.0)
-    g_blue = tl.load(grow + 8, mask=seen, other=0.0)
     g_z = tl.load(grow + 9, mask=seen, other=0.0)
 
     # The forward pass again: cheaper than keeping it. A row that is not seen gets z = 1 and stays finite.
@@ -143,40 +190,8 @@ def project_backward_kernel(
     dz = g_z - (ga0 * a0 + ga1 * a1 + ga2 * a2 + gb0 * b0 + gb1 * b1 + gb2 * b2 + u * du + v * dv) / z
     dx, dy = du / z, dv / z
 
-    # Colour: coefficients, and the direction mean - camera centre.
-    d0 = m0 + w00 * t0 + w10 * t1 + w20 * t2
-    d1 = m1 + w01 * t0 + w11 * t1 + w21 * t2
-    d2 = m2 + w02 * t0 + w12 * t1 + w22 * t2
-    length = tl.sqrt_rn(d0 * d0 + d1 * d1 + d2 * d2)
-    # A row that is not seen may sit on the camera centre; it gets direction 0 and no gradient.
-    length = tl.where(length > 0.0, length, 1.0)
-    d0, d1, d2 = d0 / length, d1 / length, d2 / length
-    red, green, blue, _ = shade(sh, i, seen, stride, d0, d1, d2, COEFFICIENTS, USED, PLANAR)
-    g_red = tl.where(red >= 0.0, g_red, 0.0)
-    g_green = tl.where(green >= 0.0, g_green, 0.0)
-    g_blue = tl.where(blue >= 0.0, g_blue, 0.0)
-    n0, n1, n2 = tl.zeros_like(d0), tl.zeros_like(d0), tl.zeros_like(d0)
-    for k in tl.static_range(COEFFICIENTS):
-        if k < USED:
-            value = basis(d0, d1, d2, k)
-            tl.store(at(d_sh, i, 3 * k, stride, 3 * COEFFICIENTS, PLANAR), value * g_red, mask=here)
-            tl.store(at(d_sh, i, 3 * k + 1, stride, 3 * COEFFICIENTS, PLANAR), value * g_green, mask=here)
-            tl.store(at(d_sh, i, 3 * k + 2, stride, 3 * COEFFICIENTS, PLANAR), value * g_blue, mask=here)
-            if k > 0:
-                r = tl.load(at(sh, i, 3 * k, stride, 3 * COEFFICIENTS, PLANAR), mask=seen, other=0.0)
-                g = tl.load(at(sh, i, 3 * k + 1, stride, 3 * COEFFICIENTS, PLANAR), mask=seen, other=0.0)
-                bl = tl.load(at(sh, i, 3 * k + 2, stride, 3 * COEFFICIENTS, PLANAR), mask=seen, other=0.0)
-                pulled = r * g_red + g * g_green + bl * g_blue
-                sx, sy, sz = slope(d0, d1, d2, k)
-                n0 += pulled * sx
-                n1 += pulled * sy
-                n2 += pulled * sz
-        else:
-            tl.store(at(d_sh, i, 3 * k, stride, 3 * COEFFICIENTS, PLANAR), tl.zeros_like(d0), mask=here)
-            tl.store(at(d_sh, i, 3 * k + 1, stride, 3 * COEFFICIENTS, PLANAR), tl.zeros_like(d0), mask=here)
-            tl.store(at(d_sh, i, 3 * k + 2, stride, 3 * COEFFICIENTS, PLANAR), tl.zeros_like(d0), mask=here)
-    along = n0 * d0 + n1 * d1 + n2 * d2
-    n0, n1, n2 = (n0 - d0 * along) / length, (n1 - d1 * along) / length, (n2 - d2 * along) / length
+    # The colour's part, by the direction m + W^T t, was left in d_means by the other kernel.
+    n0, n1, n2 = load3(d_means, i, seen, stride, PLANAR)
     store3(
         d_means, i, here, stride,
         w00 * dx + w10 * dy + w20 * dz + n0, w01 * dx + w11 * dy + w21 * dz + n1, w02 * dx + w12 * dy + w22 * dz + n2,
@@ -223,13 +238,26 @@ def project_backward(
     gradient [N, 16] as `composite_backward` fills it. Culled rows get exactly zero.
     """
     count = records.shape[0]
-    grads = tuple(torch.empty_like(x) for x in groups) if into is None else into
+    used, room = (degree + 1) ** 2, 16 if planar is not None else groups[4].shape[1]
+    if into is None:
+        into = tuple(torch.empty_like(x) for x in groups)
+        if used < room:
+            into[4].zero_()
+    means, log_scales, quats, logit_opacities, sh = groups
+    d_means, d_log_scales, d_quats, d_logits, d_sh = into
     d_viewmat = torch.zeros(4, 4, device=records.device) if with_viewmat else None
-    coefficients = 16 if planar is not None else groups[4].shape[1]
     if count:
-        project_backward_kernel[lambda meta: (triton.cdiv(count, meta["BLOCK"]),)](
-            *groups, viewmat, K, records, gradient, *grads, d_viewmat, count, planar or 0, width, height,
-            COEFFICIENTS=coefficients, USED=(degree + 1) ** 2, PLANAR=planar is not None, ANTIALIAS=antialias,
-            VIEWMAT=with_viewmat,
+
+        def grid(meta: dict[str, int]) -> tuple[int]:
+            return (triton.cdiv(count, meta["BLOCK"]),)
+
+        color_backward_kernel[grid](
+            means, sh, viewmat, K, records, gradient, d_means, d_sh, count, planar or 0,
+            COEFFICIENTS=room, USED=used, PLANAR=planar is not None,
         )  # fmt: skip
-    return grads, d_viewmat
+        shape_backward_kernel[grid](
+            means, log_scales, quats, logit_opacities, viewmat, K, records, gradient,
+            d_means, d_log_scales, d_quats, d_logits, d_viewmat, count, planar or 0, width, height,
+            PLANAR=planar is not None, ANTIALIAS=antialias, VIEWMAT=with_viewmat,
+        )  # fmt: skip
+    return into, d_viewmat

@@ -26,18 +26,28 @@ LOSS = [triton.Config({"BLOCK": block}, num_warps=block // 64) for block in (256
 
 
 def autotune(
-    configs: Sequence[triton.Config], key: Sequence[str], *, reset: Sequence[str] = ()
+    configs: Sequence[triton.Config], key: Sequence[str], *, reset: Sequence[str] = (), keep: Sequence[str] = ()
 ) -> Callable[[Any], Any]:
     """Triton's autotuner with its results on disk; `reset` names accumulators (or None) to zero between trials.
 
     Under the interpreter timing means nothing, and the first setting is taken. `reset` must not name an array whose contents
-    before the launch matter: the tuner zeroes it also before the launch that counts.
+    before the launch matter: the tuner zeroes it also before the launch that counts. `keep` names arrays that the kernel changes
+    and reads, which every trial must find as they were.
     """
 
-    def zero(arguments: Mapping[str, Any], reset_only: bool = False) -> None:
+    kept: dict[str, Any] = {}
+
+    def before(arguments: Mapping[str, Any], reset_only: bool = False) -> None:
         for name in reset:
             if arguments[name] is not None:
                 arguments[name].zero_()
+        if not reset_only:
+            kept.update((name, arguments[name].clone()) for name in keep)
+
+    def after(arguments: Mapping[str, Any], exception: Exception | None) -> None:
+        while kept:
+            name, value = kept.popitem()
+            arguments[name].copy_(value)
 
     choices = [configs[0]] if interpreting() else list(configs)
-    return triton.autotune(configs=choices, key=list(key), pre_hook=zero, cache_results=True)
+    return triton.autotune(configs=choices, key=list(key), pre_hook=before, post_hook=after, cache_results=True)
