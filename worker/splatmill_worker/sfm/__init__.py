@@ -1,1 +1,7 @@
 """From photos to cameras: structure from motion, or the cameras a capture brings along."""
+
+from splatmill_worker.sfm.failure import Cancelled, SfmFailed
+from splatmill_worker.sfm.options import SfmOptions
+from splatmill_worker.sfm.reconstruct import reconstruct, reconstruct_photos
+
+__all__ = ["Cancelled", "SfmFailed", "SfmOptions", "reconstruct", "reconstruct_photos"]

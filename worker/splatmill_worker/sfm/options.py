@@ -1,0 +1,46 @@
+"""What can be asked of structure from motion; `auto` is decided from the photos and from what was measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class SfmOptions:
+    """`side`, `features`: longest side in pixels and features per photo; None leaves them to the effort.
+
+    `frames`: how many frames are taken from a video. `camera_model`: COLMAP's name. `threads` None: all cores.
+    """
+
+    effort: Literal["auto", "lean", "standard", "high"] = "auto"
+    matcher: Literal["auto", "exhaustive", "sequential", "spatial"] = "auto"
+    mapper: Literal["auto", "incremental", "global"] = "auto"
+    side: int | None = None
+    features: int | None = None
+    camera_model: str = "auto"
+    frames: int = 150
+    seed: int = 0
+    threads: int | None = None
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How hard the photos are looked at.
+
+    `side` pixels; at most `features` a photo; `first_octave` -1 doubles the photo first (four times the time,
+    three times the features); `orientations` a feature may have; each photo is matched with `partners` others.
+    """
+
+    name: str
+    side: int
+    features: int
+    first_octave: int
+    orientations: int
+    partners: int
+
+
+LEAN = Effort("lean", 800, 1500, 0, 1, 10)
+STANDARD = Effort("standard", 1000, 3000, 0, 2, 16)
+HIGH = Effort("high", 1600, 8192, -1, 2, 30)
+EFFORTS = {effort.name: effort for effort in (LEAN, STANDARD, HIGH)}
