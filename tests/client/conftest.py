@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import shutil
 import socket as socketlib
 import subprocess
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import pytest
 import redis
+import structlog
 import uvicorn
 from redis.backoff import ConstantBackoff
 from redis.retry import Retry
@@ -229,6 +231,9 @@ def service(settings: Settings) -> Iterator[Service]:
         server.should_exit = True
         thread.join()
 
+    # The server's log goes to standard output, which the command line's tests read.
+    before = structlog.get_config()
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
     start()
     connection = connect(settings.redis_url)
     yield Service(f"http://127.0.0.1:{place['port']}", connection, Storage(settings.storage), stop, start)
@@ -236,3 +241,4 @@ def service(settings: Settings) -> Iterator[Service]:
         stop()
     connection.flushall()
     connection.close()
+    structlog.configure(**before)

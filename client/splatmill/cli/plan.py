@@ -20,7 +20,7 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
 
 def _decision(entry: Any) -> str:
     if isinstance(entry, Mapping):
-        reason = entry.get("reason") or entry.get("why")
+        reason = entry.get("reason") or entry.get("because")
         value = entry.get("value", entry.get("name"))
         if reason is not None and value is not None:
             return f"{_value(value)} ({reason})"
