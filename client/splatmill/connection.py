@@ -11,9 +11,10 @@ import httpx
 from pydantic import ValidationError
 
 from splatmill.errors import ConnectionFailed, refused
+from splatmill.schema.info import DEFAULT_PORT
 from splatmill.schema.problems import PROBLEM_MEDIA_TYPE, Problem, code_for_status
 
-DEFAULT_SERVER = "http://127.0.0.1:8000"
+DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
 SERVER_VARIABLE = "SPLATMILL_SERVER"
 API_KEY_VARIABLE = "SPLATMILL_API_KEY"
 

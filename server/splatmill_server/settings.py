@@ -9,6 +9,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from splatmill.backplane import rendering
 from splatmill.backplane.connection import DEFAULT_URL
+from splatmill.schema import DEFAULT_PORT
 
 
 class Settings(BaseSettings):
@@ -25,7 +26,9 @@ class Settings(BaseSettings):
     api_key: SecretStr | None = Field(default=None, description="Demanded as `Authorization: Bearer KEY`.")
 
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
-    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes any free one.")
+    port: int = Field(
+        default=DEFAULT_PORT, ge=0, le=65535, description="Port to listen on; 0 takes any free one."
+    )
     uds: Path | None = Field(default=None, description="Unix socket to listen on instead of host and port.")
 
     max_file_bytes: int = Field(default=4 << 30, gt=0, description="Largest uploaded file.")

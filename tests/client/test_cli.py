@@ -31,6 +31,12 @@ from splatmill.schema import (
 )
 
 PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n\0\0\0\0"
+PLAN = {
+    "image_size": 480,
+    "schedule": {"degree": 1},
+    "reasons": {"image_size": "The photos resolve no more.", "degree": "The views span 20 degrees."},
+    "left_out": {"exposure": "Exposures agree."},
+}
 WIDE = {"COLUMNS": "250", "TERM": "dumb", "NO_COLOR": "1"}
 
 
@@ -79,7 +85,7 @@ def work(service, ending: Callable[[str], None]) -> threading.Thread:
             StateEvent(state=JobState.sfm),
             LogEvent(level="warning", message="2 photos were left out"),
             StateEvent(state=JobState.training),
-            PlanEvent(plan={"sh_degree": {"value": 1, "reason": "the views span 20 degrees"}}),
+            PlanEvent(plan=PLAN),
             ProgressEvent(
                 stage="training", done=50, total=100, loss=0.25, psnr=21.5, gaussians=12345, eta=65
             ),
@@ -156,7 +162,9 @@ def test_train_on_a_server(service, photos: Path, tmp_path: Path):
         "passed over: notes.txt",
         "recovering the cameras",
         "warning: 2 photos were left out",
-        "plan: sh degree: 1 (the views span 20 degrees)",
+        "plan: image size: 480 - The photos resolve no more.",
+        "plan: degree - The views span 20 degrees.",
+        "plan: without exposure - Exposures agree.",
         "training  50/100  loss 0.2500  PSNR 21.50 dB  12,345 Gaussians  ETA 1m05s",
         "training  100/100  loss 0.1250  PSNR 26.50 dB  23,456 Gaussians  ETA 0.0s",
         "1 Gaussians",
@@ -229,16 +237,12 @@ def test_a_detached_job_and_what_is_asked_about_it(service, photos: Path, tmp_pa
     assert json.loads(invoke("jobs", "--json", *at).stdout)["name"] == "tea"
 
     service.begin(job_id)
-    plan = {
-        "sh_degree": {"value": 1, "because": "narrow"},
-        "left_out": {"exposure": {"reason": "they agree"}},
-    }
-    service.say(job_id, PlanEvent(plan=plan), ProgressEvent(stage="training", done=1, total=9, loss=0.5))
+    service.say(job_id, PlanEvent(plan=PLAN), ProgressEvent(stage="training", done=1, total=9, loss=0.5))
     status = invoke("status", job_id, *at).stdout
     for line in (
         "state     preparing",
         "progress  training  1/9  loss 0.5000",
-        "sh degree: 1 (narrow)",
+        "image size: 480",
         "without exposure",
     ):
         assert line in status

@@ -3,39 +3,34 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+_ABOUT = ("reasons", "left_out", "forced")
+
 
 def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
-    """One line per decision, `name: value (reason)`; what was left out comes last, with its reason."""
-    left_out = plan.get("left_out")
-    for name, entry in plan.items():
-        if name != "left_out" and entry is not None:
-            yield f"{name.replace('_', ' ')}: {_decision(entry)}"
-    if isinstance(left_out, Mapping):
-        for name, reason in left_out.items():
-            yield f"without {str(name).replace('_', ' ')}: {_decision(reason)}"
-    elif isinstance(left_out, list):
-        for entry in left_out:
-            yield f"left out: {_decision(entry)}"
+    """One line per decision with its reason, then one per thing that was left out.
+
+    `plan` is a plan as jobs and reports carry it: values by name, and beside them `reasons` and `left_out`, each a
+    sentence by name.
+    """
+    reasons: Mapping[str, str] = plan.get("reasons") or {}
+    for name, value in plan.items():
+        if name in _ABOUT or (isinstance(value, Mapping) and name not in reasons):
+            continue
+        shown = "" if isinstance(value, Mapping) else f": {_value(value)}"
+        reason = f" - {reasons[name]}" if name in reasons else ""
+        yield f"{_words(name)}{shown}{reason}"
+    for name, reason in reasons.items():
+        if name not in plan:
+            yield f"{_words(name)} - {reason}"
+    for name, reason in (plan.get("left_out") or {}).items():
+        yield f"without {_words(name)} - {reason}"
 
 
-def _decision(entry: Any) -> str:
-    if isinstance(entry, Mapping):
-        reason = entry.get("reason") or entry.get("because")
-        value = entry.get("value", entry.get("name"))
-        if reason is not None and value is not None:
-            return f"{_value(value)} ({reason})"
-        if reason is not None:
-            return str(reason)
-    return _value(entry)
+def _words(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def _value(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, list | tuple):
-        return " x ".join(_value(item) for item in value)
-    if isinstance(value, Mapping):
-        return ", ".join(f"{name} {_value(item)}" for name, item in value.items())
-    return str(value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -52,6 +52,7 @@ from splatmill.schema.events import (
     StateEvent,
 )
 from splatmill.schema.info import (
+    DEFAULT_PORT,
     Health,
     Info,
     Limits,
@@ -107,6 +108,7 @@ from splatmill.schema.quantities import (
 )
 
 __all__ = [
+    "DEFAULT_PORT",
     "DEPTH_SCALE_HEADER",
     "EVENT",
     "FINAL_STATES",

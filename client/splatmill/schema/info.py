@@ -6,6 +6,9 @@ from pydantic import Field
 
 from splatmill.schema.base import Response, Time
 
+DEFAULT_PORT = 8080
+"""Where a server listens, and where a client looks for one, unless told otherwise."""
+
 
 class WorkerInfo(Response):
     """A worker that is registered with the queue."""

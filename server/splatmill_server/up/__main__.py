@@ -9,10 +9,9 @@ import socket
 import sys
 from pathlib import Path
 
+from splatmill.schema import DEFAULT_PORT
 from splatmill_server.up.folder import DataFolder, UpError
 from splatmill_server.up.service import Service
-
-PORT = 8080
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -48,7 +47,9 @@ def _parser() -> argparse.ArgumentParser:
         prog="splatmill up", description="Run the whole service on this machine."
     )
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
-    parser.add_argument("--port", type=int, default=PORT, help="0 takes any free one (default %(default)s)")
+    parser.add_argument(
+        "--port", type=int, default=DEFAULT_PORT, help="0 takes any free one (default %(default)s)"
+    )
     parser.add_argument(
         "--data",
         type=Path,
