@@ -16,6 +16,7 @@ _PASSED_BACK = (
     "etag",
     "cache-control",
     "last-modified",
+    "retry-after",
 )
 _OWN_PREFIX = "splatmill-"
 

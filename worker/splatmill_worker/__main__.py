@@ -26,6 +26,9 @@ def main(argv: list[str] | None = None) -> int:
     renderer.add_argument("--host", default="127.0.0.1")
     renderer.add_argument("--port", type=int, default=8090)
     renderer.add_argument("--uds", type=Path, help="listen on this unix socket instead of host and port")
+    renderer.add_argument(
+        "--backend", choices=["reference", "cpu", "gpu"], help="what computes (default: cpu)"
+    )
     doctor = programs.add_parser("doctor", help="check this machine and say what to do")
     doctor.add_argument("--json", action="store_true", help="one JSON document instead of lines")
     bench = programs.add_parser("bench", help="run worker/bench/NAME.py (source tree only)")
@@ -37,7 +40,7 @@ def main(argv: list[str] | None = None) -> int:
     if chosen.program == "renderer":
         from splatmill_worker.renderer import serve
 
-        return serve(chosen.host, chosen.port, chosen.uds)
+        return serve(chosen.host, chosen.port, chosen.uds, chosen.backend)
     if chosen.program == "doctor":
         from splatmill_worker.doctor import report
 
