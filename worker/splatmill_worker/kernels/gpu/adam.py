@@ -97,6 +97,40 @@ def advance(p, g, m, v, rate, size, root):
     return tl.where(good, moved, p), tl.where(good, m_new, m), tl.where(good, v_new, v), ~good
 
 
+@triton.jit
+def planes_kernel(
+    params, grads, exp_avg, exp_avg_sq, seen, travel, decay1, decay2, refused, count, stride, channels,
+    means_rate, scales_rate, quats_rate, opacity_rate, dc_rate, rest_rate, size, root,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """One step on planes [59, stride] of a whole scene: 3 means, 3 log-scales, 4 quaternions, 1 opacity, 3 + 45 SH."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = i < count
+    shown = here & (tl.load(seen + i, mask=here, other=0) != 0)
+    gone = tl.load(travel + i, mask=shown, other=0.0)
+    keep1 = tl.load(decay1 + i, mask=shown, other=1.0)
+    keep2 = tl.load(decay2 + i, mask=shown, other=1.0)
+    number = tl.zeros([BLOCK], tl.int32)
+    for channel in tl.range(0, channels):
+        rate = tl.where(channel < 3, means_rate, tl.where(channel < 6, scales_rate, quats_rate))
+        late = tl.where(channel < 11, opacity_rate, tl.where(channel < 14, dc_rate, rest_rate))
+        rate = tl.where(channel < 10, rate, late)
+        place = channel * stride + i
+        p = tl.load(params + place, mask=shown, other=0.0)
+        g = tl.load(grads + place, mask=shown, other=0.0)
+        m = tl.load(exp_avg + place, mask=shown, other=0.0)
+        v = tl.load(exp_avg_sq + place, mask=shown, other=0.0)
+        p -= rate * gone * tl.where(v > 0.0, m / tl.sqrt_rn(v), 0.0)
+        p, m, v, bad = advance(p, g, m * keep1, v * keep2, rate, size, root)
+        tl.store(params + place, p, mask=shown)
+        tl.store(exp_avg + place, m, mask=shown)
+        tl.store(exp_avg_sq + place, v, mask=shown)
+        number += (bad & shown).to(tl.int32)
+    total = tl.sum(number, axis=0)
+    if total > 0:
+        tl.atomic_add(refused, total)
+
+
 class CatchUp:
     """Travel and decays [N] of one step's visible rows, made once and used by every group."""
 
@@ -127,6 +161,20 @@ def apply(
         param, grad.contiguous(), exp_avg, exp_avg_sq, *late, refused, count, rate, size, root,
         CHANNELS=entries // count, VISIBLE=missed is not None, BLOCK=4 * BLOCK,
     )  # fmt: skip
+
+
+def apply_planes(
+    params: Tensor, grads: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rates: Sequence[float], channels: int, step: int,
+    refused: Tensor, missed: CatchUp,
+) -> None:  # fmt: skip
+    """One step in place of the first `channels` of planes [59, N]; rates of means, log-scales, quats, opacity, SH DC and rest."""
+    count = params.shape[1]
+    size, root = 1 / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step)
+    if count:
+        planes_kernel[(triton.cdiv(count, BLOCK),)](
+            params, grads, exp_avg, exp_avg_sq, missed.seen, missed.travel, missed.decay1, missed.decay2, refused,
+            count, count, channels, *rates, size, root, BLOCK=BLOCK,
+        )  # fmt: skip
 
 
 @torch.no_grad()

@@ -63,11 +63,15 @@ def variants() -> Iterator[Variant]:
     coefficients = {"COEFFICIENTS": 16, "USED": 16, "PLANAR": True}
     yield Variant(project_backward.color_backward_kernel, coefficients)
     shape = {"ANTIALIAS": False}
-    yield Variant(project_backward.shape_backward_kernel, {**shape, "PLANAR": True, "VIEWMAT": False, "d_viewmat": None})
+    yield Variant(
+        project_backward.shape_backward_kernel, {**shape, "PLANAR": True, "VIEWMAT": False, "d_viewmat": None}
+    )
     yield Variant(project_backward.shape_backward_kernel, {**shape, "PLANAR": False, "VIEWMAT": True})
     lists = {"BLOCK": bin.BLOCK, "LANES": bin.LANES}
     warps = (triton.Config({}, num_warps=4),)
-    yield Variant(bin.pairs_kernel, {**lists, "WRITE": False, "ends": None, "keys": None, "ids": None}, settings=warps)
+    yield Variant(
+        bin.pairs_kernel, {**lists, "WRITE": False, "ends": None, "keys": None, "ids": None}, settings=warps
+    )
     yield Variant(bin.pairs_kernel, {**lists, "WRITE": True}, settings=warps)
     walk = {"SEGMENT": composite.SEGMENT, "BACKGROUND": True}
     nothing = {"depth": None, "checkpoints": None, "first_segment": None, "segment_tile": None}
@@ -76,7 +80,15 @@ def variants() -> Iterator[Variant]:
     back = {"background": None, "BACKGROUND": False, "SEGMENT": composite.SEGMENT}
     yield Variant(
         composite_backward.composite_backward_kernel,
-        {**back, "ALPHA": False, "DEPTH": False, "SCORES": True, "d_alpha": None, "d_depth": None, "depth": None},
+        {
+            **back,
+            "ALPHA": False,
+            "DEPTH": False,
+            "SCORES": True,
+            "d_alpha": None,
+            "d_depth": None,
+            "depth": None,
+        },
     )
     yield Variant(
         composite_backward.composite_backward_kernel,
@@ -87,7 +99,7 @@ def variants() -> Iterator[Variant]:
     yield Variant(loss.across_kernel, {"MASK": True, "STATS": False})
     yield Variant(loss.value_kernel, {**bare, "STATS": True, "SLOPES": True})
     yield Variant(loss.value_kernel, {**photo, "MASK": True, "STATS": False, "SLOPES": True})
-    yield Variant(loss.slopes_kernel, {})
+    yield Variant(loss.down_kernel, {})
     yield Variant(loss.gradient_kernel, bare)
     yield Variant(adam.drift_kernel, {"BLOCK": adam.BLOCK}, settings=warps)
     yield Variant(adam.adam_kernel, {"CHANNELS": 3, "VISIBLE": True, "BLOCK": 4 * adam.BLOCK}, settings=warps)
@@ -110,7 +122,9 @@ def compile_variant(variant: Variant, setting: triton.Config, architecture: int)
         options={"num_warps": setting.num_warps, "num_stages": setting.num_stages},
     )
     registers, spilled = resources(made.asm["cubin"])
-    chosen = ", ".join(f"{k}={v}" for k, v in {**variant.constants, **setting.all_kwargs()}.items() if v is not None)
+    chosen = ", ".join(
+        f"{k}={v}" for k, v in {**variant.constants, **setting.all_kwargs()}.items() if v is not None
+    )
     return Compiled(function.__name__, chosen, architecture, registers, spilled, made.metadata.shared)
 
 
@@ -120,7 +134,9 @@ def resources(binary: bytes) -> tuple[int, int]:
         file.write(binary)
         file.flush()
         tool = triton.knobs.nvidia.cuobjdump.path
-        told = subprocess.run([tool, "-res-usage", file.name], capture_output=True, text=True, check=True).stdout
+        told = subprocess.run(
+            [tool, "-res-usage", file.name], capture_output=True, text=True, check=True
+        ).stdout
     found = re.search(r"REG:(\d+) STACK:(\d+)", told)
     if found is None:
         raise RuntimeError(f"cuobjdump -res-usage said nothing of registers: {told!r}")

@@ -28,6 +28,18 @@ class GpuUnavailable(RuntimeError):
     """The GPU engine was asked for and cannot run here; the message says why and what to do."""
 
 
+class GpuMemoryShort(MemoryError):
+    """Device memory ran out in mid-training; the scene is as it was before the call that failed."""
+
+    def __init__(self, where: torch.device, params: Tensor | None) -> None:
+        free, total = torch.cuda.mem_get_info(where)
+        held = "no" if params is None else str(params.shape[1])
+        super().__init__(
+            f"The GPU ran out of memory with {held} Gaussians in training: {free / 2**30:.1f} of {total / 2**30:.1f} GiB are free. "
+            "Go on with fewer Gaussians or smaller photos, or close what else uses the GPU."
+        )
+
+
 @dataclass(frozen=True)
 class DeviceFacts:
     """One GPU that the kernels run on: its name, compute capability, and memory in bytes as seen now."""

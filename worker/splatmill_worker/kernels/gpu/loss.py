@@ -124,13 +124,15 @@ def value_kernel(
 
 @autotune(LOSS, key=[])
 @triton.jit
-def slopes_kernel(slopes, taps, planes, width, height, BLOCK: tl.constexpr):
-    """The nine planes of slopes windowed along columns, one per second index of the grid."""
+def down_kernel(planes, taps, windowed, width, height, BLOCK: tl.constexpr):
+    """Planes windowed along columns, one per second index of the grid."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     plane = width * height
     here = p < plane
     source = tl.program_id(1) * plane
-    tl.store(planes + source + p, down(slopes + source, taps, p, p // width, here, width, height), mask=here)
+    tl.store(
+        windowed + source + p, down(planes + source, taps, p, p // width, here, width, height), mask=here
+    )
 
 
 @autotune(LOSS, key=["MASK"])
@@ -184,7 +186,9 @@ def loss_and_gradient(
     height, width = color.shape[:2]
     pixels = height * width
     if pixels * 15 >= 2**31:
-        raise ValueError(f"an image of {width}x{height}: offsets into its planes are 32-bit; use fewer than 143 megapixels")
+        raise ValueError(
+            f"an image of {width}x{height}: offsets into its planes are 32-bit; use fewer than 143 megapixels"
+        )
     like = {"device": color.device, "dtype": torch.float32}
     if mask is not None:
         mask = mask.to(torch.uint8).contiguous()
@@ -211,7 +215,7 @@ def loss_and_gradient(
     value = (1 - dssim_weight) * off + dssim_weight * ((count > 0).float() - similar)
     if slopes is None:
         return value, off, None
-    slopes_kernel[lambda meta: (triton.cdiv(pixels, meta["BLOCK"]), 9)](slopes, taps, planes, width, height)
+    down_kernel[lambda meta: (triton.cdiv(pixels, meta["BLOCK"]), 9)](slopes, taps, planes, width, height)
     d_color = torch.empty_like(color)
     gradient_kernel[grid](
         color, photo, mask, taps, planes, count, d_color, width, height, dssim_weight, MASK=masked
@@ -255,3 +259,27 @@ def loss(
     device.require(color)
     value: Tensor = _Loss.apply(color, photo, dssim_weight, mask, stats)
     return value
+
+
+@torch.no_grad()
+def photo_stats(photo: Tensor, *, mask: Tensor | None = None) -> PhotoStats:
+    """Windowed mean and variance of a photo (uint8 [H,W,3]) under a mask, each [H,W,3]; 24 bytes a pixel when kept."""
+    device.require(photo)
+    height, width = photo.shape[:2]
+    mask = None if mask is None else mask.to(torch.uint8).contiguous()
+    seen = photo.to(torch.float32) / 255
+    taps = window_taps(photo.device)
+    planes = torch.empty(3, 3, height, width, device=photo.device)
+    windowed = torch.empty_like(planes)
+
+    def grid(meta: dict[str, Any]) -> tuple[int, int]:
+        return triton.cdiv(height * width, meta["BLOCK"]), 3
+
+    across_kernel[grid](
+        seen, photo.contiguous(), mask, taps, planes, width, height, MASK=mask is not None, STATS=True
+    )
+    down_kernel[lambda meta: (triton.cdiv(height * width, meta["BLOCK"]), 6)](
+        planes, taps, windowed, width, height
+    )
+    mean, square = windowed[0].permute(1, 2, 0), windowed[1].permute(1, 2, 0)
+    return PhotoStats(mean.contiguous(), (square - mean * mean).contiguous())

@@ -26,7 +26,11 @@ LOSS = [triton.Config({"BLOCK": block}, num_warps=block // 64) for block in (256
 
 
 def autotune(
-    configs: Sequence[triton.Config], key: Sequence[str], *, reset: Sequence[str] = (), keep: Sequence[str] = ()
+    configs: Sequence[triton.Config],
+    key: Sequence[str],
+    *,
+    reset: Sequence[str] = (),
+    keep: Sequence[str] = (),
 ) -> Callable[[Any], Any]:
     """Triton's autotuner with its results on disk; `reset` names accumulators (or None) to zero between trials.
 
@@ -50,4 +54,6 @@ def autotune(
             arguments[name].copy_(value)
 
     choices = [configs[0]] if interpreting() else list(configs)
-    return triton.autotune(configs=choices, key=list(key), pre_hook=before, post_hook=after, cache_results=True)
+    return triton.autotune(
+        configs=choices, key=list(key), pre_hook=before, post_hook=after, cache_results=True
+    )
