@@ -16,7 +16,9 @@ def supported() -> tuple[str, ...]:
 def load(isa: str) -> ModuleType:
     """The engine's extension module for `isa`; raises RuntimeError when the processor cannot run it."""
     if isa not in ISAS:
-        raise RuntimeError(f"{VARIABLE}={isa!r} is not a build of the CPU engine; choose one of {', '.join(ISAS)}.")
+        raise RuntimeError(
+            f"{VARIABLE}={isa!r} is not a build of the CPU engine; choose one of {', '.join(ISAS)}."
+        )
     here = supported()
     if isa not in here:
         raise RuntimeError(

@@ -1,8 +1,18 @@
 // The extension module: one line per op. Built once per instruction set under the name SPLATMILL_MODULE.
-#include "bindings.hpp"
+#include "arguments.hpp"
+#include "frame.hpp"
 #include "threads.hpp"
 
 namespace splatmill {
+
+void bind_adam(nb::module_& m);
+void bind_bin(nb::module_& m);
+void bind_composite(nb::module_& m);
+void bind_knn(nb::module_& m);
+void bind_loss(nb::module_& m);
+void bind_pack(nb::module_& m);
+void bind_project(nb::module_& m);
+void bind_step(nb::module_& m);
 
 // Which builds this processor can run, best first. Asked of the baseline module, which runs anywhere.
 std::vector<std::string> supported() {
@@ -24,6 +34,22 @@ std::vector<std::string> supported() {
 
 NB_MODULE(SPLATMILL_MODULE, m) {
   using namespace splatmill;
+  nb::set_leak_warnings(false);  // tensors alive at exit keep frames alive: no fault of theirs
   m.def("supported", &supported, "Instruction sets this processor can run, best first.");
   m.def("default_threads", &default_threads, "Threads an op uses when not told: the affinity mask and OMP_NUM_THREADS.");
+  nb::class_<Camera>(m, "Camera", "A pinhole camera: viewmat [4,4] and K [3,3] float32, image size in pixels.")
+      .def(
+          "__init__",
+          [](Camera* self, Matrix4 viewmat, Tensor<float, nb::shape<3, 3>> K, int width, int height, float near,
+             bool antialias) { new (self) Camera(make_camera(viewmat.data(), K.data(), width, height, near, antialias)); },
+          "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a, "near"_a, "antialias"_a);
+  nb::class_<Frame>(m, "Frame", "Buffers of one view between the passes; grown as needed and reused.").def(nb::init<>());
+  bind_adam(m);
+  bind_bin(m);
+  bind_composite(m);
+  bind_knn(m);
+  bind_loss(m);
+  bind_pack(m);
+  bind_project(m);
+  bind_step(m);
 }

@@ -341,6 +341,14 @@ SPLATMILL_INLINE Float select(Mask m, Float a, Float b) {
 }
 SPLATMILL_INLINE void store(float* p, Mask m, Float x) { store(p, select(m, x, load(p))); }
 #endif
+// m ? a * b : 0, one instruction where masks are registers.
+SPLATMILL_INLINE Float keep_product(Mask m, Float a, Float b) {
+#if defined(__AVX512F__)
+  return {{_mm512_maskz_mul_ps(m.bits, a.part[0], b.part[0])}};
+#else
+  return keep(m, a * b);
+#endif
+}
 SPLATMILL_INLINE Mask operator>(Float a, Float b) { return b < a; }
 SPLATMILL_INLINE Mask operator>=(Float a, Float b) { return b <= a; }
 SPLATMILL_INLINE Mask operator<(Float a, float b) { return a < splat(b); }

@@ -1,0 +1,25 @@
+// The shapes in which Python hands over a scene and a camera.
+#pragma once
+
+#include "bindings.hpp"
+#include "camera.hpp"
+#include "layout.hpp"
+
+namespace splatmill {
+
+using namespace nb::literals;
+
+using Blocks = Tensor<float, nb::shape<-1, kRows, kLanes>>;  // parameters, moments or gradients
+using Row = Tensor<float, nb::shape<-1>>;
+template <int N>
+using Rows = Tensor<float, nb::shape<-1, N>>;
+using Matrix4 = Tensor<float, nb::shape<4, 4>>;
+using CameraArgument = Camera;  // bound as a class
+using Image = Tensor<float, nb::ndim<3>>;  // [3 or 5, rows, stride], both padded to whole tiles
+
+inline Planes planes_of(const Image& image, const Camera& cam) {
+  const auto stride = static_cast<int64_t>(image.shape(2));
+  return {image.data(), cam.width, cam.height, stride, stride * static_cast<int64_t>(image.shape(1))};
+}
+
+}  // namespace splatmill

@@ -1,0 +1,136 @@
+// bin: the pairs of a frame by tile, front to back. Depth is sorted once for the visible Gaussians, on the bits in which their
+// depths differ; then one stable counting pass by tile.
+#include "bin.hpp"
+
+#include <algorithm>
+#include <utility>
+
+#include "rows.hpp"
+#include "touches.hpp"
+
+namespace splatmill {
+namespace {
+
+constexpr int kMostDigitBits = 13;  // 8192 counters, 32 KiB: a thread's histogram stays in its first two caches
+constexpr int kAhead = 16;          // Gaussians whose spans and touches are fetched early
+
+struct Digits {
+  uint32_t lowest = 0;
+  int passes = 0, bits = 0;
+};
+
+Digits digits_of(const uint32_t* keys, int64_t n) {
+  if (n == 0) return {};
+  const auto [low, high] = std::minmax_element(keys, keys + n);
+  const uint32_t range = *high - *low;
+  const int bits = range ? 32 - __builtin_clz(range) : 0;
+  const int passes = (bits + kMostDigitBits - 1) / kMostDigitBits;
+  return {*low, passes, passes ? (bits + passes - 1) / passes : 0};
+}
+
+// Turns counts[thread][bin] into the place where that thread's first element of that bin goes.
+void starts_from_counts(uint32_t* counts, int64_t bins, int team, int64_t stride) {
+  uint32_t total = 0;
+  for (int64_t bin = 0; bin < bins; ++bin)
+    for (int t = 0; t < team; ++t) total += std::exchange(counts[t * stride + bin], total);
+}
+
+}  // namespace
+
+void bin_frame(Frame& frame, int threads) {
+  const int64_t n = frame.visible_count;
+  const int tiles = frame.tiles();
+  const int64_t stride = std::max<int64_t>(tiles, int64_t{1} << kMostDigitBits);
+  uint32_t* histogram = frame.histogram.reserve(stride * threads);
+  int64_t* offsets = frame.offsets.reserve(tiles + 1);
+  Entry* entries = frame.entries.reserve(frame.pairs);
+  const Digits digits = digits_of(frame.keys.get(), n);
+
+#pragma omp parallel num_threads(threads)
+  {
+    const int t = omp_get_thread_num(), team = omp_get_num_threads();
+    const int64_t begin = n * t / team, end = n * (t + 1) / team;
+    uint32_t* counts = histogram + t * stride;
+    uint32_t *ids = frame.ids.get(), *keys = frame.keys.get();
+    uint32_t *ids_to = frame.ids_swap.get(), *keys_to = frame.keys_swap.get();
+    for (int pass = 0; pass < digits.passes; ++pass) {
+      const int shift = pass * digits.bits;
+      const uint32_t mask = (1u << digits.bits) - 1;
+      const auto digit = [&](int64_t i) { return (keys[i] - digits.lowest) >> shift & mask; };
+      std::fill_n(counts, mask + 1, 0u);
+      for (int64_t i = begin; i < end; ++i) ++counts[digit(i)];
+#pragma omp barrier
+#pragma omp single
+      starts_from_counts(histogram, mask + 1, team, stride);
+      for (int64_t i = begin; i < end; ++i) {
+        const uint32_t to = counts[digit(i)]++;
+        ids_to[to] = ids[i];
+        keys_to[to] = keys[i];
+      }
+#pragma omp barrier
+      std::swap(ids, ids_to);
+      std::swap(keys, keys_to);
+    }
+
+    const auto fetch_ahead = [&](int64_t i) {
+      if (i + 2 * kAhead < end) __builtin_prefetch(&frame.spans[ids[i + 2 * kAhead]]);
+      if (i + kAhead < end) __builtin_prefetch(&frame.touches[frame.spans[ids[i + kAhead]].first]);
+    };
+    std::fill_n(counts, tiles, 0u);
+    for (int64_t i = begin; i < end; ++i) {
+      fetch_ahead(i);
+      const Span span = frame.spans[ids[i]];
+      for (uint32_t k = 0; k < span.count; ++k) ++counts[frame.touches[span.first + k].tile];
+    }
+#pragma omp barrier
+#pragma omp single
+    {
+      starts_from_counts(histogram, tiles, team, stride);
+      for (int tile = 0; tile < tiles; ++tile) offsets[tile] = histogram[tile];
+      offsets[tiles] = frame.pairs;
+    }
+    for (int64_t i = begin; i < end; ++i) {
+      fetch_ahead(i);
+      const Span span = frame.spans[ids[i]];
+      for (uint32_t k = 0; k < span.count; ++k) {
+        const uint32_t slot = span.first + k;
+        const Touch touch = frame.touches[slot];
+        entries[counts[touch.tile]++] = {ids[i], slot, touch.blocks};
+      }
+    }
+  }
+}
+
+void bind_bin(nb::module_& m) {
+  m.def(
+      "bin",
+      [](Frame& frame, Rows<2> means2d, Rows<3> conics, Row opacities, Row depths, Rows<2> extents, int width, int height,
+         int threads) {
+        const ProjectedRows rows{means2d.data(), conics.data(), opacities.data(), nullptr, depths.data(), extents.data()};
+        const auto count = static_cast<int64_t>(depths.shape(0));
+        nb::gil_scoped_release release;
+        frame.camera = Camera{};
+        frame.camera.width = width, frame.camera.height = height;
+        collect_touches(frame, count, threads, [&](int64_t begin, int64_t end, TouchWriter& writer) {
+          for (int64_t i = begin * kLanes; i < std::min(count, end * kLanes); ++i) {
+            if (culled(rows, i)) continue;
+            frame.records[i] = record_of(rows, i);
+            writer.add(static_cast<uint32_t>(i));
+          }
+        });
+        bin_frame(frame, threads);
+        return frame.pairs;
+      },
+      "frame"_a, "means2d"_a.noconvert(), "conics"_a.noconvert(), "opacities"_a.noconvert(), "depths"_a.noconvert(),
+      "extents"_a.noconvert(), "width"_a, "height"_a, "threads"_a,
+      "Makes the lists of projected Gaussians in the frame; returns the number of pairs, for `lists`.");
+  m.def(
+      "lists",
+      [](const Frame& frame, Tensor<int64_t, nb::ndim<1>> offsets, Tensor<int32_t, nb::ndim<1>> ids) {
+        std::copy_n(frame.offsets.get(), offsets.shape(0), offsets.data());
+        for (int64_t k = 0; k < frame.pairs; ++k) ids.data()[k] = static_cast<int32_t>(frame.entries[k].id);
+      },
+      "frame"_a, "offsets"_a.noconvert(), "ids"_a.noconvert(), "Copies the frame's lists out: offsets [tiles + 1], ids [pairs].");
+}
+
+}  // namespace splatmill

@@ -1,0 +1,67 @@
+// One Gaussian over one 4x4-pixel block: the arithmetic that the forward and the backward pass must do bit for bit alike.
+#pragma once
+
+#include "frame.hpp"
+#include "math.hpp"
+#include "reach.hpp"
+
+namespace splatmill {
+
+// Pixel centres relative to a tile's corner block, by lane, and the blocks' corners, by block.
+struct TileLanes {
+  Float pixel_x, pixel_y;  // lane's pixel within a block
+  Float block_x, block_y;  // lane b: left and top of block b
+};
+SPLATMILL_INLINE TileLanes tile_lanes() {
+  const Float l = iota(), row = floor(l * 0.25f), column = fma(row, splat(-4.0f), l);
+  return {column, row, column * 4.0f, row * 4.0f};
+}
+
+// u and v over a tile: at block b they are the lanes' part plus that block's offset.
+struct TileForm {
+  Float u, v;
+  alignas(64) float block_u[kTileBlocks], block_v[kTileBlocks];
+
+  // The tile's first pixel centre is at (x0, y0).
+  SPLATMILL_INLINE TileForm(const Record& r, const TileLanes& lanes, float x0, float y0) {
+    const Float ux = splat(r.ux), uy = splat(r.uy), vy = splat(r.vy);
+    const Float y = lanes.pixel_y + (y0 - r.y);
+    u = fma(ux, lanes.pixel_x + (x0 - r.x), uy * y);
+    v = vy * y;
+    store(block_u, fma(ux, lanes.block_x, uy * lanes.block_y));
+    store(block_v, vy * lanes.block_y);
+  }
+  SPLATMILL_INLINE Float u_at(int block) const { return u + block_u[block]; }
+  SPLATMILL_INLINE Float v_at(int block) const { return v + block_v[block]; }
+};
+
+// log2 of alpha before the clamp.
+SPLATMILL_INLINE Float log2_alpha(Float level, Float u, Float v) { return fnma(v, v, fnma(u, u, level)); }
+
+// The blocks of a tile that hold pixels of the image.
+inline uint32_t blocks_inside(int tile_x, int tile_y, const Camera& cam) {
+  uint32_t inside = 0;
+  for (int b = 0; b < kTileBlocks; ++b)
+    if (tile_x * kTile + b % 4 * kBlockSide < cam.width && tile_y * kTile + b / 4 * kBlockSide < cam.height)
+      inside |= 1u << b;
+  return inside;
+}
+
+// Copies between a plane and a block's sixteen lanes.
+SPLATMILL_INLINE float* block_origin(const Planes& image, int plane, int tile_x, int tile_y, int block) {
+  return image.at(plane, tile_y * kTile + block / 4 * kBlockSide, tile_x * kTile + block % 4 * kBlockSide);
+}
+SPLATMILL_INLINE Float load_block(const float* origin, int64_t stride) {
+  alignas(64) float lanes[kLanes];
+  for (int y = 0; y < kBlockSide; ++y) std::memcpy(lanes + 4 * y, origin + y * stride, 16);
+  return load(lanes);
+}
+SPLATMILL_INLINE void store_block(float* origin, int64_t stride, Float x) {
+  alignas(64) float lanes[kLanes];
+  store(lanes, x);
+  for (int y = 0; y < kBlockSide; ++y) std::memcpy(origin + y * stride, lanes + 4 * y, 16);
+}
+
+inline constexpr int kEntriesAhead = 16;  // records of the list that are fetched early
+
+}  // namespace splatmill

@@ -1,0 +1,153 @@
+// composite, backward: the lists again front to back. What lies behind a splat is the final colour minus what was blended so far,
+// so transmittance is never recovered by division; a pixel ends where its transmittance reaches the forward pass's, bit for bit.
+//
+// The sums of a (tile, Gaussian) pair stay in registers over the tile's blocks, are reduced together, and stored once; a
+// Gaussian's pairs are added later in a fixed order. No atomics, and the same bytes on any number of threads.
+#include "blend.hpp"
+#include "composite.hpp"
+#include "shuffles.hpp"
+#include "threads.hpp"
+
+namespace splatmill {
+namespace {
+
+template <bool kDepth, bool kScores>
+struct Block {
+  alignas(64) float T[kLanes], final_T[kLanes];
+  alignas(64) float behind[kLanes];  // gradient . (final image - blended so far): what a splat here would hide
+  alignas(64) float d_red[kLanes], d_green[kLanes], d_blue[kLanes];
+  alignas(64) float d_depth[kDepth ? kLanes : 1];
+  alignas(64) float error[kScores ? kLanes : 1];
+};
+
+// Sum over the channels of |colour - photo|; 0 outside the image and where a pixel does not count.
+Float load_block_error(const ImageGradient& g, int tile_x, int tile_y, int b) {
+  const int x = tile_x * kTile + b % 4 * kBlockSide, y = tile_y * kTile + b / 4 * kBlockSide;
+  const int64_t stride = g.image.stride, plane = stride * g.image.height;
+  const int rows = std::min(kBlockSide, g.image.height - y);
+  const auto bytes = [&](const uint8_t* p) {
+    alignas(64) float lanes[kLanes] = {};
+    for (int i = 0; i < rows; ++i)
+      for (int j = 0; j < kBlockSide; ++j) lanes[4 * i + j] = p[(y + i) * stride + x + j];
+    return load(lanes);
+  };
+  Float error = splat(0.0f);
+  for (int c = 0; c < 3; ++c)
+    error += abs(load_block(block_origin(g.image, c, tile_x, tile_y, b), stride) - bytes(g.photo + c * plane) * (1.0f / 255.0f));
+  return keep(bytes(g.used) > 0.0f, error);
+}
+
+template <bool kDepth, bool kScores>
+SPLATMILL_INLINE void load_block_gradient(const Frame& frame, const ImageGradient& g, int tile, int tile_x, int tile_y, int b,
+                                          Block<kDepth, kScores>& block) {
+  const Float final_T = load(frame.final_T.get() + (static_cast<int64_t>(tile) * kTileBlocks + b) * kLanes);
+  Float behind = splat(0.0f);
+  float* d_color[3] = {block.d_red, block.d_green, block.d_blue};
+  for (int c = 0; c < 3; ++c) {
+    const Float d = load_block(block_origin(g.gradient, c, tile_x, tile_y, b), g.gradient.stride);
+    behind = fma(d, load_block(block_origin(g.image, c, tile_x, tile_y, b), g.image.stride), behind);
+    store(d_color[c], d);
+  }
+  if constexpr (kDepth) {
+    const Float d_depth = load_block(block_origin(g.gradient, kDepthPlane, tile_x, tile_y, b), g.gradient.stride);
+    behind = fma(d_depth, load_block(block_origin(g.image, kDepthPlane, tile_x, tile_y, b), g.image.stride), behind);
+    store(block.d_depth, d_depth);
+    // alpha = 1 - final T: a splat that hides what is behind it takes that share of the background's weight with it.
+    const Float d_alpha = load_block(block_origin(g.gradient, kAlphaPlane, tile_x, tile_y, b), g.gradient.stride);
+    behind = fnma(d_alpha, final_T, behind);
+  }
+  if constexpr (kScores) store(block.error, g.photo ? load_block_error(g, tile_x, tile_y, b) : splat(0.0f));
+  store(block.behind, behind);
+  store(block.T, splat(1.0f));
+  store(block.final_T, final_T);
+}
+
+template <bool kDepth, bool kScores>
+void differentiate_tile(Frame& frame, const ImageGradient& g, int tile) {
+  constexpr int kCount = kScores ? kSums : kDepth ? kSumDepth + 1 : kSumBlue + 1;
+  const int columns = frame.camera.columns(), tile_x = tile % columns, tile_y = tile / columns;
+  const float x0 = tile_x * kTile + 0.5f, y0 = tile_y * kTile + 0.5f;
+  const TileLanes lanes = tile_lanes();
+  Block<kDepth, kScores> blocks[kTileBlocks];
+  for (int b = 0; b < kTileBlocks; ++b) load_block_gradient(frame, g, tile, tile_x, tile_y, b, blocks[b]);
+
+  int64_t k = frame.offsets[tile];
+  const int64_t end = frame.offsets[tile + 1], walked = k + frame.walked[tile];
+  for (; k < walked; ++k) {
+    if (k + kEntriesAhead < walked) __builtin_prefetch(&frame.records[frame.entries[k + kEntriesAhead].id]);
+    const Entry entry = frame.entries[k];
+    if (!entry.blocks) {
+      frame.touches[entry.slot].blocks = 0;
+      continue;
+    }
+    const Record& r = frame.records[entry.id];
+    const TileForm form(r, lanes, x0, y0);
+    const Float level = splat(r.level);
+    const Float red = splat(r.color[0]), green = splat(r.color[1]), blue = splat(r.color[2]);
+    const bool may_clamp = r.opacity > kAlphaMax * 0.9999f;
+    Float s[kCount];
+    for (int i = 0; i < kCount; ++i) s[i] = splat(0.0f);
+    for (uint32_t left = entry.blocks; left; left &= left - 1) {
+      const int b = __builtin_ctz(left);
+      Block<kDepth, kScores>& block = blocks[b];
+      const Float u = form.u_at(b), v = form.v_at(b);
+      const Float e = log2_alpha(level, u, v);
+      const Float raw = exp2_of_alpha(e), alpha = min(raw, kAlphaMax);
+      const Float T = load(block.T), T_after = fnma(alpha, T, T);
+      const Mask blended = (e >= kLog2AlphaMin) & (T_after >= load(block.final_T));
+      const Float w = keep_product(blended, alpha, T);
+      store(block.T, select(blended, T_after, T));
+      const Float d_red = load(block.d_red), d_green = load(block.d_green), d_blue = load(block.d_blue);
+      Float along = fma(blue, d_blue, fma(green, d_green, red * d_red));  // colour . gradient
+      if constexpr (kDepth) along = fma(splat(r.depth), load(block.d_depth), along);
+      const Float gain = w * along;
+      const Float behind = load(block.behind) - gain;
+      store(block.behind, behind);
+      Float q = fnma(keep_product(blended, alpha, reciprocal(1.0f - alpha)), behind, gain);  // alpha dL/dalpha
+      if (__builtin_expect(may_clamp, 0)) q = keep(raw <= splat(kAlphaMax), q);  // no gradient through the clamp
+      const Float qu = q * u, qv = q * v;
+      s[kSumQ] += q;
+      s[kSumQU] += qu;
+      s[kSumQV] += qv;
+      s[kSumQUU] = fma(qu, u, s[kSumQUU]);
+      s[kSumQUV] = fma(qu, v, s[kSumQUV]);
+      s[kSumQVV] = fma(qv, v, s[kSumQVV]);
+      s[kSumRed] = fma(w, d_red, s[kSumRed]);
+      s[kSumGreen] = fma(w, d_green, s[kSumGreen]);
+      s[kSumBlue] = fma(w, d_blue, s[kSumBlue]);
+      if constexpr (kDepth) s[kSumDepth] = fma(w, load(block.d_depth), s[kSumDepth]);
+      if constexpr (kScores) {
+        s[kSumAbsX] += abs(qu);
+        s[kSumAbsY] += abs(fma(splat(r.uy), qu, splat(r.vy) * qv));
+        s[kSumError] = fma(w, load(block.error), s[kSumError]);
+      }
+    }
+    float* sums = frame.pair_sums.get() + static_cast<int64_t>(entry.slot) * kPairSums;
+    store_lane_sums<kCount>(sums, s);
+  }
+  for (; k < end; ++k) frame.touches[frame.entries[k].slot].blocks = 0;
+}
+
+}  // namespace
+
+void composite_backward(Frame& frame, const ImageGradient& g, int threads) {
+  const int tiles = frame.tiles();
+  frame.pair_sums.reserve(frame.touches.capacity() * kPairSums);
+#pragma omp parallel num_threads(threads)
+  {
+    const FlushDenormals flush;
+#pragma omp for schedule(dynamic, 2)
+    for (int tile = 0; tile < tiles; ++tile) {
+      if (g.with_alpha_and_depth && g.scores)
+        differentiate_tile<true, true>(frame, g, tile);
+      else if (g.with_alpha_and_depth)
+        differentiate_tile<true, false>(frame, g, tile);
+      else if (g.scores)
+        differentiate_tile<false, true>(frame, g, tile);
+      else
+        differentiate_tile<false, false>(frame, g, tile);
+    }
+  }
+}
+
+}  // namespace splatmill

@@ -1,0 +1,52 @@
+// Everything between the parameters and the image for one view, kept from step to step.
+#pragma once
+
+#include "buffer.hpp"
+#include "camera.hpp"
+#include "layout.hpp"
+
+namespace splatmill {
+
+// One (Gaussian, tile) pair where it was found: the tile, and which of its sixteen 4x4-pixel blocks the ellipse reaches.
+struct Touch {
+  uint32_t tile;
+  uint32_t blocks;
+};
+
+// The same pair in its tile's list.
+struct Entry {
+  uint32_t id;      // Gaussian
+  uint32_t slot;    // its Touch, and its row of pair sums
+  uint32_t blocks;  // reached; the forward pass leaves those that it changed
+};
+
+// A Gaussian's touches: a run in the buffer, in tile order. Sums over it are taken in this order, whatever the threads.
+struct Span {
+  uint32_t first, count;
+};
+
+inline constexpr int kPairSums = 16;  // floats per pair
+
+struct Frame {
+  Camera camera;
+  int64_t count = 0;          // Gaussians
+  int64_t visible_count = 0;  // that reach a block
+  int64_t pairs = 0;
+
+  Buffer<Record> records;        // [count], written where visible
+  Buffer<uint16_t> visible;      // [blocks] one bit per Gaussian
+  Buffer<Span> spans;            // [count], written where visible
+  Buffer<Touch> touches;         // one stretch per thread
+  int64_t stretch = 0;           // touches of a thread at most
+  Buffer<uint32_t> ids, keys, ids_swap, keys_swap;  // visible Gaussians by depth
+  Buffer<uint32_t> histogram;    // [threads][max(tiles, digits)]
+  Buffer<int64_t> offsets;       // [tiles + 1]
+  Buffer<Entry> entries;         // [pairs] by tile, front to back
+  Buffer<float> final_T;         // [tiles][16 blocks][16 pixels]
+  Buffer<int32_t> walked;        // [tiles] entries of the list that the forward pass looked at
+  Buffer<float> pair_sums;       // [slots][kPairSums]
+
+  int tiles() const { return camera.columns() * camera.rows(); }
+};
+
+}  // namespace splatmill

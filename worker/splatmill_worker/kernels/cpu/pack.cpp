@@ -1,0 +1,77 @@
+// Between the plain form of a scene, one row per Gaussian, and its blocks of sixteen.
+#include "arguments.hpp"
+#include "shuffles.hpp"
+#include "threads.hpp"
+
+namespace splatmill {
+namespace {
+
+// One parameter group [count, width] and the row of the blocks where it starts.
+struct Group {
+  float* data;
+  int64_t width;
+  int first;
+};
+
+template <bool kToBlocks>
+void move_groups(const std::vector<Group>& groups, float* blocks, int64_t count, int threads) {
+  const int64_t n = blocks_for(count);
+#pragma omp parallel for schedule(static) num_threads(threads)
+  for (int64_t b = 0; b < n; ++b) {
+    float* block = blocks + b * kBlockFloats;
+    const int used = static_cast<int>(std::min<int64_t>(kLanes, count - b * kLanes));
+    for (const Group& g : groups) {
+      float* rows = g.data + b * kLanes * g.width;
+      int64_t k = 0;
+      if (used == kLanes)
+        for (; k + kLanes <= g.width; k += kLanes) {
+          Float square[kLanes];
+          float* to = block + (g.first + k) * kLanes;
+          for (int l = 0; l < kLanes; ++l) square[l] = kToBlocks ? load_unaligned(rows + l * g.width + k) : load(to + l * kLanes);
+          transpose(square);
+          for (int l = 0; l < kLanes; ++l)
+            if (kToBlocks)
+              store(to + l * kLanes, square[l]);
+            else
+              store_unaligned(rows + l * g.width + k, square[l]);
+        }
+      for (int l = 0; l < used; ++l)
+        for (int64_t j = k; j < g.width; ++j) {
+          float &plain = rows[l * g.width + j], &blocked = block[(g.first + j) * kLanes + l];
+          if (kToBlocks)
+            blocked = plain;
+          else
+            plain = blocked;
+        }
+    }
+  }
+}
+
+using Plain = Tensor<float, nb::ndim<2>>;
+
+std::vector<Group> groups_of(const std::vector<Plain>& tensors, const std::vector<int>& first) {
+  std::vector<Group> groups;
+  for (size_t i = 0; i < tensors.size(); ++i)
+    groups.push_back({tensors[i].data(), static_cast<int64_t>(tensors[i].shape(1)), first.at(i)});
+  return groups;
+}
+
+}  // namespace
+
+void bind_pack(nb::module_& m) {
+  m.def(
+      "pack",
+      [](const std::vector<Plain>& groups, const std::vector<int>& first, Blocks blocks, int64_t count, int threads) {
+        move_groups<true>(groups_of(groups, first), blocks.data(), count, threads);
+      },
+      "groups"_a, "first"_a, "blocks"_a.noconvert(), "count"_a, "threads"_a,
+      "Writes groups [count, width] into the blocks from row `first` on; lanes beyond count are left as they are.");
+  m.def(
+      "unpack",
+      [](const std::vector<Plain>& groups, const std::vector<int>& first, Blocks blocks, int64_t count, int threads) {
+        move_groups<false>(groups_of(groups, first), blocks.data(), count, threads);
+      },
+      "groups"_a, "first"_a, "blocks"_a.noconvert(), "count"_a, "threads"_a, "The reverse of `pack`.");
+}
+
+}  // namespace splatmill

@@ -1,0 +1,189 @@
+// project: Gaussians to the image plane, alone (differentiable) and as the first pass of a frame.
+#include "project.hpp"
+
+#include <vector>
+
+#include "arguments.hpp"
+#include "geometry.hpp"
+#include "rows.hpp"
+#include "shuffles.hpp"
+#include "touches.hpp"
+
+namespace splatmill {
+namespace {
+
+// Colour of a block, clamped at 0; a colour that is not finite makes its lane invisible.
+SPLATMILL_INLINE void shade(const float* p, const Camera& cam, int degree, Projection& o, Float* color) {
+  Float inv_distance, basis[16];
+  const Direction d = view_direction(p, cam, inv_distance);
+  sh_basis(degree, d, basis);
+  sh_color(p, basis, degree, color);
+  for (int c = 0; c < 3; ++c) {
+    o.visible &= is_finite(color[c]);
+    color[c] = max(color[c], 0.0f);
+  }
+}
+
+// The sixteen records of a block.
+SPLATMILL_INLINE void make_records(const Projection& o, const Float* color, Float* records) {
+  const Factor f = conic_factor(o.b, o.c, o.det);
+  records[0] = o.x2d, records[1] = o.y2d;
+  records[2] = f.ux, records[3] = f.uy, records[4] = f.vy;
+  records[5] = o.cut + kLog2AlphaMin;
+  for (int c = 0; c < 3; ++c) records[6 + c] = color[c];
+  records[9] = o.z;
+  records[10] = o.cut;
+  records[11] = o.b / o.c, records[12] = o.b / o.a;
+  records[13] = o.extent_x, records[14] = o.extent_y;
+  records[15] = o.opacity;
+  transpose(records);
+}
+
+}  // namespace
+
+void project_frame(const float* blocks, int64_t count, int degree, Frame& frame, int threads) {
+  const Camera cam = frame.camera;
+  collect_touches(frame, count, threads, [&](int64_t begin, int64_t end, TouchWriter& writer) {
+    for (int64_t b = begin; b < end; ++b) {
+      const float* p = blocks + b * kBlockFloats;
+      uint32_t seen = 0;
+      Projection o;
+      project_geometry(p, cam, o);
+      o.visible &= mask_of(lanes_of(b, count));
+      if (any(o.visible)) {
+        Float color[3], records[kLanes];
+        shade(p, cam, degree, o, color);
+        make_records(o, color, records);
+        for (uint32_t left = bits(o.visible); left; left &= left - 1) {
+          const int lane = __builtin_ctz(left);
+          const int64_t id = b * kLanes + lane;
+          store(reinterpret_cast<float*>(&frame.records[id]), records[lane]);
+          if (writer.add(static_cast<uint32_t>(id))) seen |= 1u << lane;
+        }
+      }
+      frame.visible[b] = static_cast<uint16_t>(seen);
+    }
+  });
+}
+
+namespace {
+
+void project_rows(const float* blocks, int64_t count, int degree, const Camera& cam, const ProjectedRows& out, int threads) {
+  const int64_t n = blocks_for(count);
+#pragma omp parallel num_threads(threads)
+  {
+    const FlushDenormals flush;
+#pragma omp for schedule(static)
+    for (int64_t b = 0; b < n; ++b) {
+      const float* p = blocks + b * kBlockFloats;
+      Projection o;
+      project_geometry(p, cam, o);
+      Float color[3], fields[13];
+      shade(p, cam, degree, o, color);
+      fields[0] = o.x2d, fields[1] = o.y2d;
+      fields[2] = o.c / o.det, fields[3] = -(o.b / o.det), fields[4] = o.a / o.det;
+      fields[5] = o.opacity;
+      for (int c = 0; c < 3; ++c) fields[6 + c] = color[c];
+      fields[9] = o.z;
+      fields[10] = o.extent_x, fields[11] = o.extent_y;
+      alignas(64) float lanes[12][kLanes];
+      for (int f = 0; f < 12; ++f) store(lanes[f], keep(o.visible, fields[f]));
+      const int used = static_cast<int>(std::min<int64_t>(kLanes, count - b * kLanes));
+      for (int l = 0; l < used; ++l) {
+        const int64_t i = b * kLanes + l;
+        for (int f = 0; f < 2; ++f) out.means2d[2 * i + f] = lanes[f][l], out.extents[2 * i + f] = lanes[10 + f][l];
+        for (int f = 0; f < 3; ++f) out.conics[3 * i + f] = lanes[2 + f][l], out.colors[3 * i + f] = lanes[6 + f][l];
+        out.opacities[i] = lanes[5][l];
+        out.depths[i] = lanes[9][l];
+      }
+    }
+  }
+}
+
+// Gradient of the op. Conic gradients (a, b, c of the upper triangle) become gradients to Sigma' = C^-1: -C D C.
+void project_rows_backward(const float* blocks, int64_t count, int degree, const Camera& cam, const ProjectedRows& d,
+                           float* grad_blocks, float* d_viewmat, int threads) {
+  constexpr int64_t kChunk = 64;  // blocks whose camera gradients are added together first: a fixed cut, whatever the threads
+  const int64_t n = blocks_for(count), chunks = (n + kChunk - 1) / kChunk;
+  std::vector<double> partial(static_cast<size_t>(chunks) * 12);
+#pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
+  for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+    const FlushDenormals flush;
+    for (int64_t b = chunk * kChunk; b < std::min(n, (chunk + 1) * kChunk); ++b) {
+      const float* p = blocks + b * kBlockFloats;
+      float* g = grad_blocks + b * kBlockFloats;
+      for (int r = 0; r < kRows; ++r) store(g + r * kLanes, splat(0.0f));
+      Projection o;
+      project_geometry(p, cam, o);
+      Float color[3];
+      shade(p, cam, degree, o, color);
+      o.visible &= mask_of(lanes_of(b, count));
+      if (!any(o.visible)) continue;
+
+      alignas(64) float lanes[10][kLanes] = {};
+      for (uint32_t left = bits(o.visible); left; left &= left - 1) {
+        const int l = __builtin_ctz(left);
+        const int64_t i = b * kLanes + l;
+        for (int f = 0; f < 2; ++f) lanes[f][l] = d.means2d[2 * i + f];
+        for (int f = 0; f < 3; ++f) lanes[2 + f][l] = d.conics[3 * i + f], lanes[6 + f][l] = d.colors[3 * i + f];
+        lanes[5][l] = d.opacities[i];
+        lanes[9][l] = d.depths[i];
+      }
+      const Float A = o.c / o.det, B = -(o.b / o.det), C = o.a / o.det;
+      const Float da = load(lanes[2]), half_db = load(lanes[3]) * 0.5f, dc = load(lanes[4]);
+      const Float p0 = da * A + half_db * B, p1 = da * B + half_db * C, q0 = half_db * A + dc * B, q1 = half_db * B + dc * C;
+      ProjectedGradient to;
+      to.x2d = load(lanes[0]);
+      to.y2d = load(lanes[1]);
+      to.Gaa = -(A * p0 + B * q0);
+      to.Gab = -(A * p1 + B * q1);
+      to.Gcc = -(B * p1 + C * q1);
+      to.logit = load(lanes[5]) * o.opacity * (1.0f - o.sigmoid);
+      for (int c = 0; c < 3; ++c) to.color[c] = load(lanes[6 + c]);
+      to.depth = load(lanes[9]);
+      CameraGradient camera;
+      project_backward<true>(p, cam, degree, o, to, g, &camera);
+      const int rows = kSh + 3 * (degree + 1) * (degree + 1);
+      for (int r = 0; r < rows; ++r) store(g + r * kLanes, keep(o.visible, load(g + r * kLanes)));
+      double* sums = &partial[static_cast<size_t>(chunk) * 12];
+      for (int m = 0; m < 3; ++m) {
+        for (int k = 0; k < 3; ++k) sums[4 * m + k] += sum(keep(o.visible, camera.R[3 * m + k]));
+        sums[4 * m + 3] += sum(keep(o.visible, camera.t[m]));
+      }
+    }
+  }
+  for (int k = 0; k < 12; ++k) {
+    double total = 0;
+    for (int64_t chunk = 0; chunk < chunks; ++chunk) total += partial[static_cast<size_t>(chunk) * 12 + k];
+    d_viewmat[k] = static_cast<float>(total);
+  }
+  for (int k = 12; k < 16; ++k) d_viewmat[k] = 0.0f;
+}
+
+}  // namespace
+
+void bind_project(nb::module_& m) {
+  m.def(
+      "project",
+      [](Blocks blocks, int64_t count, int degree, const CameraArgument& camera, Rows<2> means2d, Rows<3> conics,
+         Row opacities, Rows<3> colors, Row depths, Rows<2> extents, int threads) {
+        const ProjectedRows out{means2d.data(), conics.data(), opacities.data(), colors.data(), depths.data(), extents.data()};
+        nb::gil_scoped_release release;
+        project_rows(blocks.data(), count, degree, camera, out, threads);
+      },
+      "blocks"_a.noconvert(), "count"_a, "degree"_a, "camera"_a, "means2d"_a.noconvert(), "conics"_a.noconvert(),
+      "opacities"_a.noconvert(), "colors"_a.noconvert(), "depths"_a.noconvert(), "extents"_a.noconvert(), "threads"_a);
+  m.def(
+      "project_backward",
+      [](Blocks blocks, int64_t count, int degree, const CameraArgument& camera, Rows<2> d_means2d, Rows<3> d_conics,
+         Row d_opacities, Rows<3> d_colors, Row d_depths, Blocks grad_blocks, Matrix4 d_viewmat, int threads) {
+        const ProjectedRows d{d_means2d.data(), d_conics.data(), d_opacities.data(), d_colors.data(), d_depths.data(), nullptr};
+        nb::gil_scoped_release release;
+        project_rows_backward(blocks.data(), count, degree, camera, d, grad_blocks.data(), d_viewmat.data(), threads);
+      },
+      "blocks"_a.noconvert(), "count"_a, "degree"_a, "camera"_a, "d_means2d"_a.noconvert(), "d_conics"_a.noconvert(),
+      "d_opacities"_a.noconvert(), "d_colors"_a.noconvert(), "d_depths"_a.noconvert(), "grad_blocks"_a.noconvert(),
+      "d_viewmat"_a.noconvert(), "threads"_a);
+}
+
+}  // namespace splatmill

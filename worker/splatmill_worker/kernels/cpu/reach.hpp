@@ -1,0 +1,77 @@
+// Which tiles, and which 4x4-pixel blocks of each, the 1/255 ellipse of a Gaussian reaches: the one test behind every list.
+#pragma once
+
+#include <algorithm>
+
+#include "frame.hpp"
+
+namespace splatmill {
+
+// A tile's pixels as vectors: block b is 4x4 pixels at (4 (b % 4), 4 (b / 4)), lane l of it the pixel (l % 4, l / 4).
+inline constexpr int kBlockSide = 4;
+inline constexpr int kTileBlocks = 16;
+
+struct BlockOffsets {
+  Float x, y;  // of lane b: the left and upper pixel centre of block b
+};
+SPLATMILL_INLINE BlockOffsets block_offsets() {
+  const Float b = iota(), row = floor(b * 0.25f);
+  return {fma(row, splat(-16.0f), b * 4.0f) + 0.5f, fma(row, 4.0f, splat(0.5f))};
+}
+
+// The test, for one Gaussian, tile by tile.
+//
+// The least u^2 + v^2 over a block's rectangle of pixel centres lies on the edge nearest the mean in x or in y: both are tried at
+// once for the sixteen blocks. The margin covers the rounding of u and v (it grows with how far the ellipse reaches), so that no
+// pixel is missed; the pixel's own test decides afterwards.
+class Reach {
+ public:
+  SPLATMILL_INLINE explicit Reach(const Record& r)
+      : x_(r.x), y_(r.y), corner_(block_offsets()), ux_(splat(r.ux)), uy_(splat(r.uy)), vy_(splat(r.vy)),
+        slope_x_(splat(r.slope_x)), slope_y_(splat(r.slope_y)),
+        cut_(splat(r.cut + 2e-5f + 1e-6f * (r.ux * r.extent_x + __builtin_fabsf(r.uy) * r.extent_y))) {}
+
+  // Everything that a row of tiles shares.
+  struct Row {
+    Float top, bottom, u, v2, best_x;
+  };
+  SPLATMILL_INLINE Row row(int tile_y) const {
+    const Float top = corner_.y + (static_cast<float>(tile_y * kTile) - y_), bottom = top + kSpan;
+    const Float nearest = min(max(splat(0.0f), top), bottom), v = vy_ * nearest;
+    return {top, bottom, uy_ * nearest, v * v, slope_x_ * nearest};
+  }
+  SPLATMILL_INLINE uint32_t blocks(const Row& row, int tile_x) const {
+    const Float left = corner_.x + (static_cast<float>(tile_x * kTile) - x_), right = left + kSpan;
+    const Float nearest = min(max(splat(0.0f), left), right);
+    const Float dy = min(max(slope_y_ * nearest, row.top), row.bottom);
+    const Float u1 = fma(uy_, dy, ux_ * nearest), v1 = vy_ * dy;
+    const Float dx = min(max(row.best_x, left), right);
+    const Float u2 = fma(ux_, dx, row.u);
+    return bits(min(fma(u1, u1, v1 * v1), fma(u2, u2, row.v2)) <= cut_);
+  }
+
+ private:
+  static constexpr float kSpan = kBlockSide - 1;
+  float x_, y_;
+  BlockOffsets corner_;
+  Float ux_, uy_, vy_, slope_x_, slope_y_, cut_;
+};
+
+// Calls sink(tile, blocks) for every tile that `r` reaches, row by row; bounded by the grid, whatever the extents are.
+template <class Sink>
+SPLATMILL_INLINE void for_each_tile(const Record& r, int columns, int rows, Sink sink) {
+  const auto bounded = [](float tile, int n) {
+    return static_cast<int>(std::min(std::max(tile, 0.0f), static_cast<float>(n)));
+  };
+  constexpr float kPerTile = 1.0f / kTile;
+  const int x0 = bounded((r.x - r.extent_x - 0.5f) * kPerTile, columns), x1 = bounded((r.x + r.extent_x - 0.5f) * kPerTile + 1.0f, columns);
+  const int y0 = bounded((r.y - r.extent_y - 0.5f) * kPerTile, rows), y1 = bounded((r.y + r.extent_y - 0.5f) * kPerTile + 1.0f, rows);
+  const Reach reach(r);
+  for (int ty = y0; ty < y1; ++ty) {
+    const Reach::Row row = reach.row(ty);
+    for (int tx = x0; tx < x1; ++tx)
+      if (const uint32_t blocks = reach.blocks(row, tx)) sink(static_cast<uint32_t>(ty * columns + tx), blocks);
+  }
+}
+
+}  // namespace splatmill

@@ -1,0 +1,204 @@
+// The fused training step: project, bin and composite a view; later, from the gradient of its image, one pass over the blocks of
+// sixteen Gaussians that sums their pairs, differentiates the projection and moves them by Adam. A Gaussian's gradient never
+// leaves the first cache.
+#include "adam.hpp"
+#include "arguments.hpp"
+#include "bin.hpp"
+#include "composite.hpp"
+#include "geometry.hpp"
+#include "project.hpp"
+#include "shuffles.hpp"
+#include "threads.hpp"
+
+namespace splatmill {
+namespace {
+
+// Rows of the densification scores [kScoreRows][Gaussians]; lengths in NDC units.
+enum Score { kPlain, kAbsolute, kSeen, kExtent, kError, kScoreRows };
+
+struct Scene {
+  const float* params;
+  int degree;
+};
+
+// What the pass over blocks writes: moved parameters and moments, or gradients alone.
+struct Update {
+  float *params = nullptr, *exp_avg = nullptr, *exp_avg_sq = nullptr;
+  float rates[kRows] = {};  // with the bias correction of the first moment
+  float root = 0;           // bias correction of the second
+  float* gradients = nullptr;
+  float* scores = nullptr;  // [kScoreRows][stride]
+  int64_t score_stride = 0;
+};
+
+// The pair sums of a block, added up in the order of the pairs: row k, lane l is sum k of Gaussian l.
+SPLATMILL_INLINE void add_pairs(const Frame& frame, int64_t b, uint32_t visible, Float* sums) {
+  for (int l = 0; l < kLanes; ++l) sums[l] = splat(0.0f);
+  for (uint32_t left = visible; left; left &= left - 1) {
+    const int l = __builtin_ctz(left);
+    const Span span = frame.spans[b * kLanes + l];
+    Float total = splat(0.0f);
+    for (uint32_t k = span.first; k < span.first + span.count; ++k)
+      if (frame.touches[k].blocks) total += load(&frame.pair_sums[static_cast<int64_t>(k) * kPairSums]);
+    sums[l] = total;
+  }
+  transpose(sums);
+}
+
+// Sums over (u, v) to gradients of the projected Gaussian. With e = log2 alpha = level - u^2 - v^2 and q = alpha dL/dalpha,
+// dL/de = q ln 2; the conic applied to the offset is 2 ln 2 (ux u, uy u + vy v), and dL/dSigma' = q/2 times its outer square.
+SPLATMILL_INLINE ProjectedGradient gradient_from_sums(const Float* s, const Projection& o) {
+  const Factor f = conic_factor(o.b, o.c, o.det);
+  const Float uu = s[kSumQUU], uv = s[kSumQUV], vv = s[kSumQVV];
+  constexpr float k1 = 2.0f * kLn2, k2 = 2.0f * kLn2 * kLn2;
+  ProjectedGradient d;
+  d.x2d = f.ux * s[kSumQU] * k1;
+  d.y2d = fma(f.uy, s[kSumQU], f.vy * s[kSumQV]) * k1;
+  d.Gaa = f.ux * f.ux * uu * k2;
+  d.Gab = f.ux * fma(f.uy, uu, f.vy * uv) * k2;
+  d.Gcc = fma(f.uy * f.uy, uu, fma(f.uy * f.vy * 2.0f, uv, f.vy * f.vy * vv)) * k2;
+  d.logit = s[kSumQ] * (1.0f - o.sigmoid);
+  for (int c = 0; c < 3; ++c) d.color[c] = s[kSumRed + c];
+  d.depth = s[kSumDepth];
+  return d;
+}
+
+SPLATMILL_INLINE void add_scores(const Update& update, const Camera& cam, int64_t b, const Float* s, const Projection& o,
+                                 const ProjectedGradient& d, Mask visible) {
+  const float half_w = 0.5f * cam.width, half_h = 0.5f * cam.height;
+  const auto length = [&](Float x, Float y) {
+    x = x * half_w, y = y * half_h;
+    return sqrt(fma(x, x, y * y));
+  };
+  const Factor f = conic_factor(o.b, o.c, o.det);
+  constexpr float k1 = 2.0f * kLn2;
+  float* score = update.scores + b * kLanes;
+  const auto at = [&](Score k) { return score + k * update.score_stride; };
+  store(at(kPlain), visible, load(at(kPlain)) + length(d.x2d, d.y2d));
+  store(at(kAbsolute), visible, load(at(kAbsolute)) + length(f.ux * s[kSumAbsX] * k1, s[kSumAbsY] * k1));
+  store(at(kSeen), visible, load(at(kSeen)) + 1.0f);
+  const float per_image = 2.0f / static_cast<float>(std::max(cam.width, cam.height));
+  store(at(kExtent), visible, max(max(o.extent_x, o.extent_y) * per_image, load(at(kExtent))));
+  store(at(kError), visible, load(at(kError)) + s[kSumError]);
+}
+
+// Sums that a pass did not take hold garbage in memory.
+SPLATMILL_INLINE void clear_unused(Float* sums, const ImageGradient& g) {
+  if (!g.scores)
+    for (int k : {kSumAbsX, kSumAbsY, kSumError}) sums[k] = splat(0.0f);
+  if (!g.with_alpha_and_depth) sums[kSumDepth] = splat(0.0f);
+}
+
+// One block; returns how many gradient values Adam refused.
+template <bool kAdam>
+int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, int64_t b) {
+  const int rows = kSh + 3 * (scene.degree + 1) * (scene.degree + 1);
+  const float* p = scene.params + b * kBlockFloats;
+  const uint32_t seen = frame.visible[b];
+  const Mask visible = mask_of(seen);
+  alignas(64) float gradient[kBlockFloats];
+  if (seen) {
+    Float sums[kLanes];
+    add_pairs(frame, b, seen, sums);
+    clear_unused(sums, g);
+    Projection o;
+    project_geometry(p, frame.camera, o);
+    const ProjectedGradient d = gradient_from_sums(sums, o);
+    if (g.scores) add_scores(update, frame.camera, b, sums, o, d, visible);
+    project_backward<false>(p, frame.camera, scene.degree, o, d, gradient, nullptr);
+  }
+  if constexpr (!kAdam) {
+    float* out = update.gradients + b * kBlockFloats;
+    for (int r = 0; r < kRows; ++r)
+      store(out + r * kLanes, seen && r < rows ? keep(visible, load(gradient + r * kLanes)) : splat(0.0f));
+    return 0;
+  } else {
+    int64_t refused = 0;
+    float *params = update.params + b * kBlockFloats, *exp_avg = update.exp_avg + b * kBlockFloats,
+          *exp_avg_sq = update.exp_avg_sq + b * kBlockFloats;
+    for (int r = 0; r < rows; ++r) {
+      Float x = row(params, r), m = row(exp_avg, r), v = row(exp_avg_sq, r);
+      const Float slope = seen ? keep(visible, load(gradient + r * kLanes)) : splat(0.0f);
+      const Mask good = adam_update(x, m, v, slope, splat(update.rates[r]), splat(update.root));
+      refused += kLanes - __builtin_popcount(bits(good));
+      store(params + r * kLanes, x);
+      store(exp_avg + r * kLanes, m);
+      store(exp_avg_sq + r * kLanes, v);
+    }
+    return refused;
+  }
+}
+
+template <bool kAdam>
+int64_t update_scene(const Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, int threads) {
+  const int64_t n = blocks_for(frame.count);
+  int64_t refused = 0;
+#pragma omp parallel num_threads(threads) reduction(+ : refused)
+  {
+    const FlushDenormals flush;
+#pragma omp for schedule(dynamic, 16)
+    for (int64_t b = 0; b < n; ++b) refused += update_block<kAdam>(frame, g, scene, update, b);
+  }
+  return refused;
+}
+
+using Bytes3 = Tensor<const uint8_t, nb::shape<3, -1, -1>>;
+using Bytes2 = Tensor<const uint8_t, nb::shape<-1, -1>>;
+using ScoreRows = Tensor<float, nb::shape<kScoreRows, -1>>;
+
+}  // namespace
+
+void bind_step(nb::module_& m) {
+  m.def(
+      "render",
+      [](Frame& frame, Blocks params, int64_t count, int degree, const CameraArgument& camera,
+         const std::tuple<float, float, float>& background, Image image, int threads) {
+        const float rgb[3] = {std::get<0>(background), std::get<1>(background), std::get<2>(background)};
+        const bool with_alpha_and_depth = image.shape(0) == 5;
+        nb::gil_scoped_release release;
+        frame.camera = camera;
+        project_frame(params.data(), count, degree, frame, threads);
+        bin_frame(frame, threads);
+        composite_forward(frame, planes_of(image, camera), with_alpha_and_depth, rgb, threads);
+        return std::make_tuple(frame.visible_count, frame.pairs);
+      },
+      "frame"_a, "params"_a.noconvert(), "count"_a, "degree"_a, "camera"_a, "background"_a, "image"_a.noconvert(), "threads"_a,
+      "Renders blocks of parameters into planes (colour, and with five of them alpha and depth); returns how many Gaussians were "
+      "visible, and the (tile, Gaussian) pairs.");
+  m.def(
+      "update",
+      [](Frame& frame, Blocks params, Blocks exp_avg, Blocks exp_avg_sq, int degree, Image image, Image gradient,
+         std::optional<Bytes3> photo, std::optional<Bytes2> used, const std::vector<float>& rates, int64_t step,
+         std::optional<ScoreRows> scores, int threads) {
+        Update update;
+        update.params = params.data(), update.exp_avg = exp_avg.data(), update.exp_avg_sq = exp_avg_sq.data();
+        const AdamStep scale(step);
+        for (int r = 0; r < kRows; ++r) update.rates[r] = rates.at(r) * scale.size;
+        update.root = scale.root;
+        ImageGradient g{planes_of(image, frame.camera), planes_of(gradient, frame.camera), gradient.shape(0) == 5};
+        g.scores = scores.has_value();
+        if (scores) update.scores = scores->data(), update.score_stride = static_cast<int64_t>(scores->shape(1));
+        if (photo && used) g.photo = photo->data(), g.used = used->data();
+        nb::gil_scoped_release release;
+        composite_backward(frame, g, threads);
+        return update_scene<true>(frame, g, {params.data(), degree}, update, threads);
+      },
+      "frame"_a, "params"_a.noconvert(), "exp_avg"_a.noconvert(), "exp_avg_sq"_a.noconvert(), "degree"_a,
+      "image"_a.noconvert(), "gradient"_a.noconvert(), "photo"_a.noconvert().none(), "used"_a.noconvert().none(), "rates"_a,
+      "step"_a, "scores"_a.noconvert().none(), "threads"_a,
+      "Backward pass of the last render and one Adam step; returns how many gradient values were refused as not finite.");
+  m.def(
+      "gradients",
+      [](Frame& frame, Blocks params, int degree, Image image, Image gradient, Blocks gradients, int threads) {
+        Update update;
+        update.gradients = gradients.data();
+        const ImageGradient g{planes_of(image, frame.camera), planes_of(gradient, frame.camera), gradient.shape(0) == 5};
+        nb::gil_scoped_release release;
+        composite_backward(frame, g, threads);
+        update_scene<false>(frame, g, {params.data(), degree}, update, threads);
+      },
+      "frame"_a, "params"_a.noconvert(), "degree"_a, "image"_a.noconvert(), "gradient"_a.noconvert(), "gradients"_a.noconvert(),
+      "threads"_a, "Backward pass of the last render: gradients in blocks, nothing moves.");
+}
+
+}  // namespace splatmill

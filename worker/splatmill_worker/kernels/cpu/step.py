@@ -1,0 +1,331 @@
+"""The fused training step: one scene's parameters, moments and scores in the engine's layout, and the step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from splatmill_worker.kernels import checks
+from splatmill_worker.kernels.records import TILE
+
+from . import blocks, engine
+from .loss import PhotoStats, photo_stats
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's learning rates (betas 0.9 and 0.999, eps 1e-15), in world units for the means."""
+
+    means: float
+    log_scales: float
+    quats: float
+    logit_opacities: float
+    sh_dc: float
+    sh_rest: float
+
+    def rows(self) -> list[float]:
+        """One rate for each of the 59 rows of a block."""
+        return [
+            *[self.means] * 3,
+            *[self.log_scales] * 3,
+            *[self.quats] * 4,
+            self.logit_opacities,
+            *[self.sh_dc] * 3,
+            *[self.sh_rest] * 45,
+        ]
+
+
+class Visibility(NamedTuple):
+    """What the last rendering found."""
+
+    visible: int  # Gaussians that reach a pixel
+    pairs: int  # (tile, Gaussian) pairs
+
+
+class StepResult(NamedTuple):
+    """What one training step saw, before it moved anything."""
+
+    loss: float  # (1 - w) l1 + w (1 - ssim)
+    l1: float
+    ssim: float
+    visible: int
+    pairs: int
+    refused: int  # gradient values that were not finite, and were left out of the update
+
+
+class Step:
+    """A scene under training on the CPU. Not for use from two threads at once.
+
+    `blocks`, `exp_avg` and `exp_avg_sq` are float32 [ceil(N/16), 59, 16] (rows: means 0-2, 3-5, quats 6-9, logit_opacities 10, sh 11-58 by coefficient, then channel). Dense Adam: every step moves every
+    Gaussian, also those that were not in view.
+    """
+
+    def __init__(
+        self,
+        means: Tensor,
+        log_scales: Tensor,
+        quats: Tensor,
+        logit_opacities: Tensor,
+        sh: Tensor,
+        *,
+        threads: int | None = None,
+    ) -> None:
+        """means [N,3], log_scales [N,3], quats [N,4], logit_opacities [N], sh [N,16,3], all float32 on the CPU."""
+        self.threads = threads or engine.default_threads()
+        if self.threads < 1:
+            raise ValueError(f"threads: expected at least 1, got {threads}")
+        self.keep_scores = True  # taking them costs the backward pass about a sixth more
+        self._frame = engine.Frame()
+        self._image = torch.zeros(0)
+        self._gradient = torch.zeros(0)
+        self._size = (0, 0)
+        self._degree = 0
+        self.visibility = Visibility(0, 0)
+        self.replace(
+            {
+                "means": means,
+                "log_scales": log_scales,
+                "quats": quats,
+                "logit_opacities": logit_opacities,
+                "sh": sh,
+            },
+            None,
+            None,
+        )
+
+    # ---- state
+
+    def replace(self, params: dict[str, Tensor], exp_avg: Tensor | None, exp_avg_sq: Tensor | None) -> None:
+        """Take other Gaussians (after densification, relocation or a roll-back), with moments [N, 59] or zeros.
+
+        Zeros the scores.
+        """
+        ordered = {name: params[name] for name in blocks.FIRST}
+        checks.gaussians(*ordered.values(), coefficients=16)
+        count = len(ordered["means"])
+        for name, moment in (("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
+            if moment is not None:
+                checks.tensor(name, moment, (count, blocks.ROWS))
+        self.count = count
+        self.blocks = blocks.pack(ordered, count, self.threads)
+        self.exp_avg = blocks.empty(count) if exp_avg is None else blocks.pack_rows(exp_avg, self.threads)
+        self.exp_avg_sq = (
+            blocks.empty(count) if exp_avg_sq is None else blocks.pack_rows(exp_avg_sq, self.threads)
+        )
+        self._scores = torch.zeros(5, len(self.blocks) * blocks.LANES)
+        self._rendered = False
+
+    def parameters(self) -> dict[str, Tensor]:
+        """Copies of the parameters, [N, ...] each, under the names of the constructor."""
+        n = self.count
+        shapes = {
+            "means": (n, 3),
+            "log_scales": (n, 3),
+            "quats": (n, 4),
+            "logit_opacities": (n,),
+            "sh": (n, 16, 3),
+        }
+        return blocks.unpack(self.blocks, {k: torch.Size(s) for k, s in shapes.items()}, n, self.threads)
+
+    def moments(self) -> tuple[Tensor, Tensor]:
+        """Copies of Adam's two moments, [N, 59] each; columns in the order of the block's rows."""
+        return (
+            blocks.unpack_rows(self.exp_avg, self.count, self.threads),
+            blocks.unpack_rows(self.exp_avg_sq, self.count, self.threads),
+        )
+
+    # Densification scores, views [N] that add up over steps until `replace` or `clear_scores`. Lengths are in NDC units
+    # (the image is 2 wide and 2 high), the units of the published thresholds.
+
+    @property
+    def plain_sum(self) -> Tensor:
+        """Sum over views of |dL/d mean2d|."""
+        return self._scores[0, : self.count]
+
+    @property
+    def abs_sum(self) -> Tensor:
+        """Sum over views of |(sum over pixels |dL/dx|, sum over pixels |dL/dy|)| (AbsGS, Ye et al. 2024)."""
+        return self._scores[1, : self.count]
+
+    @property
+    def visible_count(self) -> Tensor:
+        """Views in which the Gaussian reached a pixel."""
+        return self._scores[2, : self.count]
+
+    @property
+    def max_extent(self) -> Tensor:
+        """Largest half side over the views of its 1/255 ellipse's box, in halves of the image's longer side."""
+        return self._scores[3, : self.count]
+
+    @property
+    def error_sum(self) -> Tensor:
+        """Sum over views and pixels of blending weight times sum of |colour - photo| (`train` only)."""
+        return self._scores[4, : self.count]
+
+    def clear_scores(self) -> None:
+        """Start the scores anew."""
+        self._scores.zero_()
+
+    # ---- the step
+
+    def forward(
+        self,
+        viewmat: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        *,
+        degree: int,
+        background: Tensor | None = None,
+        antialias: bool = False,
+        near: float = 0.01,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Render color [H,W,3], alpha [H,W], depth [H,W] = sum of weight times z.
+
+        These are views on buffers that the next call overwrites, and not to be written to. viewmat [4,4] world to
+        camera, K [3,3] pixels, float32. `visibility` tells what was seen.
+        """
+        self._render(viewmat, K, width, height, degree, background, antialias, near, planes=5)
+        inside = self._image[:, :height, :width]
+        return inside[:3].permute(1, 2, 0), inside[3], inside[4]
+
+    def backward_update(
+        self,
+        d_color: Tensor,
+        d_alpha: Tensor | None = None,
+        d_depth: Tensor | None = None,
+        *,
+        rates: Rates,
+        step: int,
+    ) -> int:
+        """Differentiate the last `forward` and move everything by Adam's step number `step`, from 1.
+
+        Returns how many gradient values were refused as not finite.
+        d_color [H,W,3], d_alpha [H,W], d_depth [H,W]: the loss's gradient to what `forward` gave.
+        """
+        gradient = self._take_gradient(d_color, d_alpha, d_depth)
+        return self._update(gradient, None, rates, step)
+
+    def gradients(
+        self, d_color: Tensor, d_alpha: Tensor | None = None, d_depth: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Gradients of the last `forward` to the parameters, [N, ...] each; nothing moves and no score is kept."""
+        gradient = self._take_gradient(d_color, d_alpha, d_depth)
+        out = torch.empty_like(self.blocks)
+        engine.gradients(self._frame, self.blocks, self._degree, self._image, gradient, out, self.threads)
+        shapes = {name: value.shape for name, value in self.parameters().items()}
+        return blocks.unpack(out, shapes, self.count, self.threads)
+
+    def train(
+        self,
+        viewmat: Tensor,
+        K: Tensor,
+        photo: Tensor | None,
+        *,
+        degree: int,
+        rates: Rates,
+        step: int,
+        background: Tensor | None = None,
+        mask: Tensor | None = None,
+        dssim_weight: float = 0.2,
+        photo_stats: PhotoStats | None = None,
+        antialias: bool = False,
+        near: float = 0.01,
+    ) -> StepResult:
+        """One step on one photo: render, L1 + D-SSIM, gradients, scores, Adam.
+
+        photo uint8 [H,W,3] with mask [H,W] (nonzero = used), or photo_stats made of both by `loss.photo_stats` (then
+        photo and mask may be None): keep those, making them costs as much as the loss. step counts from 1.
+        """
+        stats = _stats(photo, mask) if photo_stats is None else photo_stats
+        height, width = stats.pixels.shape[1], stats.width
+        self._render(viewmat, K, width, height, degree, background, antialias, near, planes=3)
+        l1, ssim = engine.loss(
+            self._image,
+            stats.pixels,
+            stats.used,
+            stats.mean,
+            stats.variance,
+            width,
+            height,
+            stats.count,
+            dssim_weight,
+            self._gradient,
+            self.threads,
+        )
+        refused = self._update(self._gradient, stats, rates, step)
+        total = (1 - dssim_weight) * l1 + dssim_weight * (1 - ssim)
+        return StepResult(total, l1, ssim, *self.visibility, refused)
+
+    def _render(
+        self,
+        viewmat: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        degree: int,
+        background: Tensor | None,
+        antialias: bool,
+        near: float,
+        planes: int,
+    ) -> None:
+        checks.camera(viewmat, K, width, height, degree, near, background)
+        shape = (planes, -(-height // TILE) * TILE, -(-width // TILE) * TILE)
+        if self._image.shape != shape:
+            self._image, self._gradient = torch.zeros(shape), torch.zeros(shape)
+        camera = engine.Camera(viewmat.contiguous(), K.contiguous(), width, height, near, antialias)
+        color = (0.0, 0.0, 0.0) if background is None else tuple(background.tolist())
+        seen = engine.render(
+            self._frame, self.blocks, self.count, degree, camera, color, self._image, self.threads
+        )
+        self.visibility = Visibility(*seen)
+        self._degree, self._size, self._rendered = degree, (height, width), True
+
+    def _take_gradient(self, d_color: Tensor, d_alpha: Tensor | None, d_depth: Tensor | None) -> Tensor:
+        if not self._rendered or len(self._image) != 5:
+            raise RuntimeError("Nothing to differentiate: call forward first, after every replace or train.")
+        height, width = self._size
+        checks.tensor("d_color", d_color, (height, width, 3), contiguous=False)
+        planes = 3 if d_alpha is None and d_depth is None else 5
+        gradient = self._gradient[:planes]
+        gradient[:3, :height, :width] = d_color.permute(2, 0, 1)
+        for i, (name, d) in enumerate((("d_alpha", d_alpha), ("d_depth", d_depth)), 3):
+            if d is not None:
+                checks.tensor(name, d, (height, width), contiguous=False)
+                gradient[i, :height, :width] = d
+            elif planes == 5:
+                gradient[i].zero_()
+        return gradient
+
+    def _update(self, gradient: Tensor, stats: PhotoStats | None, rates: Rates, step: int) -> int:
+        if step < 1:
+            raise ValueError(f"step: counts from 1, got {step}")
+        refused: int = engine.update(
+            self._frame,
+            self.blocks,
+            self.exp_avg,
+            self.exp_avg_sq,
+            self._degree,
+            self._image,
+            gradient,
+            None if stats is None else stats.pixels,
+            None if stats is None else stats.used,
+            rates.rows(),
+            step,
+            self._scores if self.keep_scores else None,
+            self.threads,
+        )
+        self._rendered = False  # what was rendered is of the Gaussians before they moved
+        return refused
+
+
+def _stats(photo: Tensor | None, mask: Tensor | None) -> PhotoStats:
+    if photo is None:
+        raise ValueError("photo: give a photo, or photo_stats made of it")
+    checks.tensor("photo", photo, (None, None, 3), dtype=torch.uint8, contiguous=False)
+    if mask is not None:
+        checks.tensor("mask", mask, tuple(photo.shape[:2]), dtype=None, contiguous=False)
+    return photo_stats(photo, mask=mask)

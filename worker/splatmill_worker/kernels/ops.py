@@ -1,0 +1,268 @@
+"""The one surface of the kernels: each op once, on the backend that was asked for or that suits the tensors.
+
+Backends are `reference` (plain torch, any dtype, the definition), `cpu` (C++, float32) and `gpu` (Triton, float32). A
+backend that lacks an op is an error; nothing falls back in silence.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, cast
+
+import torch
+from torch import Tensor
+
+from . import checks
+from .records import TILE, Bins, Projected
+
+__all__ = [
+    "Backend",
+    "Bins",
+    "Projected",
+    "adam_",
+    "backend_for",
+    "bin",
+    "composite",
+    "knn",
+    "loss",
+    "photo_stats",
+    "project",
+]
+
+Backend = Literal["reference", "cpu", "gpu"]
+
+
+def backend_for(tensor: Tensor) -> Backend:
+    """The backend that ops choose for this tensor when not told."""
+    return "gpu" if tensor.device.type == "cuda" else "cpu"
+
+
+def project(
+    means: Tensor,
+    log_scales: Tensor,
+    quats: Tensor,
+    logit_opacities: Tensor,
+    sh: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    *,
+    degree: int,
+    near: float = 0.01,
+    antialias: bool = False,
+    backend: Backend | None = None,
+) -> Projected:
+    """Project Gaussians into one pinhole camera (EWA splatting, Zwicker et al. 2002; Kerbl et al. 2023).
+
+    means [N,3] world; log_scales [N,3]; quats [N,4] wxyz of any norm > 0; logit_opacities [N]; sh [N, (degree+1)^2 to
+    16, 3]; viewmat [4,4] world to camera, OpenCV axes; K [3,3] pixels without skew. Gradients reach the five groups and
+    viewmat. Raises TypeError or ValueError naming the argument.
+    """
+    name = _backend(backend, means)
+    kind = _kind(name, means)
+    checks.gaussians(means, log_scales, quats, logit_opacities, sh, **kind)
+    checks.camera(viewmat, K, width, height, degree, near, **kind)
+    if not (degree + 1) ** 2 <= sh.shape[1] <= 16:
+        raise ValueError(
+            f"sh: degree {degree} needs {(degree + 1) ** 2} to 16 coefficients, got {sh.shape[1]}"
+        )
+    op = _op(name, "project")
+    rows: Projected = op(
+        means,
+        log_scales,
+        quats,
+        logit_opacities,
+        sh,
+        viewmat,
+        K,
+        width,
+        height,
+        degree=degree,
+        near=near,
+        antialias=antialias,
+    )
+    return rows
+
+
+def bin(projected: Projected, width: int, height: int, *, backend: Backend | None = None) -> Bins:
+    """List for every 16x16 tile the Gaussians whose 1/255 ellipse reaches it, front to back, ties by index."""
+    name = _backend(backend, projected.means2d)
+    _check_projected(projected, name)
+    checks.image_size(width, height)
+    lists: Bins = _op(name, "bin")(projected, width, height)
+    return lists
+
+
+def composite(
+    projected: Projected,
+    bins: Bins,
+    width: int,
+    height: int,
+    *,
+    background: Tensor | None = None,
+    backend: Backend | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Blend front to back into color [H,W,3], alpha [H,W] and depth [H,W] = sum of weight times z, not over alpha.
+
+    background [3] shows through what transmittance is left (None: black). Differentiable in every field of projected
+    but the extents, and in the background.
+    """
+    name = _backend(backend, projected.means2d)
+    kind = _check_projected(projected, name)
+    checks.image_size(width, height)
+    tiles = -(-width // TILE) * -(-height // TILE)
+    checks.tensor("bins.offsets", bins.offsets, (tiles + 1,), dtype=torch.int64, device=kind["device"])
+    checks.tensor("bins.ids", bins.ids, (None,), dtype=torch.int32, device=kind["device"])
+    if background is not None:
+        checks.tensor("background", background, (3,), **kind)
+    image: tuple[Tensor, Tensor, Tensor] = _op(name, "composite")(
+        projected, bins, width, height, background=background
+    )
+    return image
+
+
+def loss(
+    color: Tensor,
+    photo: Tensor,
+    *,
+    dssim_weight: float = 0.2,
+    mask: Tensor | None = None,
+    stats: Any = None,
+    backend: Backend | None = None,
+) -> Tensor:
+    """(1 - w) mean|color - photo/255| + w (1 - mean SSIM).
+
+    color [H,W,3], photo uint8 [H,W,3], mask [H,W] nonzero = used. SSIM with an 11-tap Gaussian
+    window of sigma 1.5 and zero padding (Wang et al. 2004); stats from `photo_stats`.
+    """
+    name = _backend(backend, color)
+    kind = _kind(name, color)
+    checks.tensor("color", color, (None, None, 3), **kind)
+    height, width = color.shape[:2]
+    checks.image_size(width, height)
+    checks.tensor("photo", photo, (height, width, 3), dtype=torch.uint8, device=kind["device"])
+    _check_mask(mask, height, width, kind["device"])
+    op = _op(name, "loss")
+    return cast(Tensor, op(color, photo, dssim_weight=dssim_weight, mask=mask, stats=stats))
+
+
+def photo_stats(photo: Tensor, *, mask: Tensor | None = None, backend: Backend | None = None) -> Any:
+    """What `loss` needs of a photo alone; worth keeping for photos that are visited often."""
+    name = _backend(backend, photo)
+    checks.tensor("photo", photo, (None, None, 3), dtype=torch.uint8, device=photo.device.type)
+    _check_mask(mask, photo.shape[0], photo.shape[1], photo.device.type)
+    return _op(name, "loss", "photo_stats")(photo, mask=mask)
+
+
+def adam_(
+    params: Sequence[Tensor],
+    grads: Sequence[Tensor],
+    exp_avg: Sequence[Tensor],
+    exp_avg_sq: Sequence[Tensor],
+    rates: Sequence[float],
+    *,
+    step: int,
+    visible: Tensor | None = None,
+    last_step: Tensor | None = None,
+    backend: Backend | None = None,
+) -> int:
+    """One Adam step in place on groups [N, ...]; dense, or for the visible rows with catch-up.
+
+    Returns how many gradient values were refused as not finite. See `reference.adam_`.
+    """
+    if not len(params) == len(grads) == len(exp_avg) == len(exp_avg_sq) == len(rates):
+        raise ValueError("params, grads, exp_avg, exp_avg_sq, rates: one of each per group")
+    if step < 1:
+        raise ValueError(f"step: counts from 1, got {step}")
+    if not params:
+        return 0
+    name = _backend(backend, params[0])
+    kind = _kind(name, params[0])
+    for i, p in enumerate(params):
+        for label, group in (
+            ("params", params),
+            ("grads", grads),
+            ("exp_avg", exp_avg),
+            ("exp_avg_sq", exp_avg_sq),
+        ):
+            # In place: a copy would leave the caller's tensor as it was.
+            checks.tensor(f"{label}[{i}]", group[i], tuple(p.shape), contiguous=True, **kind)
+        if len(p) != len(params[0]):
+            raise ValueError(f"params[{i}]: {len(p)} rows, but params[0] has {len(params[0])}")
+    if visible is not None:
+        checks.tensor(
+            "visible", visible, (len(params[0]),), dtype=torch.bool, contiguous=True, device=kind["device"]
+        )
+        if last_step is None:
+            raise ValueError("last_step: needed with visible, to know how many steps a row missed")
+        checks.tensor(
+            "last_step",
+            last_step,
+            (len(params[0]),),
+            dtype=torch.int32,
+            contiguous=True,
+            device=kind["device"],
+        )
+    op = _op(name, "adam", "adam_")
+    return cast(
+        int, op(params, grads, exp_avg, exp_avg_sq, rates, step=step, visible=visible, last_step=last_step)
+    )
+
+
+def knn(points: Tensor, *, backend: Backend | None = None) -> Tensor:
+    """Mean distance [N] from each of points [N,3] to its three nearest others."""
+    name = _backend(backend, points)
+    checks.tensor("points", points, (None, 3), **_kind(name, points))
+    return cast(Tensor, _op(name, "knn")(points))
+
+
+def _backend(asked: Backend | None, tensor: object) -> Backend:
+    if asked is None:
+        return backend_for(tensor) if isinstance(tensor, Tensor) else "cpu"
+    if asked not in ("reference", "cpu", "gpu"):
+        raise ValueError(f"backend: expected 'reference', 'cpu' or 'gpu', got {asked!r}")
+    return asked
+
+
+def _op(backend: Backend, stem: str, function: str | None = None) -> Callable[..., Any]:
+    """The function of that stem in the backend's package."""
+    module = f"{__package__}.{backend}.{stem}"
+    try:
+        found = getattr(importlib.import_module(module), function or stem)
+    except ModuleNotFoundError as error:
+        if error.name is not None and module.startswith(error.name):
+            raise NotImplementedError(
+                f"The {backend} backend has no op '{stem}'; choose backend='reference' or another that has it."
+            ) from None
+        raise
+    return cast(Callable[..., Any], found)
+
+
+def _kind(backend: Backend, like: object) -> dict[str, Any]:
+    """Which dtype and device the op's tensors must have: the reference takes any, as long as they agree."""
+    if backend == "cpu":
+        return {"dtype": torch.float32, "device": "cpu"}
+    if not isinstance(like, Tensor):
+        return {"dtype": torch.float32, "device": "cpu"}
+    return {"dtype": like.dtype if backend == "reference" else torch.float32, "device": like.device.type}
+
+
+def _check_projected(projected: Projected, backend: Backend) -> dict[str, Any]:
+    kind = _kind(backend, projected.means2d)
+    checks.tensor("projected.means2d", projected.means2d, (None, 2), **kind)
+    n = len(projected.means2d)
+    shapes: dict[str, tuple[int, ...]] = {
+        "conics": (n, 3), "opacities": (n,), "colors": (n, 3), "depths": (n,), "extents": (n, 2)
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        checks.tensor(f"projected.{name}", getattr(projected, name), shape, **kind)
+    return kind
+
+
+def _check_mask(mask: Tensor | None, height: int, width: int, device: str) -> None:
+    if mask is not None:
+        checks.tensor("mask", mask, (height, width), dtype=None, device=device)
+        if mask.dtype not in (torch.uint8, torch.bool):
+            raise TypeError(f"mask: expected uint8 or bool, got {mask.dtype}")
