@@ -59,8 +59,9 @@ class StepResult(NamedTuple):
 class Step:
     """A scene under training on the CPU. Not for use from two threads at once.
 
-    `blocks`, `exp_avg` and `exp_avg_sq` are float32 [ceil(N/16), 59, 16] (rows: means 0-2, 3-5, quats 6-9, logit_opacities 10, sh 11-58 by coefficient, then channel). Dense Adam: every step moves every
-    Gaussian, also those that were not in view.
+    `blocks`, `exp_avg` and `exp_avg_sq` are float32 [ceil(N/16), 59, 16]; rows: means 0-2, log_scales 3-5, quats 6-9,
+    logit_opacities 10, sh 11-58 by coefficient, then channel. Dense Adam: every step moves every Gaussian, also those
+    that were not in view.
     """
 
     def __init__(
