@@ -1,6 +1,7 @@
 """`python -m splatmill_server`: serve the API as the environment says."""
 
 import logging
+import signal
 import socket
 import sys
 from pathlib import Path
@@ -29,8 +30,10 @@ class Server(uvicorn.Server):
         self._app = app
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        # uvicorn's own would raise the signal again after a clean end, and nothing after `run` would happen.
         self._app.state.service.closing.set()
-        super().handle_exit(sig, frame)
+        self.force_exit = self.should_exit and sig == signal.SIGINT
+        self.should_exit = True
 
 
 def main() -> int:

@@ -20,6 +20,8 @@ from splatmill_server.settings import Settings
 _PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif")
 _READS_AT_ONCE = 32
 _COUNTED_CAPTURES = 1000
+_CLAIM_SECONDS = 60
+"""How long a digest without a file counts as an upload that is just being put in place."""
 
 
 class Captures:
@@ -160,15 +162,24 @@ class Captures:
         return file, new
 
     def _claim(self, capture_id: str, file: CaptureFile, incoming: str) -> bool:
-        """Make an upload the owner of its name. The digest is written first and only once, so that of two uploads at
-        the same moment one wins; the other learns it by comparing digests."""
-        digest_path = layout.capture_digest(capture_id, file.role, file.name)
+        """Make an upload the owner of its name; False when other bytes own it.
+
+        The digest is written first and only once, so that of two uploads at one moment exactly one wins. A digest
+        without its file is either about to get it, or was left by a server that died in between.
+        """
+        path = layout.capture_digest(capture_id, file.role, file.name)
         target = layout.capture_file(capture_id, file.role, file.name)
-        if not self.storage.put_new(digest_path, file.sha256.encode()):
+        if not self.storage.put_new(path, file.sha256.encode()):
+            claim = self.storage.head(path)
             if self.storage.exists(target):
                 return False
-            # A server that died between digest and file left a name that nobody owns.
-            self.storage.put(digest_path, file.sha256.encode())
+            if self._digest(capture_id, file.role, file.name) != file.sha256:
+                if (
+                    claim is not None
+                    and (datetime.now(UTC) - claim.modified).total_seconds() < _CLAIM_SECONDS
+                ):
+                    return False
+                self.storage.put(path, file.sha256.encode())
         self.storage.rename(incoming, target)
         return True
 

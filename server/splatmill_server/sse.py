@@ -21,6 +21,7 @@ from splatmill.schema import EventRecord, Job, JobState, StateEvent, Time
 from splatmill_server.service import Service
 
 _CURSOR = re.compile(r"(\d{1,19}-\d{1,19})_(\d{1,19}-\d{1,19})_(\d{1,9})")
+_LINE_ENDS = {0x85: "\\u0085", 0x2028: "\\u2028", 0x2029: "\\u2029"}
 _BLOCK_MS = 500
 """How long one read waits; also how late a change of the row can be noticed."""
 
@@ -97,15 +98,26 @@ class Follower:
         states, progress = keys.states(self.job_id), keys.progress(self.job_id)
         positions: Any = {states: self.cursor.states, progress: self.cursor.progress}
         reply = await self._reply(self.redis.xread(positions, block=_BLOCK_MS))
-        found: list[tuple[Stored, bool]] = []
-        for name, entries in reply or []:
-            is_state = name.decode() == states
-            found += [(stored, is_state) for stored in events.decode(entries)]
-        # In one millisecond progress goes first: a final state must not cut off what led to it.
-        return sorted(found, key=lambda pair: (pair[0].order[0], pair[1], pair[0].order[1]))
+        entries = {name.decode(): events.decode(found) for name, found in reply or []}
+        return _merge(entries.get(states, []), entries.get(progress, []))
 
     async def _reply(self, pending: Any) -> Any:
         return await pending
+
+
+def _merge(states: list[Stored], progress: list[Stored]) -> list[tuple[Stored, bool]]:
+    """Both in the order of time, each in its own order; True marks states.
+
+    Within one millisecond a state goes before the progress made in it, but a final state after what led to it.
+    """
+    merged: list[tuple[Stored, bool]] = []
+    waiting = progress[::-1]
+    for stored in states:
+        final = isinstance(stored.event, StateEvent) and stored.event.state.final
+        while waiting and (waiting[-1].at <= stored.at if final else waiting[-1].at < stored.at):
+            merged.append((waiting.pop(), False))
+        merged.append((stored, True))
+    return merged + [(stored, False) for stored in reversed(waiting)]
 
 
 async def event_stream(follower: Follower, heartbeat: float) -> AsyncIterator[bytes]:
@@ -133,8 +145,8 @@ async def event_stream(follower: Follower, heartbeat: float) -> AsyncIterator[by
 
 
 def encode(record: EventRecord) -> bytes:
-    """One message. JSON holds no line ends, so `data` is a single line."""
-    data = record.model_dump_json(exclude_none=True)
+    """One message. `data` is a single line also for readers that take U+2028 and its like for ends of lines."""
+    data = record.model_dump_json(exclude_none=True).translate(_LINE_ENDS)
     return f"id: {record.id}\nevent: {record.event.type}\ndata: {data}\n\n".encode()
 
 

@@ -1,0 +1,213 @@
+"""Captures over real HTTP into a real folder: names, digests, limits, and what is left after each refusal.
+
+Not proved here: an S3 bucket as storage (the same calls of obstore, but no bucket runs in these tests), and what a
+worker makes of the files.
+"""
+
+import hashlib
+import socket
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime
+from pathlib import Path
+from urllib.parse import quote
+
+import pytest
+
+from splatmill.backplane import layout
+from splatmill.schema import Role
+
+from .conftest import Running, Serve, problem, wait_for
+
+PHOTO = b"\xff\xd8\xff a photo"
+
+
+def stored(app: Running) -> list[str]:
+    """Every file in storage."""
+    root = app.service.storage.root
+    assert root is not None
+    return sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.is_file())
+
+
+def test_a_capture_is_made_listed_read_and_deleted(app: Running) -> None:
+    made = app.http.post("/v1/captures", json={"name": "fox"})
+    assert made.status_code == 201
+    capture_id = made.json()["id"]
+    assert made.headers["location"] == f"/v1/captures/{capture_id}"
+    put = app.http.put(f"/v1/captures/{capture_id}/images/day 1/ü.jpg", content=PHOTO)
+    assert put.status_code == 201
+    assert put.json() == {
+        "role": "images",
+        "name": "day 1/ü.jpg",
+        "size": len(PHOTO),
+        "sha256": hashlib.sha256(PHOTO).hexdigest(),
+    }
+    assert app.http.get(f"/v1/captures/{capture_id}").json()["files"] == [put.json()]
+    assert [c["id"] for c in app.http.get("/v1/captures").json()["captures"]] == [capture_id]
+    assert app.http.delete(f"/v1/captures/{capture_id}").status_code == 204
+    assert stored(app) == []
+    problem(app.http.get(f"/v1/captures/{capture_id}"), 404, "capture_not_found")
+
+
+def test_pages_of_captures_hold_each_once_newest_first(app: Running) -> None:
+    made = [app.http.post("/v1/captures", json={}).json() for _ in range(5)]
+    seen, cursor = [], None
+    while True:
+        params = {"limit": "2"} | ({"cursor": cursor} if cursor else {})
+        page = app.http.get("/v1/captures", params=params).json()
+        seen += [capture["id"] for capture in page["captures"]]
+        cursor = page["cursor"]
+        if cursor is None:
+            break
+    newest = sorted(made, key=lambda c: (int(_ms(c["created_at"])), c["id"]), reverse=True)
+    assert seen == [capture["id"] for capture in newest]
+    problem(app.http.get("/v1/captures?cursor=nonsense"), 422, "cursor_invalid")
+
+
+def _ms(moment: str) -> float:
+    return datetime.fromisoformat(moment).timestamp() * 1000
+
+
+def test_the_same_bytes_again_are_200_and_other_bytes_409_and_lose_nothing(app: Running) -> None:
+    capture_id = app.http.post("/v1/captures", json={}).json()["id"]
+    address = f"/v1/captures/{capture_id}/images/a.jpg"
+    assert app.http.put(address, content=PHOTO).status_code == 201
+    assert app.http.put(address, content=PHOTO).status_code == 200
+    before = stored(app)
+    refused = problem(app.http.put(address, content=b"other"), 409, "name_taken")
+    assert refused["facts"]["stored_sha256"] == hashlib.sha256(PHOTO).hexdigest()
+    assert stored(app) == before
+    assert app.service.storage.get(layout.capture_file(capture_id, Role.images, "a.jpg")) == PHOTO
+    # The two Unicode spellings of one name are one name.
+    assert app.http.put(f"/v1/captures/{capture_id}/images/e\u0301.jpg", content=PHOTO).status_code == 201
+    assert app.http.put(f"/v1/captures/{capture_id}/images/\u00e9.jpg", content=PHOTO).status_code == 200
+
+
+def test_of_many_uploads_at_once_under_one_name_exactly_one_wins(app: Running) -> None:
+    capture_id = app.http.post("/v1/captures", json={}).json()["id"]
+    bodies = [b"%d" % i * 300_000 for i in range(8)]
+    gate = threading.Barrier(len(bodies))
+
+    def put(body: bytes) -> int:
+        gate.wait()
+        return app.http.put(f"/v1/captures/{capture_id}/images/a.jpg", content=body).status_code
+
+    with ThreadPoolExecutor(len(bodies)) as pool:
+        codes = list(pool.map(put, bodies))
+    assert sorted(codes) == [201] + [409] * 7
+    winner = bodies[codes.index(201)]
+    assert app.service.storage.get(layout.capture_file(capture_id, Role.images, "a.jpg")) == winner
+    assert not any("incoming" in path for path in stored(app))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../escape.jpg",
+        "a/../../b.jpg",
+        "/etc/passwd",
+        "a//b.jpg",
+        "a\\b.jpg",
+        "a/./b.jpg",
+        "x\x07.jpg",
+        "x#1",
+        "C:x",
+    ],
+)
+def test_names_that_lead_elsewhere_are_refused(app: Running, name: str) -> None:
+    capture_id = app.http.post("/v1/captures", json={}).json()["id"]
+    before = stored(app)
+    # By hand, because httpx would resolve the dots before sending.
+    status, body = raw(app, f"PUT /v1/captures/{capture_id}/images/{quote(name, safe='')} HTTP/1.1", PHOTO)
+    assert status == 422, body
+    assert b'"name_invalid"' in body
+    assert stored(app) == before
+
+
+def raw(app: Running, line: str, body: bytes, *headers: str, length: int | None = None) -> tuple[int, bytes]:
+    """Send a request as these bytes; status and body of the answer."""
+    with socket.create_connection(app.address, 10) as link:
+        head = [
+            line,
+            "Host: test",
+            "Connection: close",
+            f"Content-Length: {length or len(body)}",
+            *headers,
+            "",
+            "",
+        ]
+        link.sendall("\r\n".join(head).encode() + body)
+        answer = b""
+        while chunk := link.recv(65536):
+            answer += chunk
+    return int(answer.split()[1]), answer.partition(b"\r\n\r\n")[2]
+
+
+def test_a_body_that_breaks_off_leaves_nothing_and_the_next_try_works(app: Running) -> None:
+    capture_id = app.http.post("/v1/captures", json={}).json()["id"]
+    before = stored(app)
+    for sent in (0, 10, 3_000_000):
+        with socket.create_connection(app.address, 10) as link:
+            head = f"PUT /v1/captures/{capture_id}/images/a.jpg HTTP/1.1\r\nHost: t\r\nContent-Length: 5000000\r\n\r\n"
+            link.sendall(head.encode() + b"x" * sent)
+        wait_for(lambda: stored(app) == before and not incoming(app))
+    whole = b"x" * 5_000_000
+    assert app.http.put(f"/v1/captures/{capture_id}/images/a.jpg", content=whole).status_code == 201
+
+
+def incoming(app: Running) -> list[Path]:
+    root = app.service.storage.root
+    assert root is not None
+    return [path for path in root.rglob("*") if path.is_file() and "incoming" in path.parts]
+
+
+def test_what_does_not_fit_its_digest_is_empty_or_too_large_is_refused(serve: Serve) -> None:
+    app = serve(max_file_bytes=1000, max_files_per_capture=2)
+    capture_id = app.http.post("/v1/captures", json={}).json()["id"]
+    address = f"/v1/captures/{capture_id}/images/a.jpg"
+    before = stored(app)
+    wrong = {"X-Content-SHA256": "0" * 64}
+    problem(app.http.put(address, content=PHOTO, headers=wrong), 422, "digest_mismatch")
+    problem(app.http.put(address, content=b""), 422, "file_empty")
+    problem(app.http.put(address, content=b"x" * 1001), 413, "body_too_large")
+    # Without an announced length the limit holds as well.
+    problem(app.http.put(address, content=iter([b"x" * 600, b"x" * 600])), 413, "body_too_large")
+    problem(
+        app.http.put(address, content=PHOTO, headers={"Content-Type": "text/html"}),
+        415,
+        "unsupported_media_type",
+    )
+    assert stored(app) == before
+    right = {"X-Content-SHA256": hashlib.sha256(PHOTO).hexdigest().upper()}
+    assert app.http.put(address, content=PHOTO, headers=right).status_code == 201
+    assert app.http.put(f"/v1/captures/{capture_id}/masks/a.png", content=PHOTO).status_code == 201
+    problem(app.http.put(f"/v1/captures/{capture_id}/images/c.jpg", content=PHOTO), 413, "body_too_large")
+
+
+def test_unknown_captures_and_roles_are_named(app: Running) -> None:
+    problem(
+        app.http.put("/v1/captures/0123456789abcdef/images/a.jpg", content=PHOTO), 404, "capture_not_found"
+    )
+    problem(app.http.get("/v1/captures/..%2f..%2fetc"), 405, "method_not_allowed")
+    problem(app.http.get("/v1/captures/NOT-AN-ID"), 404, "capture_not_found")
+    capture_id = app.capture()
+    problem(app.http.put(f"/v1/captures/{capture_id}/videos/a.mp4", content=PHOTO), 422, "invalid_request")
+
+
+def test_a_capture_that_a_job_uses_cannot_be_deleted(app: Running) -> None:
+    capture_id = app.capture()
+    job_id = app.job(capture_id)
+    refused = problem(app.http.delete(f"/v1/captures/{capture_id}"), 409, "capture_in_use")
+    assert refused["facts"] == {"job": job_id}
+    app.http.post(f"/v1/jobs/{job_id}/cancel")
+    assert app.http.delete(f"/v1/captures/{capture_id}").status_code == 204
+
+
+def test_a_disk_without_room_for_it_refuses_an_upload(serve: Serve) -> None:
+    app = serve(min_free_bytes=1 << 60)
+    capture_id = app.http.post("/v1/captures", json={}).json()["id"]
+    refused = problem(
+        app.http.put(f"/v1/captures/{capture_id}/images/a.jpg", content=PHOTO), 507, "storage_full"
+    )
+    assert refused["facts"]["free"] > 0
+    assert app.http.get(f"/v1/captures/{capture_id}").json()["files"] == []

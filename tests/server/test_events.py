@@ -1,0 +1,187 @@
+"""Server-sent events over a real connection: order, ids that survive a reconnect anywhere, heartbeats, the end.
+
+Not proved here: what a browser's EventSource does with them, and the SDK's reader (tests/client).
+"""
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from splatmill.backplane import events
+from splatmill.schema import EventRecord, JobState, LogEvent, PlanEvent, ProgressEvent, StateEvent
+
+from .conftest import Running, Serve, problem
+
+
+def messages(lines: Iterator[str]) -> Iterator[dict[str, str]]:
+    """The messages of an event stream as dicts of their fields; comments under the key ''."""
+    message: dict[str, str] = {}
+    for line in lines:
+        if not line:
+            if message:
+                yield message
+            message = {}
+        else:
+            name, _, value = line.partition(":")
+            message[name] = value.removeprefix(" ")
+
+
+def follow(app: Running, job_id: str, after: str | None = None) -> list[dict[str, Any]]:
+    """Every event until the server ends the stream."""
+    headers = {"Last-Event-ID": after} if after else {}
+    with app.http.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers) as answer:
+        if answer.status_code == 204:
+            return []
+        assert answer.status_code == 200
+        assert answer.headers["content-type"].startswith("text/event-stream")
+        found = [m for m in messages(answer.iter_lines()) if "data" in m]
+    for message in found:
+        record = EventRecord.model_validate_json(message["data"])
+        assert (record.id, record.event.type) == (message["id"], message["event"])
+    return [json.loads(m["data"]) for m in found]
+
+
+def brief(found: list[dict[str, Any]]) -> list[Any]:
+    return [e["event"].get("state") or e["event"].get("done") or e["event"]["type"] for e in found]
+
+
+def a_whole_job(app: Running) -> str:
+    job_id = app.job()
+    app.begin(job_id)
+    app.say(job_id, StateEvent(state=JobState.sfm), ProgressEvent(stage="features", done=1))
+    app.say(
+        job_id,
+        StateEvent(state=JobState.training),
+        PlanEvent(plan={"sh": 3}),
+        LogEvent(message="a\nb\u2028c"),
+    )
+    app.say(job_id, *(ProgressEvent(stage="training", done=n) for n in range(2, 6)))
+    app.say(job_id, StateEvent(state=JobState.succeeded))
+    return job_id
+
+
+WHOLE = ["queued", "preparing", "sfm", 1, "training", "plan", "log", 2, 3, 4, 5, "succeeded"]
+
+
+def test_a_stream_tells_everything_once_in_order_and_ends(app: Running) -> None:
+    found = follow(app, a_whole_job(app))
+    # Both streams are put in order by Redis's clock; within one of its milliseconds progress goes first.
+    assert sorted(map(str, brief(found))) == sorted(map(str, WHOLE))
+    assert [b for b in brief(found) if isinstance(b, int)] == [1, 2, 3, 4, 5]
+    assert [b for b in brief(found) if b in JobState.__members__] == [
+        *("queued", "preparing", "sfm", "training", "succeeded"),
+    ]
+    assert brief(found)[-1] == "succeeded"
+    assert [e["attempt"] for e in found] == [0] + [1] * 11
+
+
+def test_a_reconnect_after_any_event_goes_on_exactly_there(app: Running) -> None:
+    job_id = a_whole_job(app)
+    found = follow(app, job_id)
+    for index, event in enumerate(found):
+        assert follow(app, job_id, event["id"]) == found[index + 1 :]
+    # A browser stops reconnecting at 204 and at nothing else.
+    answer = app.http.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": found[-1]["id"]})
+    assert answer.status_code == 204
+
+
+def test_events_arrive_while_they_happen_with_heartbeats_between(serve: Serve) -> None:
+    app = serve(heartbeat=0.05)
+    job_id = app.job()
+    with app.http.stream("GET", f"/v1/jobs/{job_id}/events") as answer:
+        stream = messages(answer.iter_lines())
+        assert "retry" in next(stream)
+        assert json.loads(next(stream)["data"])["event"]["state"] == "queued"
+        assert next(stream) == {"": "still here"}
+        app.begin(job_id)
+        first = next(m for m in stream if "data" in m)
+        assert json.loads(first["data"])["event"]["state"] == "preparing"
+        app.say(job_id, StateEvent(state=JobState.succeeded))
+        rest = [json.loads(m["data"]) for m in stream if "data" in m]
+        assert brief(rest) == ["succeeded"]
+
+
+def test_a_cancelled_job_ends_its_stream_with_the_servers_word(app: Running) -> None:
+    job_id = app.job()
+    found: list[dict[str, Any]] = []
+    reader = threading.Thread(target=lambda: found.extend(follow(app, job_id)))
+    reader.start()
+    assert app.http.post(f"/v1/jobs/{job_id}/cancel").json()["state"] == "cancelled"
+    reader.join(5)
+    assert brief(found) == ["queued", "cancelled"]
+    assert {e["attempt"] for e in found} == {0}
+    assert follow(app, job_id, found[0]["id"]) == found[1:]
+    assert follow(app, job_id, found[1]["id"]) == []
+
+
+def test_what_a_superseded_attempt_still_says_is_not_told(app: Running) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.begin(job_id)
+    app.say(job_id, StateEvent(state=JobState.succeeded), attempt=1)
+    app.say(job_id, ProgressEvent(stage="training", done=99), attempt=1)
+    app.say(job_id, ProgressEvent(stage="training", done=7), StateEvent(state=JobState.succeeded))
+    found = follow(app, job_id)
+    assert brief(found) == ["queued", "preparing", "preparing", 7, "succeeded"]
+
+
+def test_a_restarted_job_goes_on_after_the_last_id(app: Running) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.say(job_id, StateEvent(state=JobState.succeeded))
+    first = follow(app, job_id)
+    app.http.post(f"/v1/jobs/{job_id}/restart")
+    app.begin(job_id)
+    app.say(job_id, StateEvent(state=JobState.succeeded))
+    second = follow(app, job_id, first[-1]["id"])
+    assert brief(second) == ["queued", "preparing", "succeeded"]
+    assert [e["attempt"] for e in second] == [0, 2, 2]
+    assert brief(follow(app, job_id)) == ["queued", "preparing", "succeeded"]
+
+
+def test_ids_and_jobs_that_are_not_ours_are_refused(app: Running) -> None:
+    job_id = app.job()
+    for bad in ("7", "1-1_2-2", "x_y_z", "1-1_1-1_" + "9" * 40):
+        answer = app.http.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": bad})
+        problem(answer, 422, "cursor_invalid")
+    problem(app.http.get("/v1/jobs/0123456789abcdef/events"), 404, "job_not_found")
+
+
+def test_an_open_stream_does_not_hold_up_the_end_of_the_server(serve: Serve) -> None:
+    app = serve()
+    job_id = app.job()
+    with app.http.stream("GET", f"/v1/jobs/{job_id}/events") as answer:
+        stream = messages(answer.iter_lines())
+        next(m for m in stream if "data" in m)
+        app.service.closing.set()
+        begun = time.monotonic()
+        assert [m for m in stream if "data" in m] == []
+        assert time.monotonic() - begun < 5
+
+
+def test_the_progress_stream_is_trimmed_and_the_states_are_not(app: Running) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    for n in range(events.PROGRESS_LENGTH + 500):
+        app.say(job_id, ProgressEvent(stage="training", done=n), StateEvent(state=JobState.training))
+    left = events.read_progress(app.redis, job_id)
+    assert events.PROGRESS_LENGTH <= len(left) < events.PROGRESS_LENGTH + 200
+    assert len(events.read_states(app.redis, job_id)) == events.PROGRESS_LENGTH + 501
+    latest = events.last_progress(app.redis, job_id)
+    assert latest is not None
+    assert latest.id == left[-1].id
+
+
+def test_logs_are_lines_of_all_attempts(app: Running) -> None:
+    job_id = app.job()
+    for attempt in ("first", "second"):
+        app.begin(job_id)
+        app.say(job_id, LogEvent(message=attempt, level="warning"), ProgressEvent(stage="x"))
+    lines = app.http.get(f"/v1/jobs/{job_id}/logs").json()["lines"]
+    assert [(line["attempt"], line["message"]) for line in lines] == [(1, "first"), (2, "second")]
+    assert [line["message"] for line in app.http.get(f"/v1/jobs/{job_id}/logs?limit=1").json()["lines"]] == [
+        "second"
+    ]
+    problem(app.http.get("/v1/jobs/0123456789abcdef/logs"), 404, "job_not_found")

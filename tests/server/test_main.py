@@ -1,0 +1,137 @@
+"""`python -m splatmill_server` as a process: what it says when it cannot serve, and how it ends.
+
+Not proved here: `splatmill up`, which starts Redis, the worker and the renderer as well (tests/service).
+"""
+
+import json
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from .conftest import problem, wait_for
+
+
+def command(**env: str) -> dict[str, Any]:
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("SPLATMILL_")}
+    return {"args": [sys.executable, "-m", "splatmill_server"], "env": clean | env, "text": True}
+
+
+def refusal(**env: str) -> str:
+    """What the server says on its way out, which must be one sentence and no traceback."""
+    done = subprocess.run(**command(**env), capture_output=True, timeout=60, check=False)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stderr
+
+
+def test_reasons_not_to_start_are_sentences(tmp_path: Path, redis_url: str) -> None:
+    data = str(tmp_path / "data")
+    assert "SPLATMILL_API_KEY" in refusal(SPLATMILL_HOST="0.0.0.0", SPLATMILL_DATA=data)
+    (tmp_path / "file").write_text("x")
+    assert "cannot be made" in refusal(SPLATMILL_DATA=str(tmp_path / "file"))
+    assert "SPLATMILL_PORT" in refusal(SPLATMILL_PORT="99999999", SPLATMILL_DATA=data)
+    assert "renderer" in refusal(SPLATMILL_RENDERER_URL="ftp://x", SPLATMILL_DATA=data).lower()
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        said = refusal(SPLATMILL_PORT=port, SPLATMILL_DATA=data)
+        assert port in said
+        assert "SPLATMILL_PORT" in said
+
+
+@contextmanager
+def served(uds: Path, **options: Any) -> Iterator[tuple[subprocess.Popen[str], httpx.Client]]:
+    """A server process on a unix socket."""
+    env = options.pop("env")
+    process = subprocess.Popen(**command(SPLATMILL_UDS=str(uds), **env), **options, stderr=subprocess.PIPE)
+    transport = httpx.HTTPTransport(uds=str(uds))
+    try:
+        with httpx.Client(transport=transport, base_url="http://server", timeout=30) as http:
+            wait_for(lambda: process.poll() is None and listening(uds), 60)
+            yield process, http
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def listening(uds: Path) -> bool:
+    with socket.socket(socket.AF_UNIX) as probe:
+        return probe.connect_ex(str(uds)) == 0
+
+
+def test_one_signal_ends_it_with_a_stream_open(tmp_path: Path, redis_url: str) -> None:
+    env = {"REDIS_URL": redis_url, "SPLATMILL_DATA": str(tmp_path / "data")}
+    uds = tmp_path / "s"
+    with served(uds, env=env) as (process, http):
+        assert oct(uds.stat().st_mode)[-3:] == "600"
+        capture_id = http.post("/v1/captures", json={}).json()["id"]
+        for name in ("a.jpg", "b.jpg"):
+            http.put(f"/v1/captures/{capture_id}/images/{name}", content=name.encode())
+        job_id = http.post("/v1/jobs", json={"capture": capture_id}).json()["id"]
+        with http.stream("GET", f"/v1/jobs/{job_id}/events") as answer:
+            stream = answer.iter_raw()
+            assert b"retry" in next(stream)
+            begun = time.monotonic()
+            threading.Timer(0.1, process.send_signal, [signal.SIGTERM]).start()
+            for _ in stream:
+                pass
+        assert process.wait(20) == 0
+        assert time.monotonic() - begun < 5
+        assert not uds.exists()
+        _, log = process.communicate()
+        assert json.loads(log.splitlines()[0])["event"] == "serving"
+
+
+def limit_files() -> None:
+    """No file over 2 MB for this process: the kernel refuses writes as a full disk does."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, 2_000_000))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's file size limit")
+def test_storage_that_fills_up_during_an_upload_is_507_and_loses_nothing(
+    tmp_path: Path, redis_url: str
+) -> None:
+    env = {"REDIS_URL": redis_url, "SPLATMILL_DATA": str(tmp_path / "data")}
+    with served(tmp_path / "s", env=env, preexec_fn=limit_files) as (_, http):
+        capture_id = http.post("/v1/captures", json={}).json()["id"]
+        address = f"/v1/captures/{capture_id}/images"
+        assert http.put(f"{address}/a.jpg", content=b"a" * 1_000_000).status_code == 201
+        files = sorted(p for p in (tmp_path / "data").rglob("*") if p.is_file())
+        answer = http.put(f"{address}/b.jpg", content=b"b" * 30_000_000)
+        assert problem(answer, 507, "storage_full")["advice"]
+        assert sorted(p for p in (tmp_path / "data").rglob("*") if p.is_file()) == files
+        assert http.put(f"{address}/b.jpg", content=b"b" * 1_000_000).status_code == 201
+        assert [f["name"] for f in http.get(f"/v1/captures/{capture_id}").json()["files"]] == [
+            "a.jpg",
+            "b.jpg",
+        ]
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
+def test_uploads_and_downloads_are_never_whole_in_memory(tmp_path: Path, redis_url: str) -> None:
+    env = {"REDIS_URL": redis_url, "SPLATMILL_DATA": str(tmp_path / "data")}
+    with served(tmp_path / "s", env=env) as (process, http):
+        capture_id = http.post("/v1/captures", json={}).json()["id"]
+        before = peak(process.pid)
+        chunk = os.urandom(1 << 20)
+        answer = http.put(f"/v1/captures/{capture_id}/images/video.mp4", content=(chunk for _ in range(200)))
+        assert answer.json()["size"] == 200 << 20
+        assert peak(process.pid) - before < 100 << 20
+
+
+def peak(pid: int) -> int:
+    """Bytes of the largest resident size a process ever had."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return int(next(line.split()[1] for line in lines if line.startswith("VmHWM"))) * 1024

@@ -1,0 +1,207 @@
+"""Cancelling real processes, and what the reaper mends: lost attempts, used-up tries, jobs the queue forgot.
+
+The worker is RQ's own, in a process of its own, with an attempt that sleeps. Not proved here: the project's worker
+(tests/service), whose attempts also resume.
+"""
+
+import os
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from rq.job import Job, JobStatus
+
+from splatmill.backplane import queue, row
+from splatmill.schema import JobState, ProgressEvent, StateEvent
+
+from .conftest import Running, Serve, wait_for
+
+WORKER = textwrap.dedent(
+    """
+    import os, pathlib, sys, time, types
+    module = types.ModuleType("splatmill_worker.job")
+    def run_attempt(job_id):
+        pathlib.Path(sys.argv[2]).write_text(str(os.getpid()))
+        if sys.argv[3] == "die":
+            os._exit(1)
+        while sys.argv[3] == "sleep":
+            time.sleep(0.05)
+    module.run_attempt = run_attempt
+    sys.modules["splatmill_worker"] = types.ModuleType("splatmill_worker")
+    sys.modules["splatmill_worker.job"] = module
+    from rq import Worker
+    from splatmill.backplane import queue
+    from splatmill.backplane.connection import connect
+    class Quick(Worker):
+        def get_heartbeat_ttl(self, job):
+            return 2
+    connection = connect(sys.argv[1])
+    worker = Quick([queue.open_queue(connection)], connection=connection, serializer=queue.SERIALIZER)
+    worker.work(burst=sys.argv[3] != "sleep", logging_level="ERROR")
+    """
+)
+
+
+@contextmanager
+def worker(app: Running, pid_file: Path, what: str = "sleep") -> Iterator[subprocess.Popen[bytes]]:
+    command = [sys.executable, "-c", WORKER, app.settings.redis_url, str(pid_file), what]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        if pid_file.exists():
+            pid = int(pid_file.read_text())
+            if alive(pid):
+                os.kill(pid, 9)
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def test_a_waiting_job_is_cancelled_at_once(app: Running) -> None:
+    job_id = app.job()
+    answer = app.http.post(f"/v1/jobs/{job_id}/cancel")
+    assert (answer.status_code, answer.json()["state"]) == (202, "cancelled")
+    assert answer.json()["finished_at"]
+    assert queue.waiting(app.redis) == {"train": 0}
+    assert app.http.post(f"/v1/jobs/{job_id}/cancel").json()["state"] == "cancelled"
+
+
+def test_cancelled_is_said_only_once_the_process_is_dead(serve: Serve, tmp_path: Path) -> None:
+    app = serve()
+    job_id = app.job()
+    pid_file = tmp_path / "pid"
+    with worker(app, pid_file):
+        pid = int(wait_for(lambda: pid_file.exists() and pid_file.read_text(), 20))
+        begun = time.monotonic()
+        first = app.http.post(f"/v1/jobs/{job_id}/cancel").json()
+        assert first["cancel_requested"]
+        wait_for(lambda: app.state(job_id) == "cancelled" or (alive(pid) and False))
+        assert not alive(pid)
+        assert time.monotonic() - begun < 2
+    # A wish that came too late for the worker's last word is no cancel.
+    done = app.job()
+    app.begin(done)
+    app.finish(done)
+    assert app.http.post(f"/v1/jobs/{done}/cancel").status_code == 409
+
+
+def test_a_final_state_that_comes_after_the_verdict_is_too_late(app: Running) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.http.post(f"/v1/jobs/{job_id}/cancel")
+    assert app.state(job_id) == "cancelled"
+    app.say(job_id, StateEvent(state=JobState.succeeded))
+    assert app.state(job_id) == "cancelled"
+    app.http.post(f"/v1/jobs/{job_id}/restart")
+    assert app.state(job_id) == "queued"
+
+
+def test_a_dead_workers_attempt_is_queued_again(app: Running, tmp_path: Path) -> None:
+    job_id = app.job()
+    pid_file = tmp_path / "pid"
+    with worker(app, pid_file) as process:
+        pid = int(wait_for(lambda: pid_file.exists() and pid_file.read_text(), 20))
+        assert queue.place(app.redis, job_id, 1).standing == "running"
+        process.kill()
+        process.wait()
+        os.kill(pid, 9)
+    # Its heartbeat was good for two seconds; the reaper sees that it is over.
+    wait_for(lambda: app.service.reaper.tick() or queue.place(app.redis, job_id, 1).standing == "waiting", 15)
+    assert app.state(job_id) == "queued"
+
+
+def test_a_job_whose_tries_are_used_up_fails_by_name(app: Running, tmp_path: Path) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.say(job_id, StateEvent(state=JobState.training), ProgressEvent(stage="training", done=3))
+    with worker(app, tmp_path / "pid", "die") as process:
+        process.wait(60)
+    assert queue.place(app.redis, job_id, 1).standing == "failed"
+    app.service.reaper.tick()
+    job = app.http.get(f"/v1/jobs/{job_id}").json()
+    assert job["state"] == "failed"
+    assert job["problem"]["code"] == "attempts_exhausted"
+    assert job["problem"]["facts"]["stage"] == "training"
+    assert "restart" in job["problem"]["advice"]
+    assert app.http.post(f"/v1/jobs/{job_id}/restart").json()["state"] == "queued"
+
+
+def test_an_attempt_that_ends_without_a_word_is_noticed_on_the_second_look(
+    app: Running, tmp_path: Path
+) -> None:
+    job_id = app.job()
+    with worker(app, tmp_path / "pid", "return") as process:
+        process.wait(60)
+    app.service.reaper.tick()
+    assert app.state(job_id) == "queued"  # its last word may still be on its way
+    app.service.reaper.tick()
+    assert app.http.get(f"/v1/jobs/{job_id}").json()["problem"]["code"] == "worker_lost"
+
+
+def test_a_job_the_queue_forgot_is_queued_again_once(app: Running) -> None:
+    job_id = app.job()
+    queue.forget(app.redis, job_id, 1)
+    assert queue.place(app.redis, job_id, 1).standing == "absent"
+    for _ in range(3):
+        app.service.reaper.tick()
+    assert queue.waiting(app.redis) == {"train": 1}
+    # A cancelled one is not: the wish is fulfilled by its absence.
+    other = app.job()
+    queue.forget(app.redis, other, 1)
+    app.service.jobs.cancel(other)
+    app.service.reaper.tick()
+    assert app.state(other) == "cancelled"
+
+
+def test_a_wish_that_outlived_the_server_is_fulfilled_by_the_next_one(serve: Serve) -> None:
+    app = serve()
+    job_id = app.job()
+    app.service.jobs.cancel(job_id)  # the wish is noted, and the server dies before it does anything about it
+    assert app.state(job_id) == "queued"
+    serve(reaper_interval=0.05)
+    wait_for(lambda: app.state(job_id) == "cancelled")
+
+
+def test_two_reapers_at_once_requeue_an_attempt_once(app: Running) -> None:
+    job_id = app.job()
+    entry = Job.fetch(queue.rq_id(job_id, 1), connection=app.redis, serializer=queue.SERIALIZER)
+    registry = queue.open_queue(app.redis).started_job_registry
+    app.redis.lrem(queue.open_queue(app.redis).key, 0, entry.id)
+    entry.set_status(JobStatus.STARTED)
+    app.redis.zadd(registry.key, {f"{entry.id}:x": 1})
+    # Another process is cleaning: this one must not.
+    app.redis.set(queue.open_queue(app.redis).registry_cleaning_key, 1, ex=899)
+    queue.reclaim(app.redis)
+    assert queue.waiting(app.redis) == {"train": 0}
+    # It was killed while it cleaned: its lock is broken after a while, and the next look mends the job.
+    app.redis.expire(queue.open_queue(app.redis).registry_cleaning_key, 800)
+    queue.reclaim(app.redis)
+    queue.reclaim(app.redis)
+    queue.reclaim(app.redis)
+    assert queue.waiting(app.redis) == {"train": 1}
+
+
+@pytest.mark.parametrize("change", ["restart", "final"])
+def test_a_verdict_on_what_changed_meanwhile_is_not_given(app: Running, change: str) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    old = row.read(app.redis, job_id)
+    assert old is not None
+    app.say(job_id, StateEvent(state=JobState.succeeded))
+    if change == "restart":
+        app.http.post(f"/v1/jobs/{job_id}/restart")
+    assert app.service.jobs.end(old, "cancelled") is False
+    assert app.state(job_id) == ("queued" if change == "restart" else "succeeded")

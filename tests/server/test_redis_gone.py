@@ -1,0 +1,58 @@
+"""Redis stops, and comes back empty: what is stored is still served, and the next request works.
+
+Not proved here: a Redis that comes back with its log (tests/service does that with the whole service).
+"""
+
+from pathlib import Path
+
+from splatmill.backplane import layout
+from splatmill.backplane.connection import connect
+
+from .conftest import Running, Serve, problem, redis_process, running, store_model
+from .test_events import brief, follow
+
+MODEL = "a" * 16
+
+
+def test_stored_things_outlast_redis(serve: Serve, tmp_path: Path) -> None:
+    folder = tmp_path / "r"
+    folder.mkdir()
+    with redis_process(folder) as url:
+        settings = serve(redis_url=url).settings
+        client = connect(url)
+        with running(settings, client) as app:
+            store_model(app.service, MODEL, "fox")
+            capture_id = app.capture()
+            app.job(capture_id)
+            app.redis = client
+    with running(settings, client) as app:
+        answer = app.http.post("/v1/jobs", json={"capture": capture_id})
+        assert problem(answer, 503, "queue_unavailable")["advice"]
+        assert answer.headers["retry-after"]
+        problem(app.http.get("/v1/jobs"), 503, "queue_unavailable")
+        ready = app.http.get("/readyz")
+        assert (ready.status_code, ready.json()["ready"]) == (503, False)
+        assert ready.json()["checks"]["storage"] == "ok"
+        assert app.http.get("/healthz").status_code == 200
+        assert "splatmill_redis_up 0.0" in app.http.get("/metrics").text
+        # Nothing of these needs Redis.
+        assert [m["id"] for m in app.http.get("/v1/models").json()["models"]] == [MODEL]
+        assert app.http.get(f"/v1/models/{MODEL}/files/model.ply").status_code == 200
+        assert app.http.get(f"/v1/captures/{capture_id}").json()["id"] == capture_id
+        put = app.http.put(f"/v1/captures/{capture_id}/images/c.jpg", content=b"c")
+        assert put.status_code == 201
+        with redis_process(folder):
+            check_after_return(app, capture_id)
+    client.close()
+
+
+def check_after_return(app: Running, capture_id: str) -> None:
+    """The same address, an empty Redis: the server needs no restart."""
+    assert app.http.get("/readyz").status_code == 200
+    assert app.http.get("/v1/jobs").json()["jobs"] == []
+    job = app.http.get(f"/v1/jobs/{MODEL}").json()
+    assert (job["state"], job["name"], job["model"]) == ("succeeded", "fox", MODEL)
+    assert brief(follow(app, MODEL)) == ["succeeded"]
+    assert app.state(app.job(capture_id)) == "queued"
+    assert app.http.delete(f"/v1/jobs/{MODEL}").status_code == 204
+    assert not app.service.storage.exists(layout.model_file(MODEL, "model.ply"))

@@ -1,0 +1,187 @@
+"""Forwarding to a renderer that is a real HTTP process of its own, on a unix socket, and every bad camera.
+
+Not proved here: pictures. The renderer of these tests answers with what it was asked for.
+"""
+
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+from fastapi import FastAPI, Request
+from starlette.responses import JSONResponse, Response, StreamingResponse
+
+from splatmill.schema import RenderRequest
+
+from .conftest import Running, Serve, problem, store_model, wait_for
+
+MODEL = "a" * 16
+EYE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -4], [0, 0, 0, 1]]
+CAMERA: dict[str, Any] = {"camera_to_world": EYE, "width": 64, "height": 48, "fov_y_deg": 50}
+
+
+@pytest.fixture
+def renderer(tmp_path: Path) -> Iterator[str]:
+    """A renderer that echoes requests; the address to reach it by."""
+    echo = FastAPI()
+
+    @echo.post("/v1/models/{model_id}/{kind}")
+    async def answer(model_id: str, kind: str, request: Request) -> Response:
+        body = await request.body()
+        if b'"jpeg"' in body:
+            return JSONResponse({"code": "render_failed"}, 500, media_type="application/problem+json")
+        etag = f'"{hash(body):x}"'
+        if request.headers.get("if-none-match") == etag:
+            return Response(status_code=304, headers={"ETag": etag})
+
+        async def pieces() -> Any:
+            for _ in range(3):
+                yield (
+                    json.dumps({"model": model_id, "kind": kind, "asked": json.loads(body)}).encode() + b"\n"
+                )
+
+        headers = {
+            "ETag": etag,
+            "Splatmill-Depth-Scale": "0.5",
+            "Set-Cookie": "no=1",
+            "Cache-Control": "private",
+        }
+        return StreamingResponse(pieces(), headers=headers, media_type="image/png")
+
+    path = tmp_path / "s"
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(path))
+    server = uvicorn.Server(uvicorn.Config(echo, log_level="error"))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+    thread.start()
+    wait_for(lambda: server.started)
+    yield f"unix:{path}"
+    server.should_exit = True
+    thread.join(10)
+
+
+@pytest.fixture
+def app(serve: Serve, renderer: str) -> Running:
+    running = serve(renderer_url=renderer)
+    store_model(running.service, MODEL)
+    return running
+
+
+def test_a_picture_is_passed_on_with_what_belongs_to_it(app: Running) -> None:
+    answer = app.http.post(f"/v1/models/{MODEL}/render", json={"camera": CAMERA, "output": "depth"})
+    assert answer.status_code == 200
+    assert answer.headers["content-type"] == "image/png"
+    assert answer.headers["splatmill-depth-scale"] == "0.5"
+    assert "set-cookie" not in answer.headers
+    lines = [json.loads(line) for line in answer.content.splitlines()]
+    assert len(lines) == 3
+    assert (lines[0]["model"], lines[0]["kind"], lines[0]["asked"]["output"]) == (MODEL, "render", "depth")
+    again = app.http.post(
+        f"/v1/models/{MODEL}/render",
+        json={"camera": CAMERA, "output": "depth"},
+        headers={"If-None-Match": answer.headers["etag"]},
+    )
+    assert (again.status_code, again.content) == (304, b"")
+
+
+def test_the_cacheable_address_asks_for_the_same_picture(app: Running) -> None:
+    wish = RenderRequest.model_validate({"camera": CAMERA, "format": "webp", "background": "white"})
+    posted = app.http.post(
+        f"/v1/models/{MODEL}/render",
+        content=wish.model_dump_json(),
+        headers={"Content-Type": "application/json"},
+    )
+    got = app.http.get(f"/v1/models/{MODEL}/render", params=wish.to_query())
+    assert got.status_code == 200
+    assert (
+        json.loads(got.content.splitlines()[0])["asked"]
+        == json.loads(posted.content.splitlines()[0])["asked"]
+    )
+    problem(app.http.get(f"/v1/models/{MODEL}/render"), 422, "camera_invalid")
+    bad = wish.to_query() | {"camera_to_world": "1,2,x"}
+    problem(app.http.get(f"/v1/models/{MODEL}/render", params=bad), 422, "camera_invalid")
+
+
+def test_a_video_with_and_without_wishes(app: Running) -> None:
+    video = app.http.post(f"/v1/models/{MODEL}/orbit", json={"seconds": 2})
+    assert json.loads(video.content.splitlines()[0])["asked"]["seconds"] == 2
+    assert app.http.post(f"/v1/models/{MODEL}/orbit").status_code == 200
+    problem(app.http.post(f"/v1/models/{MODEL}/orbit", json={"width": 100_000}), 422, "size_out_of_range")
+
+
+SHEARED = [[1, 0.5, 0, 0], [0, 0.87, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"camera_to_world": [[0] * 4] * 3 + [[0, 0, 0, 1]]}, "camera_invalid"),
+        ({"camera_to_world": SHEARED}, "camera_invalid"),
+        ({"camera_to_world": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]}, "camera_invalid"),
+        ({"camera_to_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 1]]}, "camera_invalid"),
+        ({"camera_to_world": [[1, 0], [0, 1]]}, "camera_invalid"),
+        ({"camera_to_world": "NaN"}, "camera_invalid"),
+        ({"fov_y_deg": None}, "camera_invalid"),
+        ({"fov_y_deg": 0}, "camera_invalid"),
+        ({"width": 0}, "size_out_of_range"),
+        ({"width": 100_000}, "size_out_of_range"),
+        ({"height": -1}, "size_out_of_range"),
+        ({"width": 8192, "height": 8192}, "size_out_of_range"),
+        ({"zoom": 3}, "camera_invalid"),
+    ],
+)
+def test_cameras_that_cannot_be_rendered_from_are_refused(
+    app: Running, change: dict[str, Any], code: str
+) -> None:
+    refused = problem(
+        app.http.post(f"/v1/models/{MODEL}/render", json={"camera": CAMERA | change}), 422, code
+    )
+    assert refused["facts"]["errors"]
+    assert app.http.post(f"/v1/models/{MODEL}/render", json={"camera": CAMERA}).status_code == 200
+
+
+def test_numbers_that_are_not_finite_are_refused(app: Running) -> None:
+    for word in ("NaN", "Infinity", "1e999"):
+        body = json.dumps({"camera": CAMERA}).replace("-4", word)
+        answer = app.http.post(
+            f"/v1/models/{MODEL}/render", content=body, headers={"Content-Type": "application/json"}
+        )
+        problem(answer, 422, "camera_invalid")
+
+
+def test_the_renderers_own_problems_pass_through(app: Running) -> None:
+    wish = {"camera": CAMERA, "format": "jpeg"}
+    answer = app.http.post(f"/v1/models/{MODEL}/render", json=wish)
+    assert (answer.status_code, answer.json()) == (500, {"code": "render_failed"})
+
+
+def test_without_a_renderer_pictures_are_503_and_files_still_come(serve: Serve, tmp_path: Path) -> None:
+    for settings in ({}, {"renderer_url": f"unix:{tmp_path}/gone"}, {"renderer_url": "http://127.0.0.1:9"}):
+        app = serve(**settings)
+        store_model(app.service, MODEL)
+        answer = app.http.post(f"/v1/models/{MODEL}/render", json={"camera": CAMERA})
+        assert problem(answer, 503, "renderer_unavailable")["advice"]
+        assert app.http.get(f"/v1/models/{MODEL}/files/model.ply").status_code == 200
+
+
+def test_a_renderer_that_hangs_is_given_up(serve: Serve, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        app = serve(renderer_url=f"http://127.0.0.1:{silent.getsockname()[1]}", render_timeout=0.2)
+        store_model(app.service, MODEL)
+        problem(app.http.post(f"/v1/models/{MODEL}/orbit"), 504, "render_timeout")
+
+
+def test_models_that_are_not_there_are_said_so_before_rendering(app: Running) -> None:
+    problem(
+        app.http.post("/v1/models/0123456789abcdef/render", json={"camera": CAMERA}), 404, "model_not_found"
+    )
+    problem(app.http.post(f"/v1/models/{app.job()}/render", json={"camera": CAMERA}), 409, "model_not_ready")
+    problem(
+        app.http.post(f"/v1/models/{MODEL}/render", content=b"{}", headers={"Content-Type": "text/plain"}),
+        415,
+        "unsupported_media_type",
+    )

@@ -1,0 +1,135 @@
+"""The service's own pages, the API key, and what every answer has in common.
+
+Not proved here: that a Prometheus server likes the metrics (their text is parsed with its own client library).
+"""
+
+import ast
+from pathlib import Path
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from pydantic import ValidationError
+
+from splatmill.backplane.storage import StorageError
+from splatmill.schema import TrainOptions
+from splatmill_server import app as app_module
+from splatmill_server.app import create_app
+from splatmill_server.settings import Settings
+
+from .conftest import Running, Serve, problem
+
+
+def test_options_are_those_of_the_schema(app: Running) -> None:
+    options = app.http.get("/v1/options").json()["options"]
+    assert [option["name"] for option in options] == list(TrainOptions.model_fields)
+    assert all(option["help"] for option in options)
+
+
+def test_health_readiness_and_info(app: Running) -> None:
+    assert app.http.get("/healthz").json() == {"status": "ok"}
+    ready = app.http.get("/readyz")
+    assert (ready.status_code, ready.json()["checks"]) == (
+        200,
+        {"redis": "ok", "storage": "ok", "renderer": "none is configured"},
+    )
+    app.job()
+    info = app.http.get("/v1/info").json()
+    assert (info["name"], info["queued"], info["storage"], info["workers"]) == ("splatmill", 1, "file", [])
+    assert info["limits"]["max_file_bytes"] == app.settings.max_file_bytes
+
+
+def test_metrics_count_by_route_and_not_by_id(app: Running) -> None:
+    job_id = app.job()
+    for _ in range(3):
+        app.http.get(f"/v1/jobs/{job_id}")
+    app.http.get("/no/such/page")
+    families = {f.name: f for f in text_string_to_metric_families(app.http.get("/metrics").text)}
+    counts = {
+        (s.labels["route"], s.labels["status"]): s.value
+        for s in families["splatmill_http_requests"].samples
+        if s.name.endswith("_total")
+    }
+    assert counts["/v1/jobs/{job_id}", "200"] == 3
+    assert counts["other", "404"] == 1
+    assert not any(job_id in route for route, _ in counts)
+    assert families["splatmill_queue_length"].samples[0].value == 1
+    assert families["splatmill_redis_up"].samples[0].value == 1
+
+
+def test_addresses_and_methods_that_do_not_exist(app: Running) -> None:
+    problem(app.http.get("/no/such/page"), 404, "not_found")
+    refused = app.http.patch("/v1/jobs")
+    problem(refused, 405, "method_not_allowed")
+    assert refused.headers["allow"]
+    assert problem(app.http.get("/v1/jobs/x"), 404, "job_not_found")["instance"] == "/v1/jobs/x"
+
+
+def test_every_answer_carries_its_request_id(app: Running) -> None:
+    assert app.http.get("/healthz", headers={"X-Request-ID": "abc-1"}).headers["x-request-id"] == "abc-1"
+    for given in ("x" * 65, "a\tb", ""):
+        made = app.http.get("/healthz", headers={"X-Request-ID": given}).headers["x-request-id"]
+        assert made != given
+        assert len(made) == 16
+
+
+def test_a_key_is_asked_for_in_the_header_and_nowhere_else(serve: Serve) -> None:
+    app = serve(api_key="s3cret")
+    assert app.http.get("/v1/jobs").status_code == 200
+    for headers in (
+        {},
+        {"Authorization": "Bearer wrong"},
+        {"Authorization": "s3cret"},
+        {"Authorization": "Bearer é"},
+    ):
+        answer = app.http.get(
+            "/v1/jobs?api_key=s3cret",
+            headers={"Authorization": ""} | {k: v.encode() for k, v in headers.items()},
+        )
+        problem(answer, 401, "unauthorized")
+        assert answer.headers["www-authenticate"] == "Bearer"
+        assert "s3cret" not in answer.text
+    for address in ("/healthz", "/readyz", "/openapi.json"):
+        assert app.http.get(address, headers={"Authorization": ""}).status_code == 200
+    # The body is not read before the key is known to be right.
+    answer = app.http.post(
+        "/v1/captures", content=b"{", headers={"Authorization": "", "Content-Type": "application/json"}
+    )
+    problem(answer, 401, "unauthorized")
+
+
+def test_the_document_describes_every_answer_with_examples(app: Running) -> None:
+    document = app.http.get("/openapi.json").json()
+    for path, methods in document["paths"].items():
+        for method, operation in methods.items():
+            assert operation["summary"], (method, path)
+            assert operation.get("description"), (method, path)
+            if path.startswith("/v1/") and path != "/v1/options":
+                kinds = {kind for r in operation["responses"].values() for kind in r.get("content", {})}
+                assert "application/problem+json" in kinds, (method, path)
+    assert "HTTPValidationError" not in document["components"]["schemas"]
+    assert document["paths"]["/v1/jobs"]["post"]["requestBody"]["content"]["application/json"]["examples"]
+
+
+def test_other_machines_need_a_key() -> None:
+    with pytest.raises(ValidationError, match="SPLATMILL_API_KEY"):
+        Settings(host="0.0.0.0")
+    assert Settings(host="0.0.0.0", api_key="k").host == "0.0.0.0"
+    for loopback in ("127.0.0.1", "::1", "localhost", "127.1.2.3"):
+        assert Settings(host=loopback).api_key is None
+
+
+def test_storage_that_cannot_be_opened_is_said_so(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(StorageError, match="cannot be made"):
+        create_app(Settings(data=tmp_path / "file"))
+    with pytest.raises(StorageError, match="neither file"):
+        create_app(Settings(storage="ftp://x/y"))
+
+
+def test_importing_the_server_runs_nothing() -> None:
+    root = Path(app_module.__file__).parent
+    assert (root / "reaper.py").is_file()
+    for path in root.rglob("*.py"):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+                pytest.fail(f"{path}:{node.lineno} calls something when imported")

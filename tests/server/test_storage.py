@@ -1,0 +1,108 @@
+"""Storage on a local folder: atomic writes, ranges, listing, and errors as sentences.
+
+Not proved here: S3. The same calls reach a bucket through obstore, but no bucket runs in these tests.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from splatmill.backplane import layout
+from splatmill.backplane.storage import Storage, StorageError
+
+
+@pytest.fixture
+def storage(tmp_path: Path) -> Storage:
+    return Storage((tmp_path / "s").as_uri())
+
+
+def files(storage: Storage) -> list[str]:
+    assert storage.root is not None
+    return sorted(str(p.relative_to(storage.root)) for p in storage.root.rglob("*") if p.is_file())
+
+
+def test_what_is_put_is_read_listed_and_deleted(storage: Storage, tmp_path: Path) -> None:
+    storage.put("a/b.bin", b"0123456789")
+    (tmp_path / "local").write_bytes(b"x" * 3_000_000)
+    storage.put("a/c.bin", tmp_path / "local")
+    assert storage.get("a/b.bin") == b"0123456789"
+    assert storage.get("a/b.bin", 2, 5) == b"234"
+    assert storage.get("a/b.bin", 7) == b"789"
+    assert [(e.path, e.size) for e in storage.entries("a")] == [("a/b.bin", 10), ("a/c.bin", 3_000_000)]
+    assert storage.children("") == ["a"]
+    head = storage.head("a/b.bin")
+    assert head is not None
+    assert head.etag
+    storage.put("a/b.bin", b"other bytes")
+    changed = storage.head("a/b.bin")
+    assert changed is not None
+    assert changed.etag != head.etag
+    assert storage.delete_prefix("a") == 2
+    assert storage.children("") == []
+    assert storage.head("a/b.bin") is None
+    storage.delete("a/b.bin")
+    with pytest.raises(FileNotFoundError):
+        storage.get("a/b.bin")
+
+
+def test_only_the_first_of_two_new_files_is_stored(storage: Storage) -> None:
+    assert storage.put_new("x", b"1")
+    assert not storage.put_new("x", b"2")
+    assert storage.get("x") == b"1"
+
+
+def test_a_stream_that_breaks_leaves_nothing(storage: Storage) -> None:
+    async def chunks(count: int, break_at: int | None = None) -> AsyncIterator[bytes]:
+        for i in range(count):
+            if i == break_at:
+                raise RuntimeError("the line went dead")
+            yield bytes([i]) * 5_000_000
+
+    asyncio.run(storage.stream_put("whole", chunks(5)))
+    for break_at in (0, 1, 4):
+        with pytest.raises(RuntimeError, match="line went dead"):
+            asyncio.run(storage.stream_put("broken", chunks(5, break_at)))
+    assert files(storage) == ["whole"]
+
+    async def read(start: int, end: int | None) -> bytes:
+        return b"".join([piece async for piece in storage.stream_get("whole", start, end)])
+
+    whole = storage.get("whole")
+    assert len(whole) == 25_000_000
+    assert asyncio.run(read(0, None)) == whole
+    assert asyncio.run(read(4_999_999, 5_000_002)) == whole[4_999_999:5_000_002]
+    assert asyncio.run(read(24_999_990, None)) == whole[-10:]
+
+
+def test_folders_go_in_and_come_out_unchanged(storage: Storage, tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    for name in ("a.txt", "deep/ü b.txt", "deep/er/c.txt"):
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        (source / name).write_text(name)
+    names = storage.upload_folder(source, layout.job_work("a" * 16))
+    assert names == sorted(["a.txt", "deep/er/c.txt", "deep/ü b.txt"])
+    target = tmp_path / "target"
+    assert sorted(storage.download_prefix(layout.job_work("a" * 16), target)) == names
+    assert {n: (target / n).read_text() for n in names} == {n: n for n in names}
+    assert not list(target.rglob("*.part"))
+
+
+def test_errors_are_sentences_without_a_dump(storage: Storage) -> None:
+    storage.put("file", b"x")
+    with pytest.raises(StorageError) as caught:
+        storage.put("file/below", b"x")
+    text = str(caught.value)
+    assert "could not write file/below" in text
+    assert "\n" not in text
+    assert "Debug source" not in text
+    assert storage.get("file") == b"x"
+
+
+@pytest.mark.parametrize(
+    "text", ["", "..", "a/b", "UPPER000", "short", "a" * 41, "0123456789abcde\n", "../../etc/passwd"]
+)
+def test_only_ids_reach_paths(text: str) -> None:
+    assert not layout.is_id(text)
+    assert layout.is_id("0123456789abcdef")
