@@ -12,7 +12,6 @@ from splatmill.schema.events import Progress
 T = TypeVar("T")
 
 _DONE: Final = object()
-ENDING = 5.0  # seconds that cancelled work may take to clean up
 
 
 class BackgroundLoop:
@@ -29,21 +28,11 @@ class BackgroundLoop:
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
         """The result of `work`; an interruption here (Ctrl-C) cancels it there."""
-        ended = threading.Event()
-
-        async def watched() -> T:
-            try:
-                return await work
-            finally:
-                ended.set()
-
-        future = asyncio.run_coroutine_threadsafe(watched(), self._loop)
+        future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result()
         except BaseException:
-            # What comes next (closing a generator, say) must not meet it half-way through its own ending.
-            if future.cancel():
-                ended.wait(ENDING)
+            future.cancel()
             raise
 
     def run_reporting(
@@ -68,10 +57,18 @@ class BackgroundLoop:
     def iterate(self, items: AsyncIterator[T]) -> Iterator[T]:
         """The items of an asynchronous generator; it is closed when the iteration is left."""
 
+        advancing: asyncio.Task[Any] | None = None
+
         async def advance() -> T | object:
+            nonlocal advancing
+            advancing = asyncio.current_task()
             return await anext(items, _DONE)
 
         async def leave() -> None:
+            # An interruption may have struck while the next item was awaited; a generator that runs cannot close.
+            if advancing is not None and not advancing.done():
+                advancing.cancel()
+                await asyncio.wait({advancing})
             close = getattr(items, "aclose", None)
             if close is not None:
                 await close()

@@ -3,6 +3,7 @@
 Does not prove the embedded service, which tests/service starts; a worker's part is played through the backplane here.
 """
 
+import asyncio
 import json
 import os
 import pty
@@ -314,3 +315,44 @@ def test_starting_is_quick():
     ).stdout.split()
     # What takes time to load is loaded by the commands that need it.
     assert not {"pydantic", "httpx", "asyncio", "rich.progress"} & set(loaded)
+
+
+def test_a_second_interruption_does_not_wait(peer, reply, photos: Path, tmp_path: Path):
+    job = {
+        "id": "j1",
+        "capture": "c1",
+        "state": "queued",
+        "options": {},
+        "created_at": "2026-01-01T00:00:00Z",
+    }
+    capture = {"id": "c1", "created_at": "2026-01-01T00:00:00Z"}
+    file = {"role": "images", "name": "a.jpg", "size": 1, "sha256": "0" * 64}
+
+    async def answer(seen):
+        if seen.path.endswith(("/events", "/cancel")):
+            await asyncio.Event().wait()  # a server that hangs
+        body = file if seen.method == "PUT" else capture if seen.path.endswith("/captures") else job
+        return reply(status=201, body=json.dumps(body).encode())
+
+    peer.answer = answer
+    process = spawn("train", photos, "-o", tmp_path / "out", "--server", peer.url)
+    eventually(lambda: any(seen.path.endswith("/events") for seen in peer.seen))
+    process.send_signal(signal.SIGINT)
+    eventually(lambda: any(seen.path.endswith("/cancel") for seen in peer.seen))
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=30)
+    assert process.returncode == Exit.cancelled
+    assert "Cancelling the job j1" in stdout
+    assert stderr == "Not waiting for the cancellation.\n"
+
+
+def test_an_interruption_before_the_job_began(peer, reply, photos: Path, tmp_path: Path):
+    async def hang(_):
+        await asyncio.Event().wait()
+
+    peer.answer = hang
+    process = spawn("train", photos, "-o", tmp_path / "out", "--server", peer.url)
+    eventually(lambda: peer.seen)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=30)
+    assert (process.returncode, stderr) == (Exit.cancelled, "Stopped.\n")

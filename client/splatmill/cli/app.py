@@ -55,6 +55,7 @@ class Commands(TyperGroup):
 
             raise typer.Exit(tell(error)) from error
         except KeyboardInterrupt:
+            typer.echo("Stopped.", err=True)
             raise typer.Exit(130) from None
 
 

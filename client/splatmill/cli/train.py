@@ -11,13 +11,15 @@ import typer
 
 from splatmill.cli.embedded import embedded_service
 from splatmill.cli.exits import Exit
+from splatmill.cli.follow import LeftBehind, follow
 from splatmill.cli.models import download_files
-from splatmill.cli.progress import Display, make_display, show
+from splatmill.cli.progress import make_display
 from splatmill.cli.schema_options import with_training_options
 from splatmill.cli.servers import connect
-from splatmill.client import Client, JobHandle, ModelHandle
+from splatmill.client import Client, ModelHandle
+from splatmill.errors import JobCancelled
 from splatmill.layout import Found, find_files
-from splatmill.schema import Role, TrainOptions, format_bytes
+from splatmill.schema import Capture, Role, TrainOptions, format_bytes
 
 
 @with_training_options
@@ -63,11 +65,12 @@ def train(
     out.mkdir(parents=True, exist_ok=True)
     _announce(found)
     with _sigterm_as_interrupt(), _client(server, out) as client:
-        job = _start(client, path, name or path.expanduser().resolve().name, checked)
+        title = name or path.expanduser().resolve().name
+        capture = _upload(client, path, title)
         if detach:
-            typer.echo(job.id)
+            typer.echo(client.submit(capture.id, checked, name=title).id)
             return
-        model = _follow(job, verbose)
+        model = _follow(client, capture, title, checked, verbose)
         written = download_files(model, out)
         if orbit:
             written.append(model.orbit(out / "orbit.mp4"))
@@ -96,42 +99,22 @@ def _client(server: str | None, out: Path) -> Iterator[Client]:
         yield client
 
 
-def _start(client: Client, path: Path, name: str, options: TrainOptions) -> JobHandle:
-    given = options.model_dump(exclude_unset=True)
-    try:
-        with make_display() as display:
-            job = client.train(path, name=name, on_progress=display.progress, **given)
-    except KeyboardInterrupt:
-        typer.echo("Stopped before the job began.", err=True)
-        raise typer.Exit(Exit.cancelled) from None
-    for photo, problem in job.refused:
+def _upload(client: Client, path: Path, name: str) -> Capture:
+    with make_display() as display:
+        capture, uploaded = client.upload(path, name=name, on_progress=display.progress)
+    for photo, problem in uploaded.refused:
         typer.echo(f"left out: {photo}: {problem.detail}", err=True)
-    return job
+    return capture
 
 
-def _follow(job: JobHandle, verbose: bool) -> ModelHandle:
-    """Show the job until its end; Ctrl-C cancels it, a second Ctrl-C does not wait for that."""
+def _follow(client: Client, capture: Capture, name: str, options: TrainOptions, verbose: bool) -> ModelHandle:
     try:
-        with make_display() as display:
-            for record in job.events():
-                show(record, display, verbose=verbose)
-        return job.result()
-    except KeyboardInterrupt:
-        with make_display() as display:
-            _cancel(job, display)
-        raise typer.Exit(Exit.cancelled) from None
-
-
-def _cancel(job: JobHandle, display: Display) -> None:
-    display.say(f"Cancelling the job {job.id} ...")
-    try:
-        job.cancel()
-        for _ in job.events():
-            pass
-    except KeyboardInterrupt:
-        display.say("Not waiting for the cancellation; the service is ended.")
-        return
-    display.say(f"The job {job.id} is {job.state.value}.")
+        return follow(lambda: client.submit(capture.id, options, name=name), verbose=verbose)
+    except JobCancelled as cancelled:
+        typer.echo(f"The job {cancelled.job_id} is cancelled.")
+    except LeftBehind:
+        typer.echo("Not waiting for the cancellation.", err=True)
+    raise typer.Exit(Exit.cancelled)
 
 
 def _summary(model: ModelHandle, written: list[Path]) -> None:
@@ -146,7 +129,7 @@ def _summary(model: ModelHandle, written: list[Path]) -> None:
 
 @contextmanager
 def _sigterm_as_interrupt() -> Iterator[None]:
-    """A polite end (`kill`, a stopped container) cancels the job just as Ctrl-C does."""
+    """A polite end (`kill`, a stopped container) is taken like Ctrl-C: what was started is ended."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
