@@ -1,6 +1,7 @@
 """Compile every kernel for a GPU that need not be there, and read registers, spills and shared memory from the binary.
 
-`python -m splatmill_worker.kernels.gpu.compiled 80 90` prints one JSON line per kernel, setting and architecture.
+`python -m splatmill_worker.kernels.gpu.compiled 80 90` prints one JSON line per kernel, setting and architecture; with --first
+only of the setting that is used where nothing was measured.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from . import adam, bin, composite, composite_backward, knn, loss, project, project_backward
+from . import adam, bin, composite, composite_backward, knn, loss, project, project_backward, step
 
 FLOATS = "*fp32"
 TYPES = {
@@ -27,7 +28,9 @@ TYPES = {
     "order": "*i32", "counts": "*i64", "ends": "*i64", "keys": "*i16", "visible": "*i64", "room": "i32", "seen": "*u8",
     "last_step": "*i32", "refused": "*i32", "count": "i32", "stride": "i32", "width": "i32", "height": "i32",
     "columns": "i32", "rows": "i32", "step": "i32", "near": "fp32", "weight": "fp32", "rate": "fp32", "size": "fp32",
-    "root": "fp32", "nearest": "fp32",
+    "root": "fp32", "nearest": "fp32", "channels": "i32", "half_width": "fp32", "half_height": "fp32",
+    "per_image": "fp32", "means_rate": "fp32", "scales_rate": "fp32", "quats_rate": "fp32", "opacity_rate": "fp32",
+    "dc_rate": "fp32", "rest_rate": "fp32",
 }  # fmt: skip
 """Type of every argument that is not a float32 array, by the name it has in all kernels."""
 
@@ -77,7 +80,7 @@ def variants() -> Iterator[Variant]:
     nothing = {"depth": None, "checkpoints": None, "first_segment": None, "segment_tile": None}
     yield Variant(composite.composite_kernel, {**walk, **nothing, "DEPTH": False, "CHECKPOINTS": False})
     yield Variant(composite.composite_kernel, {**walk, "DEPTH": False, "CHECKPOINTS": True, "depth": None})
-    back = {"background": None, "BACKGROUND": False, "SEGMENT": composite.SEGMENT}
+    back = {"SEGMENT": composite.SEGMENT}
     yield Variant(
         composite_backward.composite_backward_kernel,
         {
@@ -101,6 +104,8 @@ def variants() -> Iterator[Variant]:
     yield Variant(loss.value_kernel, {**photo, "MASK": True, "STATS": False, "SLOPES": True})
     yield Variant(loss.down_kernel, {})
     yield Variant(loss.gradient_kernel, bare)
+    yield Variant(step.scores_kernel, {"BLOCK": 256}, settings=warps)
+    yield Variant(adam.planes_kernel, {"BLOCK": adam.BLOCK}, settings=warps)
     yield Variant(adam.drift_kernel, {"BLOCK": adam.BLOCK}, settings=warps)
     yield Variant(adam.adam_kernel, {"CHANNELS": 3, "VISIBLE": True, "BLOCK": 4 * adam.BLOCK}, settings=warps)
     yield Variant(knn.knn_kernel, {"ROWS": knn.ROWS, "OTHERS": knn.OTHERS}, settings=warps)
@@ -148,14 +153,15 @@ def settings(variant: Variant) -> tuple[triton.Config, ...]:
     return variant.settings or tuple(variant.kernel.configs)
 
 
-def main(architectures: list[int]) -> None:
+def main(arguments: list[str]) -> None:
     if os.environ.get("TRITON_INTERPRET") == "1":
         raise SystemExit("TRITON_INTERPRET=1 replaces the compiler; unset it to compile.")
-    for architecture in architectures:
+    first = "--first" in arguments
+    for architecture in [int(x) for x in arguments if x.isdigit()] or [80, 90]:
         for variant in variants():
-            for setting in settings(variant):
+            for setting in settings(variant)[: 1 if first else None]:
                 print(json.dumps(asdict(compile_variant(variant, setting, architecture))), flush=True)
 
 
 if __name__ == "__main__":
-    main([int(x) for x in sys.argv[1:]] or [80, 90])
+    main(sys.argv[1:])

@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from ..records import TILE, Bins, Projected
 from . import device, record
-from .blend import PIXELS, STRIDE, TRANSMITTANCE_MIN, alphas, exponents, tile_pixels
+from .blend import PIXELS, STOP, STRIDE, advance, alpha_of, tile_pixels
 from .tuning import COMPOSITE, autotune
 
 SEGMENT = 128
@@ -26,63 +26,52 @@ chip, long enough that the 5 KB of a checkpoint are little beside the 128 record
 def composite_kernel(
     records, offsets, ids, background, color, transmittance, depth, checkpoints, first_segment, segment_tile,
     width, height, columns,
-    BACKGROUND: tl.constexpr, DEPTH: tl.constexpr, CHECKPOINTS: tl.constexpr, SEGMENT: tl.constexpr,
-    BATCH: tl.constexpr, EXPONENT: tl.constexpr,
+    BACKGROUND: tl.constexpr, DEPTH: tl.constexpr, CHECKPOINTS: tl.constexpr, SEGMENT: tl.constexpr, BATCH: tl.constexpr,
 ):  # fmt: skip
     tile = tl.program_id(0)
-    left, top, column, row = tile_pixels(tile, columns)
+    column, row = tile_pixels(tile, columns)
     x = column.to(tl.float32) + 0.5
     y = row.to(tl.float32) + 0.5
     inside = (column < width) & (row < height)
     start = tl.load(offsets + tile)
     count = (tl.load(offsets + tile + 1) - start).to(tl.int32)
-    lane = tl.arange(0, BATCH)
     pixel = tl.arange(0, PIXELS)
 
-    # `through` also counts the splat that ends a pixel, so it stays at or below the stop; `left_over` is what the pixel keeps.
     through = tl.where(inside, 1.0, 0.0)
-    left_over = through
     red = tl.zeros([PIXELS], tl.float32)
-    green = tl.zeros([PIXELS], tl.float32)
-    blue = tl.zeros([PIXELS], tl.float32)
-    deep = tl.zeros([PIXELS], tl.float32)
+    green, blue, deep = red, red, red
     done = 0
     most = tl.max(through, 0)
-    while (done < count) & (most > TRANSMITTANCE_MIN):
+    while (done < count) & (most > STOP):
         if CHECKPOINTS:
             if done % SEGMENT == 0:
                 segment = tl.load(first_segment + tile) + done // SEGMENT
                 tl.store(segment_tile + segment, tile)
-                place = checkpoints + segment * (5 * PIXELS) + pixel
+                place = checkpoints + segment.to(tl.int64) * (5 * PIXELS) + pixel
                 tl.store(place, red)
                 tl.store(place + PIXELS, green)
                 tl.store(place + 2 * PIXELS, blue)
                 tl.store(place + 3 * PIXELS, through)
                 if DEPTH:
                     tl.store(place + 4 * PIXELS, deep)
-        here = done + lane
-        splat = tl.load(ids + start + here, mask=here < count, other=0)
-        source = records + splat.to(tl.int64) * STRIDE
-        opacity = tl.load(source + 5, mask=here < count, other=0.0)
-        sigma = exponents(
-            tl.load(source), tl.load(source + 1), tl.load(source + 2), tl.load(source + 3), tl.load(source + 4),
-            x, y, left, top, EXPONENT, BATCH,
-        )  # fmt: skip
-        alpha = alphas(sigma, opacity)
-        after = through[None, :] * tl.cumprod(1.0 - alpha, axis=0)
-        kept = after > TRANSMITTANCE_MIN
-        # One rounding from the product before this splat; nothing accumulates, unlike walking a list back by division.
-        weight = tl.where(kept, alpha * (after / (1.0 - alpha)), 0.0)
-        red += tl.sum(weight * tl.load(source + 6)[:, None], axis=0)
-        green += tl.sum(weight * tl.load(source + 7)[:, None], axis=0)
-        blue += tl.sum(weight * tl.load(source + 8)[:, None], axis=0)
-        if DEPTH:
-            deep += tl.sum(weight * tl.load(source + 9)[:, None], axis=0)
-        left_over = tl.minimum(left_over, tl.min(tl.where(kept, after, 1.0), axis=0))
-        through = tl.min(after, axis=0)
+        for j in tl.static_range(BATCH):
+            listed = done + j < count
+            splat = tl.load(ids + start + done + j, mask=listed, other=0)
+            source = records + splat.to(tl.int64) * STRIDE
+            alpha = alpha_of(
+                x - tl.load(source), y - tl.load(source + 1), tl.load(source + 2), tl.load(source + 3),
+                tl.load(source + 4), tl.load(source + 5, mask=listed, other=0.0),
+            )  # fmt: skip
+            weight, through, _ = advance(through, alpha)
+            red += weight * tl.load(source + 6)
+            green += weight * tl.load(source + 7)
+            blue += weight * tl.load(source + 8)
+            if DEPTH:
+                deep += weight * tl.load(source + 9)
         most = tl.max(through, 0)
         done += BATCH
 
+    left_over = tl.abs(through)
     out = row * width + column
     if BACKGROUND:
         red += left_over * tl.load(background)
@@ -169,7 +158,7 @@ class _Composite(torch.autograd.Function):
 
         records, background = ctx.saved_tensors
         gradient = blend_backward(
-            records, ctx.bins, ctx.made, *ctx.size, background, d_color, d_alpha=d_alpha, d_depth=d_depth
+            records, ctx.bins, ctx.made, *ctx.size, d_color, d_alpha=d_alpha, d_depth=d_depth
         )
         d_background = None
         if background is not None and ctx.needs_input_grad[6]:

@@ -27,7 +27,9 @@ class Readback:
     """A queue of small copies to pinned memory, each with the event that says it has arrived."""
 
     def __init__(self) -> None:
-        self._pending: deque[tuple[tuple[int, tuple[int, int, int]], Tensor, torch.cuda.Event | None]] = deque()
+        self._pending: deque[tuple[tuple[int, tuple[int, int, int]], Tensor, torch.cuda.Event | None]] = (
+            deque()
+        )
         self._latest: Numbers | None = None
 
     def post(self, key: tuple[int, tuple[int, int, int]], values: Tensor) -> list[Numbers]:

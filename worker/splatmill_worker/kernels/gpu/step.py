@@ -94,7 +94,6 @@ class _View:
     width: int
     height: int
     degree: int
-    background: Tensor | None
     antialias: bool
     records: Tensor
     lists: Lists
@@ -133,7 +132,9 @@ class Step:
         self._resident: WeakTensorKeyDictionary = WeakTensorKeyDictionary()  # type: ignore[type-arg]
         self._readback = Readback()
         self._steps = 0
-        self._generation = 0  # of the parameters; what arrives late from before a `replace` says nothing of room
+        self._generation = (
+            0  # of the parameters; what arrives late from before a `replace` says nothing of room
+        )
         self.overflowed = 0
         """Steps whose lists did not fit into their room: their farthest pairs were left out."""
         self.refused = 0
@@ -314,7 +315,7 @@ class Step:
             visible, pairs = made.used.tolist()
             self._rooms[key] = _room(visible, pairs)
         image = blend(records, made.bins, width, height, background, depth=depth, checkpoints=True)
-        return _View(key, viewmat, K, width, height, degree, background, antialias, records, made, image)
+        return _View(key, viewmat, K, width, height, degree, antialias, records, made, image)
 
     def _differentiate(
         self,
@@ -330,7 +331,7 @@ class Step:
             errors = torch.zeros(view.height, view.width, device=self.device)
         image = view.image
         gradient = blend_backward(
-            view.records, view.lists.bins, image, *size, view.background, d_color,
+            view.records, view.lists.bins, image, *size, d_color,
             d_alpha=d_alpha, d_depth=d_depth, errors=errors,
         )  # fmt: skip
         project_backward(

@@ -9,20 +9,18 @@ import triton
 
 from .device import interpreting
 
-PROJECT = [triton.Config({"BLOCK": block}, num_warps=warps) for block, warps in ((128, 4), (64, 2), (256, 8))]
-PROJECT_BACKWARD = [
-    triton.Config({"BLOCK": block}, num_warps=warps) for block, warps in ((64, 2), (128, 4), (32, 1))
-]
+PROJECT = [triton.Config({"BLOCK": block}, num_warps=warps) for block, warps in ((128, 4), (64, 2))]
+PROJECT_BACKWARD = [triton.Config({"BLOCK": block}, num_warps=warps) for block, warps in ((64, 2), (128, 4))]
 COMPOSITE = [
-    triton.Config({"BATCH": batch, "EXPONENT": "fma"}, num_warps=warps, num_stages=1)
-    for batch, warps in ((8, 4), (16, 4), (16, 8), (4, 2))
+    triton.Config({"BATCH": batch}, num_warps=warps, num_stages=1)
+    for batch, warps in ((2, 2), (4, 2), (4, 1), (8, 2))
 ]
 COMPOSITE_BACKWARD = [
-    triton.Config({"BATCH": batch, "EXPONENT": "fma", "SUMS": sums}, num_warps=warps, num_stages=1)
-    for batch, warps, sums in ((8, 4, "tree"), (4, 4, "tree"), (8, 8, "tree"), (16, 8, "dot"))
+    triton.Config({"BATCH": batch}, num_warps=warps, num_stages=1)
+    for batch, warps in ((2, 1), (2, 2), (1, 2))
 ]
 SMALLEST_LOSS_BLOCK = 128
-LOSS = [triton.Config({"BLOCK": block}, num_warps=block // 64) for block in (256, 128, 512)]
+LOSS = [triton.Config({"BLOCK": block}, num_warps=block // 64) for block in (256, 128)]
 
 
 def autotune(
