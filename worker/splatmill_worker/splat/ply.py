@@ -41,7 +41,7 @@ def write(
     """Write `gaussians` as binary little-endian float32 and return how many were written.
 
     Left out are rows with a non-finite parameter and those with an opacity under 1/255; quaternions become
-    unit length. `degree` pads or cuts the SH coefficients (3 is what some viewers insist on); None keeps them.
+    unit length. `degree` pads or cuts the SH coefficients (some viewers insist on 3); None keeps them.
     The file appears whole or not at all: it is written beside `path`, synced and renamed.
     """
     if degree is not None:

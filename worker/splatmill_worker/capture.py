@@ -1,0 +1,107 @@
+"""What a capture gives to train on: its cameras, its held-out views, and the kernels that will do the work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from splatmill.schema import Backend, TrainOptions
+from splatmill_worker import sfm
+from splatmill_worker.refusal import Refusal
+from splatmill_worker.scene import Scene, View, split
+from splatmill_worker.sfm import posed
+from splatmill_worker.splat.plan import Kernels
+
+OnProgress = Callable[[str, int, int, str], None]
+
+
+def cameras_of(
+    capture: Path,
+    workdir: Path,
+    options: TrainOptions,
+    on_progress: OnProgress,
+    cancelled: Callable[[], bool],
+) -> Scene:
+    """The posed scene: the cameras that came with the photos, or those recovered from them.
+
+    `capture` holds images/, and masks/ and poses/ where given (or is a data set's own folder). Raises Refusal
+    for poses that cannot be used, and what `sfm.reconstruct` raises.
+    """
+    given = posed.find(capture)
+    if given is not None:
+        try:
+            return given.load()
+        except (ValueError, OSError) as error:
+            raise Refusal(
+                "poses_invalid",
+                str(error),
+                advice="Correct the poses, or leave them out to have the cameras recovered from the photos.",
+            ) from error
+    images = capture / "images"
+    masks = capture / "masks"
+    wanted = sfm.SfmOptions(
+        effort=options.sfm_effort.value,
+        matcher=options.matcher.value,
+        mapper=options.mapper.value,
+        frames=options.max_video_frames,
+        seed=options.seed,
+    )
+    return sfm.reconstruct(
+        images if images.is_dir() else capture,
+        masks if masks.is_dir() else None,
+        workdir,
+        wanted,
+        on_progress,
+        cancelled,
+    )
+
+
+def held_out_of(scene: Scene, options: TrainOptions) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """Training and held-out views: those named by `test_views`, else the data set's own, else every n-th.
+
+    Raises Refusal when a name is unknown or nothing is left to train on.
+    """
+    if options.test_views is not None:
+        wanted = set(options.test_views)
+        unknown = sorted(wanted - {view.name for view in scene.views})
+        if unknown:
+            raise Refusal(
+                "holdout_empty",
+                f"test_views names photos that have no camera: {', '.join(unknown[:5])}.",
+                advice="Name photos as the capture does, and only those that were registered.",
+                facts={"unknown": unknown},
+            )
+        ordered = sorted(scene.views, key=lambda view: view.name)
+        train = tuple(view for view in ordered if view.name not in wanted)
+        test = tuple(view for view in ordered if view.name in wanted)
+    else:
+        try:
+            train, test = split(scene, options.holdout)
+        except ValueError as error:
+            raise Refusal("holdout_empty", str(error), advice="Hold out fewer photos.") from error
+    if not train:
+        raise Refusal(
+            "holdout_empty",
+            f"All {len(test)} views are held out; nothing is left to train on.",
+            advice="Hold out fewer photos.",
+        )
+    return train, test
+
+
+def kernels_of(options: TrainOptions) -> Kernels:
+    """The kernels to train with: those asked for, else the GPU's where there is one, else the CPU's.
+
+    Raises Refusal where the ones asked for do not run.
+    """
+    if options.backend is Backend.auto:
+        return "gpu" if torch.cuda.is_available() else "cpu"
+    if options.backend is Backend.gpu and not torch.cuda.is_available():
+        raise Refusal(
+            "backend_unavailable",
+            "The gpu backend was asked for, and torch sees no GPU on this machine.",
+            advice="Leave backend at auto, or run a worker on a machine with a GPU.",
+        )
+    named: dict[Backend, Kernels] = {Backend.reference: "reference", Backend.cpu: "cpu", Backend.gpu: "gpu"}
+    return named[options.backend]

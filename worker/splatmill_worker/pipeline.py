@@ -1,0 +1,232 @@
+"""The whole path of a capture: images -> cameras -> plan -> train -> evaluate -> export."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatmill.schema import (
+    Event,
+    JobState,
+    LogEvent,
+    MetricEvent,
+    PlanEvent,
+    PreviewEvent,
+    ProgressEvent,
+    StateEvent,
+    TrainOptions,
+)
+from splatmill_worker import sfm
+from splatmill_worker.capture import cameras_of, held_out_of, kernels_of
+from splatmill_worker.images import load_views
+from splatmill_worker.refusal import Refusal
+from splatmill_worker.scene import Normalization, Scene, View
+from splatmill_worker.splat import checkpoint, initialise
+from splatmill_worker.splat.decide import decide, loading_size
+from splatmill_worker.splat.engine import Engine, open_engine
+from splatmill_worker.splat.export import Frame, export
+from splatmill_worker.splat.facts import Facts, measure
+from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.picture import save_jpeg
+from splatmill_worker.splat.plan import Plan
+from splatmill_worker.splat.probe import probe
+from splatmill_worker.splat.report import write_report
+from splatmill_worker.splat.run import Row
+from splatmill_worker.splat.stages import Stages
+from splatmill_worker.splat.train import Cancelled, Hooks, Tick, Trained, drawer, evaluation_background, train
+from splatmill_worker.splat.views import TrainingView
+
+Emit = Callable[[Event], None]
+
+EXTENT = 1.1
+"""Radius of the cameras in the training world, where the farthest is at 1, with the paper's tenth added."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended: "succeeded" with files in `out`, or "cancelled" with a checkpoint to go on from."""
+
+    ended: str
+    out: Path
+    trained: Trained | None = None
+
+
+def run(
+    capture: Path, workdir: Path, options: TrainOptions, emit: Emit, cancelled: Callable[[], bool]
+) -> Outcome:
+    """Train a scene from `capture` and leave model.ply, cameras.json and the reports in `workdir/out`.
+
+    `workdir` survives attempts: what is there is gone on from. Events are emitted as things happen; states are
+    sfm, training and exporting, the final one is the caller's to say. Raises Refusal, sfm.SfmFailed and
+    TrainingFailed, each with a sentence for the person who asked.
+    """
+    out = workdir / "out"
+    out.mkdir(parents=True, exist_ok=True)
+    stages = Stages(workdir / "stages.json")
+    try:
+        kernels = kernels_of(options)
+
+        emit(StateEvent(state=JobState.sfm))
+        with stages.measured("sfm"):
+            scene = cameras_of(capture, workdir, options, _sfm_progress(emit), cancelled)
+        for note in scene.notes:
+            emit(LogEvent(message=note))
+        for name, reason in scene.left_out:
+            emit(LogEvent(level="warning", message=f"{name} is left out: {reason}"))
+
+        emit(StateEvent(state=JobState.training))
+        with stages.measured("load"):
+            frame = Normalization.of(scene)
+            world = frame.apply(scene)
+            train_views, test_views = held_out_of(scene, options)
+            size = loading_size(options, kernels)
+            views, held_out = _loaded(train_views, size, frame), _loaded(test_views, size, frame)
+        with stages.measured("plan"):
+            gaussians = _first_gaussians(world, views, options)
+            plan, facts = _plan(world, views, held_out, gaussians, options, workdir)
+        emit(PlanEvent(plan=plan.as_dict()))
+        if plan.image_size < max(facts.width, facts.height):
+            with stages.measured("load"):
+                views, held_out = (
+                    _loaded(train_views, plan.image_size, frame),
+                    _loaded(test_views, plan.image_size, frame),
+                )
+
+        engine = open_engine(gaussians, plan.kernels)
+        teller = _Teller(emit, workdir, plan, (held_out or views)[0])
+        trained = train(
+            engine,
+            views,
+            held_out,
+            plan,
+            extent=EXTENT,
+            hooks=Hooks(
+                tick=teller.tick,
+                measured=teller.measured,
+                warn=teller.warn,
+                cancelled=cancelled,
+                checkpoint=lambda state: checkpoint.save(workdir / "checkpoints", state),
+            ),
+            resume_from=_resumable(workdir, views),
+        )
+    except (Cancelled, sfm.Cancelled):
+        return Outcome("cancelled", out)
+
+    emit(StateEvent(state=JobState.exporting))
+    with stages.measured("export"):
+        home = Frame.of(frame, scene)
+        written = export(out, trained, plan, home, views, held_out)
+        teller.preview(engine, trained.steps)
+    write_report(
+        out, trained, plan, facts, scene, stages, written, home, engine, views, held_out, teller.warnings
+    )
+    return Outcome("succeeded", out, trained)
+
+
+def _loaded(views: tuple[View, ...], size: int, frame: Normalization) -> list[TrainingView]:
+    return [TrainingView.of(photo, frame) for photo in load_views(views, size)]
+
+
+def _first_gaussians(world: Scene, views: list[TrainingView], options: TrainOptions) -> Gaussians:
+    if len(world.points) >= initialise.ENOUGH_POINTS:
+        points, colors = torch.from_numpy(world.points), torch.from_numpy(world.colors)
+    else:
+        targets = [view.full for view in views]
+        points, colors = initialise.in_frusta(targets, initialise.RANDOM_GAUSSIANS, options.seed)
+    return initialise.from_points(points, colors)
+
+
+def _plan(
+    world: Scene,
+    views: list[TrainingView],
+    held_out: list[TrainingView],
+    gaussians: Gaussians,
+    options: TrainOptions,
+    workdir: Path,
+) -> tuple[Plan, Facts]:
+    """The plan, made once: an attempt that goes on keeps the one it started with."""
+    kernels = kernels_of(options)
+    stored = workdir / "plan.json"
+    facts = measure(world, views, len(held_out), probe(open_engine(gaussians, kernels), views))
+    if stored.is_file():
+        kept = json.loads(stored.read_text())
+        if kept["options"] == options.model_dump(mode="json"):
+            return Plan.from_dict(kept["plan"]), facts
+    try:
+        plan = decide(facts, options, kernels)
+    except ValueError as error:
+        raise Refusal(
+            "option_out_of_range", str(error), advice="Change the option and start again."
+        ) from error
+    part = stored.with_suffix(".part")
+    part.write_text(
+        json.dumps({"options": options.model_dump(mode="json"), "plan": plan.as_dict(whole=True)})
+    )
+    part.replace(stored)
+    return plan, facts
+
+
+def _resumable(workdir: Path, views: list[TrainingView]) -> dict[str, Any] | None:
+    """The state of an earlier attempt at the same photos."""
+    state = checkpoint.load(workdir / "checkpoints")
+    return state if state is not None and state["views"] == [view.name for view in views] else None
+
+
+def _sfm_progress(emit: Emit) -> Callable[[str, int, int, str], None]:
+    def tell(stage: str, done: int, total: int, note: str) -> None:
+        emit(ProgressEvent(stage=stage, done=done, total=total or None, note=note or None))
+
+    return tell
+
+
+class _Teller:
+    """Turns what training says into events, and keeps the preview picture up to date."""
+
+    def __init__(self, emit: Emit, workdir: Path, plan: Plan, view: TrainingView) -> None:
+        self._emit, self._workdir, self._plan, self._view = emit, workdir, plan, view
+        self._last: Row | None = None
+        self.warnings: list[str] = []
+
+    def tick(self, tick: Tick) -> None:
+        self._emit(
+            ProgressEvent(
+                stage="training",
+                done=tick.step,
+                total=tick.steps,
+                step=tick.step,
+                loss=tick.loss,
+                psnr=None if self._last is None else self._last.psnr,
+                ssim=None if self._last is None else self._last.ssim,
+                gaussians=tick.gaussians,
+                seconds=tick.seconds,
+                eta=tick.eta,
+            )
+        )
+
+    def measured(self, row: Row, engine: Engine) -> None:
+        self._last = row
+        self._emit(
+            MetricEvent(
+                seconds=row.seconds,
+                step=row.step,
+                loss=row.loss,
+                psnr=row.psnr,
+                ssim=row.ssim,
+                gaussians=row.gaussians,
+            )
+        )
+        self.preview(engine, row.step)
+
+    def warn(self, message: str) -> None:
+        self.warnings.append(message)
+        self._emit(LogEvent(level="warning", message=message))
+
+    def preview(self, engine: Engine, step: int) -> None:
+        color = drawer(engine, self._plan)(self._view.full, evaluation_background(self._plan))
+        save_jpeg(self._workdir / "out" / "preview.jpg", color)
+        self._emit(PreviewEvent(path="out/preview.jpg", step=step))

@@ -1,0 +1,298 @@
+"""From facts and options to a plan: pure, so that the same facts always give the same plan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from splatmill.schema import Background, Densify, Preset, Switch, TrainOptions
+from splatmill_worker.splat.budget import Budget
+from splatmill_worker.splat.facts import Facts, Speed
+from splatmill_worker.splat.initialise import ENOUGH_POINTS, RANDOM_GAUSSIANS
+from splatmill_worker.splat.plan import Kernels, Plan, Strategy
+from splatmill_worker.splat.schedule import Schedule
+
+PRESET_STEPS = {Preset.draft: 1000, Preset.balanced: 3000, Preset.quality: 10_000}
+PRESET_SIZE: dict[Kernels, dict[Preset, int]] = {
+    "reference": {Preset.draft: 64, Preset.balanced: 64, Preset.quality: 128},
+    "cpu": {Preset.draft: 480, Preset.balanced: 640, Preset.quality: 960},
+    "gpu": {Preset.draft: 640, Preset.balanced: 1280, Preset.quality: 1920},
+}
+STEPS_PER_1000_GAUSSIANS = 25
+"""A Gaussian needs some tens of steps that see it; more Gaussians than the budget can settle only blur the end."""
+
+PIXELS_PER_GAUSSIAN = 20
+"""Over all training photos: with fewer, Gaussians describe noise."""
+
+UNKNOWN_SPEED = Speed(per_pixel=3e-8, per_gaussian=1e-7)
+BLURRED = 1.5  # grey levels of 255; below the noise of a phone's photo
+EXPOSURES_DIFFER = 0.06  # log brightness: 6 %, which the eye sees side by side
+DISTANCES_DIFFER = 4.0
+
+
+@dataclass
+class _Reasons:
+    """Collects sentences while a plan is made."""
+
+    chosen: dict[str, str] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    forced: list[str] = field(default_factory=list)
+
+    def option(self, name: str) -> None:
+        self.chosen[name] = "Set by option."
+        self.forced.append(name)
+
+
+def loading_size(options: TrainOptions, kernels: Kernels) -> int:
+    """Longest side, in pixels, at which photos are loaded before their facts are known."""
+    return options.image_size or PRESET_SIZE[kernels][options.preset]
+
+
+def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
+    """The plan for a scene. Every field carries the fact or the option that decided it.
+
+    Raises ValueError, as a sentence, for an option that this engine cannot follow.
+    """
+    if options.pose_refinement is Switch.on:
+        raise ValueError(
+            "pose_refinement=on is not possible: training keeps the cameras as they are. Leave it at auto."
+        )
+    why = _Reasons()
+    image_size = _image_size(facts, options, why)
+    shrunk = (image_size / max(facts.width, facts.height)) ** 2
+    pixels = facts.pixels * min(1.0, shrunk)
+    initial, start = _initial(facts, why)
+    speed = facts.speed or UNKNOWN_SPEED
+    budget, steps = _budget(facts, options, speed, pixels, start, why)
+    most = _max_gaussians(facts, options, steps, pixels, start, why)
+    densify = _densify(options, most, start, why)
+    schedule = Schedule(
+        budget=budget,
+        resolution=_resolution(steps, image_size, why),
+        degree=_degree(facts, options, why),
+        degree_every=max(50, min(300, steps // 8)),
+        densify_from=max(50, min(300, steps // 8)),
+        densify_every=max(40, min(100, steps // 20)),
+        densify_until=0.7,
+    )
+    _undistortion(facts, why)
+    return Plan(
+        schedule=schedule,
+        image_size=image_size,
+        max_gaussians=most,
+        densify=densify,
+        initial=initial,
+        kernels=kernels,
+        background=_background(facts, options, why),
+        exposure=_exposure(facts, options, why),
+        antialias=_antialias(facts, options, why),
+        target_psnr=options.target_psnr,
+        max_memory=options.max_memory,
+        stops_when_flat=options.steps is None and options.time_budget is None,
+        seed=options.seed,
+        reasons=why.chosen,
+        left_out=why.left_out,
+        forced=tuple(why.forced),
+    )
+
+
+def _image_size(facts: Facts, options: TrainOptions, why: _Reasons) -> int:
+    longest = max(facts.width, facts.height)
+    if options.image_size is not None:
+        why.option("image_size")
+        return longest
+    if facts.halving_loss < BLURRED and longest >= 256:
+        why.chosen["image_size"] = (
+            f"Halving the photos changes them by {facts.halving_loss:.1f} of 255 grey levels: they hold no more."
+        )
+        return (longest + 1) // 2
+    why.chosen["image_size"] = (
+        f"Halving the photos would lose {facts.halving_loss:.1f} of 255 grey levels; "
+        f"{longest} pixels is what the preset allows of {facts.native_longest}."
+    )
+    return longest
+
+
+def _initial(facts: Facts, why: _Reasons) -> tuple[Literal["points", "random"], int]:
+    if facts.points >= ENOUGH_POINTS:
+        why.chosen["initial"] = f"The reconstruction has {facts.points} points."
+        return "points", facts.points
+    why.chosen["initial"] = (
+        f"There are {facts.points} points to start from, so Gaussians start where cameras look."
+    )
+    return "random", RANDOM_GAUSSIANS
+
+
+def _budget(
+    facts: Facts, options: TrainOptions, speed: Speed, pixels: float, start: int, why: _Reasons
+) -> tuple[Budget, int]:
+    """The budget, and the number of steps it is expected to allow."""
+    if options.time_budget is not None:
+        steps = _affordable_steps(options.time_budget, speed, pixels, start)
+        if options.steps is not None:
+            steps = min(steps, options.steps)
+        why.option("budget")
+        why.chosen["schedule"] = (
+            f"{options.time_budget:g} s at {1e9 * speed.per_pixel:.0f} ns a pixel and "
+            f"{1e9 * speed.per_gaussian:.0f} ns a Gaussian allow about {steps} steps."
+        )
+        return Budget(options.steps, options.time_budget), steps
+    if options.steps is not None:
+        why.option("budget")
+        why.chosen["schedule"] = f"{options.steps} steps were asked for."
+        return Budget(options.steps), options.steps
+    preset = Preset.quality if options.target_psnr is not None else options.preset
+    steps = PRESET_STEPS[preset]
+    why.chosen["budget"] = f"No budget was given; the preset {preset.value} allows {steps} steps."
+    why.chosen["schedule"] = why.chosen["budget"]
+    return Budget(steps), steps
+
+
+def _affordable_steps(seconds: float, speed: Speed, pixels: float, start: int) -> int:
+    """Steps in `seconds` when the number of Gaussians grows with the steps, as `_max_gaussians` lets it.
+
+    A run is cheaper than its end: coarse photos and few Gaussians make the mean step about 0.8 of the last.
+    Solves 0.8 n (pixels p + max(start, 1000 n / STEPS_PER_1000) g) = seconds for n.
+    """
+    fixed = 0.8 * speed.per_pixel * pixels
+    growing = 0.8 * speed.per_gaussian * 1000.0 / STEPS_PER_1000_GAUSSIANS
+    with_growth = (-fixed + (fixed * fixed + 4.0 * growing * seconds) ** 0.5) / (2.0 * growing)
+    without = seconds / (fixed + 0.8 * speed.per_gaussian * start)
+    return max(10, int(min(with_growth, without)))
+
+
+def _max_gaussians(
+    facts: Facts, options: TrainOptions, steps: int, pixels: float, start: int, why: _Reasons
+) -> int:
+    settled = round(1000 * steps / STEPS_PER_1000_GAUSSIANS)
+    resolved = round(pixels * facts.views / PIXELS_PER_GAUSSIAN)
+    held = Plan.gaussians_within(options.max_memory or facts.memory_available // 2)
+    most = max(min(settled, resolved, held), min(start, held))
+    if options.max_gaussians is not None and options.max_gaussians <= most:
+        why.option("max_gaussians")
+        return options.max_gaussians
+    if options.max_gaussians is not None:
+        most = min(options.max_gaussians, resolved, held)
+    reasons = {
+        settled: f"About {steps} steps settle no more than {settled} Gaussians.",
+        resolved: f"{facts.views} photos of {round(pixels)} pixels resolve no more than {resolved} Gaussians.",
+        held: f"Memory holds no more than {held} Gaussians.",
+    }
+    why.chosen["max_gaussians"] = reasons.get(most, f"The scene starts with {start} Gaussians.")
+    return most
+
+
+def _densify(options: TrainOptions, most: int, start: int, why: _Reasons) -> Strategy | None:
+    if options.densify is Densify.off:
+        why.forced.append("densify")
+        why.left_out["densify"] = "Left out by option."
+        return None
+    if options.densify is not Densify.auto:
+        why.option("densify")
+        chosen: dict[Densify, Strategy] = {
+            Densify.classic: "classic",
+            Densify.absolute: "absolute",
+            Densify.mcmc: "mcmc",
+        }
+        return chosen[options.densify]
+    if start >= most:
+        why.left_out["densify"] = f"The {start} Gaussians to start with are all that the budget allows."
+        return None
+    why.chosen["densify"] = f"{start} Gaussians to start with do not resolve the photos; {most} may."
+    return "classic"
+
+
+def _resolution(steps: int, image_size: int, why: _Reasons) -> tuple[tuple[int, int], ...]:
+    first, second = max(20, min(200, steps // 8)), max(50, min(500, steps // 3))
+    if image_size < 100:
+        why.left_out["coarse_to_fine"] = f"Photos of {image_size} pixels are coarse already."
+        return ((0, 1),)
+    if image_size < 240:
+        return ((0, 2), (second, 1))
+    return ((0, 4), (first, 2), (second, 1))
+
+
+def _degree(facts: Facts, options: TrainOptions, why: _Reasons) -> int:
+    if options.sh_degree is not None:
+        why.option("sh_degree")
+        return options.sh_degree
+    angle = facts.view_angle
+    if angle is None:
+        why.chosen["sh_degree"] = "How far apart the views of a point are is not known."
+        return 3
+    degree = 1 if angle < 6.0 else 2 if angle < 12.0 else 3
+    why.chosen["sh_degree"] = f"Half of the points are seen from directions up to {angle:.0f} degrees apart."
+    return degree
+
+
+def _background(facts: Facts, options: TrainOptions, why: _Reasons) -> Literal["black", "white", "random"]:
+    if options.background is not Background.auto:
+        why.option("background")
+        named: dict[Background, Literal["black", "white", "random"]] = {
+            Background.black: "black",
+            Background.white: "white",
+            Background.random: "random",
+        }
+        return named[options.background]
+    if facts.transparent:
+        why.chosen["background"] = (
+            f"{facts.transparent} photos are transparent, and must stay so over any colour."
+        )
+        return "random"
+    why.chosen["background"] = "No photo is transparent."
+    why.left_out["alpha"] = "No photo is transparent."
+    return "black"
+
+
+def _exposure(facts: Facts, options: TrainOptions, why: _Reasons) -> bool:
+    if options.exposure is not Switch.auto:
+        why.forced.append("exposure")
+        place = why.chosen if options.exposure is Switch.on else why.left_out
+        place["exposure"] = "Set by option."
+        return options.exposure is Switch.on
+    spread = facts.exposure_spread
+    if spread is None:
+        why.left_out["exposure"] = (
+            "Whether the photos' exposures differ cannot be measured: there are no tracks."
+        )
+        return False
+    if spread > EXPOSURES_DIFFER:
+        why.chosen["exposure"] = (
+            f"The same points differ by {100 * spread:.0f} % in brightness between photos."
+        )
+        return True
+    why.left_out["exposure"] = (
+        f"Exposures agree: the same points differ by {100 * spread:.1f} % between photos."
+    )
+    return False
+
+
+def _antialias(facts: Facts, options: TrainOptions, why: _Reasons) -> bool:
+    if options.antialias is not Switch.auto:
+        why.forced.append("antialias")
+        place = why.chosen if options.antialias is Switch.on else why.left_out
+        place["antialias"] = "Set by option."
+        return options.antialias is Switch.on
+    ratio = facts.distance_ratio
+    if ratio is not None and ratio > DISTANCES_DIFFER:
+        why.chosen["antialias"] = f"Points are seen from distances that differ by a factor of {ratio:.1f}."
+        return True
+    seen = (
+        "is not known"
+        if ratio is None
+        else f"differ by a factor of {ratio:.1f} at most for nine points in ten"
+    )
+    why.left_out["antialias"] = f"The distances that points are seen from {seen}."
+    return False
+
+
+def _undistortion(facts: Facts, why: _Reasons) -> None:
+    if facts.distorted:
+        why.chosen["undistortion"] = f"{facts.distorted} photos were taken through a lens with distortion."
+    else:
+        why.left_out["undistortion"] = "All cameras are pinholes already."
+    if not facts.masked:
+        why.left_out["masks"] = "No photo has pixels that are masked."
+    error = facts.reprojection
+    fits = "are taken as given" if error is None else f"fit their points to {error:.2f} pixels"
+    why.left_out["pose_refinement"] = f"The cameras {fits}."

@@ -1,0 +1,1 @@
+"""Strategies that change how many Gaussians there are, behind one small interface."""

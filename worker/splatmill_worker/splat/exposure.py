@@ -1,0 +1,48 @@
+"""An affine colour per photo, for photos whose exposure or white balance differ."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+PULL = 1e-3
+"""Weight of the squared distance from the identity: without it, scene and photos could drift apart together."""
+
+RATE = 1e-3
+
+
+class Exposure:
+    """A matrix [3, 3] and an offset [3] per photo, applied to the rendered colour before the loss.
+
+    They start as the identity and are pulled towards it, so that the scene keeps the photos' mean exposure,
+    which is the one that held-out views are judged with.
+    """
+
+    def __init__(self, photos: int) -> None:
+        self.affine = torch.eye(3, 4).repeat(photos, 1, 1).requires_grad_()
+        self._adam = torch.optim.Adam([self.affine], lr=RATE)
+
+    def applied(self, photo: int, color: Tensor) -> Tensor:
+        """Colour [H, W, 3] as photo number `photo` would have taken it."""
+        return color @ self.affine[photo, :, :3].T + self.affine[photo, :, 3]
+
+    def penalty(self, photo: int) -> Tensor:
+        """To be added to the loss."""
+        return PULL * (self.affine[photo] - torch.eye(3, 4)).square().sum()
+
+    def update(self, scale: float) -> None:
+        """One Adam step with the rate times `scale`, from the gradients that the loss left."""
+        for group in self._adam.param_groups:
+            group["lr"] = RATE * scale
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
+
+    def state(self) -> dict[str, object]:
+        """For a checkpoint."""
+        return {"affine": self.affine.detach().clone(), "adam": self._adam.state_dict()}
+
+    def restore(self, state: dict[str, object]) -> None:
+        """From a checkpoint."""
+        with torch.no_grad():
+            self.affine.copy_(state["affine"])  # type: ignore[arg-type]  # a checkpoint holds plain objects
+        self._adam.load_state_dict(state["adam"])  # type: ignore[arg-type]

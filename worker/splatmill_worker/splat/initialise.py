@@ -1,0 +1,127 @@
+"""The first Gaussians: from SfM points, or at random where cameras look when there are none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from splatmill_worker.kernels import ops
+from splatmill_worker.scene import Camera
+from splatmill_worker.splat.gaussians import SH_C0, Gaussians
+from splatmill_worker.splat.views import Target
+
+Float = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+INITIAL_OPACITY = 0.1
+
+ENOUGH_POINTS = 20
+"""With fewer, the reconstruction says too little about where things are."""
+
+RANDOM_GAUSSIANS = 20_000
+
+
+def from_points(points: Tensor, colors: Tensor, *, backend: ops.Backend | None = None) -> Gaussians:
+    """One round Gaussian per point [M, 3], as wide as the mean distance to its three nearest neighbours.
+
+    colors uint8 [M, 3]. Duplicate points get the smallest positive width among all, so that none is a spike.
+    Raises ValueError for fewer than two points.
+    """
+    points = points.float()
+    width = ops.knn(points, backend=backend)
+    positive = width[width > 0]
+    floor = float(torch.quantile(positive, 0.001)) if len(positive) else 1e-3
+    return round_ones(points, width.clamp_min(floor), colors)
+
+
+def round_ones(points: Tensor, width: Tensor, colors: Tensor) -> Gaussians:
+    """Isotropic Gaussians at `points` [M, 3] with standard deviations `width` [M] and flat colours uint8 [M, 3]."""
+    n = points.shape[0]
+    quats = torch.zeros(n, 4)
+    quats[:, 0] = 1.0
+    sh = torch.zeros(n, 16, 3)
+    sh[:, 0] = (colors.float() / 255.0 - 0.5) / SH_C0
+    return Gaussians(
+        points.float(),
+        width.float().log()[:, None].expand(n, 3).contiguous(),
+        quats,
+        torch.full((n,), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))),
+        sh,
+    )
+
+
+def in_frusta(targets: Sequence[Target], count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Random points [count, 3] and colours uint8 [count, 3] where cameras look, for scenes without points.
+
+    Candidates are drawn along the rays of random pixels, between 0.2 and 1.8 times the distance of what the
+    cameras look at. Those that most cameras see are kept; a camera whose photo is transparent there does not
+    see them, so that an object on a transparent background starts as its visual hull. Colours are the means of
+    what the cameras show at that place.
+    """
+    random = np.random.default_rng(seed)
+    cameras = [target.camera for target in targets]
+    centers = np.array([camera.center for camera in cameras])
+    axes = np.array([camera.viewmat[2, :3] for camera in cameras])
+    _, distance = looked_at(centers, axes)
+    tried = 8 * count
+    points = _along_rays(cameras, distance, tried, random)
+    seen = np.zeros(tried)
+    missed = np.zeros(tried)
+    color = np.zeros((tried, 3))
+    for target in targets:
+        inside, rows, columns = _pixels(target.camera, points)
+        cover = np.ones(len(rows)) if target.alpha is None else target.alpha.numpy()[rows, columns] / 255.0
+        seen[inside] += cover
+        missed[inside] += 1.0 - cover
+        color[inside] += cover[:, None] * target.rgb.numpy()[rows, columns]
+    # One camera that sees through a point outweighs many that see something there.
+    rank = seen - 4.0 * missed + random.uniform(0.0, 1.0, tried)
+    order = np.argsort(-rank, kind="stable")[:count]
+    mean = color[order] / np.maximum(seen[order], 1e-9)[:, None]
+    mean[seen[order] <= 0] = 128.0
+    return torch.from_numpy(points[order]).float(), torch.from_numpy(mean.clip(0, 255).astype(np.uint8))
+
+
+def looked_at(centers: Float, axes: Float) -> tuple[Float, float]:
+    """The point [3] nearest to all optical axes (least squares), and the cameras' median distance to it.
+
+    For parallel axes the least-squares problem is singular; a small ridge keeps the answer near the cameras.
+    """
+    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
+    middle = centers.mean(axis=0)
+    ridge = 1e-3 * len(centers) * np.eye(3)
+    right = (across @ (centers - middle)[:, :, None]).sum(axis=0)[:, 0]
+    target = middle + np.linalg.solve(across.sum(axis=0) + ridge, right)
+    distance = float(np.median(np.linalg.norm(centers - target, axis=1)))
+    return target, distance if distance > 1e-6 else 1.0
+
+
+def _along_rays(cameras: Sequence[Camera], distance: float, count: int, random: np.random.Generator) -> Float:
+    """Points [count, 3] along the rays of random pixels, uniform in the volume that the cameras see."""
+    points = np.empty((count, 3))
+    pick = random.integers(len(cameras), size=count)
+    for i, camera in enumerate(cameras):
+        rows = np.flatnonzero(pick == i)
+        u = random.uniform(0, camera.width, len(rows))
+        v = random.uniform(0, camera.height, len(rows))
+        z = distance * np.cbrt(random.uniform(0.2**3, 1.8**3, len(rows)))
+        local = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+        points[rows] = (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    return points
+
+
+def _pixels(camera: Camera, points: Float) -> tuple[Index, Index, Index]:
+    """Indices of the points that fall on the photo, with the row and the column that they fall on."""
+    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    z = np.maximum(local[:, 2], 1e-9)
+    u = local[:, 0] / z * camera.fx + camera.cx
+    v = local[:, 1] / z * camera.fy + camera.cy
+    on = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    inside = np.flatnonzero(on)
+    return inside, v[inside].astype(np.int64), u[inside].astype(np.int64)

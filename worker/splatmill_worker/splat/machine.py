@@ -1,0 +1,58 @@
+"""Where a report was made: processor, memory and versions."""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import psutil
+import torch
+
+PACKAGES = ("splatmill", "splatmill-worker", "torch", "pycolmap", "numpy")
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores that may be used, memory in bytes, operating system."""
+    return {
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "memory": psutil.virtual_memory().total,
+        "system": platform.platform(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+    }
+
+
+def versions(kernels: str) -> dict[str, Any]:
+    """Versions of what computes, and the backend used."""
+    found: dict[str, Any] = {"python": platform.python_version(), "backend": kernels}
+    for package in PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = None
+    if kernels == "cpu":
+        from splatmill_worker.kernels.cpu import isa
+
+        found["instruction_set"] = isa.chosen()
+    return found
+
+
+def peak_memory() -> int:
+    """Largest resident size of this process so far, in bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if platform.system() == "Darwin" else 1024 * peak
+
+
+def _processor() -> str:
+    """The model name as the kernel tells it, or what Python knows."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

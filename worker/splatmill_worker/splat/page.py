@@ -1,0 +1,113 @@
+"""The report as one self-contained page."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from splatmill_worker.splat.evaluate import ViewScore
+from splatmill_worker.splat.picture import data_uri
+
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.1rem; margin-top: 2rem; }
+table { border-collapse: collapse; } td, th { padding: .2rem .8rem .2rem 0; text-align: left; vertical-align: top; }
+td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
+img { max-width: 100%; height: auto; } .pair { display: flex; gap: .5rem; margin: .5rem 0; }
+.pair figure { margin: 0; flex: 1; } figcaption, .dim { color: #666; font-size: .85rem; }
+.warn { background: #fff4e0; padding: .5rem .8rem; border-left: 3px solid #d08a20; margin: .3rem 0; }
+"""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A rendered view [H, W, 3] beside its photo."""
+
+    score: ViewScore
+    rendered: Tensor
+    photo: Tensor
+
+
+def render(report: dict[str, Any], figure: Path, pairs: Sequence[Pair]) -> str:
+    """The page as text; the figure and the pictures are inside it."""
+    curve = base64.b64encode(figure.read_bytes()).decode()
+    parts = [
+        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
+        f"<title>Splatmill report</title><style>{STYLE}</style>",
+        f"<h1>{_headline(report['result'])}</h1>",
+        *(f"<p class=warn>{html.escape(warning)}</p>" for warning in report["warnings"]),
+        f"<img alt='held-out error against training seconds' src='data:image/png;base64,{curve}'>",
+        "<h2>Where the time went</h2>",
+        _table(["stage", "seconds"], [[name, f"{value:.1f}"] for name, value in report["seconds"].items()]),
+        "<h2>What was decided, and why</h2>",
+        _plan(report["plan"]),
+        "<h2>What was left out, and why</h2>",
+        _table(
+            ["", ""], [[row.get("what") or row.get("photo"), row["why"]] for row in report["left_out"]], 2
+        ),
+        "<h2>Worst views: rendered, and the photo</h2>",
+        *(_pair(pair) for pair in pairs),
+        "<h2>Every measured view</h2>",
+        _table(
+            ["photo", "split", "PSNR (dB)", "SSIM"],
+            [
+                [row["name"], row["split"], f"{row['psnr']:.2f}", f"{row['ssim']:.4f}"]
+                for row in report["views"]
+            ],
+            2,
+        ),
+        f"<p class=dim>{html.escape(_footer(report))}</p></html>",
+    ]
+    return "\n".join(parts)
+
+
+def _headline(result: dict[str, Any]) -> str:
+    counted = f"{result['gaussians']:,} Gaussians after {result['steps']:,} steps"
+    if result["psnr"] is None:
+        return f"{counted}; no photo was held out, training photos {result['train_psnr']:.2f} dB"
+    return f"{result['psnr']:.2f} dB on held-out views (SSIM {result['ssim']:.3f}), {counted}"
+
+
+def _plan(plan: dict[str, Any]) -> str:
+    reasons = plan.get("reasons", {})
+    rows = []
+    for name, reason in reasons.items():
+        value = plan.get(name, "")
+        rows.append([name.replace("_", " "), "" if isinstance(value, dict) else str(value), reason])
+    return _table(["", "", ""], rows, 3)
+
+
+def _pair(pair: Pair) -> str:
+    name = html.escape(pair.score.name)
+    return (
+        "<div class=pair>"
+        f"<figure><img alt='rendered' src='{data_uri(pair.rendered, 480)}'>"
+        f"<figcaption>{name}: {pair.score.psnr:.2f} dB, SSIM {pair.score.ssim:.3f}</figcaption></figure>"
+        f"<figure><img alt='photo' src='{data_uri(pair.photo, 480)}'><figcaption>photo</figcaption></figure></div>"
+    )
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[Any]], text_columns: int = 1) -> str:
+    """A table whose first `text_columns` columns are text and whose others are numbers."""
+
+    def cell(tag: str, column: int, value: Any) -> str:
+        kind = "" if column < text_columns else " class=n"
+        return f"<{tag}{kind}>{html.escape(str(value))}</{tag}>"
+
+    head = "".join(cell("th", i, value) for i, value in enumerate(heads)) if any(heads) else ""
+    body = "".join(
+        "<tr>" + "".join(cell("td", i, value) for i, value in enumerate(row)) + "</tr>" for row in rows
+    )
+    return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def _footer(report: dict[str, Any]) -> str:
+    machine, versions = report["machine"], report["versions"]
+    named = ", ".join(f"{name} {value}" for name, value in versions.items() if value)
+    return f"{machine['processor']}, {machine['cores']} cores. {named}. Stopped because {report['result']['stopped']}."

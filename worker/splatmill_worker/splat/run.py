@@ -1,0 +1,227 @@
+"""A training run in flight: one photo at a time, and whatever is due after it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatmill_worker.kernels import ops
+from splatmill_worker.kernels.cpu.step import Rates
+from splatmill_worker.splat.budget import Budget, Clock
+from splatmill_worker.splat.density.interface import Densifier, Moment
+from splatmill_worker.splat.engine import Engine, StepResult
+from splatmill_worker.splat.exposure import Exposure
+from splatmill_worker.splat.failure import FailureName, TrainingFailed
+from splatmill_worker.splat.health import Health
+from splatmill_worker.splat.plan import Plan
+from splatmill_worker.splat.rates import RateSchedule
+from splatmill_worker.splat.views import Target, TrainingView
+
+SNAPSHOT_SHARE = 0.04
+"""Of the budget between two copies of a good state: 2 % of the time at most, and little is lost."""
+
+GREY = 0.5
+
+
+@dataclass(frozen=True)
+class Row:
+    """One point of error against run time, on the held-out views; None where there are none."""
+
+    seconds: float
+    step: int
+    loss: float
+    psnr: float | None
+    ssim: float | None
+    gaussians: int
+
+
+@dataclass
+class Run:
+    """Everything that changes while training. `extent` is the radius of the cameras in the training world."""
+
+    engine: Engine
+    plan: Plan
+    views: Sequence[TrainingView]
+    extent: float
+    densifier: Densifier | None
+    exposure: Exposure | None
+    warn: Callable[[str], None]
+    clock: Clock = field(default_factory=Clock)
+    step: int = 0
+    loss: float = math.nan
+    rows: list[Row] = field(default_factory=list)
+    recoveries: int = 0
+    rate_scale: float = 1.0
+    reduction: int = 0
+    order: list[int] = field(default_factory=list)
+    health: Health = field(default_factory=Health)
+    shortened: bool = False
+
+    def __post_init__(self) -> None:
+        self.budget: Budget = self.plan.schedule.budget
+        self.random = torch.Generator().manual_seed(self.plan.seed)
+        self._good: tuple[dict[str, Tensor], Tensor, Tensor] | None = None
+        self._good_progress = -math.inf
+        self._fixed = torch.full((3,), {"black": 0.0, "white": 1.0, "random": GREY}[self.plan.background])
+
+    @property
+    def progress(self) -> float:
+        """Share of the budget that is spent, 0..1."""
+        return self.budget.progress(self.step, self.clock.seconds)
+
+    def advance(self) -> None:
+        """One step, and densification where it is due. Raises TrainingFailed by name."""
+        schedule = self.plan.schedule
+        progress = self.progress
+        if progress - self._good_progress >= SNAPSHOT_SHARE:
+            self._remember(progress)
+        self.step += 1
+        reduction = schedule.reduction(self.step)
+        if reduction != self.reduction:
+            self.reduction = reduction
+            self.health.disturbed(self.step)
+        number = self._next_view()
+        target = self.views[number].reduced(reduction)
+        rates = RateSchedule(self.extent, scale=self.rate_scale).at(progress)
+        degree = schedule.degree_at(self.step, progress)
+        if self.exposure is None:
+            result = self._plain_step(number, target, degree, rates)
+        else:
+            result = self._exposed_step(self.exposure, number, target, degree, rates)
+        self.loss = result.loss
+        self.health.watch(self.step, result.loss, result.visible)
+        if self.densifier is not None:
+            self.densifier.after_step(self.engine, rates.means, self.random)
+            if schedule.densifies(self.step, progress):
+                self._densify(self.densifier, progress)
+
+    def recover(self, failure: TrainingFailed) -> None:
+        """Back to the last good state, with steps half as long."""
+        if self._good is None:
+            raise failure
+        self.recoveries += 1
+        self.rate_scale *= 0.5
+        self.engine.replace(*self._good)
+        self.health = Health(calm_from=self.step + self.health.grace)
+        self.warn(f"{failure} Went back to the last good state, with steps half as long.")
+
+    def shorten(self, tail: float) -> None:
+        """End after another `tail` of what was spent so far: rates fall to their ends in that time."""
+        self.budget = self.budget.ending_at(self.progress, tail)
+        self.shortened = True
+
+    def restore_good(self) -> bool:
+        """Back to the last good state without going on; False when there is none."""
+        if self._good is None:
+            return False
+        self.engine.replace(*self._good)
+        return True
+
+    def background(self, target: Target) -> Tensor:
+        """RGB [3] behind this step's photo: random where the photo is transparent and the plan says so."""
+        if target.alpha is not None and self.plan.background == "random":
+            return torch.rand(3, generator=self.random)
+        return self._fixed if target.alpha is not None or self.plan.background == "white" else torch.zeros(3)
+
+    def state(self) -> dict[str, Any]:
+        """Everything a later attempt needs to go on, as plain values and tensors."""
+        exp_avg, exp_avg_sq = self.engine.moments()
+        return {
+            "parameters": self.engine.parameters(),
+            "exp_avg": exp_avg,
+            "exp_avg_sq": exp_avg_sq,
+            "step": self.step,
+            "seconds": self.clock.seconds,
+            "rows": [asdict(row) for row in self.rows],
+            "recoveries": self.recoveries,
+            "rate_scale": self.rate_scale,
+            "order": self.order,
+            "random": self.random.get_state(),
+            "views": [view.name for view in self.views],
+            "exposure": None if self.exposure is None else self.exposure.state(),
+            "budget": asdict(self.budget),
+            "shortened": self.shortened,
+        }
+
+    def resume(self, state: dict[str, Any]) -> None:
+        """Go on from `state`; densification scores start again, which is all that is lost."""
+        self.engine.replace(state["parameters"], state["exp_avg"], state["exp_avg_sq"])
+        self.step = state["step"]
+        self.clock = Clock(state["seconds"])
+        self.rows = [Row(**row) for row in state["rows"]]
+        self.recoveries = state["recoveries"]
+        self.rate_scale = state["rate_scale"]
+        self.order = list(state["order"])
+        self.random.set_state(state["random"])
+        self.budget = Budget(**state["budget"])
+        self.shortened = state["shortened"]
+        self.health.disturbed(self.step)
+        if self.exposure is not None:
+            self.exposure.restore(state["exposure"])
+
+    def _plain_step(self, number: int, target: Target, degree: int, rates: Rates) -> StepResult:
+        background = self.background(target)
+        return self.engine.train_photo(
+            target.viewmat,
+            target.K,
+            target.over(background),
+            degree=degree,
+            rates=rates,
+            step=self.step,
+            background=background,
+            mask=target.mask,
+            antialias=self.plan.antialias,
+            key=(number, self.reduction) if target.alpha is None else None,
+        )
+
+    def _exposed_step(
+        self, exposure: Exposure, number: int, target: Target, degree: int, rates: Rates
+    ) -> StepResult:
+        background = self.background(target)
+        color, alpha, _ = self.engine.forward(
+            target.viewmat,
+            target.K,
+            target.camera.width,
+            target.camera.height,
+            degree=degree,
+            background=background,
+            antialias=self.plan.antialias,
+        )
+        color = color.detach().clone().requires_grad_()
+        seen = exposure.applied(number, color)
+        loss = ops.loss(seen, target.over(background), mask=target.mask, backend=self.plan.kernels)
+        (loss + exposure.penalty(number)).backward()  # type: ignore[no-untyped-call]  # torch's own gap
+        exposure.update(self.rate_scale)
+        assert color.grad is not None
+        self.engine.backward_update(color.grad, rates=rates, step=self.step)
+        return StepResult(float(loss), int(bool((alpha > 0).any())), 0)
+
+    def _next_view(self) -> int:
+        """Every photo once in random order, then again."""
+        if not self.order:
+            self.order = torch.randperm(len(self.views), generator=self.random).tolist()
+        return self.order.pop()
+
+    def _densify(self, densifier: Densifier, progress: float) -> None:
+        allowed = self.plan.max_gaussians
+        if self.plan.max_memory is not None:
+            allowed = min(allowed, self.plan.gaussians_within(self.plan.max_memory))
+        densifier.densify(self.engine, Moment(self.step, progress, self.extent, allowed), self.random)
+        if self.engine.count == 0:
+            seen = "every Gaussian became transparent and was removed."
+            raise TrainingFailed(FailureName.empty_scene, seen, step=self.step)
+
+    def _remember(self, progress: float) -> None:
+        parameters = self.engine.parameters()
+        spoilt = sum(int((~torch.isfinite(value)).sum()) for value in parameters.values())
+        if spoilt:
+            raise TrainingFailed(
+                FailureName.non_finite, f"{spoilt} parameters are not finite.", step=self.step
+            )
+        self._good = (parameters, *self.engine.moments())
+        self._good_progress = progress

@@ -1,0 +1,48 @@
+"""What is trained when: resolution, SH degree, densification, rates."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from splatmill_worker.splat.budget import Budget
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The course of a run, in shares of its budget where not said otherwise.
+
+    resolution: (first step, reduction) pairs; photos are reduced by 4, then 2, then not at all, because early
+    steps gain as much from a small photo as from a large one. degree_every: steps between SH degrees.
+    densify_from / densify_every in steps, densify_until as a share: after it, positions and colours settle.
+    """
+
+    budget: Budget
+    resolution: tuple[tuple[int, int], ...]
+    degree: int
+    degree_every: int
+    densify_from: int
+    densify_every: int
+    densify_until: float
+
+    def reduction(self, step: int) -> int:
+        """By how much photos are reduced at `step` (1-based)."""
+        return [factor for first, factor in self.resolution if first < step][-1]
+
+    def degree_at(self, step: int, progress: float) -> int:
+        """SH degree in use; a short budget reaches its last degree by its first third."""
+        by_steps = (step - 1) // self.degree_every
+        by_share = int(progress * 3.0 * self.degree)
+        return min(self.degree, max(by_steps, by_share))
+
+    def densifies(self, step: int, progress: float) -> bool:
+        """Whether the number of Gaussians may change after `step`."""
+        return (
+            step >= self.densify_from
+            and progress < self.densify_until
+            and (step - self.densify_from) % self.densify_every == 0
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the report."""
+        return asdict(self)

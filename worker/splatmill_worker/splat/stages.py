@@ -1,0 +1,29 @@
+"""Seconds of each stage, over all attempts at a job."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+class Stages:
+    """Wall seconds by stage name, kept in a file: a later attempt adds to what earlier ones spent."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.seconds: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
+
+    @contextmanager
+    def measured(self, stage: str) -> Iterator[None]:
+        """Adds the time inside to `stage`, also when it ends with an exception."""
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - started
+            part = self._path.with_suffix(".part")
+            part.write_text(json.dumps(self.seconds))
+            part.replace(self._path)

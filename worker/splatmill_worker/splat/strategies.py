@@ -1,0 +1,22 @@
+"""The densification strategy that a plan names."""
+
+from __future__ import annotations
+
+from splatmill_worker.splat.density.classic import Classic
+from splatmill_worker.splat.density.interface import Densifier
+from splatmill_worker.splat.density.mcmc import Mcmc
+from splatmill_worker.splat.plan import Plan
+
+PLAIN_THRESHOLD = 2e-4
+ABSOLUTE_THRESHOLD = 8e-4
+
+
+def densifier_of(plan: Plan) -> Densifier | None:
+    """None when the plan leaves densification out."""
+    if plan.densify is None:
+        return None
+    if plan.densify == "classic":
+        return Classic("plain", PLAIN_THRESHOLD)
+    if plan.densify == "absolute":
+        return Classic("absolute", ABSOLUTE_THRESHOLD)
+    return Mcmc()

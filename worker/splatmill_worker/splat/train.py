@@ -1,0 +1,232 @@
+"""Training: runs until the budget is spent, measures on the way, and recovers from numerical failures."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatmill_worker.splat.engine import Engine, gaussians_of
+from splatmill_worker.splat.evaluate import Score, evaluate
+from splatmill_worker.splat.exposure import Exposure
+from splatmill_worker.splat.failure import FailureName, TrainingFailed
+from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.plan import Plan
+from splatmill_worker.splat.run import Row, Run
+from splatmill_worker.splat.strategies import densifier_of
+from splatmill_worker.splat.views import Target, TrainingView
+
+MAX_RECOVERIES = 3
+TICK_SECONDS = 0.5
+MEASURED_AT = (0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""Shares of the budget at which the held-out views are rendered: close together where the curve is steep."""
+
+FLAT_GAIN = 0.02
+"""dB over the last quarter of what was spent; training that gains less is not worth its time."""
+
+FLAT_TAIL = 0.1
+
+
+class Cancelled(Exception):
+    """The caller asked the run to end."""
+
+
+@dataclass(frozen=True)
+class Tick:
+    """Where the run stands between two points of the curve; eta in seconds."""
+
+    step: int
+    steps: int
+    loss: float
+    gaussians: int
+    seconds: float
+    eta: float
+
+
+@dataclass
+class Hooks:
+    """What a caller watches and decides. `checkpoint` gets plain values and tensors to store."""
+
+    tick: Callable[[Tick], None] = lambda _: None
+    measured: Callable[[Row, Engine], None] = lambda _row, _engine: None
+    warn: Callable[[str], None] = lambda _: None
+    cancelled: Callable[[], bool] = lambda: False
+    checkpoint: Callable[[dict[str, Any]], None] | None = None
+    checkpoint_seconds: float = 20.0
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What came out. `gaussians` are in the training world; `stopped` says why the run ended."""
+
+    gaussians: Gaussians
+    rows: tuple[Row, ...]
+    held_out: Score | None
+    on_training: Score
+    steps: int
+    seconds: float
+    evaluate_seconds: float
+    stopped: str
+    failure: TrainingFailed | None
+    recoveries: int
+
+
+@dataclass
+class _Measuring:
+    """Seconds spent on evaluation, and which points of the curve are done."""
+
+    seconds: float = 0.0
+    done: int = 0
+    since: float = field(default_factory=time.perf_counter)
+
+
+def train(
+    engine: Engine,
+    views: Sequence[TrainingView],
+    held_out: Sequence[TrainingView],
+    plan: Plan,
+    *,
+    extent: float,
+    hooks: Hooks | None = None,
+    resume_from: dict[str, Any] | None = None,
+) -> Trained:
+    """Optimise what `engine` holds until it shows `views`, as `plan` says.
+
+    extent: radius of the cameras in the training world, the unit of the position rate. resume_from: a state that
+    `hooks.checkpoint` was given by an earlier attempt with the same plan. Evaluation and checkpoints are not on
+    the training clock. Raises TrainingFailed when nothing usable was reached, Cancelled on request.
+    """
+    hooks = hooks or Hooks()
+    exposure = Exposure(len(views)) if plan.exposure else None
+    warm_up(engine, views[0], plan)
+    run = Run(engine, plan, views, extent, densifier_of(plan), exposure, hooks.warn)
+    if resume_from is not None:
+        run.resume(resume_from)
+    measuring = _Measuring(done=sum(share <= run.progress for share in MEASURED_AT))
+    stopped, failure = "", None
+    last_tick = last_checkpoint = time.monotonic()
+    while not stopped:
+        if hooks.cancelled():
+            raise Cancelled
+        try:
+            run.advance()
+        except TrainingFailed as named:
+            if run.recoveries >= MAX_RECOVERIES or named.name is FailureName.empty_scene:
+                if not run.restore_good() or not run.rows:
+                    raise
+                stopped, failure = f"failed: {named}", named
+                break
+            run.recover(named)
+        if run.progress >= MEASURED_AT[measuring.done]:
+            with run.clock.stopped():
+                row = _measure(run, held_out, measuring)
+                hooks.measured(row, engine)
+            stopped = _enough(run, plan)
+        now = time.monotonic()
+        if now - last_tick >= TICK_SECONDS:
+            last_tick = now
+            hooks.tick(_tick(run))
+        if hooks.checkpoint is not None and now - last_checkpoint >= hooks.checkpoint_seconds:
+            with run.clock.stopped():
+                hooks.checkpoint(run.state())
+            last_checkpoint = time.monotonic()
+    seconds = run.clock.seconds
+    started = time.perf_counter()
+    draw = drawer(engine, plan)
+    backdrop = evaluation_background(plan)
+    final = evaluate(draw, held_out, backdrop) if held_out else None
+    sample = views[:: max(1, len(views) // 16)]
+    on_training = evaluate(draw, sample, backdrop)
+    return Trained(
+        gaussians_of(engine).padded(plan.schedule.degree),
+        tuple(run.rows),
+        final,
+        on_training,
+        run.step,
+        seconds,
+        measuring.seconds + time.perf_counter() - started,
+        stopped,
+        failure,
+        run.recoveries,
+    )
+
+
+def drawer(engine: Engine, plan: Plan) -> Callable[[Target, Tensor], Tensor]:
+    """Renders targets with what the engine holds now."""
+
+    def draw(target: Target, background: Tensor) -> Tensor:
+        camera = target.camera
+        color, _, _ = engine.forward(
+            target.viewmat,
+            target.K,
+            camera.width,
+            camera.height,
+            degree=plan.schedule.degree,
+            background=background,
+            antialias=plan.antialias,
+        )
+        return color
+
+    return draw
+
+
+def evaluation_background(plan: Plan) -> Tensor:
+    """White behind transparent photos unless the plan says black: what published results are judged on."""
+    return torch.zeros(3) if plan.background == "black" else torch.ones(3)
+
+
+def warm_up(engine: Engine, view: TrainingView, plan: Plan) -> None:
+    """Touch code and memory once before the clock starts; changes nothing."""
+    drawer(engine, plan)(view.full, evaluation_background(plan))
+
+
+def _measure(run: Run, held_out: Sequence[TrainingView], measuring: _Measuring) -> Row:
+    started = time.perf_counter()
+    while measuring.done < len(MEASURED_AT) and run.progress >= MEASURED_AT[measuring.done]:
+        measuring.done += 1
+    score = None
+    if held_out:
+        score = evaluate(drawer(run.engine, run.plan), held_out, evaluation_background(run.plan))
+    row = Row(
+        run.clock.seconds,
+        run.step,
+        run.loss,
+        None if score is None else score.psnr,
+        None if score is None else score.ssim,
+        run.engine.count,
+    )
+    run.rows.append(row)
+    measuring.seconds += time.perf_counter() - started
+    return row
+
+
+def _enough(run: Run, plan: Plan) -> str:
+    """Why the run ends here; empty when it goes on."""
+    if run.progress >= 1.0:
+        return "the held-out curve became flat" if run.shortened else "the budget is spent"
+    reached = run.rows[-1].psnr
+    if plan.target_psnr is not None and reached is not None and reached >= plan.target_psnr:
+        return f"the held-out views reached {reached:.2f} dB"
+    if plan.stops_when_flat and not run.shortened and _flat(run.rows):
+        run.shorten(FLAT_TAIL)
+    return ""
+
+
+def _flat(rows: Sequence[Row]) -> bool:
+    """Whether the last quarter of the time gained less than FLAT_GAIN on the held-out views."""
+    now = rows[-1]
+    before = [row for row in rows if row.seconds <= 0.75 * now.seconds and row.step >= 500]
+    if not before or now.psnr is None or before[-1].psnr is None:
+        return False
+    return now.psnr - before[-1].psnr < FLAT_GAIN
+
+
+def _tick(run: Run) -> Tick:
+    progress, seconds = run.progress, run.clock.seconds
+    total = run.step if progress <= 0 else round(run.step / progress)
+    eta = seconds * (1.0 - progress) / max(progress, 1e-6)
+    return Tick(run.step, max(run.step, total), run.loss, run.engine.count, seconds, eta)

@@ -1,0 +1,86 @@
+"""Training photos as tensors at every resolution that the schedule asks for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from splatmill_worker.images import Photo
+from splatmill_worker.scene import Camera, Normalization
+
+
+class Target(NamedTuple):
+    """What one camera should see: rgb uint8 [H, W, 3], alpha uint8 [H, W], mask bool [H, W] of pixels that count."""
+
+    camera: Camera
+    viewmat: Tensor
+    K: Tensor
+    rgb: Tensor
+    alpha: Tensor | None
+    mask: Tensor | None
+
+    def over(self, background: Tensor) -> Tensor:
+        """The photo, uint8 [H, W, 3], with `background` [3] in 0..1 behind what is transparent."""
+        if self.alpha is None:
+            return self.rgb
+        cover = self.alpha[..., None].float() / 255.0
+        return (self.rgb * cover + (1.0 - cover) * (255.0 * background) + 0.5).to(torch.uint8)
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """One photo in the training world, with its reduced copies made on first use."""
+
+    name: str
+    levels: dict[int, Target]
+
+    @staticmethod
+    def of(photo: Photo, normalization: Normalization) -> TrainingView:
+        """The photo at full training resolution; its camera moved into the training world."""
+        mask = None if photo.mask is None or photo.mask.all() else torch.from_numpy(photo.mask)
+        alpha = None if photo.alpha is None or (photo.alpha == 255).all() else torch.from_numpy(photo.alpha)
+        target = _target(normalization.camera(photo.camera), torch.from_numpy(photo.rgb), alpha, mask)
+        return TrainingView(photo.view.name, {1: target})
+
+    @property
+    def full(self) -> Target:
+        """At full training resolution."""
+        return self.levels[1]
+
+    def reduced(self, factor: int) -> Target:
+        """With both sides divided by `factor` (area filter), or as far as one pixel."""
+        if factor not in self.levels:
+            self.levels[factor] = _reduced(self.full, factor)
+        return self.levels[factor]
+
+
+def _target(camera: Camera, rgb: Tensor, alpha: Tensor | None, mask: Tensor | None) -> Target:
+    viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float32)
+    intrinsics = torch.as_tensor(camera.K, dtype=torch.float32)
+    return Target(camera, viewmat, intrinsics, rgb.contiguous(), alpha, mask)
+
+
+def _reduced(full: Target, factor: int) -> Target:
+    height, width = full.rgb.shape[:2]
+    size = (max(1, round(height / factor)), max(1, round(width / factor)))
+
+    def area(planes: Tensor) -> Tensor:  # [C, H, W] float
+        return torch.nn.functional.interpolate(planes[None], size=size, mode="area")[0]
+
+    rgb = full.rgb.permute(2, 0, 1).float()
+    alpha = mask = None
+    if full.alpha is None:
+        rgb = area(rgb)
+    else:
+        # Colours are averaged by what they cover, so that hidden ones do not bleed in.
+        cover = full.alpha[None].float() / 255.0
+        small = area(cover)
+        rgb = area(rgb * cover) / small.clamp_min(1.0 / 255.0)
+        alpha = (small[0] * 255.0 + 0.5).to(torch.uint8)
+    if full.mask is not None:
+        mask = area(full.mask[None].float())[0] >= 0.5
+    pixels = (rgb.clamp(0.0, 255.0) + 0.5).to(torch.uint8).permute(1, 2, 0)
+    return _target(full.camera.scaled_to(size[1], size[0]), pixels, alpha, mask)
