@@ -54,7 +54,8 @@ def test_reasons_not_to_start_are_sentences(tmp_path: Path, redis_url: str) -> N
 def served(uds: Path, **options: Any) -> Iterator[tuple[subprocess.Popen[str], httpx.Client]]:
     """A server process on a unix socket."""
     env = options.pop("env")
-    process = subprocess.Popen(**command(SPLATMILL_UDS=str(uds), **env), **options, stderr=subprocess.PIPE)
+    with uds.with_suffix(".log").open("w") as log:
+        process = subprocess.Popen(**command(SPLATMILL_UDS=str(uds), **env), **options, stderr=log)
     transport = httpx.HTTPTransport(uds=str(uds))
     try:
         with httpx.Client(transport=transport, base_url="http://server", timeout=30) as http:
@@ -62,7 +63,7 @@ def served(uds: Path, **options: Any) -> Iterator[tuple[subprocess.Popen[str], h
             yield process, http
     finally:
         process.kill()
-        process.communicate()
+        process.wait()
 
 
 def listening(uds: Path) -> bool:
@@ -89,7 +90,7 @@ def test_one_signal_ends_it_with_a_stream_open(tmp_path: Path, redis_url: str) -
         assert process.wait(20) == 0
         assert time.monotonic() - begun < 5
         assert not uds.exists()
-        _, log = process.communicate()
+        log = uds.with_suffix(".log").read_text()
         assert json.loads(log.splitlines()[0])["event"] == "serving"
 
 
