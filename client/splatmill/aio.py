@@ -317,6 +317,7 @@ class AsyncModelHandle:
             f"/v1/models/{self.id}/render",
             json=request.model_dump(mode="json", exclude_none=True),
             repeatable=True,
+            timeout=RENDER_TIMEOUT,
         )
         return response.content
 
@@ -336,6 +337,8 @@ class AsyncModelHandle:
         return write_whole(target_of(path, "orbit.mp4"), response.content)
 
 
+# A little longer than the server waits for its renderer, so that its sentence arrives instead of ours.
+RENDER_TIMEOUT = httpx.Timeout(30.0, read=150.0)
 # Hundreds of frames on a machine without a GPU take minutes, and the answer begins when the video is whole.
 ORBIT_TIMEOUT = httpx.Timeout(30.0, read=900.0)
 

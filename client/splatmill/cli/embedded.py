@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import secrets
 import select
 import shutil
 import subprocess
@@ -55,6 +56,7 @@ def embedded_service(data: Path) -> Iterator[Service]:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,
+                env=_environment(),
                 # Ctrl-C is for this process, which cancels the job first and ends the service after it.
                 start_new_session=True,
             )
@@ -62,6 +64,14 @@ def embedded_service(data: Path) -> Iterator[Service]:
             yield _wait_ready(process, log)
         finally:
             _end(process)
+
+
+def _environment() -> dict[str, str]:
+    """This process's environment without what points at another service: its Redis would hand this call's job to
+    strangers, and theirs to this machine. The key keeps other users of this machine out."""
+    foreign = ("REDIS_URL", "SPLATMILL_STORAGE", "SPLATMILL_DATA", "SPLATMILL_RENDERER_URL", "SPLATMILL_UDS")
+    kept = {name: value for name, value in os.environ.items() if name not in foreign}
+    return kept | {"SPLATMILL_API_KEY": secrets.token_urlsafe(24)}
 
 
 @contextmanager

@@ -1,0 +1,114 @@
+"""The service for the time of one call: it comes up, keeps to itself, ends whole, and says why when it cannot start.
+
+Does not prove what the service does with a job; tests/service does. Here a job only has to reach its worker.
+"""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from splatmill import Client
+from splatmill.cli.embedded import embedded_service
+from splatmill.cli.exits import Exit
+from splatmill.errors import ServiceFailed, Unauthorized
+
+
+def family() -> set[int]:
+    return {child.pid for child in psutil.Process().children(recursive=True)}
+
+
+def runs(pid: int) -> bool:
+    """Whether a process is there and not merely waiting to be collected."""
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def test_it_comes_up_and_leaves_nothing(tmp_path: Path, monkeypatch):
+    # What points at another service is not for this one.
+    monkeypatch.setenv("REDIS_URL", "redis://127.0.0.1:9/0")
+    monkeypatch.setenv("SPLATMILL_STORAGE", "s3://somebody-elses/bucket")
+    before = family()
+    data = tmp_path / "out" / ".splatmill"
+    with embedded_service(data) as service:
+        with Client(service.url, api_key=service.api_key) as client:
+            assert client.ready().ready
+            assert client.info().storage == "file"
+        with Client(service.url) as stranger, pytest.raises(Unauthorized):
+            stranger.info()
+        with pytest.raises(ServiceFailed, match="Another `splatmill train`"), embedded_service(data):
+            pass
+        children = family() - before
+        assert len(children) >= 4, "supervisor, Redis, API, worker"
+    assert not any(runs(pid) for pid in children)
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_what_a_killed_call_left_is_cleared(tmp_path: Path):
+    data = tmp_path / ".splatmill"
+    (data / "storage").mkdir(parents=True)
+    (data / "storage" / "old").write_text("left behind")
+    with embedded_service(data):
+        assert not (data / "storage" / "old").exists()
+
+
+def test_a_start_that_fails_is_told_with_its_last_words(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("splatmill.cli.embedded.SUPERVISOR", "splatmill_server.no_such_module")
+    with (
+        pytest.raises(ServiceFailed, match="ended at its start with code 1") as failed,
+        embedded_service(tmp_path / "d"),
+    ):
+        pass
+    assert "no_such_module" in str(failed.value)
+    assert not (tmp_path / "d").exists()
+
+
+def test_it_ends_with_its_caller(tmp_path: Path):
+    code = f"""
+import json, os, psutil, sys
+from pathlib import Path
+from splatmill.cli.embedded import embedded_service
+with embedded_service(Path({str(tmp_path / "data")!r})) as service:
+    pids = [child.pid for child in psutil.Process().children(recursive=True)]
+    print(json.dumps(pids), flush=True)
+    os.kill(os.getpid(), 9)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    pids = json.loads(done.stdout)
+    assert len(pids) >= 4
+    end = time.monotonic() + 30
+    while left := {pid for pid in pids if runs(pid)}:
+        assert time.monotonic() < end, f"{left} outlived the call"
+        time.sleep(0.02)
+
+
+def test_photos_that_are_none_fail_with_a_sentence(tmp_path: Path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for n in range(3):
+        (photos / f"{n}.jpg").write_text("this is not a photo, whatever its name says")
+    command = [sys.executable, "-m", "splatmill", "train", str(photos), "-o", str(tmp_path / "out")]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=120, env=os.environ | {"NO_COLOR": "1"}
+    )
+    assert done.returncode == Exit.job_failed, done.stderr
+    assert done.stderr.startswith("Error: ")
+    assert "Traceback" not in done.stderr
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_up_refuses_a_port_in_use(tmp_path: Path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        command = [sys.executable, "-m", "splatmill", "up", "--port", port, "--data", str(tmp_path)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert f"Port {port} on 127.0.0.1 is in use" in done.stderr
