@@ -23,7 +23,7 @@ def adam_(
     """One Adam step in place; the definition, and what is returned, are `reference.adam_`'s. float32, contiguous."""
 
     def rows(tensors: Sequence[Tensor]) -> list[Tensor]:
-        return [t.detach().view(t.shape[0], -1) for t in tensors]
+        return [t.detach().unsqueeze(1).flatten(1) for t in tensors]
 
     refused: int = cpu.engine.adam(
         rows(params), rows(grads), rows(exp_avg), rows(exp_avg_sq), list(rates), step, visible, last_step

@@ -24,7 +24,7 @@ def pack(groups: dict[str, Tensor], count: int, threads: int) -> Tensor:
     Unused lanes stay all zero: a quaternion of 0 is never visible, and rests under Adam.
     """
     blocks = empty(count)
-    flat = [g.detach().reshape(count, -1).contiguous() for g in groups.values()]
+    flat = [g.detach().unsqueeze(1).flatten(1).contiguous() for g in groups.values()]
     engine.pack(flat, [FIRST[name] for name in groups], blocks, count, threads)
     return blocks
 
@@ -32,7 +32,7 @@ def pack(groups: dict[str, Tensor], count: int, threads: int) -> Tensor:
 def unpack(blocks: Tensor, shapes: dict[str, torch.Size], count: int, threads: int) -> dict[str, Tensor]:
     """Plain tensors of the given shapes [count, ...]."""
     groups = {name: torch.empty(shape) for name, shape in shapes.items()}
-    flat = [g.view(count, -1) for g in groups.values()]
+    flat = [g.unsqueeze(1).flatten(1) for g in groups.values()]  # views: what is written shows in groups
     engine.unpack(flat, [FIRST[name] for name in groups], blocks, count, threads)
     return groups
 

@@ -1,0 +1,175 @@
+"""What the proofs share: running a case on a backend, and how far float32 may be from the definition."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor
+
+from splatmill_worker.kernels import ops
+from splatmill_worker.kernels.cpu import isa
+from splatmill_worker.kernels.records import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Bins, Projected
+
+from .cases import GROUPS, Case
+
+EPS = 2.0**-24  # half a unit in the last place of float32
+EXP2_ERROR = 2e-5  # relative error the engines allow their vector 2^x on [-8, 0]
+
+
+def backends() -> list[object]:
+    """Every backend that can run here: the builds of the CPU engine, and gpu on a device or in Triton's interpreter."""
+    found: list[object] = [f"cpu:{name}" for name in isa.supported()]
+    if torch.cuda.is_available() or os.environ.get("TRITON_INTERPRET") == "1":
+        found.append(pytest.param("gpu", marks=pytest.mark.gpu))
+    return found
+
+
+@contextmanager
+def use(backend: str) -> Iterator[ops.Backend]:
+    """Run with one build of the CPU engine (`cpu:avx2`); gives the name that ops know the backend by."""
+    name, _, build = backend.partition(":")
+    if not build:
+        yield name  # type: ignore[misc]
+        return
+    engine = isa.load(build)
+    prefix = "splatmill_worker.kernels.cpu"
+    modules = [m for k, m in sys.modules.items() if k.startswith(prefix) and hasattr(m, "engine")]
+    before = [m.engine for m in modules]
+    for m in modules:
+        m.engine = engine  # type: ignore[attr-defined]
+    try:
+        yield "cpu"
+    finally:
+        for m, old in zip(modules, before, strict=True):
+            m.engine = old  # type: ignore[attr-defined]
+
+
+@dataclass
+class Run:
+    """One case through project, bin and composite, with the leaves that gradients arrive at."""
+
+    leaves: dict[str, Tensor]  # the five groups, viewmat and background
+    projected: Projected
+    bins: Bins
+    color: Tensor
+    alpha: Tensor
+    depth: Tensor
+
+    def gradients(self, d_color: Tensor, d_alpha: Tensor, d_depth: Tensor) -> dict[str, Tensor]:
+        """Gradients of the weighted sum of the three images to every leaf."""
+        kind = {"dtype": self.color.dtype, "device": self.color.device}
+        total = (
+            (self.color * d_color.to(**kind)).sum()
+            + (self.alpha * d_alpha.to(**kind)).sum()
+            + (self.depth * d_depth.to(**kind)).sum()
+        )
+        grads = torch.autograd.grad(total, list(self.leaves.values()), allow_unused=True)
+        pairs = zip(self.leaves.items(), grads, strict=True)
+        return {k: torch.zeros_like(x) if g is None else g for (k, x), g in pairs}
+
+
+def run(case: Case, backend: ops.Backend, dtype: torch.dtype = torch.float32) -> Run:
+    """Project, bin and composite a case."""
+    device = "cuda" if backend == "gpu" and torch.cuda.is_available() else "cpu"
+    names = (*GROUPS, "viewmat", "background")
+    tensors = [*case.groups(), case.viewmat, case.background]
+    leaves = {
+        k: x.detach().clone().to(device, dtype).requires_grad_() for k, x in zip(names, tensors, strict=True)
+    }
+    projected = ops.project(
+        *(leaves[k] for k in GROUPS),
+        leaves["viewmat"],
+        case.K.to(device, dtype),
+        case.width,
+        case.height,
+        degree=case.degree,
+        near=case.near,
+        antialias=case.antialias,
+        backend=backend,
+    )
+    bins = ops.bin(projected, case.width, case.height, backend=backend)
+    image = ops.composite(
+        projected, bins, case.width, case.height, background=leaves["background"], backend=backend
+    )
+    return Run(leaves, projected, bins, *image)
+
+
+def define(case: Case) -> Run:
+    """The definition: the reference in float64."""
+    return run(case, "reference", torch.float64)
+
+
+def alpha_error(case: Case, exact: Projected) -> Tensor:
+    """How far, relatively, float32 may put each Gaussian's alpha [N], to first order, from the definition.
+
+    alpha = o 2^(-q/2 log2 e), q = d^T C d <= 2 ln 255 = 11. A camera-space coordinate is a sum of four products, known to
+    4 eps (|mean| + |t|). Divided by z it moves the centre by that times f/z (1 + |u|), and rounding the pixel coordinate
+    by 2 eps |coordinate|; alpha's slope along q is at most sqrt(11 lambda_max(C)) <= 6 per pixel. Relative errors of the
+    covariance, 2 dz/z + 16 eps, act on q <= 11. The vector 2^x adds its own error, the sigmoid and the products 8 eps.
+    """
+    coordinate = 4 * EPS * (case.means.double().abs().sum(1) + case.viewmat[:3, 3].double().abs().sum())
+    z = exact.depths.detach()
+    seen = (exact.extents > 0).all(1)
+    z = torch.where(seen, z, 1.0)
+    focal = float(case.K[0, 0].maximum(case.K[1, 1]))
+    offset = (exact.means2d.detach() - case.K[:2, 2].double()).abs().amax(1) / focal
+    pixels = focal * coordinate / z * (1 + offset) + 2 * EPS * exact.means2d.detach().abs().amax(1)
+    a, b, c = exact.conics.detach().unbind(1)
+    stiffest = (a + c) / 2 + torch.sqrt(((a - c) / 2) ** 2 + b * b)
+    q = 11.0
+    error = torch.sqrt(q * stiffest) * pixels + q / 2 * (2 * coordinate / z + 16 * EPS) + EXP2_ERROR + 8 * EPS
+    return torch.where(seen, error, 0.0)
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Per pixel, the relative distance of the nearest alpha from a threshold, in units of its possible error."""
+
+    jump: Tensor  # [H,W] to 1/255, or of the transmittance to its end: the image jumps there
+    gate: Tensor  # [H,W] to 0.999: the gradient jumps there
+
+
+def margins(exact: Projected, bins: Bins, width: int, height: int, error: Tensor) -> Margins:
+    """How far every pixel is from a decision that float32 could take otherwise (a value <= 1 may go either way)."""
+    columns = -(-width // TILE)
+    jump = torch.full((height, width), float("inf"), dtype=torch.float64)
+    gate = jump.clone()
+    for tile in range(len(bins.offsets) - 1):
+        ids = bins.ids[bins.offsets[tile] : bins.offsets[tile + 1]].long()
+        if not len(ids):
+            continue
+        top, left = tile // columns * TILE, tile % columns * TILE
+        ys = torch.arange(top, min(top + TILE, height))
+        xs = torch.arange(left, min(left + TILE, width))
+        y, x = torch.meshgrid(ys + 0.5, xs + 0.5, indexing="ij")
+        d = (
+            torch.stack([x.reshape(-1, 1), y.reshape(-1, 1)]).double()
+            - exact.means2d[ids].detach().T[:, None]
+        )
+        a, b, c = exact.conics[ids].detach().T[:, None]
+        raw = exact.opacities[ids].detach() * torch.exp(
+            -0.5 * (a * d[0] ** 2 + c * d[1] ** 2) - b * d[0] * d[1]
+        )
+        at_cut = ((raw / ALPHA_MIN - 1).abs() / error[ids]).amin(1)
+        at_gate = ((raw / ALPHA_MAX - 1).abs() / error[ids]).amin(1)
+        alpha = torch.where(raw >= ALPHA_MIN, raw.clamp_max(ALPHA_MAX), 0.0)
+        after = torch.cumprod(1 - alpha, 1)
+        # Relative errors of 1 - alpha add up along the list.
+        unsure = torch.cumsum(error[ids] * alpha / (1 - alpha) + EPS, 1)
+        at_stop = ((after / TRANSMITTANCE_MIN - 1).abs() / unsure).amin(1)
+        shape = (len(ys), len(xs))
+        jump[ys[0] : ys[-1] + 1, xs[0] : xs[-1] + 1] = torch.minimum(at_cut, at_stop).reshape(shape)
+        gate[ys[0] : ys[-1] + 1, xs[0] : xs[-1] + 1] = at_gate.reshape(shape)
+    return Margins(jump, gate)
+
+
+def brightest(exact: Run) -> tuple[float, float]:
+    """Largest colour and largest depth that any pixel can show."""
+    color = max(float(exact.leaves["background"].detach().max()), *exact.projected.colors.flatten().tolist(), 1e-6)
+    return color, max([*exact.projected.depths.tolist(), 1e-6])

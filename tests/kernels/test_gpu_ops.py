@@ -1,0 +1,363 @@
+"""The Triton kernels against the float64 reference, forward and backward, on the shared cases.
+
+Without a GPU they run through Triton's interpreter, on thinned cases, because it takes milliseconds for every splat of a tile;
+on a machine with one, `pytest -m gpu` runs the cases whole on the device. What the interpreter does not prove: atomics under
+real concurrency, the hardware's approximate exp2 and division, and that the compiler keeps what the source says.
+"""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+import torch
+from torch import Tensor
+
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # before Triton is first imported
+
+pytest.importorskip("triton", reason="Triton comes with torch's GPU builds; pip install triton to prove the kernels here")
+
+from splatmill_worker.kernels import ops, reference
+from splatmill_worker.kernels.records import ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Bins, Projected
+from splatmill_worker.kernels.reference.composite import _weights
+
+from .cases import CASES, GROUPS, Case
+
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # the interpreter's numpy, where NaN is the point
+INTERPRETING = os.environ.get("TRITON_INTERPRET") == "1"
+EPS = 2.0**-24
+DEVICES = [
+    pytest.param("cpu", marks=pytest.mark.skipif(not INTERPRETING, reason="a GPU is here; TRITON_INTERPRET=1 runs this")),
+    pytest.param(
+        "cuda",
+        marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")],
+    ),
+]
+BY_CASE = pytest.mark.parametrize("name", list(CASES))
+BY_DEVICE = pytest.mark.parametrize("device", DEVICES)
+
+
+def case_for(name: str, device: str, most: int) -> Case:
+    """The case, thinned for the interpreter to at most `most` Gaussians spread over its list."""
+    case = CASES[name]()
+    n = len(case.means)
+    if device == "cuda" or n <= most:
+        return case
+    rows = torch.linspace(0, n - 1, most).round().long()
+    from dataclasses import replace
+
+    return replace(case, **{group: getattr(case, group)[rows] for group in GROUPS})
+
+
+def project(case: Case, dtype: torch.dtype, backend: ops.Backend, device: str = "cpu") -> tuple[Projected, list[Tensor]]:
+    """Fields and the leaves that gradients are asked for."""
+    leaves = [x.to(device).requires_grad_() for x in case.groups(dtype)]
+    viewmat, K = (x.to(device) for x in case.camera(dtype))
+    leaves.append(viewmat.requires_grad_())
+    fields = ops.project(
+        *leaves, K, case.width, case.height,
+        degree=case.degree, near=case.near, antialias=case.antialias, backend=backend,
+    )  # fmt: skip
+    return fields, leaves
+
+
+def close(name: str, seen: Tensor, plain: Tensor, exact: Tensor, *, slack: float = 8.0) -> None:
+    """`seen` is as near to `exact` (float64) as the reference's own arithmetic in float32 (`plain`) is, within `slack`.
+
+    That is what float32 can give for this scene; a needle may lose all digits and an ordinary splat almost none. The floor of 64
+    roundings of the largest value covers sums in another order.
+    """
+    if not exact.numel():
+        assert not seen.numel()
+        return
+    seen, plain = seen.detach().cpu().double(), plain.detach().cpu().double()
+    floor = 64 * EPS * float(exact.abs().max())
+    allowed = slack * float((plain - exact).abs().max()) + floor
+    error = float((seen - exact).abs().max())
+    assert error <= allowed, f"{name}: error {error:.3g} where {allowed:.3g} is allowed, largest {exact.abs().max():.3g}"
+
+
+@BY_DEVICE
+@BY_CASE
+def test_project_agrees_with_the_definition(name: str, device: str) -> None:
+    case = case_for(name, device, 64)
+    exact, _ = project(case, torch.float64, "reference")
+    plain, _ = project(case, torch.float32, "reference")
+    seen, _ = project(case, torch.float32, "gpu", device)
+    shown = seen.extents[:, 0].cpu() > 0
+    # Who is culled may differ only where float32 itself is undecided.
+    assert torch.equal(shown, exact.extents[:, 0] > 0) or torch.equal(shown, plain.extents[:, 0] > 0)
+    both = shown & (exact.extents[:, 0] > 0) & (plain.extents[:, 0] > 0)
+    for field, a, b, c in zip(Projected._fields, seen, plain, exact, strict=True):
+        close(field, a.cpu()[both], b[both], c[both])
+        assert not a.cpu()[~shown].any(), f"{field}: a culled row is not zero"
+
+
+@BY_DEVICE
+@BY_CASE
+def test_gradient_of_project_agrees_with_the_definition(name: str, device: str) -> None:
+    case = case_for(name, device, 64)
+    weights: list[Tensor] | None = None
+    found = []
+    for dtype, backend, where in (
+        (torch.float64, "reference", "cpu"),
+        (torch.float32, "reference", "cpu"),
+        (torch.float32, "gpu", device),
+    ):
+        fields, leaves = project(case, dtype, backend, where)  # type: ignore[arg-type]
+        if weights is None:
+            g = torch.Generator().manual_seed(5)
+            weights = [torch.randn(f.shape, generator=g, dtype=torch.float64) for f in fields[:5]]
+            weights[1] *= fields[1].detach().abs().clamp_min(1e-3) ** -1  # conics range over many decades
+        total = sum((f * w.to(where, dtype)).sum() for f, w in zip(fields[:5], weights, strict=True))
+        assert isinstance(total, Tensor)
+        if total.requires_grad:
+            total.backward()
+        found.append([torch.zeros_like(x) if x.grad is None else x.grad for x in leaves])
+        culled = fields.extents[:, 0].cpu() == 0
+        for group, gradient in zip(GROUPS, found[-1], strict=False):
+            assert not gradient.cpu()[culled].any(), f"{group}: a culled row has a gradient"
+    for group, a, b, c in zip((*GROUPS, "viewmat"), found[2], found[1], found[0], strict=True):
+        close(group, a, b, c)
+
+
+def single(fields: Projected, device: str) -> Projected:
+    return Projected(*(x.detach().float().to(device) for x in fields))
+
+
+@BY_DEVICE
+@BY_CASE
+def test_bin_agrees_with_the_definition_but_for_real_crossings(name: str, device: str) -> None:
+    case = case_for(name, device, 64)
+    fields = single(project(case, torch.float64, "reference")[0], "cpu")
+    exact = reference.bin(Projected(*(x.double() for x in fields)), case.width, case.height)
+    seen = ops.bin(single(fields, device), case.width, case.height, backend="gpu")
+    columns = -(-case.width // TILE)
+    wanted, got = ({*pairs(exact)}, {*pairs(seen)})
+    for tile, i in wanted ^ got:
+        a, b, c = fields.conics[i].double().tolist()
+        mx, my = fields.means2d[i].double().tolist()
+        xs = [tile % columns * TILE + e - mx for e in (0.5, TILE - 0.5)]
+        ys = [tile // columns * TILE + e - my for e in (0.5, TILE - 0.5)]
+        x, y = max(map(abs, xs)), max(map(abs, ys))
+        size = a * x * x + 2 * abs(b) * x * y + c * y * y  # what the quadratic form's terms cancel from
+        level = 2 * torch.log(fields.opacities[i].double() * 255).item()
+        within = 64 * EPS * (size + abs(level) + 1)
+        least = _least(fields.conics[i].double(), xs, ys)
+        assert abs(least - level) <= within, f"pair {tile}, {i}: {least} against {level}"
+    order = [i for _, i in pairs(seen) if (_, i) in wanted]
+    assert order == [i for _, i in pairs(exact) if (_, i) in got]
+
+
+def _least(conic: Tensor, xs: list[float], ys: list[float]) -> float:
+    """The smallest value of the form over a rectangle, by the definition's own code."""
+    from splatmill_worker.kernels.reference.bin import _least as least
+
+    center = torch.tensor([[0.5 - xs[0], 0.5 - ys[0]]], dtype=torch.float64)
+    zero = torch.zeros(1, dtype=torch.int64)
+    return float(least(conic[None], center, zero, zero))
+
+
+def pairs(bins: Bins) -> list[tuple[int, int]]:
+    offsets, ids = bins.offsets.tolist(), bins.ids.tolist()
+    return [(t, i) for t in range(len(offsets) - 1) for i in ids[offsets[t] : offsets[t + 1]]]
+
+
+def undecided(fields: Projected, bins: Bins, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Pixels [H, W] where a list comes within float32's reach of 1/255 or of the stop, and a bound of the image's error there.
+
+    With d the rounding of the exponent, 8 eps (|a| x^2 + 2 |b x y| + |c| y^2) / 2, the image is off by at most
+    2 max(c) sum_i w_i d_i: once for the splat's own weight and once for what is behind it, which weighs no more.
+    """
+    near = torch.zeros(height, width, dtype=torch.bool)
+    bound = torch.zeros(height, width, dtype=torch.float64)
+    offsets, columns = bins.offsets.tolist(), -(-width // TILE)
+    exact = Projected(*(x.double() for x in fields))
+    for tile in range(len(offsets) - 1):
+        ids = bins.ids[offsets[tile] : offsets[tile + 1]].long()
+        if not len(ids):
+            continue
+        left, top = tile % columns * TILE, tile // columns * TILE
+        w, h = min(TILE, width - left), min(TILE, height - top)
+        weights = _weights(exact, ids, left, top, w, h, False)
+        y, x = torch.meshgrid(torch.arange(top, top + h) + 0.5, torch.arange(left, left + w) + 0.5, indexing="ij")
+        dx = x.reshape(-1, 1).double() - exact.means2d[ids, 0]
+        dy = y.reshape(-1, 1).double() - exact.means2d[ids, 1]
+        a, b, c = exact.conics[ids].unbind(1)
+        alpha = (exact.opacities[ids] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).clamp_max(0.999)
+        d = 8 * EPS * (1 + 0.5 * (a * dx * dx + c * dy * dy) + (b * dx * dy).abs())
+        after = torch.cumprod(torch.where(alpha >= ALPHA_MIN, 1 - alpha, 1.0), 1)
+        drift = torch.cumsum(d * alpha / (1 - alpha), 1) + 8 * EPS * len(ids)
+        close_cut = (alpha / ALPHA_MIN - 1).abs() <= d + 8 * EPS
+        close_stop = (after / TRANSMITTANCE_MIN - 1).abs() <= drift
+        near[top : top + h, left : left + w] = (close_cut | close_stop).any(1).reshape(h, w)
+        bound[top : top + h, left : left + w] = ((weights * d).sum(1) + 2 * EPS * len(ids)).reshape(h, w)
+    return near, bound
+
+
+@BY_DEVICE
+@BY_CASE
+def test_composite_and_its_gradient_agree_with_the_definition(name: str, device: str) -> None:
+    case = case_for(name, device, 20)
+    width, height = case.width, case.height
+    fields = single(project(case, torch.float64, "reference")[0], "cpu")
+    bins = reference.bin(Projected(*(x.double() for x in fields)), width, height)
+    near, bound = undecided(fields, bins, width, height)
+    g = torch.Generator().manual_seed(2)
+    # At undecided pixels float32 may rightly take another branch: no gradient is sent there.
+    weights = [
+        torch.randn(height, width, *more, generator=g, dtype=torch.float64) * (~near).reshape(height, width, *[1] * len(more))
+        for more in ((3,), (), ())
+    ]
+    images, gradients = [], []
+    for dtype, backend, where in (
+        (torch.float64, "reference", "cpu"),
+        (torch.float32, "reference", "cpu"),
+        (torch.float32, "gpu", device),
+    ):
+        leaves = [x.to(where, dtype).requires_grad_() for x in fields[:5]]
+        background = case.background.to(where, dtype).requires_grad_()
+        lists = Bins(bins.offsets.to(where), bins.ids.to(where))
+        image = ops.composite(
+            Projected(*leaves, fields.extents.to(where, dtype)), lists, width, height,
+            background=background, backend=backend,  # type: ignore[arg-type]
+        )  # fmt: skip
+        total = sum((part * w.to(where, dtype)).sum() for part, w in zip(image, weights, strict=True))
+        assert isinstance(total, Tensor)
+        total.backward()
+        images.append([x.detach().cpu().double() for x in image])
+        gradients.append([torch.zeros_like(x) if x.grad is None else x.grad for x in (*leaves, background)])
+    tops = (
+        max(1.0, float(fields.colors.max()) if len(fields.colors) else 0.0),
+        1.0,
+        max(1.0, float(fields.depths.max()) if len(fields.depths) else 0.0),
+    )
+    for part, seen, exact, top in zip(("color", "alpha", "depth"), images[2], images[0], tops, strict=True):
+        allowed = (2 * top * bound + 4 * EPS * top).reshape(height, width, *[1] * (exact.dim() - 2))
+        worst = ((seen - exact).abs() / allowed).masked_fill(near.reshape(height, width, *[1] * (exact.dim() - 2)), 0)
+        assert float(worst.max()) <= 1, f"{part}: {float(worst.max()):.3g} of what is allowed"
+    for field, a, b, c in zip(
+        (*Projected._fields[:5], "background"), gradients[2], gradients[1], gradients[0], strict=True
+    ):
+        close(field, a, b, c, slack=16)
+
+
+BAD = (float("nan"), float("inf"), float("-inf"), 3.4e38, -3.4e38, 1e-45)
+
+
+@BY_DEVICE
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_bad_number_culls_its_gaussian_and_touches_no_other(group: str, device: str) -> None:
+    case = case_for("a block and one", device, 17)
+    clean, _ = project(case, torch.float32, "gpu", device)
+    victim = 3
+    from dataclasses import replace
+
+    slots = range(getattr(case, group)[victim].numel()) if group != "sh" else (0, 20, 47)
+    for slot in slots:
+        for value in BAD:
+            poisoned = getattr(case, group).clone()
+            poisoned[victim].reshape(-1)[slot] = value if poisoned.dim() > 1 else 0.0
+            if poisoned.dim() == 1:
+                poisoned[victim] = value
+            seen, _ = project(replace(case, **{group: poisoned}), torch.float32, "gpu", device)
+            others = torch.arange(17) != victim
+            for field, a, b in zip(Projected._fields, seen, clean, strict=True):
+                assert torch.equal(a.cpu()[others], b.cpu()[others]), f"{group}[{slot}] = {value} changed another's {field}"
+                assert torch.isfinite(a).all(), f"{group}[{slot}] = {value} left {field} not finite"
+            if not abs(value) < float("inf"):
+                assert not seen.extents[victim].any(), f"{group}[{slot}] = {value} was not culled"
+
+
+@BY_DEVICE
+@pytest.mark.parametrize(
+    ("height", "width", "masked", "kept"), [(24, 40, True, False), (17, 16, False, True), (1, 1, False, False), (1, 35, True, True)]
+)
+def test_loss_and_its_gradient_agree_with_the_definition(
+    height: int, width: int, masked: bool, kept: bool, device: str
+) -> None:
+    g = torch.Generator().manual_seed(height)
+    photo = torch.randint(0, 256, (height, width, 3), generator=g, dtype=torch.uint8)
+    photo[: height // 2] = 255  # a saturated part: its variance is a difference of equal numbers
+    color = torch.rand(height, width, 3, generator=g) * 1.2 - 0.1
+    mask = (torch.rand(height, width, generator=g) < 0.7) if masked else None
+    found = []
+    for dtype, backend, where in (
+        (torch.float64, "reference", "cpu"),
+        (torch.float32, "reference", "cpu"),
+        (torch.float32, "gpu", device),
+    ):
+        x = color.to(where, dtype).requires_grad_()
+        here, used = photo.to(where), None if mask is None else mask.to(where)
+        stats = ops.photo_stats(here, mask=used, backend=backend) if kept and dtype == torch.float32 else None  # type: ignore[arg-type]
+        value = ops.loss(x, here, dssim_weight=0.3, mask=used, stats=stats, backend=backend)  # type: ignore[arg-type]
+        value.backward()
+        assert x.grad is not None
+        found.append((value.detach()[None], x.grad))
+    for part, a, b, c in zip(("value", "gradient"), found[2], found[1], found[0], strict=True):
+        close(part, a, b, c)
+
+
+@BY_DEVICE
+def test_loss_with_no_used_pixel_is_zero(device: str) -> None:
+    color = torch.rand(5, 7, 3, device=device).requires_grad_()
+    photo = torch.zeros(5, 7, 3, dtype=torch.uint8, device=device)
+    value = ops.loss(color, photo, mask=torch.zeros(5, 7, dtype=torch.bool, device=device), backend="gpu")
+    value.backward()
+    assert value.item() == 0
+    assert color.grad is not None
+    assert not color.grad.any()
+
+
+@BY_DEVICE
+@pytest.mark.parametrize("visible_only", [False, True])
+def test_adam_agrees_with_the_definition(visible_only: bool, device: str) -> None:
+    g = torch.Generator().manual_seed(1)
+    shapes = [(37, 3), (37,), (37, 15, 3)]
+    rates = [1e-2, 5e-2, 1e-3]
+    start = [torch.randn(s, generator=g) for s in shapes]
+    steps = [
+        ([torch.randn(s, generator=g) * 10.0 ** float(-k) for s in shapes], torch.rand(37, generator=g) < 0.5)
+        for k in range(5)
+    ]
+    steps[2][0][0][4, 1] = float("nan")
+    steps[3][0][1][5] = 1e30  # its square is not finite
+    ends, refusals = [], []
+    for dtype, backend, where in (
+        (torch.float64, "reference", "cpu"),
+        (torch.float32, "reference", "cpu"),
+        (torch.float32, "gpu", device),
+    ):
+        state = [[x.to(where, dtype).clone() for x in group] for group in (start, start, start)]
+        state[1:] = [[torch.zeros_like(x) for x in start_] for start_ in (state[0], state[0])]
+        last = torch.zeros(37, dtype=torch.int32, device=where)
+        refused = []
+        for number, (gradients, shown) in enumerate(steps, 1):
+            # float64 holds the square of 1e30; the definition's rule is about float32's.
+            given = [x.to(where, dtype) for x in gradients]
+            if dtype == torch.float64:
+                given = [torch.where(x.abs() < 1e19, x, torch.inf) for x in given]
+            refused.append(
+                ops.adam_(
+                    state[0], given, state[1], state[2], rates, step=number,
+                    visible=shown.to(where) if visible_only else None, last_step=last if visible_only else None,
+                    backend=backend,  # type: ignore[arg-type]
+                )  # fmt: skip
+            )
+        ends.append([x for group in state for x in group])
+        refusals.append(refused)
+    assert refusals[2] == refusals[0]
+    for i, (a, b, c) in enumerate(zip(ends[2], ends[1], ends[0], strict=True)):
+        close(f"state {i}", a, b, c)
+
+
+@BY_DEVICE
+@pytest.mark.parametrize("n", [2, 3, 65, 130])
+def test_knn_agrees_with_the_definition(n: int, device: str) -> None:
+    points = torch.randn(n, 3, generator=torch.Generator().manual_seed(n))
+    points[n // 2 :: 7] = points[0]  # duplicates are other points at distance 0
+    exact = reference.knn(points.double())
+    seen = ops.knn(points.to(device), backend="gpu").cpu().double()
+    # A distance is the root of three squares: four roundings, each of half an ulp, on differences that are exact to one.
+    assert float(((seen - exact).abs() - 8 * EPS * (exact + points.abs().max())).max()) <= 0

@@ -1,0 +1,106 @@
+"""Every backend draws every case as the definition does, within the error that float32 arithmetic allows.
+
+The definition is the float64 reference; that it is right is shown by test_reference_*. Nothing here is about gradients.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from .cases import CASES
+from .proof import EPS, Run, alpha_error, backends, brightest, define, margins, run, use
+
+_exact: dict[str, Run] = {}
+
+
+def exact(name: str) -> Run:
+    """The definition of a case, drawn once for all backends."""
+    if name not in _exact:
+        _exact[name] = define(CASES[name]())
+    return _exact[name]
+
+
+@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize("name", CASES)
+def test_image_is_the_definitions(name: str, backend: str) -> None:
+    case, want = CASES[name](), exact(name)
+    with use(backend) as op:
+        got = run(case, op)
+    error = alpha_error(case, want.projected)
+    rho = float(error.max()) if len(error) else 0.0
+    near = margins(want.projected, want.bins, case.width, case.height, error).jump <= 1.0
+    # Errors of alpha reach the pixel through weights that sum to at most 1 and colours that differ by at most the
+    # brightest: |dC| <= rho * brightest; the colours' own rounding is 64 eps of the sum of up to 17 terms, depths' 8 eps.
+    color, depth = brightest(want)
+    for label, a, b, largest, own in (
+        ("color", got.color, want.color, color, 64 * EPS),
+        ("alpha", got.alpha, want.alpha, 1.0, 8 * EPS),
+        ("depth", got.depth, want.depth, depth, 8 * EPS + rho),
+    ):
+        off = (a.detach().cpu().double() - b.detach()).abs()
+        off = off.amax(2) if off.dim() == 3 else off
+        bound = (rho + own) * largest
+        wrong = (off > bound) & ~near
+        assert not wrong.any(), (
+            f"{label}: {float(off[wrong].max()):.2e} over {bound:.2e} away from any threshold"
+        )
+        # A crossing may drop or add one splat at the cut (weight 1/255), or all that is left at the end (weight 1e-4).
+        assert float(off.max()) <= bound + 2 * (1 / 255) * largest, f"{label}: more than a crossing explains"
+    # Crossings are rare, or they would hide an error; the piles put one threshold on many pixels at once.
+    if not name.startswith("pile") and near.numel() > 500:
+        assert near.double().mean() < 0.15
+
+
+@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize("name", CASES)
+def test_culled_rows_are_exactly_zero_and_the_same(name: str, backend: str) -> None:
+    case, want = CASES[name](), exact(name).projected
+    with use(backend) as op:
+        got = run(case, op).projected
+    seen, should = (got.extents.cpu() > 0).all(1), (want.extents > 0).all(1)
+    for field in got:
+        assert (field.detach().cpu()[~seen] == 0).all()
+    # No case puts a Gaussian within rounding of a cull.
+    assert torch.equal(seen, should)
+
+
+@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize("name", CASES)
+def test_no_pair_that_reaches_a_pixel_is_missing(name: str, backend: str) -> None:
+    case, want = CASES[name](), exact(name)
+    with use(backend) as op:
+        got = run(case, op)
+    tiles = len(want.bins.offsets) - 1
+    assert len(got.bins.offsets) - 1 == tiles
+    for tile in range(tiles):
+        mine = got.bins.ids[got.bins.offsets[tile] : got.bins.offsets[tile + 1]].cpu().long()
+        theirs = want.bins.ids[want.bins.offsets[tile] : want.bins.offsets[tile + 1]].long()
+        missing = set(theirs.tolist()) - set(mine.tolist())
+        extra = set(mine.tolist()) - set(theirs.tolist())
+        # A pair may differ only where the ellipse touches the tile within the error of alpha; such a pair is dim.
+        error = alpha_error(case, want.projected)
+        for i in missing | extra:
+            assert _peak(want, i, tile, case.width) <= (1 / 255) * (1 + 2 * float(error[i]) + 2e-4)
+        depth = got.projected.depths.detach().cpu()[mine]
+        order = torch.stack([depth.double(), mine.double()], 1)
+        later = (order[1:, 0] > order[:-1, 0]) | (
+            (order[1:, 0] == order[:-1, 0]) & (order[1:, 1] > order[:-1, 1])
+        )
+        assert later.all(), "front to back, ties by index"
+
+
+def _peak(want: Run, i: int, tile: int, width: int) -> float:
+    """The largest alpha of Gaussian i at the pixel centres of a whole tile."""
+    columns = -(-width // 16)
+    y, x = torch.meshgrid(
+        torch.arange(16) + 0.5 + tile // columns * 16,
+        torch.arange(16) + 0.5 + tile % columns * 16,
+        indexing="ij",
+    )
+    p = want.projected
+    dx, dy = x.double() - p.means2d[i, 0].detach(), y.double() - p.means2d[i, 1].detach()
+    a, b, c = p.conics[i].detach()
+    return float(
+        (p.opacities[i].detach() * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).max()
+    )
