@@ -52,7 +52,7 @@ class Workspace:
 
 
 def reduced_name(group: int, photo: int) -> str:
-    """The reduced photo's name in the database; a folder per camera, as COLMAP wants it."""
+    """The reduced photo's name in the database; a folder per camera."""
     return f"camera{group}/{photo:06d}.png"
 
 
@@ -72,10 +72,11 @@ def extract(
     cancelled: Callable[[], bool],
 ) -> None:
     """Fills the database with cameras, images and features; what is there already is not made again."""
-    group_of = {index: number for number, group in enumerate(groups) for index in group.photos}
-    names = {index: reduced_name(group_of[index], index) for index in range(len(photos))}
+    names = {
+        index: reduced_name(number, index) for number, group in enumerate(groups) for index in group.photos
+    }
     done = _extracted(place.database)
-    missing = [index for index in range(len(photos)) if names[index] not in done]
+    told = len(done)
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = model
     if any(photo.mask is not None for photo in photos):
@@ -87,29 +88,42 @@ def extract(
     options.sift.max_num_features = effort.features
     options.sift.first_octave = effort.first_octave
     options.sift.max_num_orientations = effort.orientations
+    place.images.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(threads) as pool:
-        for start in range(0, len(missing), BATCH):
-            batch = missing[start : start + BATCH]
-            stop_if(cancelled)
-            list(pool.map(lambda index: _reduce(photos[index], effort.side, place, names[index]), batch))
-            with native_token(cancelled) as token:
-                pycolmap.extract_features(
-                    place.database,
-                    place.images,
-                    [names[index] for index in batch],
-                    pycolmap.CameraMode.PER_FOLDER,
-                    reader,
-                    options,
-                    pycolmap.Device.cpu,
-                    token,
-                )
-            on_progress(
-                "features",
-                len(photos) - len(missing) + start + len(batch),
-                len(photos),
-                photos[batch[-1]].name,
-            )
+        for group in groups:
+            missing = [index for index in group.photos if names[index] not in done]
+            for start in range(0, len(missing), BATCH):
+                batch = missing[start : start + BATCH]
+                stop_if(cancelled)
+                list(pool.map(lambda index: _reduce(photos[index], effort.side, place, names[index]), batch))
+                # Each call would otherwise start a camera of its own for its batch.
+                reader.existing_camera_id = _camera_of(group, names, place.database)
+                with native_token(cancelled) as token:
+                    pycolmap.extract_features(
+                        place.database,
+                        place.images,
+                        [names[index] for index in batch],
+                        pycolmap.CameraMode.SINGLE,
+                        reader,
+                        options,
+                        pycolmap.Device.cpu,
+                        token,
+                    )
+                told += len(batch)
+                on_progress("features", told, len(photos), photos[batch[-1]].name)
     _set_cameras(groups, names, place.database)
+
+
+def _camera_of(group: Group, names: dict[int, str], path: Path) -> int:
+    """The database's id of the group's camera; -1 before any of its photos is in."""
+    if not path.is_file():
+        return -1
+    database = pycolmap.Database.open(path)
+    try:
+        wanted = {names[index] for index in group.photos}
+        return next((image.camera_id for image in database.read_all_images() if image.name in wanted), -1)
+    finally:
+        database.close()
 
 
 def load(database: pycolmap.Database) -> tuple[dict[int, int], list[Features]]:

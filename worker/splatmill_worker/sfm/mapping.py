@@ -134,6 +134,11 @@ def polish(
     options.ceres.solver_options.max_num_iterations = 50
     options.ceres.solver_options.function_tolerance = 1e-6
     options.ceres.min_num_residuals_for_cpu_multi_threading = 5000
-    pycolmap.bundle_adjustment(model, options)
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    # The seven degrees of freedom of the world; `pycolmap.bundle_adjustment` would do the same, and log about it.
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()
     stop_if(cancelled)
