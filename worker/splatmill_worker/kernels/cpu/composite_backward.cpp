@@ -84,44 +84,50 @@ void differentiate_tile(Frame& frame, const ImageGradient& g, int tile) {
     const TileForm form(r, lanes, x0, y0);
     const Float level = splat(r.level);
     const Float red = splat(r.color[0]), green = splat(r.color[1]), blue = splat(r.color[2]);
-    const bool may_clamp = r.opacity > kAlphaMax * 0.9999f;
     Float s[kCount];
     for (int i = 0; i < kCount; ++i) s[i] = splat(0.0f);
-    for (uint32_t left = entry.blocks; left; left &= left - 1) {
-      const int b = __builtin_ctz(left);
-      Block<kDepth, kScores>& block = blocks[b];
-      const Float u = form.u_at(b), v = form.v_at(b);
-      const Float e = log2_alpha(level, u, v);
-      const Float raw = exp2_of_alpha(e), alpha = min(raw, kAlphaMax);
-      const Float T = load(block.T), T_after = fnma(alpha, T, T);
-      const Mask blended = (e >= kLog2AlphaMin) & (T_after >= load(block.final_T));
-      const Float w = keep_product(blended, alpha, T);
-      store(block.T, select(blended, T_after, T));
-      const Float d_red = load(block.d_red), d_green = load(block.d_green), d_blue = load(block.d_blue);
-      Float along = fma(blue, d_blue, fma(green, d_green, red * d_red));  // colour . gradient
-      if constexpr (kDepth) along = fma(splat(r.depth), load(block.d_depth), along);
-      const Float gain = w * along;
-      const Float behind = load(block.behind) - gain;
-      store(block.behind, behind);
-      Float q = fnma(keep_product(blended, alpha, reciprocal(1.0f - alpha)), behind, gain);  // alpha dL/dalpha
-      if (__builtin_expect(may_clamp, 0)) q = keep(raw <= splat(kAlphaMax), q);  // no gradient through the clamp
-      const Float qu = q * u, qv = q * v;
-      s[kSumQ] += q;
-      s[kSumQU] += qu;
-      s[kSumQV] += qv;
-      s[kSumQUU] = fma(qu, u, s[kSumQUU]);
-      s[kSumQUV] = fma(qu, v, s[kSumQUV]);
-      s[kSumQVV] = fma(qv, v, s[kSumQVV]);
-      s[kSumRed] = fma(w, d_red, s[kSumRed]);
-      s[kSumGreen] = fma(w, d_green, s[kSumGreen]);
-      s[kSumBlue] = fma(w, d_blue, s[kSumBlue]);
-      if constexpr (kDepth) s[kSumDepth] = fma(w, load(block.d_depth), s[kSumDepth]);
-      if constexpr (kScores) {
-        s[kSumAbsX] += abs(qu);
-        s[kSumAbsY] += abs(fma(splat(r.uy), qu, splat(r.vy) * qv));
-        s[kSumError] = fma(w, load(block.error), s[kSumError]);
+    const auto add_blocks = [&](auto may_clamp) __attribute__((always_inline)) {
+      constexpr bool kMayClamp = decltype(may_clamp)::value;
+      for (uint32_t left = entry.blocks; left; left &= left - 1) {
+        const int b = __builtin_ctz(left);
+        Block<kDepth, kScores>& block = blocks[b];
+        const Float u = form.u_at(b), v = form.v_at(b);
+        const Float e = log2_alpha(level, u, v);
+        const Float raw = exp2_of_alpha(e), alpha = min(raw, kAlphaMax);
+        const Float T = load(block.T), T_after = fnma(alpha, T, T);
+        const Mask blended = (e >= kLog2AlphaMin) & (T_after >= load(block.final_T));
+        const Float w = keep_product(blended, alpha, T);
+        store(block.T, select(blended, T_after, T));
+        const Float d_red = load(block.d_red), d_green = load(block.d_green), d_blue = load(block.d_blue);
+        Float along = fma(blue, d_blue, fma(green, d_green, red * d_red));  // colour . gradient
+        if constexpr (kDepth) along = fma(splat(r.depth), load(block.d_depth), along);
+        const Float gain = w * along;
+        const Float behind = load(block.behind) - gain;
+        store(block.behind, behind);
+        Float q = fnma(keep_product(blended, alpha, reciprocal(1.0f - alpha)), behind, gain);  // alpha dL/dalpha
+        if constexpr (kMayClamp) q = keep(raw <= splat(kAlphaMax), q);  // no gradient through the clamp
+        const Float qu = q * u, qv = q * v;
+        s[kSumQ] += q;
+        s[kSumQU] += qu;
+        s[kSumQV] += qv;
+        s[kSumQUU] = fma(qu, u, s[kSumQUU]);
+        s[kSumQUV] = fma(qu, v, s[kSumQUV]);
+        s[kSumQVV] = fma(qv, v, s[kSumQVV]);
+        s[kSumRed] = fma(w, d_red, s[kSumRed]);
+        s[kSumGreen] = fma(w, d_green, s[kSumGreen]);
+        s[kSumBlue] = fma(w, d_blue, s[kSumBlue]);
+        if constexpr (kDepth) s[kSumDepth] = fma(w, load(block.d_depth), s[kSumDepth]);
+        if constexpr (kScores) {
+          s[kSumAbsX] += abs(qu);
+          s[kSumAbsY] += abs(fma(splat(r.uy), qu, splat(r.vy) * qv));
+          s[kSumError] = fma(w, load(block.error), s[kSumError]);
+        }
       }
-    }
+    };
+    if (__builtin_expect(r.opacity > kAlphaMax * 0.9999f, 0))
+      add_blocks(std::true_type{});
+    else
+      add_blocks(std::false_type{});
     float* sums = frame.pair_sums.get() + static_cast<int64_t>(entry.slot) * kPairSums;
     store_lane_sums<kCount>(sums, s);
   }

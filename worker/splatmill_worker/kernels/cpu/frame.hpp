@@ -27,8 +27,14 @@ struct Span {
 
 inline constexpr int kPairSums = 16;  // floats per pair
 
+// Wall seconds of the last passes, for benchmarks.
+struct PassSeconds {
+  double project = 0, bin = 0, forward = 0, backward = 0, update = 0;
+};
+
 struct Frame {
   Camera camera;
+  PassSeconds seconds;
   int64_t count = 0;          // Gaussians
   int64_t visible_count = 0;  // that reach a block
   int64_t pairs = 0;

@@ -43,7 +43,14 @@ NB_MODULE(SPLATMILL_MODULE, m) {
           [](Camera* self, Matrix4 viewmat, Tensor<float, nb::shape<3, 3>> K, int width, int height, float near,
              bool antialias) { new (self) Camera(make_camera(viewmat.data(), K.data(), width, height, near, antialias)); },
           "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a, "near"_a, "antialias"_a);
-  nb::class_<Frame>(m, "Frame", "Buffers of one view between the passes; grown as needed and reused.").def(nb::init<>());
+  nb::class_<Frame>(m, "Frame", "Buffers of one view between the passes; grown as needed and reused.")
+      .def(nb::init<>())
+      .def_prop_ro(
+          "seconds",
+          [](const Frame& f) {
+            return std::make_tuple(f.seconds.project, f.seconds.bin, f.seconds.forward, f.seconds.backward, f.seconds.update);
+          },
+          "Wall seconds of the last project, bin, composite forward, composite backward and update.");
   bind_adam(m);
   bind_bin(m);
   bind_composite(m);

@@ -66,7 +66,13 @@ SPLATMILL_INLINE Result each(Op op) {
 // ---- making, loading, storing (load and store want 64-byte alignment) ---------------------------------------------------
 
 SPLATMILL_INLINE Float splat(float x) {
-  return detail::each<Float>([&](auto) { return NativeFloat{} + x; });
+#if defined(__AVX512F__)
+  return {{_mm512_set1_ps(x)}};
+#elif defined(__AVX2__)
+  return detail::each<Float>([&](auto) { return _mm256_set1_ps(x); });
+#else
+  return detail::each<Float>([&](auto) { return NativeFloat{x, x, x, x}; });
+#endif
 }
 SPLATMILL_INLINE Int splat(int32_t x) {
   return detail::each<Int>([&](auto) { return NativeInt{} + x; });

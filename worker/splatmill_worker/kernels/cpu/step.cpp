@@ -146,6 +146,19 @@ using Bytes3 = Tensor<const uint8_t, nb::shape<3, -1, -1>>;
 using Bytes2 = Tensor<const uint8_t, nb::shape<-1, -1>>;
 using ScoreRows = Tensor<float, nb::shape<kScoreRows, -1>>;
 
+class Stopwatch {
+ public:
+  // Seconds since the last lap, or since the start.
+  double lap() {
+    const double now = omp_get_wtime(), passed = now - last_;
+    last_ = now;
+    return passed;
+  }
+
+ private:
+  double last_ = omp_get_wtime();
+};
+
 }  // namespace
 
 void bind_step(nb::module_& m) {
@@ -157,9 +170,13 @@ void bind_step(nb::module_& m) {
         const bool with_alpha_and_depth = image.shape(0) == 5;
         nb::gil_scoped_release release;
         frame.camera = camera;
+        Stopwatch watch;
         project_frame(params.data(), count, degree, frame, threads);
+        frame.seconds.project = watch.lap();
         bin_frame(frame, threads);
+        frame.seconds.bin = watch.lap();
         composite_forward(frame, planes_of(image, camera), with_alpha_and_depth, rgb, threads);
+        frame.seconds.forward = watch.lap();
         return std::make_tuple(frame.visible_count, frame.pairs);
       },
       "frame"_a, "params"_a.noconvert(), "count"_a, "degree"_a, "camera"_a, "background"_a, "image"_a.noconvert(), "threads"_a,
@@ -180,8 +197,12 @@ void bind_step(nb::module_& m) {
         if (scores) update.scores = scores->data(), update.score_stride = static_cast<int64_t>(scores->shape(1));
         if (photo && used) g.photo = photo->data(), g.used = used->data();
         nb::gil_scoped_release release;
+        Stopwatch watch;
         composite_backward(frame, g, threads);
-        return update_scene<true>(frame, g, {params.data(), degree}, update, threads);
+        frame.seconds.backward = watch.lap();
+        const int64_t refused = update_scene<true>(frame, g, {params.data(), degree}, update, threads);
+        frame.seconds.update = watch.lap();
+        return refused;
       },
       "frame"_a, "params"_a.noconvert(), "exp_avg"_a.noconvert(), "exp_avg_sq"_a.noconvert(), "degree"_a,
       "image"_a.noconvert(), "gradient"_a.noconvert(), "photo"_a.noconvert().none(), "used"_a.noconvert().none(), "rates"_a,
