@@ -2,6 +2,6 @@
 
 from splatmill_worker.sfm.failure import Cancelled, SfmFailed
 from splatmill_worker.sfm.options import SfmOptions
-from splatmill_worker.sfm.reconstruct import reconstruct, reconstruct_photos
+from splatmill_worker.sfm.solve import reconstruct, reconstruct_photos
 
 __all__ = ["Cancelled", "SfmFailed", "SfmOptions", "reconstruct", "reconstruct_photos"]
