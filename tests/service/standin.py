@@ -1,9 +1,11 @@
 """A small pipeline with the real one's contract, whose stages can be held, crashed and slowed from outside.
 
 It checkpoints every step and goes on from there, so that a test can tell a resumed attempt from a new one. The
-capture's text files steer it: `steps` how many, `pause` seconds per step, `crash` what to do at which step.
+capture's `images/script.json` steers it: `steps` how many, `pause` seconds per step, `do` what `at` which step,
+`gaussians` how many the model has. Each attempt writes into the `diary`, and whether another ran beside it.
 """
 
+import fcntl
 import json
 import os
 import signal
@@ -12,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+
 from splatmill.schema import (
     Event,
     JobState,
@@ -42,8 +45,17 @@ def run(
     workdir.mkdir(parents=True, exist_ok=True)
     checkpoint = workdir / "checkpoints" / "state.json"
     diary = Path(script["diary"])
+    # The kernel drops this lock when the process is gone, not before: finding it held means two at once.
+    alone = diary.with_suffix(".lock").open("w")
+    try:
+        fcntl.flock(alone, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        overlap = True
+    else:
+        overlap = False
     with diary.open("a") as file:
-        file.write(json.dumps({"pid": os.getpid(), "begin": time.time(), "from": _step(checkpoint)}) + "\n")
+        line = {"pid": os.getpid(), "from": _step(checkpoint), "overlap": overlap}
+        file.write(json.dumps(line) + "\n")
     emit(StateEvent(state=JobState.sfm))
     emit(ProgressEvent(stage="features", done=1, total=1))
     emit(StateEvent(state=JobState.training))
@@ -62,13 +74,11 @@ def run(
     emit(StateEvent(state=JobState.exporting))
     out = workdir / "out"
     out.mkdir(exist_ok=True)
-    write_ply(out / "model.ply")
+    write_ply(out / "model.ply", script.get("gaussians", 400))
     (out / "report.json").write_text(
         json.dumps({"curve": [{"seconds": 1.0, "step": 1, "psnr": 30.0, "gaussians": 100}], "seconds": {}})
     )
     (out / "cameras.json").write_text(json.dumps({"cameras": []}))
-    with diary.open("a") as file:
-        file.write(json.dumps({"pid": os.getpid(), "end": time.time()}) + "\n")
 
 
 def ball(count: int = 400) -> np.ndarray:
@@ -85,9 +95,9 @@ def ball(count: int = 400) -> np.ndarray:
     return rows
 
 
-def write_ply(path: Path) -> None:
+def write_ply(path: Path, count: int = 400) -> None:
     """The ball as a binary `.ply`."""
-    rows = ball()
+    rows = ball(count)
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     header += [f"property float {name}" for name in PROPERTIES] + ["end_header", ""]
     path.write_bytes("\n".join(header).encode() + rows.tobytes())

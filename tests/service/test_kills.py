@@ -1,0 +1,115 @@
+"""kill -9 of anything: the trainer, the worker, the API, Redis, the whole service. Each job still ends succeeded,
+goes on from its checkpoint, and never runs twice at once.
+
+Does not cover the loss of a machine among several: there the heartbeat decides, which tests/server covers.
+"""
+
+import os
+import signal
+
+import httpx
+import pytest
+
+from splatmill.backplane import queue
+
+from .conftest import Up, gone, wait_for
+
+STEPS = 40
+
+
+def check_resumed(up: Up, job_id: str, attempts: int = 2) -> None:
+    job = up.ended(job_id)
+    assert job["state"] == "succeeded", job
+    assert job["attempt"] == attempts
+    diary = up.diary(job_id)
+    assert len(diary) == attempts
+    assert diary[-1]["from"] >= 5, "the last attempt began anew instead of from its checkpoint"
+    assert not any(entry["overlap"] for entry in diary), "two attempts ran at once"
+
+
+def test_a_killed_trainer_is_followed_at_once(service: Up) -> None:
+    job_id = service.submit(steps=STEPS)
+    service.reached(job_id, 6)
+    os.kill(service.trainer(job_id), signal.SIGKILL)
+    check_resumed(service, job_id)
+    lines = service.http.get(f"/v1/jobs/{job_id}/logs").json()["lines"]
+    assert any("SIGKILL" in line["message"] for line in lines)
+
+
+def test_a_killed_worker_takes_its_trainer_along_and_is_followed(service: Up) -> None:
+    job_id = service.submit(steps=STEPS)
+    service.reached(job_id, 6)
+    worker, trainer = service.worker, service.trainer(job_id)
+    os.kill(worker, signal.SIGKILL)
+    wait_for(lambda: gone([worker, trainer]), 5)
+    check_resumed(service, job_id)
+
+
+def test_a_worker_killed_again_and_again_does_not_use_up_the_tries(service: Up) -> None:
+    job_id = service.submit(steps=60)
+    for attempt in range(1, queue.MAX_RETRIES + 2):
+        wait_for(lambda seen=attempt: len(service.diary(job_id)) == seen)
+        os.kill(service.worker, signal.SIGKILL)
+    job = service.ended(job_id)
+    assert job["state"] == "succeeded", job
+    assert not any(entry["overlap"] for entry in service.diary(job_id))
+
+
+@pytest.mark.parametrize("children", [True, False], ids=["with its children", "alone"])
+def test_a_killed_service_leaves_nothing_and_goes_on_when_started_again(
+    own_service: Up, children: bool
+) -> None:
+    own_service.start()
+    done = own_service.submit(steps=1)
+    own_service.ended(done)
+    job_id = own_service.submit(steps=STEPS)
+    waiting = own_service.submit(steps=2)
+    own_service.reached(job_id, 6)
+    family = own_service.kill(children=children)
+    wait_for(lambda: gone(family), 10)
+
+    own_service.start()
+    check_resumed(own_service, job_id)
+    assert own_service.ended(waiting)["state"] == "succeeded"
+    assert own_service.job(done)["state"] == "succeeded"
+    assert own_service.http.get(f"/v1/models/{done}").status_code == 200
+
+
+def test_a_stopped_service_saves_its_job_and_spends_no_try(own_service: Up) -> None:
+    own_service.start()
+    job_id = own_service.submit(steps=STEPS)
+    own_service.reached(job_id, 6)
+    family = [child.pid for child in own_service.tree()]
+    assert own_service.stop() == 0
+    assert gone(family)
+
+    own_service.start()
+    check_resumed(own_service, job_id)
+    lines = own_service.http.get(f"/v1/jobs/{job_id}/logs").json()["lines"]
+    assert any(line["message"].startswith("saved at step") for line in lines)
+    with own_service.redis() as connection:
+        entry = queue.open_queue(connection).fetch_job(queue.rq_id(job_id, 1))
+    assert entry is not None
+    assert entry.retries_left == queue.MAX_RETRIES
+
+
+def test_a_killed_redis_comes_back_and_the_trainer_never_notices(service: Up) -> None:
+    job_id = service.submit(steps=STEPS)
+    service.reached(job_id, 6)
+    trainer = service.trainer(job_id)
+    os.kill(service.child("redis"), signal.SIGKILL)
+    wait_for(lambda: service.http.get("/readyz").status_code == 200)
+    job = service.ended(job_id)
+    assert job["state"] == "succeeded"
+    assert job["attempt"] == 1
+    assert [entry["pid"] for entry in service.diary(job_id)] == [trainer]
+
+
+def test_a_killed_api_and_renderer_answer_again(service: Up) -> None:
+    api = service.child("splatmill_server.up.api")
+    os.kill(api, signal.SIGKILL)
+    wait_for(lambda: gone([api]))
+    # The port stays open, so that a new connection waits for the next API instead of being refused.
+    assert httpx.get(f"{service.http.base_url}healthz", timeout=30).status_code == 200
+    os.kill(service.child("renderer"), signal.SIGKILL)
+    wait_for(lambda: service.http.get("/readyz").json()["checks"]["renderer"] == "ok")
