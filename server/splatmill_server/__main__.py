@@ -108,7 +108,10 @@ def configure_logging(level: int = logging.INFO) -> None:
     ]
     people = sys.stderr.isatty()
     renderer: structlog.types.Processor = (
-        structlog.dev.ConsoleRenderer() if people else structlog.processors.JSONRenderer()
+        # Plain traces: the rich ones print every local variable, keys included.
+        structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)
+        if people
+        else structlog.processors.JSONRenderer()
     )
     errors = [] if people else [structlog.processors.format_exc_info]
     structlog.configure(

@@ -4,12 +4,14 @@ Plain ASGI, because Starlette's BaseHTTPMiddleware would hold back streams.
 """
 
 import hmac
+import logging
 import time
 import uuid
 from collections.abc import Awaitable, Callable
 
 import structlog
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from splatmill.schema import Problem, format_bytes
@@ -62,20 +64,46 @@ class Edge:
                     )
                     await response(scope, receive, send_marked)
                 else:
-                    await self.app(scope, self._bounded(scope, headers, receive), send_marked)
+                    await self._answer(scope, self._bounded(scope, headers, receive), send_marked)
         finally:
             seconds = time.perf_counter() - begun
             # The template, not the path: ids would make a new time series each.
             route = getattr(scope.get("route"), "path", None) or "other"
             self.metrics.requests.labels(scope["method"], route, str(status)).inc()
             self.metrics.seconds.labels(route).observe(seconds)
-            log.debug(
+            log.log(
+                logging.WARNING if status >= 500 else logging.DEBUG,
                 "request",
                 method=scope["method"],
                 path=scope["path"],
                 status=status,
                 seconds=round(seconds, 4),
             )
+
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let the app answer; a mistake of ours becomes a problem document, and a trace in the log."""
+        begun = False
+
+        async def send_noted(message: Message) -> None:
+            nonlocal begun
+            begun = True
+            await send(message)
+
+        try:
+            await self.app(scope, receive, send_noted)
+        except ClientDisconnect:
+            log.debug("the client went away", path=scope["path"])
+        except Exception as error:
+            log.exception("mistake", method=scope["method"], path=scope["path"])
+            if begun:
+                raise  # The status is sent; only breaking off tells the client that the rest is missing.
+            problem = Problem.of(
+                "internal_error",
+                f"The service made a mistake while it answered {scope['method']} {scope['path']}.",
+                advice="The server's log has the details under this answer's X-Request-ID; please report it.",
+                facts={"kind": type(error).__name__},
+            )
+            await ProblemResponse(problem, scope["path"])(scope, receive, send)
 
     def _refusal(self, scope: Scope, headers: Headers) -> Problem | None:
         if self.key is not None and scope["path"] not in OPEN_PATHS:

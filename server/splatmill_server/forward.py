@@ -22,11 +22,11 @@ _OWN_PREFIX = "splatmill-"
 
 
 async def forward(
-    renderer: httpx.AsyncClient | None, request: Request, path: str, wish: BaseModel
+    renderer: httpx.AsyncClient | None, request: Request, path: str, wish: BaseModel, seconds: float
 ) -> Response:
     """The renderer's answer to `wish`, whatever its status: pictures, 304 and problem documents alike.
 
-    Raises 503 when no renderer is there, 504 when it does not answer in time.
+    Raises 503 when no renderer is there, 504 when it does not answer within `seconds`.
     """
     if renderer is None:
         raise ProblemError(
@@ -41,7 +41,10 @@ async def forward(
     body = wish.model_dump_json(exclude_none=True)
     try:
         answer = await renderer.send(
-            renderer.build_request("POST", path, content=body, headers=headers), stream=True
+            renderer.build_request(
+                "POST", path, content=body, headers=headers, timeout=httpx.Timeout(seconds, connect=5.0)
+            ),
+            stream=True,
         )
     except httpx.TimeoutException as error:
         raise ProblemError(

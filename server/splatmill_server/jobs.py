@@ -56,6 +56,7 @@ class Jobs:
         with self.connection.pipeline(transaction=True) as pipe:
             pipe.hset(keys.job(job_id), mapping=cast(Any, new.fields()))
             pipe.zadd(keys.JOBS, {job_id: int(moment.timestamp() * 1000)})
+            pipe.sadd(keys.ACTIVE, job_id)
             pipe.execute()
         # A crash right here leaves a row without a place in the queue; the reaper enqueues it.
         queue.enqueue(self.connection, job_id, new.generation)
@@ -130,8 +131,27 @@ class Jobs:
 
     def active(self) -> list[JobRow]:
         """The rows of all jobs that have not ended."""
-        ids = [entry.decode() for entry in cast(list[bytes], self.connection.zrange(keys.JOBS, 0, -1))]
-        return [self.row(job.id) for job in self.see(ids) if job is not None and not job.state.final]
+        ids = sorted(entry.decode() for entry in cast(set[bytes], self.connection.smembers(keys.ACTIVE)))
+        found = []
+        for job_id in ids:
+            known = row.read(self.connection, job_id)
+            if known is not None and not fold(known, events.read_states(self.connection, job_id)).state.final:
+                found.append(known)
+            else:
+                self._retire(job_id)
+        return found
+
+    def _retire(self, job_id: str) -> None:
+        """Take an ended job off the reaper's list, unless it is restarted at this very moment."""
+
+        def attempt(pipe: Any) -> None:
+            known = row.read(self.connection, job_id)
+            ended = known is None or fold(known, events.read_states(self.connection, job_id)).state.final
+            pipe.multi()
+            if ended:
+                pipe.srem(keys.ACTIVE, job_id)
+
+        self.connection.transaction(attempt, keys.job(job_id))
 
     def uses(self, capture_id: str) -> str | None:
         """The id of an unfinished job on a capture, if there is one."""
@@ -180,6 +200,8 @@ class Jobs:
                 "verdict": "",
             }
 
+        # On the list before it is changed: a crash in between leaves an ended job there, which is harmless.
+        self.connection.sadd(keys.ACTIVE, job_id)
         job = self._change(job_id, anew)
         queue.enqueue(self.connection, job_id, self.row(job_id).generation)
         return job
@@ -209,6 +231,7 @@ class Jobs:
         with self.connection.pipeline(transaction=True) as pipe:
             pipe.delete(*keys.of_job(job_id))
             pipe.zrem(keys.JOBS, job_id)
+            pipe.srem(keys.ACTIVE, job_id)
             pipe.execute()
 
     def end(self, expected: JobRow, state: str, problem: Problem | None = None) -> bool:

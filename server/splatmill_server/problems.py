@@ -101,16 +101,6 @@ def install(app: FastAPI) -> None:
         # Nobody reads this answer when the connection is gone; a proxy in front of us may.
         return ProblemResponse(body_cut_off(), request.url.path)
 
-    @app.exception_handler(Exception)
-    def on_mistake(request: Request, error: Exception) -> Response:
-        problem = Problem.of(
-            "internal_error",
-            f"The service made a mistake while it answered {request.method} {request.url.path}.",
-            advice="The server's log has the details; please report it.",
-            facts={"kind": type(error).__name__},
-        )
-        return ProblemResponse(problem, request.url.path)
-
 
 def problem_of_storage(error: StorageError) -> Problem:
     """Full, not writable, or not reachable: three things an operator mends differently."""

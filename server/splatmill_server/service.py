@@ -71,8 +71,7 @@ def _renderer(settings: Settings) -> httpx.AsyncClient | None:
     base, socket = rendering.address(settings.renderer_url)
     # The renderer is one of ours on a private address: a proxy meant for the outside world must not come between.
     transport = httpx.AsyncHTTPTransport(uds=socket) if socket else None
-    timeout = httpx.Timeout(settings.render_timeout, connect=5.0)
-    return httpx.AsyncClient(base_url=base, transport=transport, timeout=timeout, trust_env=False)
+    return httpx.AsyncClient(base_url=base, transport=transport, trust_env=False)
 
 
 def _service(request: Request) -> Service:

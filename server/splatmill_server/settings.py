@@ -38,6 +38,7 @@ class Settings(BaseSettings):
 
     redis_timeout: float = Field(default=5.0, gt=0, description="Seconds to wait for a reply of Redis.")
     render_timeout: float = Field(default=120.0, gt=0, description="Seconds to wait for the renderer.")
+    orbit_timeout: float = Field(default=900.0, gt=0, description="Seconds to wait for a whole video.")
     reaper_interval: float = Field(default=10.0, gt=0, description="Seconds between looks for lost attempts.")
     stop_interval: float = Field(default=0.1, gt=0, description="Seconds between repeated stop messages.")
     heartbeat: float = Field(default=15.0, gt=0, description="Seconds between comments on a silent stream.")

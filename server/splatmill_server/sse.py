@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import redis
+from prometheus_client import Gauge
 
 from splatmill.backplane import events, keys
 from splatmill.backplane.events import START, Stored, stream_order
@@ -120,12 +121,13 @@ def _merge(states: list[Stored], progress: list[Stored]) -> list[tuple[Stored, b
     return merged + [(stored, False) for stored in reversed(waiting)]
 
 
-async def event_stream(follower: Follower, heartbeat: float) -> AsyncIterator[bytes]:
+async def event_stream(follower: Follower, heartbeat: float, open_streams: Gauge) -> AsyncIterator[bytes]:
     """The bytes of a `text/event-stream`, with a comment whenever `heartbeat` seconds pass in silence."""
-    yield b"retry: 2000\n\n"
     records = follower.run()
     pending: asyncio.Future[EventRecord] | None = None
+    open_streams.inc()
     try:
+        yield b"retry: 2000\n\n"
         while True:
             pending = pending or asyncio.ensure_future(cast(Any, anext(records)))
             done, _ = await asyncio.wait({pending}, timeout=heartbeat)
@@ -139,6 +141,7 @@ async def event_stream(follower: Follower, heartbeat: float) -> AsyncIterator[by
                 return  # At a job's end; or Redis went away, and the client comes back with its last id.
             yield encode(record)
     finally:
+        open_streams.dec()
         if pending is not None:
             pending.cancel()
             await asyncio.wait({pending})

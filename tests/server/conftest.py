@@ -5,6 +5,7 @@ Nothing is mocked. A worker's side is played by appending events through the bac
 
 import contextlib
 import json
+import logging
 import shutil
 import socket
 import struct
@@ -19,6 +20,7 @@ from typing import Any
 import httpx
 import pytest
 import redis
+import structlog
 import uvicorn
 
 from splatmill.backplane import events, layout, row
@@ -27,6 +29,15 @@ from splatmill.schema import Event, JobState, StateEvent, TrainOptions
 from splatmill_server.app import create_app
 from splatmill_server.service import Service
 from splatmill_server.settings import Settings
+
+
+@pytest.fixture(scope="session", autouse=True)
+def plain_log() -> None:
+    """structlog's own default prints every local variable of a traceback, which takes it many seconds."""
+    structlog.configure(
+        processors=[structlog.processors.format_exc_info, structlog.processors.JSONRenderer()],
+        wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING),
+    )
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from rq.job import Job, JobStatus
 
-from splatmill.backplane import queue, row
+from splatmill.backplane import keys, queue, row
 from splatmill.schema import JobState, ProgressEvent, StateEvent
 
 from .conftest import Running, Serve, wait_for
@@ -192,6 +192,22 @@ def test_two_reapers_at_once_requeue_an_attempt_once(app: Running) -> None:
     queue.reclaim(app.redis)
     queue.reclaim(app.redis)
     assert queue.waiting(app.redis) == {"train": 1}
+
+
+def test_the_reaper_looks_at_unfinished_jobs_alone_and_at_all_of_them(app: Running) -> None:
+    capture_id = app.capture()
+    waiting, ended = app.job(capture_id), app.job(capture_id)
+    app.begin(ended)
+    app.finish(ended)
+    app.service.reaper.tick()
+    assert app.redis.smembers(keys.ACTIVE) == {waiting.encode()}
+    app.http.post(f"/v1/jobs/{ended}/restart")
+    app.service.reaper.tick()
+    assert app.redis.smembers(keys.ACTIVE) == {waiting.encode(), ended.encode()}
+    for job_id in (waiting, ended):
+        app.http.post(f"/v1/jobs/{job_id}/cancel")
+        app.http.delete(f"/v1/jobs/{job_id}")
+    assert app.redis.smembers(keys.ACTIVE) == set()
 
 
 @pytest.mark.parametrize("change", ["restart", "final"])

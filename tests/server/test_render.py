@@ -170,7 +170,7 @@ def test_without_a_renderer_pictures_are_503_and_files_still_come(serve: Serve, 
 
 def test_a_renderer_that_hangs_is_given_up(serve: Serve, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        app = serve(renderer_url=f"http://127.0.0.1:{silent.getsockname()[1]}", render_timeout=0.2)
+        app = serve(renderer_url=f"http://127.0.0.1:{silent.getsockname()[1]}", orbit_timeout=0.2)
         store_model(app.service, MODEL)
         problem(app.http.post(f"/v1/models/{MODEL}/orbit"), 504, "render_timeout")
 

@@ -16,7 +16,7 @@ from splatmill_server import app as app_module
 from splatmill_server.app import create_app
 from splatmill_server.settings import Settings
 
-from .conftest import Running, Serve, problem
+from .conftest import Running, Serve, problem, wait_for
 
 
 def test_options_are_those_of_the_schema(app: Running) -> None:
@@ -133,3 +133,25 @@ def test_importing_the_server_runs_nothing() -> None:
         for node in ast.parse(path.read_text()).body:
             if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
                 pytest.fail(f"{path}:{node.lineno} calls something when imported")
+
+
+def test_a_mistake_of_ours_is_a_problem_with_a_request_id_and_the_next_request_works(app: Running) -> None:
+    app.service.storage.put("captures/" + "a" * 16 + "/capture.json", b'{"id": 7}')
+    answer = app.http.get("/v1/captures/" + "a" * 16)
+    assert problem(answer, 500, "internal_error")["advice"]
+    assert answer.headers["x-request-id"]
+    assert "Traceback" not in answer.text
+    assert app.http.get("/v1/jobs").status_code == 200
+
+
+def test_the_number_of_open_streams_is_known(app: Running) -> None:
+    job_id = app.job()
+
+    def streams() -> str:
+        return app.http.get("/metrics").text.split("\nsplatmill_event_streams ")[1].split()[0]
+
+    with app.http.stream("GET", f"/v1/jobs/{job_id}/events") as answer:
+        stream = answer.iter_raw()
+        assert b"retry" in next(stream)
+        assert streams() == "1.0"
+    wait_for(lambda: streams() == "0.0")

@@ -8,6 +8,10 @@ PREFIX = "splatmill:"
 JOBS = PREFIX + "jobs"
 """Sorted set of job ids, scored by creation time in milliseconds: the order of the list endpoint."""
 
+ACTIVE = PREFIX + "active"
+"""Set of ids of jobs that have not ended, as far as the server has seen: what the reaper looks at. An ended job may
+still be in it; one that has not ended always is."""
+
 
 def job(job_id: str) -> str:
     """Hash: the job row. Only the server writes it."""

@@ -58,7 +58,7 @@ async def follow_events(
     follower = Follower(service, job_id, cursor)
     if not await follower.begin(row):
         return Response(status_code=204)
-    stream = event_stream(follower, service.settings.heartbeat)
+    stream = event_stream(follower, service.settings.heartbeat, service.metrics.streams)
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
 

@@ -117,7 +117,9 @@ async def render(
 ) -> Response:
     """A picture of the model from a camera: colour, depth or coverage."""
     await run_in_threadpool(service.models.check, model_id)
-    return await forward(service.renderer, request, rendering.render_path(model_id), wish)
+    return await forward(
+        service.renderer, request, rendering.render_path(model_id), wish, service.settings.render_timeout
+    )
 
 
 @router.get(
@@ -134,7 +136,9 @@ async def render_cacheable(service: Shared, model_id: ModelId, request: Request)
         located = [{**found, "loc": ("query", *found["loc"])} for found in error.errors()]
         raise RequestValidationError(located) from error
     await run_in_threadpool(service.models.check, model_id)
-    return await forward(service.renderer, request, rendering.render_path(model_id), wish)
+    return await forward(
+        service.renderer, request, rendering.render_path(model_id), wish, service.settings.render_timeout
+    )
 
 
 @router.post(
@@ -154,4 +158,5 @@ async def orbit(
 ) -> Response:
     """A video that circles the scene once."""
     await run_in_threadpool(service.models.check, model_id)
-    return await forward(service.renderer, request, rendering.orbit_path(model_id), wish or OrbitRequest())
+    path, seconds = rendering.orbit_path(model_id), service.settings.orbit_timeout
+    return await forward(service.renderer, request, path, wish or OrbitRequest(), seconds)
