@@ -8,6 +8,7 @@ real concurrency, the hardware's approximate exp2 and division, and that the com
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import pytest
 import torch
@@ -16,19 +17,27 @@ from torch import Tensor
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # before Triton is first imported
 
-pytest.importorskip("triton", reason="Triton comes with torch's GPU builds; pip install triton to prove the kernels here")
+pytest.importorskip(
+    "triton", reason="Triton comes with torch's GPU builds; pip install triton to prove the kernels here"
+)
 
 from splatmill_worker.kernels import ops, reference
-from splatmill_worker.kernels.records import ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Bins, Projected
+from splatmill_worker.kernels.records import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Bins, Projected
+from splatmill_worker.kernels.reference.bin import _least as least_of
 from splatmill_worker.kernels.reference.composite import _weights
 
 from .cases import CASES, GROUPS, Case
 
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # the interpreter's numpy, where NaN is the point
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::RuntimeWarning"
+)  # the interpreter's numpy, where NaN is the point
 INTERPRETING = os.environ.get("TRITON_INTERPRET") == "1"
 EPS = 2.0**-24
 DEVICES = [
-    pytest.param("cpu", marks=pytest.mark.skipif(not INTERPRETING, reason="a GPU is here; TRITON_INTERPRET=1 runs this")),
+    pytest.param(
+        "cpu",
+        marks=pytest.mark.skipif(not INTERPRETING, reason="a GPU is here; TRITON_INTERPRET=1 runs this"),
+    ),
     pytest.param(
         "cuda",
         marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")],
@@ -45,12 +54,12 @@ def case_for(name: str, device: str, most: int) -> Case:
     if device == "cuda" or n <= most:
         return case
     rows = torch.linspace(0, n - 1, most).round().long()
-    from dataclasses import replace
-
     return replace(case, **{group: getattr(case, group)[rows] for group in GROUPS})
 
 
-def project(case: Case, dtype: torch.dtype, backend: ops.Backend, device: str = "cpu") -> tuple[Projected, list[Tensor]]:
+def project(
+    case: Case, dtype: torch.dtype, backend: ops.Backend, device: str = "cpu"
+) -> tuple[Projected, list[Tensor]]:
     """Fields and the leaves that gradients are asked for."""
     leaves = [x.to(device).requires_grad_() for x in case.groups(dtype)]
     viewmat, K = (x.to(device) for x in case.camera(dtype))
@@ -62,20 +71,22 @@ def project(case: Case, dtype: torch.dtype, backend: ops.Backend, device: str = 
     return fields, leaves
 
 
-def close(name: str, seen: Tensor, plain: Tensor, exact: Tensor, *, slack: float = 8.0) -> None:
+def close(name: str, seen: Tensor, plain: Tensor, exact: Tensor, *, slack: float = 8.0, roundings: float = 64) -> None:
     """`seen` is as near to `exact` (float64) as the reference's own arithmetic in float32 (`plain`) is, within `slack`.
 
-    That is what float32 can give for this scene; a needle may lose all digits and an ordinary splat almost none. The floor of 64
+    That is what float32 can give for this scene; a needle may lose all digits and an ordinary splat almost none. The floor of some
     roundings of the largest value covers sums in another order.
     """
     if not exact.numel():
         assert not seen.numel()
         return
-    seen, plain = seen.detach().cpu().double(), plain.detach().cpu().double()
-    floor = 64 * EPS * float(exact.abs().max())
+    seen, plain, exact = (x.detach().cpu().double() for x in (seen, plain, exact))
+    floor = roundings * EPS * float(exact.abs().max())
     allowed = slack * float((plain - exact).abs().max()) + floor
     error = float((seen - exact).abs().max())
-    assert error <= allowed, f"{name}: error {error:.3g} where {allowed:.3g} is allowed, largest {exact.abs().max():.3g}"
+    assert error <= allowed, (
+        f"{name}: error {error:.3g} where {allowed:.3g} is allowed, largest {exact.abs().max():.3g}"
+    )
 
 
 @BY_DEVICE
@@ -152,11 +163,9 @@ def test_bin_agrees_with_the_definition_but_for_real_crossings(name: str, device
 
 def _least(conic: Tensor, xs: list[float], ys: list[float]) -> float:
     """The smallest value of the form over a rectangle, by the definition's own code."""
-    from splatmill_worker.kernels.reference.bin import _least as least
-
     center = torch.tensor([[0.5 - xs[0], 0.5 - ys[0]]], dtype=torch.float64)
     zero = torch.zeros(1, dtype=torch.int64)
-    return float(least(conic[None], center, zero, zero))
+    return float(least_of(conic[None], center, zero, zero))
 
 
 def pairs(bins: Bins) -> list[tuple[int, int]]:
@@ -181,11 +190,15 @@ def undecided(fields: Projected, bins: Bins, width: int, height: int) -> tuple[T
         left, top = tile % columns * TILE, tile // columns * TILE
         w, h = min(TILE, width - left), min(TILE, height - top)
         weights = _weights(exact, ids, left, top, w, h, False)
-        y, x = torch.meshgrid(torch.arange(top, top + h) + 0.5, torch.arange(left, left + w) + 0.5, indexing="ij")
+        y, x = torch.meshgrid(
+            torch.arange(top, top + h) + 0.5, torch.arange(left, left + w) + 0.5, indexing="ij"
+        )
         dx = x.reshape(-1, 1).double() - exact.means2d[ids, 0]
         dy = y.reshape(-1, 1).double() - exact.means2d[ids, 1]
         a, b, c = exact.conics[ids].unbind(1)
-        alpha = (exact.opacities[ids] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).clamp_max(0.999)
+        alpha = (
+            exact.opacities[ids] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+        ).clamp_max(0.999)
         d = 8 * EPS * (1 + 0.5 * (a * dx * dx + c * dy * dy) + (b * dx * dy).abs())
         after = torch.cumprod(torch.where(alpha >= ALPHA_MIN, 1 - alpha, 1.0), 1)
         drift = torch.cumsum(d * alpha / (1 - alpha), 1) + 8 * EPS * len(ids)
@@ -196,10 +209,16 @@ def undecided(fields: Projected, bins: Bins, width: int, height: int) -> tuple[T
     return near, bound
 
 
+SEEN_BY_PROJECTION = {"degree 0", "degree 1", "degree 2", "dark", "principal point off centre", "sub-pixel antialias", "needles 1e+02"}
+"""Cases whose point is over once they are projected: on the device they run all the same, in the interpreter they cost seconds."""
+
+
 @BY_DEVICE
 @BY_CASE
 def test_composite_and_its_gradient_agree_with_the_definition(name: str, device: str) -> None:
-    case = case_for(name, device, 20)
+    if device == "cpu" and name in SEEN_BY_PROJECTION:
+        pytest.skip("nothing new for compositing in this case; it runs on a GPU")
+    case = case_for(name, device, 12)
     width, height = case.width, case.height
     fields = single(project(case, torch.float64, "reference")[0], "cpu")
     bins = reference.bin(Projected(*(x.double() for x in fields)), width, height)
@@ -207,7 +226,8 @@ def test_composite_and_its_gradient_agree_with_the_definition(name: str, device:
     g = torch.Generator().manual_seed(2)
     # At undecided pixels float32 may rightly take another branch: no gradient is sent there.
     weights = [
-        torch.randn(height, width, *more, generator=g, dtype=torch.float64) * (~near).reshape(height, width, *[1] * len(more))
+        torch.randn(height, width, *more, generator=g, dtype=torch.float64)
+        * (~near).reshape(height, width, *[1] * len(more))
         for more in ((3,), (), ())
     ]
     images, gradients = [], []
@@ -216,8 +236,8 @@ def test_composite_and_its_gradient_agree_with_the_definition(name: str, device:
         (torch.float32, "reference", "cpu"),
         (torch.float32, "gpu", device),
     ):
-        leaves = [x.to(where, dtype).requires_grad_() for x in fields[:5]]
-        background = case.background.to(where, dtype).requires_grad_()
+        leaves = [x.to(where, dtype).clone().requires_grad_() for x in fields[:5]]
+        background = case.background.to(where, dtype).clone().requires_grad_()
         lists = Bins(bins.offsets.to(where), bins.ids.to(where))
         image = ops.composite(
             Projected(*leaves, fields.extents.to(where, dtype)), lists, width, height,
@@ -228,6 +248,9 @@ def test_composite_and_its_gradient_agree_with_the_definition(name: str, device:
         total.backward()
         images.append([x.detach().cpu().double() for x in image])
         gradients.append([torch.zeros_like(x) if x.grad is None else x.grad for x in (*leaves, background)])
+    # What is behind a splat is a difference of two sums, rounded as they are, and is divided by 1 - alpha.
+    opaque = min(ALPHA_MAX, float(fields.opacities.max())) if len(fields.opacities) else 0.0
+    amplified = 1 / (1 - opaque)
     tops = (
         max(1.0, float(fields.colors.max()) if len(fields.colors) else 0.0),
         1.0,
@@ -235,12 +258,14 @@ def test_composite_and_its_gradient_agree_with_the_definition(name: str, device:
     )
     for part, seen, exact, top in zip(("color", "alpha", "depth"), images[2], images[0], tops, strict=True):
         allowed = (2 * top * bound + 4 * EPS * top).reshape(height, width, *[1] * (exact.dim() - 2))
-        worst = ((seen - exact).abs() / allowed).masked_fill(near.reshape(height, width, *[1] * (exact.dim() - 2)), 0)
+        worst = ((seen - exact).abs() / allowed).masked_fill(
+            near.reshape(height, width, *[1] * (exact.dim() - 2)), 0
+        )
         assert float(worst.max()) <= 1, f"{part}: {float(worst.max()):.3g} of what is allowed"
     for field, a, b, c in zip(
         (*Projected._fields[:5], "background"), gradients[2], gradients[1], gradients[0], strict=True
     ):
-        close(field, a, b, c, slack=16)
+        close(field, a, b, c, slack=16, roundings=max(64, amplified))
 
 
 BAD = (float("nan"), float("inf"), float("-inf"), 3.4e38, -3.4e38, 1e-45)
@@ -252,9 +277,7 @@ def test_a_bad_number_culls_its_gaussian_and_touches_no_other(group: str, device
     case = case_for("a block and one", device, 17)
     clean, _ = project(case, torch.float32, "gpu", device)
     victim = 3
-    from dataclasses import replace
-
-    slots = range(getattr(case, group)[victim].numel()) if group != "sh" else (0, 20, 47)
+    slots = {0, getattr(case, group)[victim].numel() - 1}
     for slot in slots:
         for value in BAD:
             poisoned = getattr(case, group).clone()
@@ -264,7 +287,9 @@ def test_a_bad_number_culls_its_gaussian_and_touches_no_other(group: str, device
             seen, _ = project(replace(case, **{group: poisoned}), torch.float32, "gpu", device)
             others = torch.arange(17) != victim
             for field, a, b in zip(Projected._fields, seen, clean, strict=True):
-                assert torch.equal(a.cpu()[others], b.cpu()[others]), f"{group}[{slot}] = {value} changed another's {field}"
+                assert torch.equal(a.cpu()[others], b.cpu()[others]), (
+                    f"{group}[{slot}] = {value} changed another's {field}"
+                )
                 assert torch.isfinite(a).all(), f"{group}[{slot}] = {value} left {field} not finite"
             if not abs(value) < float("inf"):
                 assert not seen.extents[victim].any(), f"{group}[{slot}] = {value} was not culled"
@@ -272,7 +297,8 @@ def test_a_bad_number_culls_its_gaussian_and_touches_no_other(group: str, device
 
 @BY_DEVICE
 @pytest.mark.parametrize(
-    ("height", "width", "masked", "kept"), [(24, 40, True, False), (17, 16, False, True), (1, 1, False, False), (1, 35, True, True)]
+    ("height", "width", "masked", "kept"),
+    [(20, 24, True, False), (17, 16, False, True), (1, 1, False, False), (1, 35, True, True)],
 )
 def test_loss_and_its_gradient_agree_with_the_definition(
     height: int, width: int, masked: bool, kept: bool, device: str
@@ -288,7 +314,7 @@ def test_loss_and_its_gradient_agree_with_the_definition(
         (torch.float32, "reference", "cpu"),
         (torch.float32, "gpu", device),
     ):
-        x = color.to(where, dtype).requires_grad_()
+        x = color.to(where, dtype).clone().requires_grad_()
         here, used = photo.to(where), None if mask is None else mask.to(where)
         stats = ops.photo_stats(here, mask=used, backend=backend) if kept and dtype == torch.float32 else None  # type: ignore[arg-type]
         value = ops.loss(x, here, dssim_weight=0.3, mask=used, stats=stats, backend=backend)  # type: ignore[arg-type]
@@ -340,8 +366,14 @@ def test_adam_agrees_with_the_definition(visible_only: bool, device: str) -> Non
                 given = [torch.where(x.abs() < 1e19, x, torch.inf) for x in given]
             refused.append(
                 ops.adam_(
-                    state[0], given, state[1], state[2], rates, step=number,
-                    visible=shown.to(where) if visible_only else None, last_step=last if visible_only else None,
+                    state[0],
+                    given,
+                    state[1],
+                    state[2],
+                    rates,
+                    step=number,
+                    visible=shown.to(where) if visible_only else None,
+                    last_step=last if visible_only else None,
                     backend=backend,  # type: ignore[arg-type]
                 )  # fmt: skip
             )

@@ -11,6 +11,7 @@ from . import record
 from .constant import constant
 from .harmonics import at, basis, shade, slope
 from .projection import (
+    BLUR,
     covariance,
     load3,
     load4,
@@ -115,7 +116,7 @@ def shape_backward_kernel(
     g_mx = tl.load(grow, mask=seen, other=0.0)
     g_my = tl.load(grow + 1, mask=seen, other=0.0)
     g_a = tl.load(grow + 2, mask=seen, other=0.0)
-    g_b = 0.5 * tl.load(grow + 3, mask=seen, other=0.0)
+    g_b = tl.load(grow + 3, mask=seen, other=0.0)
     g_c = tl.load(grow + 4, mask=seen, other=0.0)
     g_o = tl.load(grow + 5, mask=seen, other=0.0)
     g_z = tl.load(grow + 9, mask=seen, other=0.0)
@@ -145,17 +146,17 @@ def shape_backward_kernel(
         d_logit = d_logit * tl.sqrt_rn(tl.maximum(sharp / det, COMPENSATION_MIN))
     tl.store(d_logits + i, d_logit, mask=here)
 
-    # Conic X = Sigma^-1: dSigma = -X dX X; then M.
-    x00, x01, x11 = c / det, -b / det, a / det
-    y00 = x00 * g_a + x01 * g_b
-    y01 = x00 * g_b + x01 * g_c
-    y10 = x01 * g_a + x11 * g_b
-    y11 = x01 * g_b + x11 * g_c
-    da = -(y00 * x00 + y01 * x01)
-    db = -(y00 * x01 + y01 * x11) - (y10 * x00 + y11 * x01)
-    dc = -(y10 * x01 + y11 * x11)
-    dp0, dp1, dp2 = 2.0 * da * p0 + db * q0, 2.0 * da * p1 + db * q1, 2.0 * da * p2 + db * q2
-    dq0, dq1, dq2 = 2.0 * dc * q0 + db * p0, 2.0 * dc * q1 + db * p1, 2.0 * dc * q2 + db * p2
+    # Conic c/det, -b/det, a/det by the rows p, q of M. The determinant's part goes through the minors n = p x q as the forward
+    # pass does: -X dX X is the same, but cancels for needles.
+    d_det = -(g_a * (c / det) - g_b * (b / det) + g_c * (a / det)) / det
+    d_tr0, d_tr1, d_b = g_c / det + BLUR * d_det, g_a / det + BLUR * d_det, -g_b / det
+    n0, n1, n2 = p1 * q2 - p2 * q1, p2 * q0 - p0 * q2, p0 * q1 - p1 * q0
+    dp0 = 2.0 * d_tr0 * p0 + d_b * q0 + 2.0 * d_det * (q1 * n2 - q2 * n1)
+    dp1 = 2.0 * d_tr0 * p1 + d_b * q1 + 2.0 * d_det * (q2 * n0 - q0 * n2)
+    dp2 = 2.0 * d_tr0 * p2 + d_b * q2 + 2.0 * d_det * (q0 * n1 - q1 * n0)
+    dq0 = 2.0 * d_tr1 * q0 + d_b * p0 + 2.0 * d_det * (n1 * p2 - n2 * p1)
+    dq1 = 2.0 * d_tr1 * q1 + d_b * p1 + 2.0 * d_det * (n2 * p0 - n0 * p2)
+    dq2 = 2.0 * d_tr1 * q2 + d_b * p2 + 2.0 * d_det * (n0 * p1 - n1 * p0)
     store3(
         d_log_scales, i, here, stride, p0 * dp0 + q0 * dq0, p1 * dp1 + q1 * dq1, p2 * dp2 + q2 * dq2, PLANAR
     )

@@ -33,7 +33,7 @@ def pack(projected: Projected) -> Tensor:
             for a, b in zip(views, projected, strict=True)
         ):
             return record
-    columns = [x.detach().float().reshape(first.shape[0], -1) for x in projected]
+    columns = [x.detach().float() if x.dim() == 2 else x.detach().float()[:, None] for x in projected]
     return torch.cat(columns, 1)
 
 
