@@ -9,16 +9,26 @@ import os
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
 import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, ObjectStore, from_url
 
+if TYPE_CHECKING:  # These names exist in its stubs alone.
+    from obstore.store import ClientConfig, RetryConfig
+
 CHUNK = 1 << 20
 """Bytes per piece when a file is streamed: memory per transfer stays at a few of these."""
+
+_S3_CLIENT: "ClientConfig" = {"connect_timeout": "5s", "timeout": "600s"}
+"""obstore's own limit of 30 s counts the whole body, which a large model exceeds on a slow line."""
+
+_S3_RETRY: "RetryConfig" = {"max_retries": 4, "retry_timeout": timedelta(seconds=20)}
+"""obstore's own patience is three minutes, in which a client of the API has long given up."""
 
 _FULL = ("os error 28", "os error 122", "os error 27", "No space left", "QuotaExceeded", "StorageFull")
 
@@ -63,7 +73,7 @@ class Storage:
             # Empty folders go with their last file, so that deleting a capture leaves no skeleton behind.
             self.store: ObjectStore = LocalStore(self.root, automatic_cleanup=True)
         elif parts.scheme == "s3":
-            self.store = from_url(url)
+            self.store = from_url(url, client_options=_S3_CLIENT, retry_config=_S3_RETRY)
         else:
             raise StorageError(
                 f"SPLATMILL_STORAGE={url!r} is neither file:///folder nor s3://bucket/prefix; give one of these."
