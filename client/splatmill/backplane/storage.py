@@ -24,9 +24,6 @@ if TYPE_CHECKING:  # These names exist in its stubs alone.
 CHUNK = 1 << 20
 """Bytes per piece when a file is streamed: memory per transfer stays at a few of these."""
 
-_S3_CLIENT: "ClientConfig" = {"connect_timeout": "5s", "timeout": "600s"}
-"""obstore's own limit of 30 s counts the whole body, which a large model exceeds on a slow line."""
-
 _S3_RETRY: "RetryConfig" = {"max_retries": 4, "retry_timeout": timedelta(seconds=20)}
 """obstore's own patience is three minutes, in which a client of the API has long given up."""
 
@@ -73,7 +70,7 @@ class Storage:
             # Empty folders go with their last file, so that deleting a capture leaves no skeleton behind.
             self.store: ObjectStore = LocalStore(self.root, automatic_cleanup=True)
         elif parts.scheme == "s3":
-            self.store = from_url(url, client_options=_S3_CLIENT, retry_config=_S3_RETRY)
+            self.store = from_url(url, client_options=_s3_client(), retry_config=_S3_RETRY)
         else:
             raise StorageError(
                 f"SPLATMILL_STORAGE={url!r} is neither file:///folder nor s3://bucket/prefix; give one of these."
@@ -213,6 +210,12 @@ def _sentences(verb: str, path: str) -> Iterator[None]:
         if any(sign in text for sign in _FULL):
             raise StorageFullError(f"Storage is full: could not {verb} {path} ({fact}).") from error
         raise StorageError(f"Storage could not {verb} {path}: {fact}.") from error
+
+
+def _s3_client() -> "ClientConfig":
+    """obstore's own limit of 30 s counts the whole body, which a large model exceeds on a slow line."""
+    endpoint = os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or ""
+    return {"connect_timeout": "5s", "timeout": "600s", "allow_http": endpoint.startswith("http://")}
 
 
 def _entry(meta: "obstore.ObjectMeta") -> Entry:
