@@ -195,9 +195,8 @@ def test_train_on_a_terminal(service, photos: Path, tmp_path: Path):
 
 
 def test_a_failed_job(service, photos: Path, tmp_path: Path):
-    problem = Problem.of(
-        "sfm_no_parallax", "The camera only turned.", facts={"parallax_deg": 0.125}, advice="Walk around it."
-    )
+    facts = {"parallax_deg": 0.125, "left_out": [f"{n}.jpg" for n in range(12)]}
+    problem = Problem.of("sfm_no_parallax", "The camera only turned.", facts=facts, advice="Walk around it.")
     worker = work(service, lambda job_id: service.fail(job_id, problem))
     process = spawn("train", photos, "-o", tmp_path / "out", "--server", service.url)
     _, stderr = process.communicate(timeout=60)
@@ -206,6 +205,9 @@ def test_a_failed_job(service, photos: Path, tmp_path: Path):
     assert stderr.splitlines() == [
         "Error: The camera only turned.",
         "  parallax deg: 0.125",
+        "  left out:",
+        *(f"    {n}.jpg" for n in range(10)),
+        "    and 2 more",
         "Walk around it.",
     ]
 

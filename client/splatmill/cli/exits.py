@@ -1,6 +1,7 @@
 """What the command line's exit codes mean, and how an error is told."""
 
 import sys
+from collections.abc import Iterator
 from enum import IntEnum
 
 from splatmill import errors
@@ -34,6 +35,8 @@ _CODES: tuple[tuple[type[Exception], Exit], ...] = (
     (errors.ServiceFailed, Exit.no_service),
 )
 
+MOST_ENTRIES = 10
+
 USAGE_CODES = frozenset({"unknown_option", "option_out_of_range"})
 
 
@@ -56,12 +59,19 @@ def tell(error: Exception) -> Exit:
     print(f"Error: {message}", file=sys.stderr)
     if isinstance(error, errors.JobFailed):
         for name, value in error.problem.facts.items():
-            print(f"  {name.replace('_', ' ')}: {_shown(value)}", file=sys.stderr)
+            for line in _shown(name.replace("_", " "), value):
+                print(f"  {line}", file=sys.stderr)
     if advice:
         print(advice, file=sys.stderr)
     return code_of(error)
 
 
-def _shown(value: object) -> str:
-    text = f"{value:.4g}" if isinstance(value, float) else str(value)
-    return text if len(text) <= 200 else text[:197] + "..."
+def _shown(name: str, value: object) -> Iterator[str]:
+    """A fact in lines: a list of files has one each, and an end."""
+    if isinstance(value, list) and value:
+        yield f"{name}:"
+        yield from (f"  {entry}" for entry in value[:MOST_ENTRIES])
+        if len(value) > MOST_ENTRIES:
+            yield f"  and {len(value) - MOST_ENTRIES} more"
+    else:
+        yield f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}"

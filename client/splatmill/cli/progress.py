@@ -166,7 +166,8 @@ def show(record: EventRecord, display: Display, *, verbose: bool = False) -> Non
             f" (attempt {record.attempt})" if record.attempt > 1 and event.state is JobState.preparing else ""
         )
         display.say(STATES[event.state] + again)
-    elif isinstance(event, LogEvent) and (verbose or event.level in ("warning", "error")):
+    # An error ends the job, whose problem is told at the end.
+    elif isinstance(event, LogEvent) and (verbose or event.level == "warning"):
         display.say(f"{event.level}: {event.message}")
     elif isinstance(event, PlanEvent) and verbose:
         from splatmill.cli.plan import plan_lines
