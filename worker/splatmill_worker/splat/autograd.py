@@ -128,7 +128,7 @@ class AutogradStep:
         assert self._pending is not None
         visible = int((self._pending[0].extents[:, 0] > 0).sum())
         self.backward_update(gradient, rates=rates, step=step)
-        return StepResult(float(loss), visible, self._pairs)
+        return StepResult(float(loss.detach()), visible, self._pairs)
 
     def _score(self, projected: ops.Projected, width: int, height: int) -> None:
         gradient = projected.means2d.grad

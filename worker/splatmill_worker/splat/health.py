@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 from splatmill_worker.splat.failure import FailureName, TrainingFailed
 
@@ -16,7 +15,10 @@ RISE = 3.0
 
 MARGIN = 0.05
 
-GRACE = 200
+GOOD, GOOD_MARGIN = 1.2, 0.01
+"""A state is good while the smoothed loss is within this of its lowest."""
+
+GRACE = 100
 """Steps after a disturbance (an opacity reset, another resolution) in which a rise is expected."""
 
 BLIND = 200
@@ -32,7 +34,10 @@ class Health:
     calm_from: int = GRACE
     blind: int = 0
 
-    grace: ClassVar[int] = GRACE
+    @property
+    def well(self) -> bool:
+        """Whether the loss is near its lowest: a state worth going back to."""
+        return self.smoothed is not None and self.smoothed <= GOOD * self.lowest + GOOD_MARGIN
 
     def disturbed(self, step: int) -> None:
         """The loss is about to rise for a reason that is known."""

@@ -17,6 +17,7 @@ from splatmill_worker.splat.views import Target
 
 Float = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
+Pixels = npt.NDArray[np.uint8]
 
 INITIAL_OPACITY = 0.1
 
@@ -24,6 +25,12 @@ ENOUGH_POINTS = 20
 """With fewer, the reconstruction says too little about where things are."""
 
 RANDOM_GAUSSIANS = 20_000
+
+CANDIDATES = 4
+"""Points tried for each one kept."""
+
+JUDGES = 32
+"""Photos that are asked about every candidate; more do not change a hull's shape visibly."""
 
 
 def from_points(points: Tensor, colors: Tensor, *, backend: ops.Backend | None = None) -> Gaussians:
@@ -60,31 +67,41 @@ def in_frusta(targets: Sequence[Target], count: int, seed: int) -> tuple[Tensor,
 
     Candidates are drawn along the rays of random pixels, between 0.2 and 1.8 times the distance of what the
     cameras look at. Those that most cameras see are kept; a camera whose photo is transparent there does not
-    see them, so that an object on a transparent background starts as its visual hull. Colours are the means of
-    what the cameras show at that place.
+    see them, so that an object on a transparent background starts as its visual hull: the box around the
+    candidates that no camera sees through is filled anew. Colours are the means of what the cameras show.
     """
     random = np.random.default_rng(seed)
+    some = targets[:: max(1, len(targets) // JUDGES)]
     cameras = [target.camera for target in targets]
     centers = np.array([camera.center for camera in cameras])
     axes = np.array([camera.viewmat[2, :3] for camera in cameras])
     _, distance = looked_at(centers, axes)
-    tried = 8 * count
-    points = _along_rays(cameras, distance, tried, random)
-    seen = np.zeros(tried)
-    missed = np.zeros(tried)
-    color = np.zeros((tried, 3))
+    points = _along_rays(cameras, distance, CANDIDATES * count, random)
+    rank, color = _judged(some, points)
+    solid = points[rank > 0.5 * rank.max()]
+    if any(target.alpha is not None for target in targets) and len(solid) >= ENOUGH_POINTS:
+        low, high = solid.min(axis=0), solid.max(axis=0)
+        margin = 0.1 * (high - low)
+        points = random.uniform(low - margin, high + margin, (CANDIDATES * count, 3))
+        rank, color = _judged(some, points)
+    order = np.argsort(-rank - random.uniform(0.0, 0.5, len(rank)), kind="stable")[:count]
+    return torch.from_numpy(points[order]).float(), torch.from_numpy(color[order])
+
+
+def _judged(targets: Sequence[Target], points: Float) -> tuple[Float, Pixels]:
+    """How many photos show something at each point, minus those that see through it, and the mean colour there."""
+    seen, missed = np.zeros(len(points)), np.zeros(len(points))
+    color = np.zeros((len(points), 3))
     for target in targets:
         inside, rows, columns = _pixels(target.camera, points)
         cover = np.ones(len(rows)) if target.alpha is None else target.alpha.numpy()[rows, columns] / 255.0
         seen[inside] += cover
         missed[inside] += 1.0 - cover
         color[inside] += cover[:, None] * target.rgb.numpy()[rows, columns]
-    # One camera that sees through a point outweighs many that see something there.
-    rank = seen - 4.0 * missed + random.uniform(0.0, 1.0, tried)
-    order = np.argsort(-rank, kind="stable")[:count]
-    mean = color[order] / np.maximum(seen[order], 1e-9)[:, None]
-    mean[seen[order] <= 0] = 128.0
-    return torch.from_numpy(points[order]).float(), torch.from_numpy(mean.clip(0, 255).astype(np.uint8))
+    mean = color / np.maximum(seen, 1e-9)[:, None]
+    mean[seen <= 0] = 128.0
+    # One camera that sees through a point outweighs several that see something there.
+    return seen - 4.0 * missed, mean.clip(0, 255).astype(np.uint8)
 
 
 def looked_at(centers: Float, axes: Float) -> tuple[Float, float]:

@@ -61,12 +61,14 @@ class Run:
     order: list[int] = field(default_factory=list)
     health: Health = field(default_factory=Health)
     shortened: bool = False
+    ever_saw: bool = False
 
     def __post_init__(self) -> None:
         self.budget: Budget = self.plan.schedule.budget
         self.random = torch.Generator().manual_seed(self.plan.seed)
         self._good: tuple[dict[str, Tensor], Tensor, Tensor] | None = None
         self._good_progress = -math.inf
+        self._good_level = math.inf
         self._fixed = torch.full((3,), {"black": 0.0, "white": 1.0, "random": GREY}[self.plan.background])
 
     @property
@@ -78,7 +80,7 @@ class Run:
         """One step, and densification where it is due. Raises TrainingFailed by name."""
         schedule = self.plan.schedule
         progress = self.progress
-        if progress - self._good_progress >= SNAPSHOT_SHARE:
+        if self._good is None or (progress - self._good_progress >= SNAPSHOT_SHARE and self.health.well):
             self._remember(progress)
         self.step += 1
         reduction = schedule.reduction(self.step)
@@ -94,6 +96,7 @@ class Run:
         else:
             result = self._exposed_step(self.exposure, number, target, degree, rates)
         self.loss = result.loss
+        self.ever_saw |= result.visible > 0
         self.health.watch(self.step, result.loss, result.visible)
         if self.densifier is not None:
             self.densifier.after_step(self.engine, rates.means, self.random)
@@ -107,7 +110,7 @@ class Run:
         self.recoveries += 1
         self.rate_scale *= 0.5
         self.engine.replace(*self._good)
-        self.health = Health(calm_from=self.step + self.health.grace)
+        self.health = Health(lowest=self._good_level, calm_from=self.step + len(self.views))
         self.warn(f"{failure} Went back to the last good state, with steps half as long.")
 
     def shorten(self, tail: float) -> None:
@@ -199,7 +202,7 @@ class Run:
         exposure.update(self.rate_scale)
         assert color.grad is not None
         self.engine.backward_update(color.grad, rates=rates, step=self.step)
-        return StepResult(float(loss), int(bool((alpha > 0).any())), 0)
+        return StepResult(float(loss.detach()), int(bool((alpha > 0).any())), 0)
 
     def _next_view(self) -> int:
         """Every photo once in random order, then again."""
@@ -225,3 +228,4 @@ class Run:
             )
         self._good = (parameters, *self.engine.moments())
         self._good_progress = progress
+        self._good_level = self.health.lowest

@@ -116,7 +116,7 @@ def train(
             run.advance()
         except TrainingFailed as named:
             if run.recoveries >= MAX_RECOVERIES or named.name is FailureName.empty_scene:
-                if not run.restore_good() or not run.rows:
+                if not run.ever_saw or not run.rows or not run.restore_good():
                     raise
                 stopped, failure = f"failed: {named}", named
                 break

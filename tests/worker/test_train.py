@@ -1,0 +1,291 @@
+"""Proves that training learns held-out views, ends on its budget, resumes, stops and recovers; on a tiny scene.
+
+Does not prove quality or speed on real photos: those are measured by `bench train` and by the data tests.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import stillife
+import torch
+
+from splatmill_worker.splat import checkpoint, initialise
+from splatmill_worker.splat.budget import Budget
+from splatmill_worker.splat.engine import Engine, gaussians_of, open_engine
+from splatmill_worker.splat.exposure import Exposure
+from splatmill_worker.splat.failure import FailureName, TrainingFailed
+from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.plan import Plan
+from splatmill_worker.splat.run import Run
+from splatmill_worker.splat.schedule import Schedule
+from splatmill_worker.splat.train import Cancelled, Hooks, Tick, train
+
+
+def plan(steps: int | None = 300, seconds: float | None = None, **changes: Any) -> Plan:
+    schedule = Schedule(
+        budget=Budget(steps, seconds),
+        resolution=((0, 2), (60, 1)),
+        degree=1,
+        degree_every=100,
+        densify_from=60,
+        densify_every=40,
+        densify_until=0.7,
+    )
+    fields: dict[str, Any] = {
+        "schedule": schedule,
+        "image_size": stillife.WIDTH,
+        "max_gaussians": 4000,
+        "densify": "classic",
+        "initial": "points",
+        "kernels": "cpu",
+        "background": "black",
+        "exposure": False,
+        "antialias": False,
+        "target_psnr": None,
+        "max_memory": None,
+        "stops_when_flat": False,
+        "seed": 0,
+    }
+    return Plan(**{**fields, **changes})
+
+
+def first_engine(kernels: Any = "cpu", most: int | None = None) -> Engine:
+    points, colors = stillife.points()
+    return open_engine(initialise.from_points(points[:most], colors[:most]), kernels)
+
+
+def split() -> tuple[list[Any], list[Any]]:
+    views = stillife.training_views()
+    held_out = views[4::6]
+    return [view for view in views if view not in held_out], held_out
+
+
+def test_held_out_views_are_learned() -> None:
+    views, held_out = split()
+    trained = train(first_engine(), views, held_out, plan(400), extent=1.1)
+    assert trained.stopped == "the budget is spent"
+    assert trained.steps == 400
+    curve = [row.psnr for row in trained.rows]
+    assert curve[-1] is not None
+    assert curve[0] is not None
+    assert curve[-1] > curve[0] + 4.0
+    assert trained.held_out is not None
+    assert trained.held_out.psnr > 18.0
+    assert trained.held_out.psnr == pytest.approx(curve[-1], abs=1e-6)
+    assert 1500 < trained.gaussians.count <= 4000
+    assert trained.gaussians.degree == 1
+    assert bool(trained.gaussians.finite().all())
+
+
+@pytest.mark.parametrize("strategy", ["absolute", "mcmc"])
+def test_every_strategy_learns_and_keeps_to_its_limit(strategy: str) -> None:
+    views, held_out = split()
+    trained = train(
+        first_engine(), views, held_out, plan(300, densify=strategy, max_gaussians=2200), extent=1.1
+    )
+    assert trained.held_out is not None
+    assert trained.held_out.psnr > 17.0
+    assert trained.gaussians.count <= 2200
+
+
+def test_the_same_seed_gives_the_same_bytes() -> None:
+    views, _ = split()
+    first = train(first_engine(), views, [], plan(120), extent=1.1).gaussians
+    second = train(first_engine(), views, [], plan(120), extent=1.1).gaussians
+    other = train(first_engine(), views, [], plan(120, seed=1), extent=1.1).gaussians
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    assert other.count != first.count or not torch.equal(other.means, first.means)
+
+
+def test_the_reference_trains_through_the_same_loop_and_agrees() -> None:
+    views, _ = split()
+    course = replace(plan().schedule, budget=Budget(12), resolution=((0, 2),))
+    losses: dict[str, list[float]] = {}
+    for kernels in ("cpu", "reference"):
+        short = plan(densify=None, kernels=kernels)
+        short = replace(short, schedule=course)
+        trained = train(first_engine(kernels, 200), views, [], short, extent=1.1)
+        losses[kernels] = [row.loss for row in trained.rows] + [trained.on_training.mse]
+    # Adam divides by the gradient's own size, so that parameters with almost none (the turn of a ball) may take
+    # either sign of a full step; what is seen stays together.
+    assert losses["cpu"] == pytest.approx(losses["reference"], rel=2e-3)
+
+
+def test_a_time_budget_ends_on_time_with_rates_annealed() -> None:
+    views, held_out = split()
+    ticks: list[Tick] = []
+    hooks = Hooks(tick=ticks.append)
+    trained = train(first_engine(), views, held_out, plan(None, 2.0), extent=1.1, hooks=hooks)
+    assert trained.seconds == pytest.approx(2.0, rel=0.05)
+    assert trained.rows[-1].seconds == pytest.approx(trained.seconds, abs=0.1)
+    assert ticks
+    assert all(tick.steps >= tick.step for tick in ticks)
+
+
+def test_a_resumed_run_goes_on_where_it_was(tmp_path: Path) -> None:
+    views, held_out = split()
+    whole = plan(240)
+
+    class PowerCutError(Exception):
+        pass
+
+    def save_and_die(state: dict[str, Any]) -> None:
+        if state["step"] >= 100:
+            checkpoint.save(tmp_path, state)
+            raise PowerCutError
+
+    with pytest.raises(PowerCutError):
+        train(
+            first_engine(), views, held_out, whole, extent=1.1,
+            hooks=Hooks(checkpoint=save_and_die, checkpoint_seconds=0.0),
+        )  # fmt: skip
+    state = checkpoint.load(tmp_path)
+    assert state is not None
+    assert state["step"] == 100
+    resumed = train(first_engine(), views, held_out, whole, extent=1.1, resume_from=state)
+    straight = train(first_engine(), views, held_out, whole, extent=1.1)
+    assert resumed.steps == 240
+    assert resumed.seconds > state["seconds"]
+    assert [row.step for row in resumed.rows] == [row.step for row in straight.rows]
+    assert resumed.held_out is not None
+    assert straight.held_out is not None
+    assert resumed.held_out.psnr == pytest.approx(straight.held_out.psnr, abs=0.5)
+
+
+def test_a_cancel_is_seen_at_the_next_step() -> None:
+    views, held_out = split()
+    asked = iter(range(10_000))
+    with pytest.raises(Cancelled):
+        train(
+            first_engine(),
+            views,
+            held_out,
+            plan(300),
+            extent=1.1,
+            hooks=Hooks(cancelled=lambda: next(asked) >= 7),
+        )
+    assert next(asked) == 8
+
+
+def test_a_target_ends_the_run() -> None:
+    views, held_out = split()
+    trained = train(first_engine(), views, held_out, plan(2000, target_psnr=16.0), extent=1.1)
+    assert trained.steps < 2000
+    assert "reached" in trained.stopped
+
+
+class Sabotaged:
+    """An engine whose parameters are thrown far away at given steps, as a diverging optimiser would."""
+
+    def __init__(self, engine: Any, at: set[int], spoil: Any) -> None:
+        self._engine, self._at, self._spoil = engine, at, spoil
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._engine, name)
+
+    def train_photo(self, *args: Any, step: int, **named: Any) -> Any:
+        result = self._engine.train_photo(*args, step=step, **named)
+        if step in self._at:
+            parameters = self._engine.parameters()
+            self._spoil(parameters)
+            self._engine.replace(parameters, *self._engine.moments())
+        return result
+
+
+def thrown_away(parameters: dict[str, torch.Tensor]) -> None:
+    parameters["sh"] += 40.0
+
+
+def spoilt(parameters: dict[str, torch.Tensor]) -> None:
+    parameters["means"][:5] = math.nan
+
+
+@pytest.mark.parametrize("spoil", [thrown_away, spoilt])
+def test_a_planted_divergence_is_rolled_back(spoil: Any) -> None:
+    views, held_out = split()
+    warnings: list[str] = []
+    engine = Sabotaged(first_engine(), {330}, spoil)
+    course = plan(600, densify=None)
+    trained = train(engine, views, held_out, course, extent=1.1, hooks=Hooks(warn=warnings.append))
+    assert trained.recoveries == 1
+    assert len(warnings) == 1
+    assert "last good state" in warnings[0]
+    assert trained.failure is None
+    assert trained.held_out is not None
+    assert trained.held_out.psnr > 17.5
+    assert bool(trained.gaussians.finite().all())
+
+
+def test_what_diverges_again_and_again_stops_with_the_last_good_state() -> None:
+    views, held_out = split()
+    engine = Sabotaged(first_engine(), set(range(330, 5000, 5)), thrown_away)
+    trained = train(engine, views, held_out, plan(900, densify=None), extent=1.1)
+    assert trained.failure is not None
+    assert trained.failure.name is FailureName.divergence
+    assert trained.stopped.startswith("failed")
+    assert trained.held_out is not None
+    assert trained.held_out.psnr > 15.0
+    assert bool(trained.gaussians.finite().all())
+
+
+def test_a_scene_that_no_camera_sees_is_empty_by_name() -> None:
+    views, held_out = split()
+    behind = gaussians_of(first_engine())
+    behind.means.add_(torch.tensor([0.0, 0.0, 500.0]))
+    with pytest.raises(TrainingFailed) as failed:
+        train(open_engine(behind, "cpu"), views, [], plan(300, densify=None), extent=1.1)
+    assert failed.value.name is FailureName.empty_scene
+    assert held_out
+
+
+def test_transparent_photos_train_over_random_backgrounds() -> None:
+    views = stillife.training_views(alpha=True)
+    targets = [view.full for view in views]
+    points, colors = initialise.in_frusta(targets, 2500, 0)
+    engine = open_engine(initialise.from_points(points, colors), "cpu")
+    trained = train(engine, views[1:], views[:1], plan(400, background="random", densify=None), extent=1.1)
+    assert trained.held_out is not None
+    assert trained.held_out.psnr > 17.0
+    target = views[0].full
+    _, alpha, _ = engine.forward(
+        target.viewmat, target.K, target.camera.width, target.camera.height, degree=1
+    )
+    assert target.alpha is not None
+    hidden = target.alpha == 0
+    assert float(alpha[hidden].mean()) < 0.25
+    assert float(alpha[~hidden].mean()) > 0.8
+
+
+def test_exposures_are_fitted_where_photos_differ() -> None:
+    views = stillife.training_views()
+    for view in views[1::2]:
+        view.full.rgb.copy_((view.full.rgb.float() * 0.7).to(torch.uint8))
+    exposure = Exposure(len(views))
+    course = plan(500, exposure=True, densify=None)
+    run = Run(first_engine(), course, views, 1.1, None, exposure, warn=lambda _: None)
+    while run.progress < 1.0:
+        run.advance()
+    gains = exposure.affine.detach()[:, :, :3].diagonal(dim1=1, dim2=2).mean(dim=1)
+    assert float(gains[1::2].max()) < float(gains[0::2].min())
+    assert float(gains[0::2].mean() / gains[1::2].mean()) > 1.05
+
+
+def test_masked_pixels_teach_nothing() -> None:
+    views, _ = split()
+    target = views[0].full
+    mask = torch.ones(target.rgb.shape[:2], dtype=torch.bool)
+    mask[:, : target.rgb.shape[1] // 2] = False
+    spoilt_rgb = target.rgb.clone()
+    spoilt_rgb[~mask] = 255
+    results: list[Gaussians] = []
+    for rgb in (target.rgb, spoilt_rgb):
+        view = replace(views[0], levels={1: target._replace(rgb=rgb, mask=mask)})
+        course = plan(30, densify=None)
+        course = replace(course, schedule=replace(course.schedule, resolution=((0, 1),)))
+        results.append(train(first_engine(), [view], [], course, extent=1.1).gaussians)
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
