@@ -12,6 +12,7 @@ import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -39,7 +40,7 @@ def run(
     options: TrainOptions,
     emit: Callable[[Event], None],
     cancelled: Callable[[], bool],
-) -> None:
+) -> SimpleNamespace:
     """Photos are not looked at; the model is a ball of Gaussians."""
     script = json.loads((capture / "images" / "script.json").read_text())
     workdir.mkdir(parents=True, exist_ok=True)
@@ -67,7 +68,7 @@ def run(
         emit(ProgressEvent(stage="training", done=step, total=script["steps"], step=step, loss=1 / step))
         if cancelled():
             emit(LogEvent(message=f"saved at step {step}"))
-            return
+            return SimpleNamespace(ended="cancelled")
     (workdir / "preview.jpg").write_bytes(b"\xff\xd8 no picture \xff\xd9")
     emit(PreviewEvent(path="preview.jpg", step=script["steps"]))
     emit(MetricEvent(seconds=1.0, step=script["steps"], psnr=30.0, ssim=0.9, gaussians=len(ball())))
@@ -79,6 +80,7 @@ def run(
         json.dumps({"curve": [{"seconds": 1.0, "step": 1, "psnr": 30.0, "gaussians": 100}], "seconds": {}})
     )
     (out / "cameras.json").write_text(json.dumps({"cameras": []}))
+    return SimpleNamespace(ended="succeeded")
 
 
 def ball(count: int = 400) -> np.ndarray:

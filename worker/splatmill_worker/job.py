@@ -11,7 +11,7 @@ import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, NoReturn, Protocol, cast
 
 from rq import get_current_job
 
@@ -34,7 +34,15 @@ PIPELINE = os.environ.get("SPLATMILL_PIPELINE", "splatmill_worker.pipeline")
 TRANSIENT_WAIT = 5.0
 """Seconds before an attempt that storage refused is tried again."""
 
-Pipeline = Callable[[Path, Path, TrainOptions, Callable[[Event], None], Callable[[], bool]], Any]
+
+class Outcome(Protocol):
+    """What a pipeline returns: how it `ended`, "succeeded" or, as it was asked to, "cancelled"."""
+
+    @property
+    def ended(self) -> str: ...
+
+
+Pipeline = Callable[[Path, Path, TrainOptions, Callable[[Event], None], Callable[[], bool]], Outcome]
 
 log = logging.getLogger("splatmill_worker")
 
@@ -97,7 +105,7 @@ def _work(this: Attempt, request: JobRow, storage: Storage, outbox: Outbox) -> N
     mirror = Mirror(space, log.warning)
     try:
         run = cast(Pipeline, importlib.import_module(PIPELINE).run)
-        run(
+        outcome = run(
             space.capture,
             space.run,
             request.options,
@@ -109,8 +117,9 @@ def _work(this: Attempt, request: JobRow, storage: Storage, outbox: Outbox) -> N
         if isinstance(error, Exception) and not attempt.hand_back_requested() and _is_final(error):
             space.start_over()
         raise
-    mirror.close(copy=False)
-    if attempt.hand_back_requested() and not (space.run / "out" / "model.ply").is_file():
+    handed_back = outcome.ended == "cancelled"
+    mirror.close(copy=handed_back)
+    if handed_back:
         raise HandedBack
     if this.lock.refresh() is Held.lost:
         _superseded()

