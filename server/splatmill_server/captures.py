@@ -105,7 +105,8 @@ class Captures:
                 advice="Upload photos, a video or a zip with PUT /v1/captures/{id}/images/{name} first.",
             )
         photos = all(entry.path.lower().endswith(_PHOTO_SUFFIXES) for entry in images)
-        if len(images) == 1 and photos:
+        posed = any(True for _ in self.storage.entries(layout.capture_files(capture_id, Role.poses)))
+        if len(images) == 1 and photos and not posed:
             raise ProblemError(
                 "too_few_images",
                 "The capture holds one photo; depth cannot be recovered from a single view.",

@@ -42,8 +42,6 @@ class Jobs:
         job_id = secrets.token_hex(8)
         if key is not None:
             job_id = self._claim_key(key, hashlib.sha256(body.encode()).hexdigest(), job_id)
-            if (known := row.read(self.connection, job_id)) is not None:
-                return self._see(known), False
         moment = row.now()
         new = JobRow(
             id=job_id,
@@ -53,11 +51,21 @@ class Jobs:
             created_at=moment,
             queued_at=moment,
         )
-        with self.connection.pipeline(transaction=True) as pipe:
-            pipe.hset(keys.job(job_id), mapping=cast(Any, new.fields()))
-            pipe.zadd(keys.JOBS, {job_id: int(moment.timestamp() * 1000)})
-            pipe.sadd(keys.ACTIVE, job_id)
-            pipe.execute()
+        known: JobRow | None = None
+
+        def insert(pipe: Any) -> None:
+            nonlocal known
+            known = row.read(self.connection, job_id)
+            pipe.multi()
+            if known is None:
+                pipe.hset(keys.job(job_id), mapping=new.fields())
+                pipe.zadd(keys.JOBS, {job_id: int(moment.timestamp() * 1000)})
+                pipe.sadd(keys.ACTIVE, job_id)
+
+        # Of two requests with one key at the same moment, one makes the job.
+        self.connection.transaction(insert, keys.job(job_id))
+        if known is not None:
+            return self._see(known), False
         # A crash right here leaves a row without a place in the queue; the reaper enqueues it.
         queue.enqueue(self.connection, job_id, new.generation)
         self.metrics.created.inc()

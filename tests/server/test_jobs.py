@@ -4,6 +4,8 @@ Not proved here: that a worker trains (tests/service), and cancelling a running 
 """
 
 import json
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -70,6 +72,26 @@ def test_one_idempotency_key_makes_one_job(app: Running) -> None:
     assert len(app.http.get("/v1/jobs").json()["jobs"]) == 1
 
 
+def test_many_requests_at_once_with_one_key_make_one_job(app: Running) -> None:
+    files = [("images", (f"{i}.jpg", PHOTO + b"%d" % i)) for i in range(3)]
+    gate = threading.Barrier(6)
+
+    def post(_: int) -> str:
+        gate.wait()
+        answer = app.http.post("/v1/jobs", files=files, headers={"Idempotency-Key": "one"})
+        assert answer.status_code == 202, answer.text
+        return str(answer.json()["id"])
+
+    with ThreadPoolExecutor(6) as pool:
+        made = set(pool.map(post, range(6)))
+    assert len(made) == 1
+    assert [job["id"] for job in app.http.get("/v1/jobs").json()["jobs"]] == list(made)
+    captures = app.http.get("/v1/captures").json()["captures"]
+    assert [capture["id"] for capture in captures] == [
+        app.http.get(f"/v1/jobs/{made.pop()}").json()["capture"]
+    ]
+
+
 @pytest.mark.parametrize(
     ("options", "code", "says"),
     [
@@ -95,6 +117,8 @@ def test_captures_that_cannot_become_a_scene_are_refused(app: Running) -> None:
     single = app.capture("only.jpg")
     refused = problem(app.http.post("/v1/jobs", json={"capture": single}), 422, "too_few_images")
     assert refused["advice"]
+    app.http.put(f"/v1/captures/{single}/poses/transforms.json", content=b"{}")
+    assert app.job(single)  # a single view with its pose is the worker's to judge
     assert app.job(app.capture("video.mp4"))
     problem(app.http.post("/v1/jobs", json={"capture": "0123456789abcdef"}), 404, "capture_not_found")
     problem(app.http.post("/v1/jobs", json={"capture": "../../etc"}), 404, "capture_not_found")

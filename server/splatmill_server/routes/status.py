@@ -27,7 +27,7 @@ from splatmill_server.service import Service, Shared
 
 router = APIRouter(tags=["service"])
 
-MAX_IMAGE_PIXELS = 400_000_000
+MAX_IMAGE_PIXELS = 250_000_000
 """Photos with more pixels are left out by the worker, from their header alone."""
 
 
