@@ -171,5 +171,7 @@ def margins(exact: Projected, bins: Bins, width: int, height: int, error: Tensor
 
 def brightest(exact: Run) -> tuple[float, float]:
     """Largest colour and largest depth that any pixel can show."""
-    color = max(float(exact.leaves["background"].detach().max()), *exact.projected.colors.flatten().tolist(), 1e-6)
+    color = max(
+        float(exact.leaves["background"].detach().max()), *exact.projected.colors.flatten().tolist(), 1e-6
+    )
     return color, max([*exact.projected.depths.tolist(), 1e-6])

@@ -6,15 +6,20 @@ about speed, and nothing about whether the compiled code is right: the interpret
 
 from __future__ import annotations
 
+import ast
+import importlib.util
 import json
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-pytest.importorskip("triton", reason="Triton comes with torch's GPU builds; pip install triton to compile the kernels here")
+pytest.importorskip(
+    "triton", reason="Triton comes with torch's GPU builds; pip install triton to compile the kernels here"
+)
 
 SPILLS: dict[str, int] = {}
 """Bytes of stack per thread that a kernel may use, by name; none may. A spill that pays is written down here, with the reason."""
@@ -30,7 +35,9 @@ def start(*arguments: str) -> subprocess.Popen[str]:
     # Another process, because here the interpreter has taken the compiler's place.
     environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
     command = [sys.executable, "-m", "splatmill_worker.kernels.gpu.compiled", *arguments]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 @pytest.fixture(scope="module")
@@ -54,19 +61,19 @@ def test_no_kernel_spills_more_than_is_written_down(compiled: list[dict[str, obj
     assert not over, "\n".join(json.dumps(row) for row in over)
 
 
-def test_no_kernel_asks_for_more_shared_memory_than_every_such_card_has(compiled: list[dict[str, object]]) -> None:
+def test_no_kernel_asks_for_more_shared_memory_than_every_such_card_has(
+    compiled: list[dict[str, object]],
+) -> None:
     # 99 KiB per program on sm_86 and sm_89, the smallest of the generation.
     assert all(int(str(row["shared"])) <= 99 * 1024 for row in compiled)
 
 
 def test_every_kernel_of_the_package_is_in_the_list() -> None:
     """A kernel that is launched somewhere and compiled nowhere would escape the check."""
-    import ast
-    from pathlib import Path
-
-    import splatmill_worker.kernels
-
-    folder = Path(splatmill_worker.kernels.__path__[0]) / "gpu"
+    spec = importlib.util.find_spec("splatmill_worker.kernels.gpu")
+    assert spec is not None
+    assert spec.origin is not None
+    folder = Path(spec.origin).parent
     written = {
         node.name
         for file in folder.glob("*.py")

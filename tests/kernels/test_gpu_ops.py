@@ -71,7 +71,9 @@ def project(
     return fields, leaves
 
 
-def close(name: str, seen: Tensor, plain: Tensor, exact: Tensor, *, slack: float = 8.0, roundings: float = 64) -> None:
+def close(
+    name: str, seen: Tensor, plain: Tensor, exact: Tensor, *, slack: float = 8.0, roundings: float = 64
+) -> None:
     """`seen` is as near to `exact` (float64) as the reference's own arithmetic in float32 (`plain`) is, within `slack`.
 
     That is what float32 can give for this scene; a needle may lose all digits and an ordinary splat almost none. The floor of some
@@ -209,7 +211,15 @@ def undecided(fields: Projected, bins: Bins, width: int, height: int) -> tuple[T
     return near, bound
 
 
-SEEN_BY_PROJECTION = {"degree 0", "degree 1", "degree 2", "dark", "principal point off centre", "sub-pixel antialias", "needles 1e+02"}
+SEEN_BY_PROJECTION = {
+    "degree 0",
+    "degree 1",
+    "degree 2",
+    "dark",
+    "principal point off centre",
+    "sub-pixel antialias",
+    "needles 1e+02",
+}
 """Cases whose point is over once they are projected: on the device they run all the same, in the interpreter they cost seconds."""
 
 

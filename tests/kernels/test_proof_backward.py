@@ -1,0 +1,164 @@
+"""Every backend differentiates every case as the definition does: the chain of ops, and project and composite alone.
+
+The definition is the float64 reference; that its gradient is right is shown by test_reference_order. Pixels within the error
+of float32 of a threshold get no weight here, since the gradient jumps there; test_proof_forward shows that they are few.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from splatmill_worker.kernels import ops
+from splatmill_worker.kernels.records import Projected
+
+from .cases import CASES, GROUPS, Case
+from .proof import EPS, Run, alpha_error, backends, define, margins, run, use
+
+_exact: dict[str, tuple[Run, tuple[Tensor, Tensor, Tensor], dict[str, Tensor]]] = {}
+
+
+def exact(name: str) -> tuple[Run, tuple[Tensor, Tensor, Tensor], dict[str, Tensor]]:
+    """The definition of a case, weights for its three images, and the gradients of the weighted sum."""
+    if name not in _exact:
+        case = CASES[name]()
+        want = define(case)
+        weights = image_weights(case, want, alpha_error(case, want.projected))
+        _exact[name] = want, weights, want.gradients(*weights)
+    return _exact[name]
+
+
+def image_weights(case: Case, want: Run, error: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Random weights, zero where a decision could go either way."""
+    near = margins(want.projected, want.bins, case.width, case.height, error)
+    sure = (near.jump > 1) & (near.gate > 1)
+    g = torch.Generator().manual_seed(5)
+    shape = (case.height, case.width)
+    d_color = torch.randn(*shape, 3, generator=g) * sure[..., None]
+    return d_color, torch.randn(shape, generator=g) * sure, torch.randn(shape, generator=g) * sure
+
+
+@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize("name", CASES)
+def test_gradient_is_the_definitions(name: str, backend: str) -> None:
+    case = CASES[name]()
+    want, weights, expected = exact(name)
+    with use(backend) as op:
+        got = run(case, op).gradients(*weights)
+    error = alpha_error(case, want.projected)
+    rho = float(error.max()) if len(error) else 0.0
+    # A gradient is a sum over pixels of products of alpha (relative error rho), of d (its error is in rho) and of what lies
+    # behind, C_final - C_before (two images, each within rho): 4 rho in all, and 64 eps for the products of the chain rule.
+    relative = 4 * rho + 64 * EPS
+    size = {k: float(g.norm()) for k, g in expected.items()}
+    # Terms that cancel leave their rounding: each log-scale's are alpha dL/dalpha q with q <= 11; a quaternion's are
+    # differences of the log-scales' (all of it, where the Gaussian is round), over its norm.
+    shape = 11 * size["logit_opacities"]
+    quat = float(case.quats.norm(dim=1).min()) if len(case.quats) else 1.0
+    floor = {"log_scales": shape, "quats": 2 * (size["log_scales"] + shape) / quat}
+    for k, b in expected.items():
+        a = got[k].cpu().double()
+        assert torch.isfinite(a).all(), k
+        assert float((a - b).norm()) <= relative * (size[k] + floor.get(k, 0.0)) + 1e-12, k
+    culled = (want.projected.extents == 0).all(1)
+    for k in GROUPS:
+        assert (got[k].cpu()[culled] == 0).all(), f"{k}: a culled Gaussian has no gradient"
+    unread = (case.degree + 1) ** 2
+    assert (got["sh"].cpu()[:, unread:] == 0).all()
+
+
+ALONE = [
+    "ordinary",
+    "degree 1",
+    "antialias",
+    "needles 1e+04",
+    "discs",
+    "near plane",
+    "far off-axis",
+    "dark",
+    "portrait",
+]
+
+
+@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize("name", ALONE)
+def test_project_alone(name: str, backend: str) -> None:
+    """Weights on project's own fields: means2d, conics, opacities, colours, depths."""
+    case = CASES[name]()
+
+    def gradients(op: ops.Backend, dtype: torch.dtype) -> dict[str, Tensor]:
+        device = "cuda" if op == "gpu" and torch.cuda.is_available() else "cpu"
+        leaves = [x.to(device).requires_grad_() for x in (*case.groups(dtype), case.camera(dtype)[0])]
+        p = ops.project(
+            *leaves,
+            case.K.to(device, dtype),
+            case.width,
+            case.height,
+            degree=case.degree,
+            antialias=case.antialias,
+            backend=op,
+        )
+        g = torch.Generator().manual_seed(6)
+        total = torch.zeros((), dtype=dtype, device=device)
+        for field in p[:5]:
+            total = total + (field * torch.randn(field.shape, generator=g).to(device, dtype)).sum()
+        return dict(zip((*GROUPS, "viewmat"), torch.autograd.grad(total, leaves), strict=True))
+
+    expected = gradients("reference", torch.float64)
+    with use(backend) as op:
+        got = gradients(op, torch.float32)
+    # Every factor of the chain rule carries a few eps, and 1/z carries the error of the camera coordinate, to the third
+    # power at most. Between the two axes of a conic terms cancel in proportion to their ratio, the root of its condition.
+    p = define(case).projected
+    z = torch.where(p.depths > 0, p.depths, 1.0).detach()
+    coordinate = 4 * EPS * (case.means.double().abs().sum(1) + case.viewmat[:3, 3].double().abs().sum())
+    seen = p.depths > 0
+    axes = float(condition(p.conics.detach()[seen]).max().sqrt())
+    relative = (64 * EPS + 3 * float((coordinate / z)[seen].max())) * (1 + axes)
+    # A round Gaussian's quaternion gradient is a difference of equal terms.
+    floor = float(expected["log_scales"].norm()) / float(case.quats.norm(dim=1).min())
+    for k, b in expected.items():
+        size = float(b.norm()) + (floor if k == "quats" else 0.0)
+        assert float((got[k].cpu().double() - b).norm()) <= relative * size + 1e-12, k
+
+
+def condition(conics: Tensor) -> Tensor:
+    """Ratio of the larger to the smaller eigenvalue of each conic."""
+    a, b, c = conics.double().unbind(1)
+    root = torch.sqrt(((a - c) / 2) ** 2 + b * b)
+    low = (a + c) / 2 - root
+    return torch.where(low > 0, ((a + c) / 2 + root) / low.clamp_min(1e-30), 1.0)
+
+
+@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize(
+    "name", ["ordinary", "degree 1", "needles 1e+02", "sub-pixel", "pile of opaque", "dark", "portrait"]
+)
+def test_composite_alone(name: str, backend: str) -> None:
+    """The same rounded splats given to both: images and gradients to every field of them."""
+    case = CASES[name]()
+    want = define(case)
+    rounded = Projected(*(x.detach().float() for x in want.projected))
+    # A conic's smaller eigenvalue, recovered from three float32 numbers, is known to condition * 4 eps.
+    error = alpha_error(case, want.projected) + 5.5 * 4 * EPS * condition(rounded.conics)
+
+    def through(op: ops.Backend, dtype: torch.dtype) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+        device = "cuda" if op == "gpu" and torch.cuda.is_available() else "cpu"
+        fields = [x.to(device, dtype).requires_grad_() for x in rounded[:5]]
+        p = Projected(*fields, rounded.extents.to(device, dtype))
+        bins = ops.bin(p, case.width, case.height, backend=op)
+        image = ops.composite(p, bins, case.width, case.height, backend=op)
+        return image, fields
+
+    image, fields = through("reference", torch.float64)
+    near = Run({}, Projected(*fields, rounded.extents.double()), want.bins, *image)
+    weights = image_weights(case, near, error)
+    expected = torch.autograd.grad(sum((x * w).sum() for x, w in zip(image, weights, strict=True)), fields)
+    with use(backend) as op:
+        image, fields = through(op, torch.float32)
+        total = sum((x * w.to(x.device)).sum() for x, w in zip(image, weights, strict=True))
+        got = torch.autograd.grad(total, fields)
+    relative = 4 * float(error.max()) + 64 * EPS
+    for label, x, y in zip(Projected._fields, got, expected, strict=False):
+        assert float((x.cpu().double() - y).norm()) <= relative * float(y.norm()) + 1e-12, label

@@ -1,0 +1,195 @@
+"""The fused CPU training step is the ops one after another: the same image, gradients and Adam update, on every build.
+
+That the ops are right is shown elsewhere; here is only that fusing them changed nothing.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from splatmill_worker.kernels import ops, reference
+from splatmill_worker.kernels.cpu import isa
+from splatmill_worker.kernels.cpu.step import Rates, Step
+
+from .cases import CASES, GROUPS
+from .proof import EPS, alpha_error, brightest, define, run, use
+from .test_proof_backward import image_weights
+
+NAMES = [
+    "ordinary",
+    "degree 0",
+    "antialias",
+    "needles 1e+04",
+    "near plane",
+    "pile of opaque",
+    "side 17x257",
+    "dark",
+    "all culled",
+]
+RATES = Rates(1.6e-4, 5e-3, 1e-3, 5e-2, 2.5e-3, 1.25e-4)
+
+
+def photo(width: int, height: int, seed: int = 0) -> torch.Tensor:
+    return torch.randint(
+        0, 256, (height, width, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(seed)
+    )
+
+
+@pytest.mark.parametrize("build", isa.supported())
+@pytest.mark.parametrize("name", NAMES)
+def test_image_and_gradients_are_the_ops(name: str, build: str) -> None:
+    case = CASES[name]()
+    want = define(case)
+    error = alpha_error(case, want.projected)
+    rho = float(error.max())
+    weights = image_weights(case, want, error)
+    with use(f"cpu:{build}"):
+        alone = run(case, "cpu")
+        expected = alone.gradients(*weights)
+        step = Step(*case.groups())
+        image = step.forward(
+            *case.camera(),
+            case.width,
+            case.height,
+            degree=case.degree,
+            background=case.background,
+            antialias=case.antialias,
+        )
+        # Alone, composite gets conics that were rounded to three numbers; fused, it gets the factor. Both are within rho of
+        # the definition, so within 2 rho of one another; a pixel at a threshold may differ by the splat at stake.
+        color, depth = brightest(want)
+        for got, other, largest in (
+            (image[0], alone.color, color),
+            (image[1], alone.alpha, 1.0),
+            (image[2], alone.depth, depth),
+        ):
+            off = (got - other.detach()).abs()
+            assert float(off.max()) <= (2 * rho + 64 * EPS) * largest + (1 / 255) * largest
+            assert float(off.mean()) <= (2 * rho + 64 * EPS) * largest
+        gradients = step.gradients(*weights)
+    for k in GROUPS:
+        a, b = gradients[k].double(), expected[k].double()
+        size = float(b.norm()) + 22 * float(expected["logit_opacities"].norm())
+        assert float((a - b).norm()) <= (8 * rho + 64 * EPS) * size + 1e-12, k
+
+
+@pytest.mark.parametrize("build", isa.supported())
+def test_train_is_forward_loss_gradient_and_adam(build: str) -> None:
+    case = CASES["ordinary"]()
+    seen = photo(case.width, case.height)
+    mask = (torch.rand(case.height, case.width, generator=torch.Generator().manual_seed(1)) > 0.2).to(
+        torch.uint8
+    )
+    with use(f"cpu:{build}"):
+        fused, parts = Step(*case.groups()), Step(*case.groups())
+        moments = (
+            [torch.zeros_like(x) for x in case.groups(torch.float64)],
+            [torch.zeros_like(x) for x in case.groups(torch.float64)],
+        )
+        rates = [RATES.means, RATES.log_scales, RATES.quats, RATES.logit_opacities]
+        for t in range(1, 6):
+            before = parts.parameters()
+            image = parts.forward(
+                *case.camera(), case.width, case.height, degree=case.degree, background=case.background
+            )
+            color = image[0].clone().requires_grad_()
+            value = ops.loss(color, seen, mask=mask, backend="cpu")
+            (d_color,) = torch.autograd.grad(value, color)
+            gradients = parts.gradients(d_color)
+            assert parts.backward_update(d_color, rates=RATES, step=t) == 0
+            result = fused.train(
+                *case.camera(),
+                seen,
+                degree=case.degree,
+                rates=RATES,
+                step=t,
+                background=case.background,
+                mask=mask,
+            )
+            assert result.loss == pytest.approx(float(value.detach()), abs=1e-6)
+            assert result.refused == 0
+
+            # Adam, by its definition, on those gradients.
+            params = [before[k].double() for k in GROUPS]
+            grads = [gradients[k].double() for k in GROUPS]
+            sh, sh_m, sh_v, sh_g = params.pop(), moments[0].pop(), moments[1].pop(), grads.pop()
+            groups = [*params, sh[:, :1], sh[:, 1:]]
+            firsts, seconds = [*moments[0], sh_m[:, :1], sh_m[:, 1:]], [*moments[1], sh_v[:, :1], sh_v[:, 1:]]
+            reference.adam_(
+                groups,
+                [*grads, sh_g[:, :1], sh_g[:, 1:]],
+                firsts,
+                seconds,
+                [*rates, RATES.sh_dc, RATES.sh_rest],
+                step=t,
+            )
+            moments[0].append(sh_m)
+            moments[1].append(sh_v)
+            after = parts.parameters()
+            for k, p, rate in zip(GROUPS, [*params, sh], [*rates, RATES.sh_dc], strict=True):
+                # Rounding of the parameter itself, of the update's 16 operations, and of gradients that Adam's quotient
+                # magnifies where both moments cancel.
+                bound = 2 * EPS * p.abs() + 1e-4 * rate
+                assert ((after[k].double() - p).abs() <= bound).all(), k
+        for k, x in fused.parameters().items():
+            assert torch.allclose(x, parts.parameters()[k], rtol=1e-5, atol=1e-6), k
+
+
+@pytest.mark.parametrize("build", isa.supported())
+def test_threads_do_not_show(build: str) -> None:
+    """Twenty steps on one thread and on two leave the same bytes everywhere."""
+    case = CASES["portrait"]()
+    seen = photo(case.width, case.height)
+    states = []
+    with use(f"cpu:{build}"):
+        for threads in (1, 2, 3):
+            step = Step(*case.groups(), threads=threads)
+            for t in range(1, 21):
+                result = step.train(
+                    *case.camera(), seen, degree=case.degree, rates=RATES, step=t, background=case.background
+                )
+            states.append(
+                [
+                    step.blocks,
+                    step.exp_avg,
+                    step.exp_avg_sq,
+                    step.plain_sum,
+                    step.abs_sum,
+                    step.error_sum,
+                    torch.tensor(result.loss),
+                ]
+            )
+    for other in states[1:]:
+        for a, b in zip(states[0], other, strict=True):
+            assert a.numpy().tobytes() == b.numpy().tobytes()
+
+
+@pytest.mark.parametrize("build", isa.supported())
+@pytest.mark.parametrize("name", ["ordinary", "pile of transparent", "side 257x1"])
+def test_threads_do_not_show_in_the_ops(name: str, build: str) -> None:
+    case = CASES[name]()
+    found = []
+    g = torch.Generator().manual_seed(5)
+    weights = [torch.randn(case.height, case.width, *s, generator=g) for s in ((3,), (), ())]
+    before = torch.get_num_threads()
+    try:
+        with use(f"cpu:{build}"):
+            for threads in (1, 2):
+                torch.set_num_threads(threads)
+                got = run(case, "cpu")
+                gradients = got.gradients(*weights)
+                found.append(
+                    [
+                        *got.projected,
+                        *got.bins,
+                        got.color,
+                        got.alpha,
+                        got.depth,
+                        *(gradients[k] for k in (*GROUPS, "viewmat")),
+                    ]
+                )
+    finally:
+        torch.set_num_threads(before)
+    for a, b in zip(*found, strict=True):
+        assert a.detach().numpy().tobytes() == b.detach().numpy().tobytes()
