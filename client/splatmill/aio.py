@@ -1,7 +1,9 @@
 """The asynchronous SDK: everything the service offers, on one event loop."""
 
+import asyncio
 import os
 import tempfile
+import time
 import uuid
 from collections.abc import AsyncIterator, Mapping
 from pathlib import Path
@@ -10,9 +12,9 @@ from typing import Any, Self
 import httpx
 from pydantic import ValidationError
 
-from splatmill.connection import RETRIES, TIMEOUT, Connection
+from splatmill.connection import RETRIES, TIMEOUT, Connection, pause, read_answer
 from splatmill.downloads import OnBytes, download, target_of
-from splatmill.errors import Conflict, JobCancelled, JobFailed, invalid
+from splatmill.errors import Conflict, ConnectionFailed, JobCancelled, JobFailed, Unavailable, invalid
 from splatmill.layout import find_files
 from splatmill.schema import (
     IDEMPOTENCY_HEADER,
@@ -40,7 +42,7 @@ from splatmill.schema import (
     Report,
     TrainOptions,
 )
-from splatmill.sse import follow
+from splatmill.sse import PATIENCE, follow
 from splatmill.uploads import OnProgress, Uploaded, upload
 
 AnyPath = str | os.PathLike[str]
@@ -104,7 +106,7 @@ class AsyncClient:
         if capture is None:
             body = {"name": name or Path(path).expanduser().resolve().name}
             response = await self.connection.request("POST", "/v1/captures", json=body)
-            target = Capture.model_validate_json(response.content)
+            target = read_answer(Capture, response)
         else:
             target = await self.capture(capture)
         return target, await upload(self.connection, target.id, found.files, on_progress)
@@ -123,17 +125,17 @@ class AsyncClient:
             headers={IDEMPOTENCY_HEADER: str(uuid.uuid4())},
             repeatable=True,
         )
-        return AsyncJobHandle(self, Job.model_validate_json(response.content))
+        return AsyncJobHandle(self, read_answer(Job, response))
 
     async def capture(self, capture_id: str) -> Capture:
         """A stored capture with its files."""
         response = await self.connection.request("GET", f"/v1/captures/{capture_id}")
-        return Capture.model_validate_json(response.content)
+        return read_answer(Capture, response)
 
     async def job(self, job_id: str) -> "AsyncJobHandle":
         """A job by its id."""
         response = await self.connection.request("GET", f"/v1/jobs/{job_id}")
-        return AsyncJobHandle(self, Job.model_validate_json(response.content))
+        return AsyncJobHandle(self, read_answer(Job, response))
 
     async def jobs(self, *, limit: int | None = None) -> AsyncIterator[Job]:
         """All jobs, newest first, page by page; `limit` at most."""
@@ -142,7 +144,7 @@ class AsyncClient:
         while left is None or left > 0:
             params = {"limit": min(left or 100, 100)} | ({"cursor": cursor} if cursor else {})
             response = await self.connection.request("GET", "/v1/jobs", params=params)
-            page = JobPage.model_validate_json(response.content)
+            page = read_answer(JobPage, response)
             for job in page.jobs[:left]:
                 yield job
             left = None if left is None else left - len(page.jobs)
@@ -153,7 +155,7 @@ class AsyncClient:
     async def model(self, model_id: str) -> "AsyncModelHandle":
         """A finished model by its id, which is that of its job."""
         response = await self.connection.request("GET", f"/v1/models/{model_id}")
-        return AsyncModelHandle(self, Model.model_validate_json(response.content))
+        return AsyncModelHandle(self, read_answer(Model, response))
 
     async def models(self) -> AsyncIterator[Model]:
         """All finished models, newest first."""
@@ -161,7 +163,7 @@ class AsyncClient:
         while True:
             params = {"cursor": cursor} if cursor else None
             response = await self.connection.request("GET", "/v1/models", params=params)
-            page = ModelPage.model_validate_json(response.content)
+            page = read_answer(ModelPage, response)
             for model in page.models:
                 yield model
             cursor = page.cursor
@@ -171,17 +173,20 @@ class AsyncClient:
     async def options(self) -> list[OptionHelp]:
         """Every setting this server takes, with type, default, range and help."""
         response = await self.connection.request("GET", "/v1/options")
-        return OptionList.model_validate_json(response.content).options
+        return read_answer(OptionList, response).options
 
     async def info(self) -> Info:
         """What the server is, who works for it, and what it accepts."""
         response = await self.connection.request("GET", "/v1/info")
-        return Info.model_validate_json(response.content)
+        return read_answer(Info, response)
 
     async def ready(self) -> Ready:
         """Whether the service can do its work, part by part."""
-        response = await self.connection.http.get("/readyz")  # 503 is an answer here, not a failure
-        return Ready.model_validate_json(response.content)
+        try:
+            response = await self.connection.http.get("/readyz")  # 503 is an answer here, not a failure
+        except httpx.TransportError as error:
+            raise self.connection.lost(error) from error
+        return read_answer(Ready, response)
 
 
 class AsyncJobHandle:
@@ -205,7 +210,7 @@ class AsyncJobHandle:
     async def refresh(self) -> Job:
         """Ask for the job's present state."""
         response = await self.client.connection.request("GET", f"/v1/jobs/{self.id}")
-        self.job = Job.model_validate_json(response.content)
+        self.job = read_answer(Job, response)
         return self.job
 
     async def events(self, after: str | None = None) -> AsyncIterator[EventRecord]:
@@ -213,12 +218,27 @@ class AsyncJobHandle:
 
         `after` is the id of an event to go on after; without it the stream begins at the job's beginning.
         """
+        silent = 0
         while True:
+            silent += 1
             async for record in follow(self.client.connection, f"/v1/jobs/{self.id}/events", after=after):
-                after = record.id
+                after, silent = record.id, 0
                 yield record
-            if (await self.refresh()).state.final:
+            if (await self._refresh_patiently()).state.final:
                 return
+            if silent:  # a server that ends its streams at once must not be asked in a tight circle
+                await asyncio.sleep(pause(silent))
+
+    async def _refresh_patiently(self) -> Job:
+        """The job's present state, waiting out a service of which a part is down."""
+        end = time.monotonic() + PATIENCE
+        while True:
+            try:
+                return await self.refresh()
+            except (Unavailable, ConnectionFailed):
+                if time.monotonic() > end:
+                    raise
+                await asyncio.sleep(pause(self.client.connection.retries + 1))
 
     async def wait(self, on_progress: OnProgress | None = None) -> "AsyncModelHandle":
         """The model, once the job is done; raises JobFailed or JobCancelled when it ends without one."""
@@ -257,12 +277,12 @@ class AsyncJobHandle:
     async def report(self) -> Report:
         """Error against run time, and what led to it."""
         response = await self.client.connection.request("GET", f"/v1/jobs/{self.id}/report")
-        return Report.model_validate_json(response.content)
+        return read_answer(Report, response)
 
     async def logs(self) -> list[LogLine]:
         """The job's log, oldest line first."""
         response = await self.client.connection.request("GET", f"/v1/jobs/{self.id}/logs")
-        return LogPage.model_validate_json(response.content).lines
+        return read_answer(LogPage, response).lines
 
     async def preview(self) -> bytes:
         """The newest preview picture (JPEG)."""
@@ -272,7 +292,7 @@ class AsyncJobHandle:
     async def _post(self, wish: str) -> Job:
         # Wishing twice is wishing once.
         response = await self.client.connection.request("POST", f"/v1/jobs/{self.id}/{wish}", repeatable=True)
-        self.job = Job.model_validate_json(response.content)
+        self.job = read_answer(Job, response)
         return self.job
 
 
@@ -304,7 +324,7 @@ class AsyncModelHandle:
     async def cameras(self) -> list[ModelCamera]:
         """The cameras of the capture in the model's world, held-out ones marked `test`."""
         response = await self.client.connection.request("GET", f"/v1/models/{self.id}/cameras")
-        return ModelCameras.model_validate_json(response.content).cameras
+        return read_answer(ModelCameras, response).cameras
 
     async def render(self, camera: CameraSpec | Mapping[str, Any], **wishes: Any) -> bytes:
         """The picture from `camera`; `wishes` are `output`, `format`, `background` and `quality` of RenderRequest."""

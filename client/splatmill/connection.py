@@ -5,10 +5,10 @@ import os
 import random
 from collections.abc import AsyncIterable, AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import httpx
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from splatmill.errors import ConnectionFailed, refused
 from splatmill.schema.info import DEFAULT_PORT
@@ -25,6 +25,8 @@ FIRST_PAUSE = 0.25  # seconds; doubled each time, with jitter so that many clien
 LONGEST_PAUSE = 8.0
 PASSING = frozenset({429, 502, 503, 504})
 REPEATABLE = frozenset({"GET", "HEAD", "PUT", "DELETE"})
+
+M = TypeVar("M", bound=BaseModel)
 
 Body = Callable[[], AsyncIterable[bytes]]
 """Opens the body from its beginning, so that it can be sent again."""
@@ -143,6 +145,17 @@ class Connection:
         return ConnectionFailed(
             f"The connection to {self.server} was lost ({reason}).", "What was sent is kept; try again."
         )
+
+
+def read_answer(kind: type[M], response: httpx.Response) -> M:
+    """The answer as `kind`; ConnectionFailed for one that no Splatmill server would give."""
+    try:
+        return kind.model_validate_json(response.content)
+    except ValidationError as error:
+        raise ConnectionFailed(
+            f"{response.request.url} answered {response.status_code}, but not as a Splatmill server would.",
+            "Check the address, and that the versions of server and client go together.",
+        ) from error
 
 
 def pause(tries: int) -> float:

@@ -15,6 +15,7 @@ from splatmill.connection import Connection, pause
 from splatmill.errors import Unavailable
 from splatmill.schema.events import EventRecord
 
+PATIENCE = 300.0  # seconds without a word before a job is given up on: replacing a server may take that long
 # The server sends a comment every few seconds; silence for this long is a dead connection.
 SILENCE = httpx.Timeout(30.0, connect=10.0, read=45.0)
 
@@ -60,7 +61,7 @@ async def _lines(chunks: AsyncIterable[bytes]) -> AsyncIterator[bytes]:
 
 
 async def follow(
-    connection: Connection, path: str, *, after: str | None = None, patience: float = 300.0
+    connection: Connection, path: str, *, after: str | None = None, patience: float = PATIENCE
 ) -> AsyncIterator[EventRecord]:
     """The events at `path` until the server ends the stream, going on after the last one when the connection breaks.
 

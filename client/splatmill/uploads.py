@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-from splatmill.connection import Connection
+from splatmill.connection import Connection, read_answer
 from splatmill.errors import InvalidRequest, NothingToUpload
 from splatmill.layout import LocalFile
 from splatmill.schema.captures import SHA256_HEADER, CaptureFile, Role
@@ -85,7 +85,7 @@ async def _send(connection: Connection, capture_id: str, file: LocalFile) -> Cap
         body=lambda: _chunks(file.path),
         headers={"Content-Type": media_type, "Content-Length": str(size), SHA256_HEADER: digest},
     )
-    return CaptureFile.model_validate_json(response.content)
+    return read_answer(CaptureFile, response)
 
 
 def _digest(path: Path) -> tuple[str, int]:

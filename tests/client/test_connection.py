@@ -98,6 +98,19 @@ def test_a_page_of_something_else_is_told_as_such(peer, reply, body):
     assert error.value.problem.facts["body"] == body.decode()
 
 
+def test_another_kind_of_server_is_told_as_such(peer, reply):
+    peer.answer = lambda _: reply(body=b"<html>hello</html>")
+    with Client(peer.url) as client:
+        for ask in (client.info, client.ready, client.options, lambda: list(client.jobs())):
+            with pytest.raises(ConnectionFailed, match="not as a Splatmill server would"):
+                ask()
+
+
+def test_readiness_of_no_server_is_a_sentence():
+    with Client("http://127.0.0.1:9") as client, pytest.raises(ConnectionFailed, match="splatmill up"):
+        client.ready()
+
+
 def test_no_server_is_a_sentence():
     with (
         Client("http://127.0.0.1:9", retries=1) as client,

@@ -88,6 +88,23 @@ def test_a_broken_stream_goes_on_after_the_last_event(peer, reply):
     assert handle.job.state.final
 
 
+def test_a_part_of_the_service_that_is_down_is_waited_for(peer, reply):
+    asked: list[str] = []
+
+    def answer(seen):
+        asked.append(seen.path)
+        if seen.path.endswith("/events"):
+            return reply(body=b": nothing to tell\n\n", headers=SSE)
+        if 1 < len(asked) < 8:
+            return reply(status=503)
+        return reply(body=job("queued" if len(asked) < 20 else "cancelled"))
+
+    peer.answer = answer
+    with Client(peer.url, retries=0) as client:
+        assert list(client.job("j1").events()) == []
+    assert len(asked) >= 20
+
+
 def test_a_job_that_is_gone_ends_the_following(peer, reply):
     peer.answer = lambda seen: (
         reply(status=404) if seen.path.endswith("/events") else reply(body=job("queued"))
