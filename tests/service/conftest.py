@@ -199,24 +199,44 @@ def own_service(tmp_path: Path) -> Iterator[Up]:
     up.close()
 
 
-@pytest.fixture
-def redis_server(tmp_path: Path) -> Iterator[redis.Redis]:
-    """A Redis without the service."""
-    from splatmill_server.up.redis_server import find
+class RedisServer:
+    """A Redis without the service, which can be killed and comes back with everything it was told."""
 
-    path = tmp_path / "r.sock"
-    command = [str(find()[0]), "--port", "0", "--unixsocket", str(path), "--save", "", "--dir", str(tmp_path)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    connection = connect(f"unix://{path}", retries=0)
+    def __init__(self, folder: Path) -> None:
+        from splatmill_server.up.redis_server import find
 
-    def answers() -> bool:
+        self.path = folder / "r.sock"
+        self._command = [str(find()[0]), "--port", "0", "--unixsocket", str(self.path)]
+        self._command += ["--appendonly", "yes", "--save", "", "--dir", str(folder)]
+        self.connection = connect(f"unix://{self.path}", retries=0)
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        self._process = subprocess.Popen(self._command, stdout=subprocess.DEVNULL)
+        wait_for(self._answers)
+
+    def kill(self) -> None:
+        assert self._process is not None
+        self._process.kill()
+        self._process.wait(10)
+
+    def _answers(self) -> bool:
         try:
-            return bool(connection.ping())
+            return bool(self.connection.ping())
         except redis.ConnectionError:
             return False
 
-    wait_for(answers)
-    yield connection
-    connection.close()
-    process.terminate()
-    process.wait(10)
+
+@pytest.fixture
+def redis_server(tmp_path: Path) -> Iterator[RedisServer]:
+    server = RedisServer(tmp_path)
+    server.start()
+    yield server
+    server.connection.close()
+    server.kill()
+
+
+@pytest.fixture
+def connection(redis_server: RedisServer) -> redis.Redis:
+    """An empty Redis of the test's own."""
+    return redis_server.connection

@@ -15,7 +15,7 @@ import httpx
 import psutil
 import pytest
 
-from .conftest import Up, gone, wait_for
+from .conftest import RedisServer, Up, gone, wait_for
 
 
 def refused(*options: str, **environment: str) -> str:
@@ -82,13 +82,13 @@ def test_without_redis_on_the_path_the_one_in_the_wheel_serves(own_service: Up) 
     assert own_service.ended(own_service.submit(steps=1))["state"] == "succeeded"
 
 
-def test_a_redis_of_the_operators_own_is_used(own_service: Up, tmp_path: Path, redis_server) -> None:  # type: ignore[no-untyped-def]
-    own_service.environment["REDIS_URL"] = f"unix://{tmp_path / 'r.sock'}"
+def test_a_redis_of_the_operators_own_is_used(own_service: Up, redis_server: RedisServer) -> None:
+    own_service.environment["REDIS_URL"] = f"unix://{redis_server.path}"
     own_service.start()
     assert not [child for child in own_service.tree() if "redis" in child.name()]
     job_id = own_service.submit(steps=1)
     assert own_service.ended(job_id)["state"] == "succeeded"
-    assert redis_server.exists(f"splatmill:job:{job_id}")
+    assert redis_server.connection.exists(f"splatmill:job:{job_id}")
 
 
 def test_a_long_folder_name_still_has_sockets(tmp_path: Path) -> None:

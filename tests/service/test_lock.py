@@ -1,0 +1,121 @@
+"""The lock on a job, the outbox of events and the identity of processes, against a real Redis and real processes.
+
+Two machines are played by writing another machine's name into the lock.
+"""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import redis
+
+from splatmill.backplane import events, keys
+from splatmill.backplane.process import ProcessIdentity, start_time
+from splatmill.schema import JobState, LogEvent, ProgressEvent, StateEvent
+from splatmill_worker.attempt import Attempt
+from splatmill_worker.lock import STALE_MS, Held, JobLock
+from splatmill_worker.outbox import Outbox
+
+from .conftest import RedisServer, wait_for
+
+ME = ProcessIdentity.of(os.getpid())
+
+
+def other() -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+
+
+def test_a_living_holder_keeps_the_lock_however_silent(connection: redis.Redis) -> None:
+    first, second = (JobLock(connection, "job00001", token) for token in "ab")
+    assert first.take(ME, 1)
+    connection.hincrby(keys.lock("job00001"), "seen", -100 * STALE_MS)
+    assert not second.take(ME, 2)
+    assert first.refresh() is Held.own
+    second.release()
+    assert first.holder() is not None
+    first.release()
+    assert second.take(ME, 2)
+
+
+def test_a_dead_holder_is_followed_at_once(connection: redis.Redis) -> None:
+    process = other()
+    identity = ProcessIdentity.of(process.pid)
+    first, second = (JobLock(connection, "job00001", token) for token in "ab")
+    assert first.take(identity, 1)
+    assert not second.take(ME, 2)
+    process.kill()
+    # Not waited for yet: a zombie runs nothing and counts as dead.
+    wait_for(identity.dead)
+    assert second.take(ME, 2)
+    assert first.refresh() is Held.lost
+    process.communicate()
+
+
+def test_a_holder_out_of_sight_is_judged_by_its_silence(connection: redis.Redis) -> None:
+    first, second = (JobLock(connection, "job00001", token) for token in "ab")
+    assert first.take(replace(ME, machine="elsewhere"), 1)
+    assert not second.take(ME, 2)
+    connection.hincrby(keys.lock("job00001"), "seen", -STALE_MS - 1000)
+    assert second.take(ME, 2)
+
+
+def test_a_holder_from_before_the_last_boot_is_dead() -> None:
+    assert replace(ME, boot="an earlier one").dead()
+    assert not replace(ME, namespace="another container's").dead()
+    assert not ME.dead()
+    assert replace(ME, started="1").dead(), "the number was given to a new process"
+
+
+def test_of_two_takers_one_gets_a_dead_holders_lock(connection: redis.Redis) -> None:
+    process = other()
+    dead = ProcessIdentity.of(process.pid)
+    process.kill()
+    process.communicate()
+    assert start_time(process.pid) is None
+    assert JobLock(connection, "job00001", "dead").take(dead, 1)
+    second, third = (JobLock(connection, "job00001", token) for token in "bc")
+    assert second.take(ME, 2)
+    assert not third.take(ME, 3)
+
+
+def test_events_keep_their_order_and_progress_is_thinned(connection: redis.Redis) -> None:
+    this = Attempt(connection, "job00001", 1, 1, JobLock(connection, "job00001", "a"))
+    outbox = Outbox(this)
+    outbox.put(StateEvent(state=JobState.training))
+    for step in range(1, 501):
+        outbox.put(ProgressEvent(stage="training", step=step))
+    outbox.put(LogEvent(message="done"))
+    outbox.put(StateEvent(state=JobState.exporting))
+    outbox.close()
+    told = [stored.event for stored in events.read_progress(connection, "job00001")]
+    steps = [event.step for event in told if isinstance(event, ProgressEvent)]
+    assert len(steps) < 50
+    assert steps[-1] == 500
+    assert isinstance(told[-1], LogEvent)
+    states = [stored.event for stored in events.read_states(connection, "job00001")]
+    assert [event.state.value for event in states if isinstance(event, StateEvent)] == [
+        "training",
+        "exporting",
+    ]
+
+
+def test_what_is_said_while_redis_is_away_arrives_when_it_is_back(redis_server: RedisServer) -> None:
+    connection = redis_server.connection
+    outbox = Outbox(Attempt(connection, "job00001", 1, 1, JobLock(connection, "job00001", "a")))
+    outbox.put(LogEvent(message="before"))
+    assert outbox.flush(10)
+    redis_server.kill()
+    outbox.put(LogEvent(message="meanwhile"))
+    outbox.put(StateEvent(state=JobState.exporting))
+    assert not outbox.flush(0.3)
+    redis_server.start()
+    outbox.put(LogEvent(message="after"))
+    outbox.close(20)
+    told = [stored.event for stored in events.read_progress(connection, "job00001")]
+    assert [event.message for event in told if isinstance(event, LogEvent)] == [
+        "before",
+        "meanwhile",
+        "after",
+    ]
+    assert len(events.read_states(connection, "job00001")) == 1
