@@ -15,7 +15,7 @@ from splatmill_worker.splat.density.rows import Rows, rotations
 from splatmill_worker.splat.engine import Engine
 from splatmill_worker.splat.gaussians import Gaussians
 
-GROWTH = 1.05
+GROWTH = 0.05
 """The number of Gaussians grows by 5 % an event, up to what is allowed."""
 
 NOISE = 5e5
@@ -41,7 +41,7 @@ class Mcmc:
         dead = int((~alive).sum())
         rows = rows.keep(alive)
         room = moment.allowed - rows.gaussians.count
-        wanted = dead + math.ceil((GROWTH - 1.0) * (rows.gaussians.count + dead))
+        wanted = dead + math.ceil(GROWTH * (rows.gaussians.count + dead))
         added = max(0, min(wanted, room))
         if added:
             chance = torch.sigmoid(rows.gaussians.logit_opacities)

@@ -1,0 +1,189 @@
+"""Proves what each densification strategy does to Gaussians and moments, one event at a time.
+
+Does not prove that it helps: the ablation table of `bench train` measures that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+from torch import Tensor
+
+from splatmill_worker.kernels import ops
+from splatmill_worker.splat.density import prune
+from splatmill_worker.splat.density.classic import Classic, decayed
+from splatmill_worker.splat.density.interface import Moment
+from splatmill_worker.splat.density.mcmc import Mcmc, shared, walk
+from splatmill_worker.splat.density.rows import rotations
+from splatmill_worker.splat.gaussians import Gaussians
+
+
+def gaussians(n: int, scale: float = 0.05, opacity: float = 0.5) -> Gaussians:
+    generator = torch.Generator().manual_seed(0)
+    return Gaussians(
+        torch.randn(n, 3, generator=generator),
+        torch.full((n, 3), math.log(scale)),
+        torch.randn(n, 4, generator=generator),
+        torch.full((n,), math.log(opacity / (1 - opacity))),
+        torch.randn(n, 16, 3, generator=generator),
+    )
+
+
+@dataclass
+class Held:
+    """The state of an engine without its kernels: densification touches nothing else."""
+
+    held: Gaussians
+    plain: Tensor
+    exp_avg: Tensor = field(init=False)
+    exp_avg_sq: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        n = self.held.count
+        self.exp_avg = torch.arange(n)[:, None].expand(n, 59).float().clone()
+        self.exp_avg_sq = self.exp_avg.clone()
+        self.abs_sum: Tensor | None = 4.0 * self.plain
+        self.visible_count = torch.ones(n)
+        self.max_extent = torch.zeros(n)
+
+    @property
+    def count(self) -> int:
+        return self.held.count
+
+    @property
+    def plain_sum(self) -> Tensor:
+        return self.plain
+
+    def parameters(self) -> dict[str, Tensor]:
+        return {name: value.clone() for name, value in self.held.parameters().items()}
+
+    def moments(self) -> tuple[Tensor, Tensor]:
+        return self.exp_avg.clone(), self.exp_avg_sq.clone()
+
+    def replace(
+        self, parameters: dict[str, Tensor], exp_avg: Tensor | None, exp_avg_sq: Tensor | None
+    ) -> None:
+        self.held = Gaussians(**parameters)
+        assert exp_avg is not None
+        assert exp_avg_sq is not None
+        self.exp_avg, self.exp_avg_sq = exp_avg, exp_avg_sq
+
+
+def moment(allowed: int = 1000) -> Moment:
+    return Moment(step=100, progress=0.2, extent=1.0, allowed=allowed)
+
+
+def random() -> torch.Generator:
+    return torch.Generator().manual_seed(3)
+
+
+def test_small_ones_are_cloned_and_keep_their_moments() -> None:
+    engine = Held(gaussians(6, scale=0.005), torch.tensor([0.0, 1e-3, 0.0, 0.0, 3e-4, 1e-4]))
+    change = Classic("plain", 2e-4).densify(engine, moment(), random())
+    assert (change.added, change.removed) == (2, 0)
+    assert engine.count == 8
+    assert torch.equal(engine.held.means[6:], engine.held.means[[1, 4]])
+    assert torch.equal(engine.exp_avg[:6, 0], torch.arange(6.0))
+    assert torch.equal(engine.exp_avg[6:], torch.zeros(2, 59))
+
+
+def test_large_ones_are_split_in_two_smaller_ones() -> None:
+    before = gaussians(4, scale=0.05)
+    engine = Held(before, torch.tensor([0.0, 1e-3, 0.0, 0.0]))
+    Classic("plain", 2e-4).densify(engine, moment(), random())
+    assert engine.count == 5
+    assert torch.equal(engine.held.means[:3], before.means[[0, 2, 3]])
+    assert torch.allclose(engine.held.log_scales[3:].exp(), torch.tensor(0.05 / 1.6))
+    apart = (engine.held.means[3:] - before.means[1]).norm(dim=1)
+    assert bool((apart > 0).all())
+    assert bool((apart < 5 * 0.05).all())
+
+
+def test_the_budget_takes_the_largest_scores() -> None:
+    engine = Held(gaussians(8, scale=0.005), torch.arange(8) * 1e-3)
+    Classic("plain", 2e-4).densify(engine, moment(allowed=10), random())
+    assert engine.count == 10
+    assert torch.equal(engine.held.means[8:], engine.held.means[[6, 7]])
+
+
+def test_absolute_scores_are_their_own() -> None:
+    engine = Held(gaussians(3, scale=0.005), torch.tensor([0.0, 1.9e-4, 2.1e-4]))
+    Classic("absolute", 8e-4).densify(engine, moment(), random())
+    assert engine.count == 4
+    engine.abs_sum = None
+    with pytest.raises(ValueError, match="no absolute gradients"):
+        Classic("absolute", 8e-4).densify(engine, moment(), random())
+
+
+def test_what_cannot_be_seen_goes() -> None:
+    scene = gaussians(6)
+    scene.logit_opacities[0] = -9.0
+    scene.means[1, 0] = math.nan
+    scene.quats[2] = 0.0
+    extent = torch.tensor([0.0, 0.0, 0.0, 9.0, 0.0, math.nan])
+    assert prune.keep(scene, extent).tolist() == [False, False, False, False, True, False]
+    assert prune.keep(scene, None).tolist() == [False, False, False, True, True, True]
+
+
+def test_decayed_opacities_are_multiplied() -> None:
+    logits = torch.tensor([-2.0, 0.0, 3.0])
+    assert torch.allclose(torch.sigmoid(decayed(logits, 0.9)), 0.9 * torch.sigmoid(logits), atol=1e-6)
+
+
+def test_dead_ones_move_to_live_ones_and_the_number_grows_by_a_twentieth() -> None:
+    scene = gaussians(100)
+    scene.logit_opacities[:20] = -9.0
+    engine = Held(scene, torch.zeros(100))
+    change = Mcmc().densify(engine, moment(), random())
+    assert change.removed == 20
+    assert engine.count == 105
+    assert bool((torch.sigmoid(engine.held.logit_opacities) >= prune.MIN_OPACITY).all())
+    engine = Held(scene, torch.zeros(100))
+    Mcmc().densify(engine, moment(allowed=90), random())
+    assert engine.count == 90
+
+
+@pytest.mark.parametrize("copies", [2, 3, 5])
+def test_copies_on_one_spot_look_like_the_one_they_came_from(copies: int) -> None:
+    """Equation 9 of the paper preserves the integral of the projected alpha, so the rendered light hardly changes."""
+    one = gaussians(1, scale=0.1, opacity=0.8)
+    one.means.zero_()
+    one.sh.zero_()
+    one.sh[:, 0] = 1.0
+    several = one.map(torch.clone)
+    shared(several, torch.tensor([copies]))
+    several = several.map(lambda value: value.repeat(copies, *[1] * (value.ndim - 1)))
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 2.0
+    lens = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]])
+
+    def light(scene: Gaussians) -> Tensor:
+        rows = ops.project(*scene, viewmat, lens, 64, 64, degree=0, backend="reference")
+        return ops.composite(
+            rows, ops.bin(rows, 64, 64, backend="reference"), 64, 64, background=None, backend="reference"
+        )[1]
+
+    before, after = light(one), light(several)
+    assert float(after.sum()) == pytest.approx(float(before.sum()), rel=0.08)
+    assert float((after - before).abs().max()) < 0.12
+
+
+def test_the_walk_moves_the_transparent_and_leaves_the_opaque() -> None:
+    scene = gaussians(400, scale=0.3, opacity=0.9)
+    scene.logit_opacities[:200] = math.log(0.004 / 0.996)
+    moves = walk(scene, random()).norm(dim=1)
+    assert float(moves[:200].mean()) > 1e3 * float(moves[200:].mean())
+
+
+def test_rotations_are_rotations() -> None:
+    turn = rotations(torch.randn(50, 4, generator=random()).double())
+    identity = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
+    assert torch.allclose(turn @ turn.transpose(1, 2), identity, atol=1e-12)
+    assert torch.allclose(torch.linalg.det(turn), torch.ones(50, dtype=torch.float64))
+    quarter = rotations(torch.tensor([[math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4)]]))
+    assert torch.allclose(
+        quarter[0] @ torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]), atol=1e-6
+    )

@@ -1,0 +1,160 @@
+"""Proves that the plan follows from facts and options alone, that it says why, and what schedules and budgets mean.
+
+Does not prove that the thresholds are the best ones: `bench train --ablate` measures what each choice is worth.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import pytest
+
+from splatmill.schema import TrainOptions
+from splatmill_worker.splat.budget import Budget
+from splatmill_worker.splat.decide import decide
+from splatmill_worker.splat.facts import Facts, Speed
+from splatmill_worker.splat.plan import Plan
+from splatmill_worker.splat.rates import RateSchedule
+from splatmill_worker.splat.schedule import Schedule
+
+FACTS = Facts(
+    views=43,
+    held_out=7,
+    width=270,
+    height=480,
+    native_longest=960,
+    points=11_450,
+    source="colmap",
+    transparent=0,
+    masked=0,
+    distorted=50,
+    halving_loss=4.3,
+    exposure_spread=0.02,
+    view_angle=30.0,
+    distance_ratio=1.9,
+    depth_ratio=2.6,
+    reprojection=0.9,
+    memory_available=16 * 10**9,
+    speed=Speed(per_pixel=2.6e-8, per_gaussian=9e-8),
+)
+
+
+def options(**values: object) -> TrainOptions:
+    return TrainOptions.model_validate(values)
+
+
+def planned(facts: Facts = FACTS, **values: object) -> Plan:
+    return decide(facts, options(**values), "cpu")
+
+
+def test_the_plan_is_pure_and_survives_json() -> None:
+    first, second = planned(), planned()
+    assert first == second
+    assert Plan.from_dict(json.loads(json.dumps(first.as_dict(whole=True)))) == first
+
+
+def test_every_field_has_its_reason_and_absent_ones_say_why() -> None:
+    plan = planned()
+    told = plan.as_dict()
+    for name in ("schedule", "image_size", "max_gaussians", "densify", "initial", "background", "sh_degree"):
+        assert plan.reasons[name].endswith((".", "it.")), name
+    assert "exposure" not in told
+    assert "2.0 %" in plan.left_out["exposure"]
+    assert {"alpha", "masks", "antialias", "exposure", "pose_refinement"} <= set(plan.left_out)
+    assert not set(plan.reasons) & set(plan.left_out)
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "value"),
+    [
+        ({"exposure_spread": 0.3}, "exposure", True),
+        ({"exposure_spread": None}, "exposure", False),
+        ({"transparent": 43}, "background", "random"),
+        ({"points": 3}, "initial", "random"),
+        ({"distance_ratio": 9.0}, "antialias", True),
+        ({"halving_loss": 0.5}, "image_size", 240),
+        ({"points": 900_000}, "densify", None),
+    ],
+)
+def test_facts_decide(change: dict[str, object], field: str, value: object) -> None:
+    plan = planned(replace(FACTS, **change))  # type: ignore[arg-type]
+    assert getattr(plan, field) == value
+
+
+@pytest.mark.parametrize(("angle", "degree"), [(2.0, 1), (9.0, 2), (40.0, 3), (None, 3)])
+def test_the_degree_follows_from_the_angles_between_views(angle: float | None, degree: int) -> None:
+    assert planned(replace(FACTS, view_angle=angle)).schedule.degree == degree
+
+
+@pytest.mark.parametrize(
+    ("asked", "field", "value"),
+    [
+        ({"exposure": "on"}, "exposure", True),
+        ({"antialias": "on"}, "antialias", True),
+        ({"densify": "mcmc"}, "densify", "mcmc"),
+        ({"densify": "off"}, "densify", None),
+        ({"background": "white"}, "background", "white"),
+        ({"max_gaussians": 7000}, "max_gaussians", 7000),
+        ({"seed": 5}, "seed", 5),
+    ],
+)
+def test_options_force(asked: dict[str, object], field: str, value: object) -> None:
+    plan = planned(**asked)
+    assert getattr(plan, field) == value
+    if field != "seed":
+        assert field in plan.forced
+
+
+def test_what_cannot_be_followed_is_refused() -> None:
+    with pytest.raises(ValueError, match="pose_refinement"):
+        planned(pose_refinement="on")
+
+
+def test_more_time_allows_more_steps_and_more_gaussians() -> None:
+    plans = [planned(time_budget=seconds) for seconds in (5, 20, 80)]
+    counts = [plan.max_gaussians for plan in plans]
+    assert counts == sorted(set(counts))
+    assert all(
+        plan.schedule.budget.seconds == seconds for plan, seconds in zip(plans, (5, 20, 80), strict=True)
+    )
+    slow = planned(replace(FACTS, speed=Speed(2.6e-6, 9e-6)), time_budget=80)
+    assert slow.max_gaussians < plans[-1].max_gaussians
+
+
+def test_memory_bounds_the_gaussians() -> None:
+    plan = planned(max_memory=400_000_000, steps=30_000)
+    assert plan.max_gaussians == Plan.gaussians_within(400_000_000) < planned(steps=30_000).max_gaussians
+    assert "Memory" in plan.reasons["max_gaussians"]
+
+
+def test_a_budget_is_spent_by_whichever_ends_first() -> None:
+    assert Budget(100).progress(25, 1e9) == 0.25
+    assert Budget(None, 10.0).progress(10**6, 4.0) == 0.4
+    assert Budget(100, 10.0).progress(50, 9.0) == 0.9
+    assert Budget(100).progress(1000, 0.0) == 1.0
+    assert Budget(1000).ending_at(0.5, 0.1).progress(550, 0.0) == 1.0
+    with pytest.raises(ValueError, match="neither"):
+        Budget(None)
+
+
+def test_the_schedule_goes_from_coarse_to_fine() -> None:
+    schedule = Schedule(Budget(1000), ((0, 4), (200, 2), (500, 1)), 3, 250, 300, 100, 0.7)
+    assert [schedule.reduction(step) for step in (1, 200, 201, 500, 501, 1000)] == [4, 4, 2, 2, 1, 1]
+    assert [schedule.degree_at(step, step / 1000) for step in (1, 251, 501, 751)] == [0, 2, 3, 3]
+    assert schedule.degree_at(1000, 0.01) == 3
+    events = [step for step in range(1, 1001) if schedule.densifies(step, step / 1000)]
+    assert events == [300, 400, 500, 600]
+
+
+def test_rates_fall_to_their_ends() -> None:
+    rates = RateSchedule(extent=2.0)
+    start, end = rates.at(0.0), rates.at(1.0)
+    assert start.means == pytest.approx(3.2e-4)
+    assert end.means == pytest.approx(0.01 * start.means)
+    assert end.sh_dc == pytest.approx(0.1 * start.sh_dc)
+    assert start.sh_rest == pytest.approx(start.sh_dc / 20)
+    halved = RateSchedule(extent=2.0, scale=0.5).at(0.3)
+    assert halved.log_scales == pytest.approx(0.5 * rates.at(0.3).log_scales)
+    assert all(math.isfinite(value) for value in end.rows())
