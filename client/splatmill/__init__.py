@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from splatmill.aio import AsyncClient, AsyncJobHandle, AsyncModelHandle
+    from splatmill.aio import AsyncClient
     from splatmill.client import Client, JobHandle, ModelHandle
     from splatmill.errors import JobCancelled, JobFailed, SplatmillError
+    from splatmill.job import AsyncJobHandle
+    from splatmill.model import AsyncModelHandle
     from splatmill.schema import CameraSpec, OrbitRequest, RenderRequest, TrainOptions
 
 _HOMES = {
     "AsyncClient": "splatmill.aio",
-    "AsyncJobHandle": "splatmill.aio",
-    "AsyncModelHandle": "splatmill.aio",
+    "AsyncJobHandle": "splatmill.job",
+    "AsyncModelHandle": "splatmill.model",
     "CameraSpec": "splatmill.schema",
     "Client": "splatmill.client",
     "JobCancelled": "splatmill.errors",

@@ -1,9 +1,5 @@
 """The asynchronous SDK: everything the service offers, on one event loop."""
 
-import asyncio
-import os
-import tempfile
-import time
 import uuid
 from collections.abc import AsyncIterator, Mapping
 from pathlib import Path
@@ -12,40 +8,26 @@ from typing import Any, Self
 import httpx
 from pydantic import ValidationError
 
-from splatmill.connection import RETRIES, TIMEOUT, Connection, pause, read_answer
-from splatmill.downloads import OnBytes, download, target_of
-from splatmill.errors import Conflict, ConnectionFailed, JobCancelled, JobFailed, Unavailable, invalid
+from splatmill.connection import RETRIES, TIMEOUT, Connection, read_answer
+from splatmill.downloads import AnyPath
+from splatmill.errors import invalid
+from splatmill.job import AsyncJobHandle
 from splatmill.layout import find_files
+from splatmill.model import AsyncModelHandle, find_model
 from splatmill.schema import (
     IDEMPOTENCY_HEADER,
-    CameraSpec,
     Capture,
-    EventRecord,
     Info,
     Job,
     JobPage,
-    JobState,
-    LogLine,
-    LogPage,
     Model,
-    ModelCamera,
-    ModelCameras,
     ModelPage,
     OptionHelp,
     OptionList,
-    OrbitRequest,
-    Problem,
-    Progress,
-    ProgressEvent,
     Ready,
-    RenderRequest,
-    Report,
     TrainOptions,
 )
-from splatmill.sse import PATIENCE, follow
 from splatmill.uploads import OnProgress, Uploaded, upload
-
-AnyPath = str | os.PathLike[str]
 
 
 class AsyncClient:
@@ -81,7 +63,7 @@ class AsyncClient:
 
     async def train(
         self, path: AnyPath, *, name: str | None = None, on_progress: OnProgress | None = None, **options: Any
-    ) -> "AsyncJobHandle":
+    ) -> AsyncJobHandle:
         """Upload what lies at `path` (photos, a zip, a video or a posed data set) and start a job on it.
 
         `options` are those of `TrainOptions`; they and the path are checked before anything is sent. The job goes
@@ -113,7 +95,7 @@ class AsyncClient:
 
     async def submit(
         self, capture: str, options: TrainOptions | None = None, *, name: str | None = None
-    ) -> "AsyncJobHandle":
+    ) -> AsyncJobHandle:
         """Start a job on a capture that is already stored."""
         chosen = options.model_dump(mode="json", exclude_unset=True) if options is not None else {}
         body = {"capture": capture, "name": name, "options": chosen}
@@ -125,17 +107,17 @@ class AsyncClient:
             headers={IDEMPOTENCY_HEADER: str(uuid.uuid4())},
             repeatable=True,
         )
-        return AsyncJobHandle(self, read_answer(Job, response))
+        return AsyncJobHandle(self.connection, read_answer(Job, response))
 
     async def capture(self, capture_id: str) -> Capture:
         """A stored capture with its files."""
         response = await self.connection.request("GET", f"/v1/captures/{capture_id}")
         return read_answer(Capture, response)
 
-    async def job(self, job_id: str) -> "AsyncJobHandle":
+    async def job(self, job_id: str) -> AsyncJobHandle:
         """A job by its id."""
         response = await self.connection.request("GET", f"/v1/jobs/{job_id}")
-        return AsyncJobHandle(self, read_answer(Job, response))
+        return AsyncJobHandle(self.connection, read_answer(Job, response))
 
     async def jobs(self, *, limit: int | None = None) -> AsyncIterator[Job]:
         """All jobs, newest first, page by page; `limit` at most."""
@@ -152,10 +134,9 @@ class AsyncClient:
             if cursor is None:
                 return
 
-    async def model(self, model_id: str) -> "AsyncModelHandle":
+    async def model(self, model_id: str) -> AsyncModelHandle:
         """A finished model by its id, which is that of its job."""
-        response = await self.connection.request("GET", f"/v1/models/{model_id}")
-        return AsyncModelHandle(self, read_answer(Model, response))
+        return await find_model(self.connection, model_id)
 
     async def models(self) -> AsyncIterator[Model]:
         """All finished models, newest first."""
@@ -189,180 +170,6 @@ class AsyncClient:
         return read_answer(Ready, response)
 
 
-class AsyncJobHandle:
-    """A job on the server. `job` is what was last heard of it."""
-
-    def __init__(self, client: AsyncClient, job: Job) -> None:
-        self.client = client
-        self.job = job
-        self.refused: tuple[tuple[str, Problem], ...] = ()
-
-    @property
-    def id(self) -> str:
-        """The job's id, and its model's."""
-        return self.job.id
-
-    @property
-    def state(self) -> JobState:
-        """The state when last heard of."""
-        return self.job.state
-
-    async def refresh(self) -> Job:
-        """Ask for the job's present state."""
-        response = await self.client.connection.request("GET", f"/v1/jobs/{self.id}")
-        self.job = read_answer(Job, response)
-        return self.job
-
-    async def events(self, after: str | None = None) -> AsyncIterator[EventRecord]:
-        """What happens, as it happens, until the job's end; lost connections are taken up again.
-
-        `after` is the id of an event to go on after; without it the stream begins at the job's beginning.
-        """
-        silent = 0
-        while True:
-            silent += 1
-            async for record in follow(self.client.connection, f"/v1/jobs/{self.id}/events", after=after):
-                after, silent = record.id, 0
-                yield record
-            if (await self._refresh_patiently()).state.final:
-                return
-            if silent:  # a server that ends its streams at once must not be asked in a tight circle
-                await asyncio.sleep(pause(silent))
-
-    async def _refresh_patiently(self) -> Job:
-        """The job's present state, waiting out a service of which a part is down."""
-        end = time.monotonic() + PATIENCE
-        while True:
-            try:
-                return await self.refresh()
-            except (Unavailable, ConnectionFailed):
-                if time.monotonic() > end:
-                    raise
-                await asyncio.sleep(pause(self.client.connection.retries + 1))
-
-    async def wait(self, on_progress: OnProgress | None = None) -> "AsyncModelHandle":
-        """The model, once the job is done; raises JobFailed or JobCancelled when it ends without one."""
-        async for record in self.events():
-            if on_progress is not None and isinstance(record.event, ProgressEvent):
-                on_progress(Progress.model_validate(record.event.model_dump(exclude={"type"})))
-        return await self.result()
-
-    async def result(self) -> "AsyncModelHandle":
-        """The model of a job that has ended; raises JobFailed, JobCancelled, or Conflict while it runs."""
-        job = await self.refresh()
-        if job.state is JobState.succeeded:
-            return await self.client.model(job.model or job.id)
-        if job.state is JobState.cancelled:
-            raise JobCancelled(job.id)
-        if job.state is JobState.failed:
-            problem = job.problem or Problem.of(
-                "internal_error", f"The job {job.id} failed without a reason."
-            )
-            raise JobFailed(job.id, problem)
-        detail = f"The job {job.id} is {job.state.value}; its model is not there yet."
-        raise Conflict(Problem.of("model_not_ready", detail))
-
-    async def cancel(self) -> Job:
-        """Ask for the job's end; it is reported as cancelled once its process is gone."""
-        return await self._post("cancel")
-
-    async def restart(self) -> Job:
-        """Run a job that has ended once more, going on from its last checkpoint where there is one."""
-        return await self._post("restart")
-
-    async def delete(self) -> None:
-        """Remove the job, its model and its files."""
-        await self.client.connection.request("DELETE", f"/v1/jobs/{self.id}")
-
-    async def report(self) -> Report:
-        """Error against run time, and what led to it."""
-        response = await self.client.connection.request("GET", f"/v1/jobs/{self.id}/report")
-        return read_answer(Report, response)
-
-    async def logs(self) -> list[LogLine]:
-        """The job's log, oldest line first."""
-        response = await self.client.connection.request("GET", f"/v1/jobs/{self.id}/logs")
-        return read_answer(LogPage, response).lines
-
-    async def preview(self) -> bytes:
-        """The newest preview picture (JPEG)."""
-        response = await self.client.connection.request("GET", f"/v1/jobs/{self.id}/preview")
-        return response.content
-
-    async def _post(self, wish: str) -> Job:
-        # Wishing twice is wishing once.
-        response = await self.client.connection.request("POST", f"/v1/jobs/{self.id}/{wish}", repeatable=True)
-        self.job = read_answer(Job, response)
-        return self.job
-
-
-class AsyncModelHandle:
-    """A finished model on the server."""
-
-    def __init__(self, client: AsyncClient, model: Model) -> None:
-        self.client = client
-        self.model = model
-
-    @property
-    def id(self) -> str:
-        """The model's id."""
-        return self.model.id
-
-    async def download(
-        self, path: AnyPath, *, file: str = "model.ply", on_bytes: OnBytes | None = None
-    ) -> Path:
-        """Write one of the model's files to `path` (a file, or a folder that exists), whole or not at all."""
-        digest = next((entry.sha256 for entry in self.model.files if entry.name == file), None)
-        return await download(
-            self.client.connection,
-            f"/v1/models/{self.id}/files/{file}",
-            target_of(path, file),
-            sha256=digest,
-            on_bytes=on_bytes,
-        )
-
-    async def cameras(self) -> list[ModelCamera]:
-        """The cameras of the capture in the model's world, held-out ones marked `test`."""
-        response = await self.client.connection.request("GET", f"/v1/models/{self.id}/cameras")
-        return read_answer(ModelCameras, response).cameras
-
-    async def render(self, camera: CameraSpec | Mapping[str, Any], **wishes: Any) -> bytes:
-        """The picture from `camera`; `wishes` are `output`, `format`, `background` and `quality` of RenderRequest."""
-        try:
-            request = RenderRequest.model_validate({"camera": camera} | wishes)
-        except ValidationError as error:
-            raise invalid(error, "camera_invalid") from error
-        response = await self.client.connection.request(
-            "POST",
-            f"/v1/models/{self.id}/render",
-            json=request.model_dump(mode="json", exclude_none=True),
-            repeatable=True,
-            timeout=RENDER_TIMEOUT,
-        )
-        return response.content
-
-    async def orbit(self, path: AnyPath, **wishes: Any) -> Path:
-        """Write a video (MP4) that circles the scene to `path`; `wishes` are the fields of OrbitRequest."""
-        try:
-            request = OrbitRequest.model_validate(wishes)
-        except ValidationError as error:
-            raise invalid(error) from error
-        response = await self.client.connection.request(
-            "POST",
-            f"/v1/models/{self.id}/orbit",
-            json=request.model_dump(mode="json", exclude_none=True),
-            repeatable=True,
-            timeout=ORBIT_TIMEOUT,
-        )
-        return write_whole(target_of(path, "orbit.mp4"), response.content)
-
-
-# A little longer than the server waits for its renderer, so that its sentence arrives instead of ours.
-RENDER_TIMEOUT = httpx.Timeout(30.0, read=150.0)
-# Hundreds of frames on a machine without a GPU take minutes, and the answer begins when the video is whole.
-ORBIT_TIMEOUT = httpx.Timeout(30.0, read=900.0)
-
-
 def train_options(options: Mapping[str, Any]) -> TrainOptions:
     """The options a person gave, checked; raises InvalidRequest with one clause per value that does not fit."""
     try:
@@ -370,18 +177,3 @@ def train_options(options: Mapping[str, Any]) -> TrainOptions:
     except ValidationError as error:
         unknown = any(entry["type"] == "extra_forbidden" for entry in error.errors())
         raise invalid(error, "unknown_option" if unknown else "option_out_of_range") from error
-
-
-def write_whole(target: Path, data: bytes) -> Path:
-    """Write `data` to `target`, which appears whole or not at all."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as sink:
-            sink.write(data)
-        Path(name).chmod(0o644)
-        Path(name).replace(target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-    return target

@@ -1,4 +1,4 @@
-"""The synchronous SDK: the asynchronous one, waited for. What each call does and raises is written in `aio`."""
+"""The synchronous SDK: the asynchronous one, waited for. `aio`, `job` and `model` say what each call does and raises."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -6,10 +6,12 @@ from typing import Any, Self
 
 import httpx
 
-from splatmill.aio import AnyPath, AsyncClient, AsyncJobHandle, AsyncModelHandle
+from splatmill.aio import AsyncClient
 from splatmill.connection import RETRIES, TIMEOUT
-from splatmill.downloads import OnBytes
+from splatmill.downloads import AnyPath, OnBytes
+from splatmill.job import AsyncJobHandle
 from splatmill.loop import BackgroundLoop
+from splatmill.model import AsyncModelHandle
 from splatmill.schema import (
     CameraSpec,
     Capture,

@@ -1,8 +1,9 @@
-"""Downloading a file so that it is there whole or not at all, going on where an earlier try stopped."""
+"""Writing files so that they are there whole or not at all, and downloads that go on where an earlier try stopped."""
 
 import asyncio
 import hashlib
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,15 +13,31 @@ from splatmill.connection import Connection, pause
 from splatmill.errors import DownloadFailed, InvalidRequest, Unavailable
 from splatmill.schema.captures import SHA256_HEADER
 
+AnyPath = str | os.PathLike[str]
 OnBytes = Callable[[int, int | None], None]
 """Called with the bytes that are there and the size of the whole, where it is known."""
 
 
-def target_of(path: str | os.PathLike[str], name: str) -> Path:
+def target_of(path: AnyPath, name: str) -> Path:
     """Where `name` is written: `path` itself, or inside it where it is a folder (or ends in a separator)."""
     target = Path(path).expanduser()
     if target.is_dir() or os.fspath(path).endswith(("/", os.sep)):
         target = target / name
+    return target
+
+
+def write_whole(target: Path, data: bytes) -> Path:
+    """Write `data` to `target`, which appears whole or not at all."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as sink:
+            sink.write(data)
+        Path(name).chmod(0o644)
+        Path(name).replace(target)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
     return target
 
 

@@ -59,7 +59,7 @@ def render(
     server: Server = None,
 ) -> None:
     """Render a picture of a model."""
-    from splatmill.aio import write_whole
+    from splatmill.downloads import write_whole
     from splatmill.schema import Format
 
     suffixes = {
