@@ -1,4 +1,4 @@
-"""The synchronous SDK: the asynchronous one, waited for. `aio`, `job` and `model` say what each call does and raises."""
+"""The synchronous SDK: the asynchronous one, waited for. `aio`, `job` and `model` say what each call does."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -65,8 +65,10 @@ def capture_digest(capture_id: str, role: Role, name: str) -> str:
     return f"captures/{capture_id}/sha256/{role}/{name}"
 
 
-def capture_incoming(capture_id: str, token: str) -> str:
-    return f"captures/{capture_id}/incoming/{token}"
+def capture_incoming(capture_id: str, token: str | None = None) -> str:
+    """The folder of uploads under way, or one of them."""
+    folder = f"captures/{capture_id}/incoming"
+    return folder if token is None else f"{folder}/{token}"
 
 
 def capture_sfm(capture_id: str) -> str:

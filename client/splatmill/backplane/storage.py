@@ -9,7 +9,7 @@ import os
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
@@ -158,6 +158,19 @@ class Storage:
         for path in paths:
             self.delete(path)
         return len(paths)
+
+    def delete_stale(self, prefix: str, seconds: float) -> int:
+        """Remove the files under a folder that are older than this, and how many; also the ones the local store
+        stages a write in, which no listing shows and a killed process leaves behind."""
+        before = datetime.now(UTC).timestamp() - seconds
+        stale = [entry.path for entry in self.entries(prefix) if entry.modified.timestamp() < before]
+        for path in stale:
+            self.delete(path)
+        staged = [] if self.root is None else (self.root / prefix).glob("*#*")
+        left = [path for path in staged if path.stat().st_mtime < before]
+        for file in left:
+            file.unlink(missing_ok=True)
+        return len(stale) + len(left)
 
     def download(self, path: str, target: Path) -> None:
         """Copy a stored file to a local path, atomically. Raises FileNotFoundError."""
