@@ -111,7 +111,14 @@ def _walk(root: Path) -> list[str]:
         raise error
 
     names: list[str] = []
-    for folder, subfolders, files in os.walk(root, onerror=fail, followlinks=False):
+    visited: set[tuple[int, int]] = set()
+    # Links are followed, since data sets share their photos by links; a folder met again ends a circle.
+    for folder, subfolders, files in os.walk(root, onerror=fail, followlinks=True):
+        here = os.stat(folder)
+        if (here.st_dev, here.st_ino) in visited:
+            subfolders.clear()
+            continue
+        visited.add((here.st_dev, here.st_ino))
         subfolders[:] = [name for name in subfolders if not name.startswith((".", "__MACOSX"))]
         inside = Path(folder).relative_to(root)
         names += [(inside / name).as_posix() for name in files if not name.startswith(".")]

@@ -91,6 +91,14 @@ def test_a_video_counts_where_there_are_no_photos(tmp_path: Path):
     assert find_files(tmp_path).ignored == ("walk.mp4",)
 
 
+def test_links_are_followed_but_not_in_circles(tmp_path: Path):
+    tree(tmp_path, "shared/a.jpg", "set/masks/a.png")
+    (tmp_path / "set" / "images").symlink_to(tmp_path / "shared")
+    (tmp_path / "shared" / "again").symlink_to(tmp_path / "set")
+    (tmp_path / "set" / "gone.jpg").symlink_to(tmp_path / "nowhere")
+    assert roles(tmp_path / "set")[Role.images] == ["a.jpg"]
+
+
 def test_paths_with_nothing_to_train(tmp_path: Path):
     with pytest.raises(NothingToUpload, match="does not exist"):
         find_files(tmp_path / "nowhere")
