@@ -20,6 +20,8 @@ MIN_REGISTERED = 3
 MIN_POINTS = 60
 MIN_PARALLAX = 1.5  # degrees, median over points of the largest angle between two of their rays
 MIN_SEEN = 12  # points: a photo placed on fewer hangs on chance
+SURE_SEEN = 25  # points from which on a photo counts as placed when efforts and mappers are compared
+SURE_PIXELS = 4.0
 MAX_RESIDUAL = 3.0  # times the median photo's mean reprojection error, and at least WORST_PIXELS
 WORST_PIXELS = 2.5
 MAX_DISTORTION = 0.7  # of the first radial coefficient; a fisheye on a radial model stays under 0.5
@@ -64,6 +66,13 @@ def residuals(model: pycolmap.Reconstruction) -> dict[int, tuple[int, float]]:
         error = np.linalg.norm(projected - np.array([point.xy for point in seen]), axis=1)
         result[image_id] = len(seen), float(np.mean(error)) if np.isfinite(error).all() else math.inf
     return result
+
+
+def trusted(model: pycolmap.Reconstruction | None) -> int:
+    """Photos of a model that hang on enough points to believe in it; 0 where its cameras are none."""
+    if model is None or absurd_intrinsics(model) is not None:
+        return 0
+    return sum(count >= SURE_SEEN and error <= SURE_PIXELS for count, error in residuals(model).values())
 
 
 def drop_misplaced(model: pycolmap.Reconstruction) -> dict[int, str]:

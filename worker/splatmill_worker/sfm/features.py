@@ -180,7 +180,9 @@ def _set_cameras(groups: Sequence[Group], names: dict[int, str], path: Path) -> 
             params = np.array(camera.params)
             params[camera.focal_length_idxs()] = group.focal * max(camera.width, camera.height)
             camera.params = params.tolist()
-            camera.has_prior_focal_length = group.known
+            # EXIF is where the focal length starts, never what matches are judged by: a cropped photo or a
+            # wrong tag would rule out the true ones.
+            camera.has_prior_focal_length = False
             database.update_camera(camera)
     finally:
         database.close()

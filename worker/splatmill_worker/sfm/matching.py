@@ -17,6 +17,7 @@ from splatmill_worker.sfm.features import Features
 
 MAX_RATIO = 0.8  # of the angle to the best over the angle to the second best
 MAX_ANGLE = 0.7  # radians
+ROWS = 256  # of the products at once: they stay in the cache between the passes over them
 KEPT = 256  # photos whose descriptors are kept as floats
 
 Matches = npt.NDArray[np.uint32]
@@ -36,14 +37,20 @@ class Matcher:
         kept_b, b = self._directions(second)
         if len(a) < 2 or len(b) < 2:
             return np.zeros((0, 2), np.uint32)
-        # numpy's argmax over rows and its maxima are vectorised; torch's maxima with indices are not.
-        products = (a @ b.T).numpy()
-        rows = np.arange(len(a))
-        best = products.argmax(axis=1)
-        value = products[rows, best]
-        mutual = value == products.max(axis=0)[best]
-        products[rows, best] = -1.0
-        second_value = products.max(axis=1)
+        best = np.empty(len(a), np.int64)
+        value, second_value = np.empty(len(a), np.float32), np.empty(len(a), np.float32)
+        best_of_column = np.full(len(b), -1.0, np.float32)
+        for start in range(0, len(a), ROWS):
+            # numpy's argmax over rows and its maxima are vectorised; torch's maxima with indices are not.
+            products = (a[start : start + ROWS] @ b.T).numpy()
+            rows = slice(start, start + len(products))
+            best[rows] = products.argmax(axis=1)
+            at = np.arange(len(products)), best[rows]
+            value[rows] = products[at]
+            np.maximum(best_of_column, products.max(axis=0), out=best_of_column)
+            products[at] = -1.0
+            second_value[rows] = products.max(axis=1)
+        mutual = value == best_of_column[best]
         angle = np.arccos(np.clip(value, -1.0, 1.0))
         clear = angle < MAX_RATIO * np.arccos(np.clip(second_value, -1.0, 1.0))
         good = np.flatnonzero(mutual & clear & (angle < MAX_ANGLE))

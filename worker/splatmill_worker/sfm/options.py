@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 
@@ -41,6 +41,14 @@ class Effort:
 
 
 LEAN = Effort("lean", 800, 1500, 0, 1, 10)
-STANDARD = Effort("standard", 1000, 3000, 0, 2, 16)
-HIGH = Effort("high", 1600, 8192, -1, 2, 30)
+STANDARD = Effort("standard", 800, 3000, -1, 1, 10)
+HIGH = Effort("high", 1400, 6000, -1, 2, 16)
 EFFORTS = {effort.name: effort for effort in (LEAN, STANDARD, HIGH)}
+# Photos this small give too few features at their own size and cost little at twice it.
+SMALL_SIDE = 700
+
+
+def fitted(effort: Effort, longest_side: int) -> Effort:
+    """The effort for photos with this longest side, in pixels."""
+    small = effort.first_octave == 0 and min(effort.side, longest_side) <= SMALL_SIDE
+    return replace(effort, first_octave=-1) if small else effort

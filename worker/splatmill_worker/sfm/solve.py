@@ -26,7 +26,7 @@ from splatmill_worker.sfm.cancellation import stop_if
 from splatmill_worker.sfm.colmap_model import posed_view, scene_of
 from splatmill_worker.sfm.failure import Cancelled, SfmFailed
 from splatmill_worker.sfm.features import Features, Workspace
-from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions
+from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions, fitted
 
 OnProgress = Callable[[str, int, int, str], None]
 VERSION = 1  # of what is cached; another one means the cache of an older program is not read
@@ -156,37 +156,41 @@ def _one_thread_each() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _efforts(options: SfmOptions) -> list[Effort]:
+def _efforts(options: SfmOptions, longest_side: int) -> list[Effort]:
     """What to try, in order; a forced effort, size or number of features is not raised."""
     chosen = [LEAN, STANDARD, HIGH] if options.effort == "auto" else [EFFORTS[options.effort]]
     if options.side is not None or options.features is not None:
         chosen = chosen[:1]
-    return [
+    forced = [
         replace(effort, side=options.side or effort.side, features=options.features or effort.features)
         for effort in chosen
     ]
+    return [fitted(effort, longest_side) for effort in forced]
 
 
 def _solve(run: Run) -> Progress:
     """The best result over the efforts that were needed; raises SfmFailed where none is usable."""
     best: Progress | None = None
-    for effort in _efforts(run.options):
+    longest = int(np.median([max(photo.width, photo.height) for photo in run.prepared.photos]))
+    for effort in _efforts(run.options, longest):
         if best is not None:
-            share = best.mapped.registered if best.mapped is not None else 0
             run.notes.append(
-                f"With {best.effort.name} effort {share} of {run.count} photos found their place; trying {effort.name}."
+                f"With {best.effort.name} effort {_placed(best)[0]} of {run.count} photos surely found their place."
             )
         progress = _attempt(run, effort)
-        if best is None or _registered(progress) > _registered(best):
+        if best is None or _placed(progress) > _placed(best):
             best = progress
-        if _registered(best) >= ENOUGH * run.count:
+        if _placed(best)[0] >= ENOUGH * run.count:
             break
     assert best is not None  # _efforts gives at least one
     return best
 
 
-def _registered(progress: Progress) -> int:
-    return progress.mapped.registered if progress.mapped is not None else 0
+def _placed(progress: Progress) -> tuple[int, int]:
+    """Photos surely placed, and placed at all."""
+    if progress.mapped is None:
+        return 0, 0
+    return checks.trusted(progress.mapped.largest), progress.mapped.registered
 
 
 def _attempt(run: Run, effort: Effort) -> Progress:
@@ -226,8 +230,11 @@ def _attempt(run: Run, effort: Effort) -> Progress:
         progress.mapped = _map(run, progress)
         left = _unregistered(run, progress)
         if left and _match_left_over(run, progress, left, database):
-            again = _map(run, progress)
-            if again.registered > progress.mapped.registered:
+            again, before = _map(run, progress), progress.mapped
+            if (checks.trusted(again.largest), again.registered) > (
+                checks.trusted(before.largest),
+                before.registered,
+            ):
                 progress.mapped = again
     finally:
         database.close()
@@ -236,7 +243,7 @@ def _attempt(run: Run, effort: Effort) -> Progress:
 
 def _require_features(run: Run, progress: Progress) -> None:
     counts = [len(found.scales) for found in progress.features]
-    if progress.effort is not LEAN and float(np.median(counts)) < 2 * geometry.MIN_INLIERS:
+    if progress.effort.name != LEAN.name and float(np.median(counts)) < 2 * geometry.MIN_INLIERS:
         raise SfmFailed(
             "sfm_no_features",
             f"Half of the {run.count} photos have fewer than {int(np.median(counts)) + 1} features.",
@@ -299,17 +306,19 @@ def _edges(progress: Progress) -> list[pairs.Pair]:
 
 def _map(run: Run, progress: Progress) -> mapping.Mapped:
     """Maps by the mapper the photos speak for, then by the other or with relaxed settings where that falls short."""
+    asked = run.options.mapper
     first: mapping.Mapper = "incremental"
-    if run.options.mapper != "auto":
-        first = run.options.mapper
+    if asked != "auto":
+        first = asked
     elif run.count >= GLOBAL_FROM and len(_edges(progress)) >= 5 * run.count:
         first = "global"
     trials: list[tuple[mapping.Mapper, bool]] = [(first, False)]
-    if run.options.mapper == "auto":
-        trials += [("incremental", True)] if first == "incremental" else [("incremental", False)]
-    else:
-        trials += [(first, True)] if first == "incremental" else []
+    if asked == "auto":
+        trials.append(("global" if first == "incremental" else "incremental", False))
+    if asked != "global":
+        trials.append(("incremental", True))
     best: mapping.Mapped | None = None
+    most = 0
     with run.clock("mapping"):
         for mapper, relaxed in trials:
             result = mapping.run(
@@ -322,9 +331,10 @@ def _map(run: Run, progress: Progress) -> mapping.Mapped:
                 on_progress=lambda done, total: run.on_progress("mapping", done, total, "photos placed"),
                 cancelled=run.cancelled,
             )
-            if best is None or result.registered > best.registered:
-                best = result
-            if best.registered >= ENOUGH * run.count:
+            sure = checks.trusted(result.largest)
+            if best is None or (sure, result.registered) > (most, best.registered):
+                best, most = result, sure
+            if most >= ENOUGH * run.count:
                 break
     assert best is not None  # there is at least one trial
     return best
