@@ -19,7 +19,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # before Triton is first imported
 
-pytest.importorskip("triton", reason="Triton comes with torch's GPU builds; pip install triton to prove the kernels here")
+pytest.importorskip(
+    "triton", reason="Triton comes with torch's GPU builds; pip install triton to prove the kernels here"
+)
 
 from splatmill_worker.kernels import reference
 from splatmill_worker.kernels.gpu import bin as gpu_bin
@@ -32,7 +34,7 @@ from .cases import GROUPS, Case, scene
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
-WIDTH, HEIGHT = 24, 18
+WIDTH, HEIGHT = 20, 12
 
 
 class Rates(NamedTuple):
@@ -49,13 +51,13 @@ RATES = Rates()
 
 @pytest.fixture
 def case() -> Case:
-    return scene("small", 12, width=WIDTH, height=HEIGHT, seed=31)
+    return scene("small", 10, width=WIDTH, height=HEIGHT, seed=31)
 
 
 def away(viewmat: Tensor) -> Tensor:
     """A camera that misses some of the Gaussians."""
     moved = viewmat.clone()
-    moved[0, 3] += 1.3
+    moved[0, 3] += 2.6
     return moved
 
 
@@ -83,16 +85,26 @@ class Exact:
     def train(self, viewmat: Tensor, photo: Tensor, step: int, mask: Tensor | None) -> tuple[float, int]:
         leaves = [p.clone().requires_grad_() for p in self.params]
         fields = reference.project(
-            *leaves[:4], torch.cat(leaves[4:], 1), viewmat.double(), self.case.K.double(), WIDTH, HEIGHT, degree=3
+            *leaves[:4],
+            torch.cat(leaves[4:], 1),
+            viewmat.double(),
+            self.case.K.double(),
+            WIDTH,
+            HEIGHT,
+            degree=3,
         )
         fields.means2d.retain_grad()
         bins = reference.bin(fields, WIDTH, HEIGHT)
-        color, _, _ = reference.composite(fields, bins, WIDTH, HEIGHT, background=self.case.background.double())
+        color, _, _ = reference.composite(
+            fields, bins, WIDTH, HEIGHT, background=self.case.background.double()
+        )
         loss = reference.loss(color, photo, mask=mask)
         loss.backward()
         visible = fields.extents[:, 0] > 0
         assert fields.means2d.grad is not None
-        self.plain += torch.linalg.vector_norm(fields.means2d.grad * torch.tensor([WIDTH / 2, HEIGHT / 2]), dim=1)
+        self.plain += torch.linalg.vector_norm(
+            fields.means2d.grad * torch.tensor([WIDTH / 2, HEIGHT / 2]), dim=1
+        )
         reference.adam_(
             self.params, [torch.zeros_like(x) if x.grad is None else x.grad for x in leaves], self.exp_avg,
             self.exp_avg_sq, RATES, step=step, visible=visible, last_step=self.last,
@@ -130,7 +142,9 @@ def test_steps_agree_with_the_definition(case: Case) -> None:
         # Adam's step is the rate times a ratio of moments: relative errors of 1e-4 in a gradient stay that small in it.
         error = (here.parameters()[name].cpu() - truth).abs().max().item()
         assert error <= 2e-6, f"{name}: {error}"
-    first, second = (torch.cat([m.reshape(12, -1) for m in ms], 1) for ms in (exact.exp_avg, exact.exp_avg_sq))
+    first, second = (
+        torch.cat([m.reshape(10, -1) for m in ms], 1) for ms in (exact.exp_avg, exact.exp_avg_sq)
+    )
     for seen_moment, truth in zip(here.moments(), (first, second), strict=True):
         assert (seen_moment.cpu() - truth).abs().max() <= 1e-4 * truth.abs().max()
     assert (here.plain_sum.cpu() - exact.plain).abs().max() <= 1e-4 * exact.plain.max()
@@ -180,11 +194,15 @@ class NoQuestions(TorchDispatchMode):
         name = func.name().split("::")[1].split(".")[0]
         assert name not in self.WAITS, f"{name} waits for the device"
         if name == "index":
-            assert all(i is None or i.dtype not in (torch.bool, torch.uint8) for i in args[1]), "a mask as index waits"
+            assert all(i is None or i.dtype not in (torch.bool, torch.uint8) for i in args[1]), (
+                "a mask as index waits"
+            )
         return func(*args, **(kwargs or {}))
 
 
-def test_a_step_over_a_known_view_asks_the_device_for_nothing(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_over_a_known_view_asks_the_device_for_nothing(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
     here, photo = engine(case), photos()[0]
     more = {"degree": 1, "rates": RATES, "background": case.background}
     here.train(case.viewmat, case.K, photo, step=1, **more)
@@ -199,8 +217,10 @@ def test_what_does_not_fit_is_the_farthest_and_is_counted(case: Case) -> None:
     records = pack(fields)
     whole = gpu_bin.lists(records, WIDTH, HEIGHT, None)
     total = int(whole.bins.offsets[-1])
-    cut = gpu_bin.lists(records, WIDTH, HEIGHT, gpu_bin.Room(visible=12, pairs=total - 3))
-    assert cut.used.tolist() == whole.used.tolist(), "the true sizes are told, so that the next visit has room"
+    cut = gpu_bin.lists(records, WIDTH, HEIGHT, gpu_bin.Room(visible=10, pairs=total - 3))
+    assert cut.used.tolist() == whole.used.tolist(), (
+        "the true sizes are told, so that the next visit has room"
+    )
     kept = int(cut.bins.offsets[-1])
     assert kept == total - 3
     depth = fields.depths[whole.bins.ids.long()]
@@ -217,7 +237,7 @@ def test_room_follows_the_view_and_an_overflow_is_counted(case: Case) -> None:
     here.train(case.viewmat, case.K, photo, step=1, **more)
     (key,) = here._rooms
     assert here._rooms[key].pairs >= gpu_bin_pairs(here)
-    here._rooms[key] = gpu_bin.Room(visible=12, pairs=2)
+    here._rooms[key] = gpu_bin.Room(visible=10, pairs=2)
     here.train(case.viewmat, case.K, photo, step=2, **more)
     if DEVICE == "cuda":
         torch.cuda.synchronize()

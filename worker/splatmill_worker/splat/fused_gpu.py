@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 
 from torch import Tensor
 
-from splatmill_worker.kernels.gpu.step import Rates, Step
+from splatmill_worker.kernels.gpu.step import Rates, Step, Together
 from splatmill_worker.splat.engine import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -19,9 +19,9 @@ class FusedGpuStep(Step):
         gaussians: Gaussians,
         *,
         where: str | None = None,
-        average: Callable[[Tensor], None] | None = None,
+        together: Together | None = None,
     ) -> None:
-        super().__init__(**gaussians.padded(3).parameters(), where=where, average=average)
+        super().__init__(**gaussians.padded(3).parameters(), where=where, together=together)
 
     def train_photo(
         self,

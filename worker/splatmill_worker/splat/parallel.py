@@ -10,15 +10,17 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
+from splatmill_worker.kernels.cpu.step import Rates
+from splatmill_worker.kernels.gpu.device import interpreting
 from splatmill_worker.splat.autograd import AutogradStep
-from splatmill_worker.splat.engine import Engine, Rates, StepResult
+from splatmill_worker.splat.engine import Engine, StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 
 View = TypeVar("View")
@@ -69,7 +71,9 @@ class Replicas:
 
 def join(backend: str | None = None) -> Replicas:
     """Meet the other processes that `torchrun` started: over NCCL where there are GPUs, else gloo."""
-    missing = [name for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT") if name not in os.environ]
+    missing = [
+        name for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT") if name not in os.environ
+    ]
     if missing:
         raise RuntimeError(
             f"{', '.join(missing)} not set; start the processes with torchrun --nproc-per-node N, which sets them."
@@ -107,6 +111,13 @@ class ReplicatedStep(AutogradStep):
             self._replicas.average_(value.grad)
         super()._adam(rates, step)
 
+    def train_photo(self, *arguments: Any, **options: Any) -> StepResult:
+        """As the base class does it, with the loss of all processes, so that all judge their health alike."""
+        own = super().train_photo(*arguments, **options)
+        loss = torch.tensor(own.loss, dtype=torch.float64)
+        self._replicas.average_(loss)
+        return own._replace(loss=float(loss))
+
 
 def open_replica(gaussians: Gaussians, kernels: ops.Backend, replicas: Replicas) -> Engine:
     """The engine of one process. All must be given the same Gaussians, which is checked."""
@@ -114,8 +125,6 @@ def open_replica(gaussians: Gaussians, kernels: ops.Backend, replicas: Replicas)
     if kernels == "gpu":
         from splatmill_worker.splat.fused_gpu import FusedGpuStep
 
-        return FusedGpuStep(gaussians, where=f"cuda:{torch.cuda.current_device()}", average=replicas.average_)
+        where = gaussians.means.device if interpreting() else f"cuda:{torch.cuda.current_device()}"
+        return FusedGpuStep(gaussians, where=str(where), together=replicas)
     return ReplicatedStep(gaussians, replicas, backend=kernels)
-
-
-__all__ = ["Replicas", "ReplicatedStep", "StepResult", "join", "open_replica"]

@@ -181,8 +181,8 @@ def loss_and_gradient(
     mask: Tensor | None,
     stats: PhotoStats | None,
     gradient: bool = True,
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The loss and its L1 part as 0-d tensors on the device, and d loss / d color [H, W, 3] or None. Waits for nothing."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """The loss, its L1 and its SSIM as 0-d tensors on the device, and d loss / d color [H, W, 3] or None. Waits for nothing."""
     height, width = color.shape[:2]
     pixels = height * width
     if pixels * 15 >= 2**31:
@@ -214,13 +214,13 @@ def loss_and_gradient(
     # With no used pixel both sums are 0, and so is the loss.
     value = (1 - dssim_weight) * off + dssim_weight * ((count > 0).float() - similar)
     if slopes is None:
-        return value, off, None
+        return value, off, similar, None
     down_kernel[lambda meta: (triton.cdiv(pixels, meta["BLOCK"]), 9)](slopes, taps, planes, width, height)
     d_color = torch.empty_like(color)
     gradient_kernel[grid](
         color, photo, mask, taps, planes, count, d_color, width, height, dssim_weight, MASK=masked
     )
-    return value, off, d_color
+    return value, off, similar, d_color
 
 
 class _Loss(torch.autograd.Function):
@@ -233,7 +233,7 @@ class _Loss(torch.autograd.Function):
         mask: Tensor | None,
         stats: PhotoStats | None,
     ) -> Tensor:
-        value, _, d_color = loss_and_gradient(
+        value, _, _, d_color = loss_and_gradient(
             color.contiguous(), photo.contiguous(), dssim_weight=dssim_weight, mask=mask, stats=stats,
             gradient=ctx.needs_input_grad[0],
         )  # fmt: skip

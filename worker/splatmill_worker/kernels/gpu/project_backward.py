@@ -94,7 +94,7 @@ def color_backward_kernel(
     )  # fmt: skip
 
 
-@autotune(PROJECT_BACKWARD, key=["PLANAR", "VIEWMAT"], reset=["d_viewmat"], keep=["d_means"])
+@autotune(PROJECT_BACKWARD, key=["PLANAR", "VIEWMAT"], reset=["d_viewmat"])
 @triton.jit
 def shape_backward_kernel(
     means, log_scales, quats, logit_opacities, viewmat, K, records, gradient,

@@ -18,22 +18,27 @@ class Numbers(NamedTuple):
     key: tuple[int, tuple[int, int, int]]
     loss: float
     l1: float
+    ssim: float
     visible: int
     pairs: int
     refused: int
 
 
 class Readback:
-    """A queue of small copies to pinned memory, each with the event that says it has arrived."""
+    """A queue of small copies to pinned memory, each with the event that says it has arrived.
 
-    def __init__(self) -> None:
+    steady: numbers come exactly `AHEAD` steps late, so that processes that compare notes read the same ones.
+    """
+
+    def __init__(self, *, steady: bool = False) -> None:
+        self._steady = steady
         self._pending: deque[tuple[tuple[int, tuple[int, int, int]], Tensor, torch.cuda.Event | None]] = (
             deque()
         )
         self._latest: Numbers | None = None
 
     def post(self, key: tuple[int, tuple[int, int, int]], values: Tensor) -> list[Numbers]:
-        """Send values [5] (loss, L1, visible, pairs, refused; float64) on their way; returns all that has arrived since.
+        """Send values [6] (loss, L1, SSIM, visible, pairs, refused; float64) on their way; returns all that has arrived since.
 
         Waits only when nothing has ever arrived, or the host is `AHEAD` steps in front.
         """
@@ -48,12 +53,13 @@ class Readback:
         found = []
         while self._pending:
             name, numbers, event = self._pending[0]
-            if event is not None and not event.query():
-                if self._latest is not None and len(self._pending) <= AHEAD:
-                    break
+            early = self._steady or (event is not None and not event.query())
+            if early and self._latest is not None and len(self._pending) <= AHEAD:
+                break
+            if event is not None:
                 event.synchronize()
-            loss, l1, visible, pairs, refused = numbers.tolist()
-            self._latest = Numbers(name, loss, l1, int(visible), int(pairs), int(refused))
+            loss, l1, ssim, visible, pairs, refused = numbers.tolist()
+            self._latest = Numbers(name, loss, l1, ssim, int(visible), int(pairs), int(refused))
             found.append(self._latest)
             self._pending.popleft()
         return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -25,7 +25,6 @@ from .readback import Readback
 ViewKey = tuple[int, int, int]  # address of the camera's matrix, width, height
 CHANNELS = 59
 PARTS = {"means": (0, 3), "log_scales": (3, 6), "quats": (6, 10), "logit_opacities": (10, 11), "sh": (11, 59)}
-NEAR = 0.01
 SLACK, SPARE = 1.25, 4096
 """Room for a view's lists over what its last visit used: views change little from visit to visit, parameters move slowly."""
 
@@ -47,13 +46,23 @@ class Rates(Protocol):
     def sh_rest(self) -> float: ...
 
 
+class Together(Protocol):
+    """Several processes that train one scene; each call changes a tensor in place, to the same bits in all of them."""
+
+    def average_(self, values: Tensor) -> None: ...
+    def add_(self, values: Tensor) -> None: ...
+    def largest_(self, values: Tensor) -> None: ...
+
+
 class StepResult(NamedTuple):
     """Of the latest step whose numbers have arrived, up to `readback.AHEAD` steps ago: waiting for them would idle the GPU."""
 
-    loss: float
+    loss: float  # (1 - w) l1 + w (1 - ssim)
     l1: float
+    ssim: float
     visible: int
     pairs: int
+    refused: int  # gradient values that were not finite, and were left out of the update
 
 
 @triton.jit
@@ -107,7 +116,7 @@ class Step:
     as the caller keeps them; the first visit of a view reads its list sizes back, later ones use room from the visit before.
     Adam moves the Gaussians that a view shows; the others are brought up to date when they are seen again, or read.
 
-    average: makes gradients the mean over several processes, in place; see `splat.parallel`. Raises GpuUnavailable where
+    together: the processes whose views a step is averaged over; see `splat.parallel`. Raises GpuUnavailable where
     these kernels cannot run, and GpuMemoryShort when memory runs out, with the scene as it was before the call.
     """
 
@@ -120,17 +129,17 @@ class Step:
         sh: Tensor,
         *,
         where: torch.device | str | None = None,
-        average: Callable[[Tensor], None] | None = None,
+        together: Together | None = None,
     ) -> None:
         if where is None:
             where = "cpu" if device.interpreting() else "cuda"
         self.device = torch.device(where)
         if self.device.type != "cpu" and (reason := device.absence(self.device.index or 0)) is not None:
             raise device.GpuUnavailable(reason)
-        self._average = average
+        self._together = together
         self._rooms: dict[ViewKey, Room] = {}
         self._resident: WeakTensorKeyDictionary = WeakTensorKeyDictionary()  # type: ignore[type-arg]
-        self._readback = Readback()
+        self._readback = Readback(steady=together is not None)
         self._steps = 0
         self._generation = (
             0  # of the parameters; what arrives late from before a `replace` says nothing of room
@@ -176,6 +185,10 @@ class Step:
     def error_sum(self) -> Tensor:
         """Sum over pixels of blending weight times |colour error|."""
         return self._scores[4]
+
+    def clear_scores(self) -> None:
+        """Start the scores anew."""
+        self._scores.zero_()
 
     def parameters(self) -> dict[str, Tensor]:
         """Copies [N, ...] of the five groups, brought up to date; sh [N, 16, 3]."""
@@ -234,10 +247,13 @@ class Step:
         degree: int,
         background: Tensor | None = None,
         antialias: bool = False,
+        near: float = 0.01,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Colour [H, W, 3], alpha [H, W] and depth [H, W] on the device; `backward_update` takes it from here."""
         with self._sparing():
-            self._view = self._shown(viewmat, K, width, height, degree, background, antialias, depth=True)
+            self._view = self._shown(
+                viewmat, K, width, height, degree, background, antialias, near, depth=True
+            )
         image = self._view.image
         assert image.depth is not None
         return image.color, 1.0 - image.transmittance, image.depth
@@ -261,7 +277,7 @@ class Step:
             seen = self._differentiate(view, given[0], given[1], given[2], None)
             refused = torch.zeros(1, dtype=torch.int32, device=self.device)
             self._move(seen, view.degree, rates, step, refused)
-        self._listen(view.key, torch.zeros(2, device=self.device), view.lists.used, refused)
+        self._listen(view.key, torch.zeros(3, device=self.device), view.lists.used, refused)
 
     def train(
         self,
@@ -276,15 +292,16 @@ class Step:
         mask: Tensor | None = None,
         dssim_weight: float = 0.2,
         antialias: bool = False,
+        near: float = 0.01,
     ) -> StepResult:
         """Forward, loss against photo uint8 [H, W, 3], backward and Adam, enqueued as a whole."""
         height, width = photo.shape[:2]
         with self._sparing():
-            view = self._shown(viewmat, K, width, height, degree, background, antialias, depth=False)
+            view = self._shown(viewmat, K, width, height, degree, background, antialias, near, depth=False)
             seen_photo = self._here(photo)
             used_pixels = None if mask is None else self._here(mask)
             color = view.image.color
-            value, l1, d_color = loss_and_gradient(
+            value, l1, ssim, d_color = loss_and_gradient(
                 color, seen_photo, dssim_weight=dssim_weight, mask=used_pixels, stats=None
             )
             assert d_color is not None
@@ -294,19 +311,21 @@ class Step:
             seen = self._differentiate(view, d_color, None, None, errors)
             refused = torch.zeros(1, dtype=torch.int32, device=self.device)
             self._move(seen, degree, rates, step, refused)
-        self._listen(view.key, torch.stack([value, l1]), view.lists.used, refused)
-        latest = self._readback.latest
-        return StepResult(latest.loss, latest.l1, latest.visible, latest.pairs)
+        losses = torch.stack([value, l1, ssim])
+        if self._together is not None:
+            self._together.average_(losses)
+        self._listen(view.key, losses, view.lists.used, refused)
+        return StepResult(*self._readback.latest[1:])
 
     def _shown(
-        self, viewmat: Tensor, K: Tensor, width: int, height: int, degree: int, background: Tensor | None, antialias: bool,
+        self, viewmat: Tensor, K: Tensor, width: int, height: int, degree: int, background: Tensor | None, antialias: bool, near: float,
         *, depth: bool,
     ) -> _View:  # fmt: skip
         key = (viewmat.data_ptr(), width, height)
         viewmat, K = self._here(viewmat).float().contiguous(), self._here(K).float().contiguous()
         background = None if background is None else background.to(self.device, torch.float32).contiguous()
         records = project_records(
-            self._groups(self._params), viewmat, K, width, height, degree=degree, near=NEAR, antialias=antialias,
+            self._groups(self._params), viewmat, K, width, height, degree=degree, near=near, antialias=antialias,
             planar=self.count,
         )  # fmt: skip
         known = self._rooms.get(key)
@@ -339,22 +358,27 @@ class Step:
             degree=view.degree, antialias=view.antialias, planar=self.count, into=self._groups(self._gradient),
         )  # fmt: skip
         seen = (view.records[:, 10] > 0).to(torch.uint8)
+        scores = self._scores if self._together is None else torch.zeros_like(self._scores)
         if self.count:
             scores_kernel[(triton.cdiv(self.count, 256),)](
-                gradient, view.records, self._scores, self.count, 0.5 * view.width, 0.5 * view.height,
+                gradient, view.records, scores, self.count, 0.5 * view.width, 0.5 * view.height,
                 2.0 / max(view.width, view.height), BLOCK=256,
             )  # fmt: skip
+        if self._together is not None:
+            extent = scores[3].clone()
+            self._together.largest_(extent)
+            scores[3] = 0.0
+            self._together.add_(scores)
+            self._scores += scores
+            torch.maximum(self._scores[3], extent, out=self._scores[3])
         return seen
 
     def _move(self, seen: Tensor, degree: int, rates: Rates, step: int, refused: Tensor) -> None:
         channels = 11 + 3 * (degree + 1) ** 2
-        if self._average is not None:
+        if self._together is not None:
             # A Gaussian that any process saw moves in all of them.
-            self._gradient[channels:] = 0.0
-            shown = seen.to(torch.float32)
-            self._average(self._gradient)
-            self._average(shown)
-            seen = (shown > 0).to(torch.uint8)
+            self._together.average_(self._gradient[:channels])
+            self._together.largest_(seen)
         self._rates = (
             rates.means, rates.log_scales, rates.quats, rates.logit_opacities, rates.sh_dc, rates.sh_rest,
         )  # fmt: skip

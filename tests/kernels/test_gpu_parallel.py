@@ -1,0 +1,136 @@
+"""Two processes that train one scene over gloo do what one process does with both photos in every step.
+
+For the autograd engine on the C++ kernels, and for the fused GPU step in Triton's interpreter. NCCL, and how it scales, need cards.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from splatmill_worker.kernels import ops, reference
+from splatmill_worker.splat.parallel import Replicas, join
+
+from . import replica
+
+STEPS = 3
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def together(engine: str, steps: int, out: Path) -> list[dict[str, Any]]:
+    """What each of two processes ended with."""
+    shared = {
+        "WORLD_SIZE": "2",
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(free_port()),
+        "OMP_NUM_THREADS": "1",
+    }
+    shared |= {"TRITON_INTERPRET": "1"} if engine == "gpu" else {}
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-W", "ignore", replica.__file__, engine, str(steps), str(out)],
+            env={**os.environ, **shared, "RANK": str(rank)},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(2)
+    ]
+    for process in running:
+        _, complained = process.communicate(timeout=200)
+        assert process.returncode == 0, complained
+    return [torch.load(out / f"{rank}.pt") for rank in range(2)]
+
+
+def alone(steps: int) -> tuple[dict[str, torch.Tensor], list[float], torch.Tensor]:
+    """One process, both photos in every step, in float64: the mean of the two losses, then Adam."""
+    start = replica.scene()
+    params = [v.double() for v in (start.means, start.log_scales, start.quats, start.logit_opacities)]
+    params += [start.sh[:, :1].double(), start.sh[:, 1:].double()]
+    moments = [[torch.zeros_like(p) for p in params] for _ in range(2)]
+    rates = replica.RATES
+    each = [rates.means, rates.log_scales, rates.quats, rates.logit_opacities, rates.sh_dc, rates.sh_rest]
+    views, losses = replica.views(), []
+    scores = torch.zeros(3, start.count, dtype=torch.float64)
+    for step in range(1, steps + 1):
+        leaves = [p.clone().requires_grad_() for p in params]
+        total = torch.zeros((), dtype=torch.float64)
+        seen = []
+        for viewmat, photo in views[2 * ((step - 1) % 2) :][:2]:
+            fields = ops.project(
+                *leaves[:4], torch.cat(leaves[4:], 1), viewmat.double(), replica.K.double(), replica.WIDTH, replica.HEIGHT,
+                degree=1, backend="reference",
+            )  # fmt: skip
+            fields.means2d.retain_grad()
+            bins = reference.bin(fields, replica.WIDTH, replica.HEIGHT)
+            color, _, _ = reference.composite(
+                fields, bins, replica.WIDTH, replica.HEIGHT, background=replica.BACKGROUND.double()
+            )
+            total = total + reference.loss(color, photo)
+            seen.append(fields)
+        (total / 2).backward()
+        half = torch.tensor([replica.WIDTH / 2, replica.HEIGHT / 2])
+        for fields in seen:
+            assert fields.means2d.grad is not None
+            scores[0] += torch.linalg.vector_norm(
+                2 * fields.means2d.grad * half, dim=1
+            )  # of its own photo's loss
+            scores[1] += fields.extents[:, 0] > 0
+        reference.adam_(
+            params,
+            [x.grad if x.grad is not None else torch.zeros_like(x) for x in leaves],
+            *moments,
+            each,
+            step=step,
+        )
+        losses.append(total.item() / 2)
+    names = ("means", "log_scales", "quats", "logit_opacities")
+    return {**dict(zip(names, params, strict=False)), "sh": torch.cat(params[4:], 1)}, losses, scores
+
+
+@pytest.mark.parametrize("engine", ["cpu", "gpu"])
+def test_two_processes_take_the_step_of_one(engine: str, tmp_path: Path) -> None:
+    if engine == "gpu":
+        pytest.importorskip(
+            "triton", reason="Triton comes with torch's GPU builds; pip install triton to prove this here"
+        )
+    steps = STEPS if engine == "cpu" else 2
+    first, second = together(engine, steps, tmp_path)
+    parameters, losses, scores = alone(steps)
+    for name, truth in parameters.items():
+        assert torch.equal(first["parameters"][name], second["parameters"][name]), (
+            f"{name} differs between the processes"
+        )
+        # Adam moves by rate * m / sqrt(v): float32 gradients, good to 1e-4, leave at most 1e-4 of the largest rate a step.
+        error = (first["parameters"][name] - truth).abs().max().item()
+        assert error <= 5e-2 * 1e-4 * steps, f"{name}: {error}"
+    assert first["losses"] == second["losses"], "the processes would judge their health differently"
+    if engine == "cpu":  # the GPU step tells of earlier steps
+        assert first["losses"] == pytest.approx(losses, abs=1e-6)
+    assert torch.equal(first["scores"], second["scores"])
+    assert (first["scores"][:2] - scores[:2]).abs().max() <= 1e-3 * scores[:2].max()
+
+
+def test_shares_are_equally_long_and_cover_all_views() -> None:
+    shares = [Replicas(rank, 3).share(list(range(7))) for rank in range(3)]
+    assert shares == [[0, 3, 6], [1, 4, 0], [2, 5, 1]]
+    with pytest.raises(ValueError, match="no views"):
+        Replicas(0, 2).share([])
+
+
+def test_joining_without_torchrun_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(RuntimeError, match="torchrun"):
+        join()
