@@ -4,17 +4,22 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 
+import structlog
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
+from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 
 import splatmill
+from splatmill.backplane.storage import StorageError
 from splatmill.schema import CreateJob, EventRecord, Problem
 from splatmill_server import problems
 from splatmill_server.edge import Edge
 from splatmill_server.routes import captures, job_outputs, jobs, models, status
 from splatmill_server.service import Service
 from splatmill_server.settings import Settings
+
+log = structlog.get_logger()
 
 _DESCRIPTION = """Photos in, Gaussian splats out.
 
@@ -35,6 +40,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         reaper = asyncio.create_task(service.reaper.run())
+        sweep = asyncio.create_task(run_in_threadpool(_sweep, service))
         try:
             yield
         finally:
@@ -42,6 +48,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             reaper.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await reaper
+            await sweep
             await service.close()
 
     app = FastAPI(
@@ -58,6 +65,14 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         app.include_router(module.router)
     _describe(app, with_key=settings.api_key is not None)
     return app
+
+
+def _sweep(service: Service) -> None:
+    try:
+        if gone := service.captures.sweep():
+            log.info("removed what broken uploads had left", files=gone)
+    except StorageError as error:
+        log.warning("could not look for broken uploads", error=str(error))
 
 
 def _describe(app: FastAPI, *, with_key: bool) -> None:

@@ -20,6 +20,9 @@ from splatmill_server.settings import Settings
 _PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif")
 _READS_AT_ONCE = 32
 _COUNTED_CAPTURES = 1000
+_STALE_SECONDS = 24 * 3600
+"""Age after which an unfinished upload belongs to no request any more."""
+
 _CLAIM_SECONDS = 60
 """How long a digest without a file counts as an upload that is just being put in place."""
 
@@ -93,6 +96,14 @@ class Captures:
         self.storage.delete(layout.capture_record(capture_id))
         self.storage.delete_prefix(layout.capture(capture_id))
         self._counts.pop(capture_id, None)
+
+    def sweep(self) -> int:
+        """Remove what uploads left that were under way when a server was killed; how many files went."""
+        gone = 0
+        for capture_id in self.storage.children(layout.captures()):
+            folder = layout.capture_incoming(capture_id)
+            gone += self.storage.delete_stale(folder, _STALE_SECONDS)
+        return gone
 
     def check_trainable(self, capture_id: str) -> None:
         """Refuse what cannot become a scene whatever the photos show. Raises 404 or 422 problems."""
@@ -182,6 +193,10 @@ class Captures:
                     return False
                 self.storage.put(path, file.sha256.encode())
         self.storage.rename(incoming, target)
+        if not self.storage.exists(layout.capture_record(capture_id)):
+            # The capture was deleted while the file came in; nothing may be left of it.
+            self.storage.delete_prefix(layout.capture(capture_id))
+            self.record(capture_id)
         return True
 
     def _taken(self, capture_id: str, role: Role, name: str) -> str | None:

@@ -5,8 +5,11 @@ worker makes of the files.
 """
 
 import hashlib
+import os
 import socket
 import threading
+import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from pathlib import Path
@@ -211,3 +214,31 @@ def test_a_disk_without_room_for_it_refuses_an_upload(serve: Serve) -> None:
     )
     assert refused["facts"]["free"] > 0
     assert app.http.get(f"/v1/captures/{capture_id}").json()["files"] == []
+
+
+def test_what_a_killed_server_left_of_an_upload_is_removed_by_the_next(serve: Serve) -> None:
+    first = serve()
+    capture_id = first.capture()
+    before = stored(first)
+    root = first.service.storage.root
+    assert root is not None
+    folder = root / layout.capture_incoming(capture_id)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, age in (("old", 2 * 86400), ("old#1", 2 * 86400), ("new#1", 60)):
+        (folder / name).write_bytes(b"half an upload")
+        os.utime(folder / name, (time.time() - age,) * 2)
+    again = serve()
+    wait_for(lambda: set(stored(again)) - set(before) == {f"{layout.capture_incoming(capture_id)}/new#1"})
+
+
+def test_an_upload_into_a_capture_that_is_deleted_meanwhile_leaves_nothing(app: Running) -> None:
+    capture_id = app.capture()
+
+    def body() -> Iterator[bytes]:
+        yield b"x" * 300_000
+        assert app.http.delete(f"/v1/captures/{capture_id}").status_code == 204
+        yield b"y" * 300_000
+
+    answer = app.http.put(f"/v1/captures/{capture_id}/images/late.jpg", content=body())
+    problem(answer, 404, "capture_not_found")
+    assert stored(app) == []
