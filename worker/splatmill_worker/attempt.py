@@ -23,6 +23,10 @@ HANDED_BACK = 75
 WITHDRAWN = 77
 """Exit status of an attempt that found, before it began, that its job is to be cancelled."""
 
+HAND_BACK_SIGNAL = signal.SIGUSR1
+"""What the worker asks an attempt to save its state by. Not SIGTERM: loading pycolmap replaces its handler by one
+that prints a stack and dies."""
+
 _LOCK_POLL = 0.2
 
 
@@ -84,7 +88,7 @@ _hand_back = False
 
 
 def request_hand_back(signum: int, frame: FrameType | None) -> None:
-    """The handler of SIGTERM in the process of an attempt."""
+    """The handler of HAND_BACK_SIGNAL in the process of an attempt."""
     global _hand_back
     _hand_back = True
 
@@ -95,6 +99,7 @@ def hand_back_requested() -> bool:
 
 
 def install_signal_handlers() -> None:
-    """SIGTERM asks for a hand-back; Ctrl-C in a terminal is the parent's to act on."""
+    """HAND_BACK_SIGNAL asks for a hand-back, SIGTERM kills; Ctrl-C in a terminal is the parent's to act on."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, request_hand_back)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(HAND_BACK_SIGNAL, request_hand_back)

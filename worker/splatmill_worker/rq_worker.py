@@ -110,7 +110,7 @@ class AttemptWorker(Worker):
         if self.horse_pid:
             self._kill_at = time.monotonic() + self._grace
             with suppress(ProcessLookupError):
-                os.kill(self.horse_pid, signal.SIGTERM)
+                os.kill(self.horse_pid, attempt.HAND_BACK_SIGNAL)
 
     def request_force_stop(self, signum: int, frame: FrameType | None) -> None:
         """A second signal: do not wait for the checkpoint. The job is handed back all the same."""
@@ -145,7 +145,7 @@ class AttemptWorker(Worker):
         job_id, _ = backplane.split_rq_id(job.id)
         self._lock = JobLock(self.connection, job_id, uuid4().hex)
         parent = os.getpid()
-        signals = {signal.SIGTERM, signal.SIGINT}
+        signals = {signal.SIGTERM, signal.SIGINT, attempt.HAND_BACK_SIGNAL}
         # A signal between the fork and the child's own handlers would run the worker's in the child.
         signal.pthread_sigmask(signal.SIG_BLOCK, signals)
         child = os.fork()

@@ -111,6 +111,9 @@ def train(
     last_tick = last_checkpoint = time.monotonic()
     while not stopped:
         if hooks.cancelled():
+            # Whoever asks a run to end may have it go on later.
+            if hooks.checkpoint is not None and run.step > 0:
+                hooks.checkpoint(run.state())
             raise Cancelled
         try:
             run.advance()
