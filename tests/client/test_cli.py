@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 from splatmill.cli.app import COMMANDS, app
 from splatmill.cli.exits import Exit
+from splatmill.cli.follow import ONE_WISH
 from splatmill.client import Client
 from splatmill.schema import (
     JobState,
@@ -340,7 +341,10 @@ def test_a_second_interruption_does_not_wait(peer, reply, photos: Path, tmp_path
     process = spawn("train", photos, "-o", tmp_path / "out", "--server", peer.url)
     eventually(lambda: any(seen.path.endswith("/events") for seen in peer.seen))
     process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGTERM)  # what timeout(1) does: one wish, sent twice
     eventually(lambda: any(seen.path.endswith("/cancel") for seen in peer.seen))
+    assert process.poll() is None
+    time.sleep(2 * ONE_WISH)
     process.send_signal(signal.SIGINT)
     stdout, stderr = process.communicate(timeout=30)
     assert process.returncode == Exit.cancelled

@@ -6,8 +6,10 @@ a stream is half open. Here it is an item in the same queue as the events, and i
 
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from queue import SimpleQueue
 from types import FrameType
 
@@ -16,9 +18,15 @@ from splatmill.client import JobHandle, ModelHandle
 from splatmill.errors import Conflict
 from splatmill.schema import EventRecord
 
+# timeout(1) and some supervisors send one wish to end twice, to the process and to its group.
+ONE_WISH = 0.5  # seconds
 
+
+@dataclass(frozen=True)
 class Interruption:
-    """Ctrl-C, or a polite end from outside (`kill`, a container that is stopped)."""
+    """Ctrl-C, or a polite end from outside (`kill`, a container that is stopped), at a monotonic time in seconds."""
+
+    at: float
 
 
 class Ended:
@@ -47,7 +55,7 @@ def follow(start: Callable[[], JobHandle], *, verbose: bool) -> ModelHandle:
 
 
 def _until_ended(job: JobHandle, inbox: SimpleQueue[Item], display: Display, verbose: bool) -> None:
-    cancelling = False
+    cancelling: Interruption | None = None
     while True:
         item = inbox.get()
         if isinstance(item, EventRecord):
@@ -56,10 +64,11 @@ def _until_ended(job: JobHandle, inbox: SimpleQueue[Item], display: Display, ver
             return
         elif isinstance(item, Exception):
             raise item
-        elif cancelling:
-            raise LeftBehind
+        elif cancelling is not None:
+            if item.at - cancelling.at > ONE_WISH:
+                raise LeftBehind
         else:
-            cancelling = True
+            cancelling = item
             display.say(f"Cancelling the job {job.id} ...")
             _in_background(lambda: _cancel(job, inbox))
 
@@ -89,7 +98,9 @@ def _in_background(work: Callable[[], None]) -> None:
 @contextmanager
 def _signals_into(inbox: SimpleQueue[Item]) -> Iterator[None]:
     def arrived(number: int, frame: FrameType | None) -> None:
-        inbox.put(Interruption())  # SimpleQueue.put may be called at any point, also inside itself
+        inbox.put(
+            Interruption(time.monotonic())
+        )  # SimpleQueue.put may be called at any point, also inside itself
 
     before = {number: signal.signal(number, arrived) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
