@@ -1,9 +1,11 @@
-"""`python -m splatmill_server`: serve the API as the environment says."""
+"""`python -m splatmill_server`: serve the API as the environment says, or the options given here."""
 
+import argparse
 import logging
 import signal
 import socket
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 
@@ -36,11 +38,12 @@ class Server(uvicorn.Server):
         self.should_exit = True
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until a signal. Returns the exit status: 0, or 2 after a sentence about what has to be mended."""
+    given = vars(_options().parse_args(arguments))
     configure_logging()
     try:
-        settings = Settings()
+        settings = Settings(**{name: value for name, value in given.items() if value is not None})
         app = create_app(settings)
         listener = listen(settings)
     except ValidationError as error:
@@ -57,6 +60,18 @@ def main() -> int:
     if settings.uds is not None:
         settings.uds.unlink(missing_ok=True)
     return 0 if server.started else 1
+
+
+def _options() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m splatmill_server",
+        description="Serve the Splatmill API.",
+        epilog="Everything else is set by environment variables: REDIS_URL and "
+        + ", ".join(f"SPLATMILL_{name.upper()}" for name in Settings.model_fields if name != "redis_url"),
+    )
+    for name in ("host", "port", "uds"):
+        parser.add_argument(f"--{name}", help=Settings.model_fields[name].description)
+    return parser
 
 
 def listen(settings: Settings) -> socket.socket:

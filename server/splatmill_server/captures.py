@@ -174,7 +174,7 @@ class Captures:
         return file, new
 
     def _claim(self, capture_id: str, file: CaptureFile, incoming: str) -> bool:
-        """Make an upload the owner of its name; False when other bytes own it.
+        """Make an upload the owner of its name; False when the name is owned already.
 
         The digest is written first and only once, so that of two uploads at one moment exactly one wins. A digest
         without its file is either about to get it, or was left by a server that died in between.

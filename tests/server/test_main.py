@@ -28,9 +28,11 @@ def command(**env: str) -> dict[str, Any]:
     return {"args": [sys.executable, "-m", "splatmill_server"], "env": clean | env, "text": True}
 
 
-def refusal(**env: str) -> str:
+def refusal(*options: str, **env: str) -> str:
     """What the server says on its way out, which must be one sentence and no traceback."""
-    done = subprocess.run(**command(**env), capture_output=True, timeout=60, check=False)
+    started = command(**env)
+    started["args"] += options
+    done = subprocess.run(**started, capture_output=True, timeout=60, check=False)
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     return done.stderr
@@ -39,6 +41,7 @@ def refusal(**env: str) -> str:
 def test_reasons_not_to_start_are_sentences(tmp_path: Path, redis_url: str) -> None:
     data = str(tmp_path / "data")
     assert "SPLATMILL_API_KEY" in refusal(SPLATMILL_HOST="0.0.0.0", SPLATMILL_DATA=data)
+    assert "SPLATMILL_API_KEY" in refusal("--host", "0.0.0.0", SPLATMILL_DATA=data)
     (tmp_path / "file").write_text("x")
     assert "cannot be made" in refusal(SPLATMILL_DATA=str(tmp_path / "file"))
     # Nobody, not even root, can make a folder there.
@@ -47,7 +50,7 @@ def test_reasons_not_to_start_are_sentences(tmp_path: Path, redis_url: str) -> N
     assert "renderer" in refusal(SPLATMILL_RENDERER_URL="ftp://x", SPLATMILL_DATA=data).lower()
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        said = refusal(SPLATMILL_PORT=port, SPLATMILL_DATA=data)
+        said = refusal("--port", port, SPLATMILL_PORT="0", SPLATMILL_DATA=data)
         assert port in said
         assert "SPLATMILL_PORT" in said
 
