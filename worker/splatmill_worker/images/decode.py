@@ -27,8 +27,15 @@ def upright_size(image: Image.Image) -> tuple[int, int]:
 
 def orientation(image: Image.Image) -> int:
     """The EXIF orientation, 1 (as stored) where there is none or it makes no sense."""
-    value = image.getexif().get(ORIENTATION, 1)
+    value = tags(image).get(ORIENTATION, 1)
     return value if value in range(1, 9) else 1
+
+
+def tags(image: Image.Image) -> Image.Exif:
+    """The EXIF that stands before the pixels; Pillow would decode a whole PNG to look for more behind them."""
+    if image.format == "PNG" and not image.info.keys() & {"exif", "Raw profile type exif"}:
+        return Image.Exif()
+    return image.getexif()
 
 
 def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool = True) -> Image.Image:
@@ -51,7 +58,9 @@ def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool
                 image.draft(None, (image.width // factor, image.height // factor))
         image.load()
         photo = _plain_mode(ImageOps.exif_transpose(image) if turn else image)
-        if want is not None:
+        if (
+            want is not None and photo.mode != "RGBA"
+        ):  # which Pillow would average in 8-bit premultiplied steps
             factor = _factor(image.size, want, range(64, 0, -1))
             if factor > 1:
                 photo = photo.reduce(factor)

@@ -8,6 +8,8 @@ from typing import Any
 
 from PIL import Image
 
+from splatmill_worker.images.decode import tags
+
 MAKE, MODEL, EXIF_IFD, GPS_IFD = 0x010F, 0x0110, 0x8769, 0x8825
 FOCAL_LENGTH, FOCAL_LENGTH_35MM, LENS_MODEL = 0x920A, 0xA405, 0xA434
 FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # mm; the equivalent focal length is defined by the diagonal
@@ -33,8 +35,8 @@ class Exif:
 def read(image: Image.Image) -> Exif:
     """The fields of an opened image; broken EXIF counts as none."""
     try:
-        tags = image.getexif()
-        details, gps = tags.get_ifd(EXIF_IFD), tags.get_ifd(GPS_IFD)
+        found = tags(image)
+        details, gps = found.get_ifd(EXIF_IFD), found.get_ifd(GPS_IFD)
     except (OSError, ValueError, SyntaxError, KeyError, TypeError):
         return Exif()
     equivalent = _positive(details.get(FOCAL_LENGTH_35MM))
@@ -49,8 +51,8 @@ def read(image: Image.Image) -> Exif:
     if altitude is not None and gps.get(5) in (1, b"\x01"):
         altitude = -altitude
     return Exif(
-        make=_text(tags.get(MAKE)),
-        model=_text(tags.get(MODEL)),
+        make=_text(found.get(MAKE)),
+        model=_text(found.get(MODEL)),
         lens=_text(details.get(LENS_MODEL)),
         focal_length=_positive(details.get(FOCAL_LENGTH)),
         focal_in_diagonals=None if equivalent is None else equivalent / FULL_FRAME_DIAGONAL,

@@ -9,8 +9,8 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Camera, Lens
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")

@@ -190,11 +190,12 @@ def _look_at(name: str, path: Path, sequence: str | None) -> Usable | str:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # broken EXIF is not a reason to refuse a photo
             with Image.open(path) as image:
-                width, height = upright_size(image)
+                width, height = image.size
                 if min(width, height) < MIN_SIDE:
                     return f"{width} x {height} pixels: sides under {MIN_SIDE} pixels are too small to use"
                 if width * height > MAX_PIXELS:
                     return f"{width} x {height} pixels: more than the {MAX_PIXELS // 10**6} million that are decoded"
+                width, height = upright_size(image)
                 tags = exif.read(image)
                 if image.format == "JPEG":
                     image.draft(None, (1, 1))  # the smallest DCT scale still reads the file to its end

@@ -6,8 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import pycolmap
-
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.prepare import Usable
 
 # Without EXIF: COLMAP's guess, about a phone's main camera.

@@ -6,8 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-import pycolmap
-
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.failure import Cancelled
 
 POLL_SECONDS = 0.1

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.cameras import FOCAL_BOUNDS
 from splatmill_worker.sfm.failure import SfmFailed
 from splatmill_worker.sfm.geometry import MIN_INLIERS, TURNED_ONLY, Verified

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 from PIL import Image
 
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.decode import upright_size
 from splatmill_worker.images.lens import lens_of, pinhole
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View

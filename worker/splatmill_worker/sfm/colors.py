@@ -7,8 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.decode import decode
 from splatmill_worker.scene import View
 

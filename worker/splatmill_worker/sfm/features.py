@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 from PIL import Image
 
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.decode import decode
 from splatmill_worker.images.load import training_size
 from splatmill_worker.images.prepare import Usable

@@ -7,8 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.cancellation import stop_if
 from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.matching import Matcher, Matches

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import pycolmap
-
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.cancellation import stop_if
 
 Mapper = Literal["incremental", "global"]

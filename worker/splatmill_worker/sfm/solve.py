@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import torch
 
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.scene import Scene, View
 from splatmill_worker.sfm import cameras, checks, colors, features, geometry, mapping, pairs
@@ -112,8 +112,6 @@ def reconstruct_photos(
     """`reconstruct` for photos that were looked through already."""
     _require_photos(prepared)
     stop_if(cancelled)
-    # COLMAP talks on stderr about every step; its errors come back as exceptions.
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     folder = workdir / "sfm" / prepared.key[:24]
     stored = folder / f"model-{_digest(VERSION, pycolmap.__version__, options)}"
     if not (stored / "facts.json").is_file():

@@ -13,10 +13,10 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 from PIL import Image
 from plyfile import PlyData, PlyParseError
 
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Scene, Source, View
 from splatmill_worker.sfm.colmap_model import camera_and_lens, fit_to_file
 from splatmill_worker.sfm.files import ImageFiles
