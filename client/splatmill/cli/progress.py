@@ -101,6 +101,7 @@ class PlainDisplay:
         print(progress_text(progress), flush=True)
 
     def say(self, line: str) -> None:
+        self._last_word()
         print(line, flush=True)
 
     def _last_word(self) -> None:
