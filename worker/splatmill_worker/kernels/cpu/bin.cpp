@@ -11,8 +11,8 @@
 namespace splatmill {
 namespace {
 
-constexpr int kMostDigitBits = 13;  // 8192 counters, 32 KiB: a thread's histogram stays in its first two caches
-constexpr int kAhead = 16;          // Gaussians whose spans and touches are fetched early
+constexpr int kMostDigitBits = 11;  // a pass writes to that many places at once: more would not stay in the first cache
+constexpr int kAhead = 16;          // Gaussians whose touches are fetched early
 
 struct Digits {
   uint32_t lowest = 0;
@@ -51,8 +51,8 @@ void bin_frame(Frame& frame, int threads) {
     const int t = omp_get_thread_num(), team = omp_get_num_threads();
     const int64_t begin = n * t / team, end = n * (t + 1) / team;
     uint32_t* counts = histogram + t * stride;
-    uint32_t *ids = frame.ids.get(), *keys = frame.keys.get();
-    uint32_t *ids_to = frame.ids_swap.get(), *keys_to = frame.keys_swap.get();
+    Span *order = frame.order.get(), *order_to = frame.order_swap.get();
+    uint32_t *keys = frame.keys.get(), *keys_to = frame.keys_swap.get();
     for (int pass = 0; pass < digits.passes; ++pass) {
       const int shift = pass * digits.bits;
       const uint32_t mask = (1u << digits.bits) - 1;
@@ -64,22 +64,24 @@ void bin_frame(Frame& frame, int threads) {
       starts_from_counts(histogram, mask + 1, team, stride);
       for (int64_t i = begin; i < end; ++i) {
         const uint32_t to = counts[digit(i)]++;
-        ids_to[to] = ids[i];
+        order_to[to] = order[i];
         keys_to[to] = keys[i];
       }
 #pragma omp barrier
-      std::swap(ids, ids_to);
+      std::swap(order, order_to);
       std::swap(keys, keys_to);
     }
 
     const auto fetch_ahead = [&](int64_t i) {
-      if (i + 2 * kAhead < end) __builtin_prefetch(&frame.spans[ids[i + 2 * kAhead]]);
-      if (i + kAhead < end) __builtin_prefetch(&frame.touches[frame.spans[ids[i + kAhead]].first]);
+      if (i + kAhead >= end) return;
+      const Touch* touch = &frame.touches[order[i + kAhead].first];
+      __builtin_prefetch(touch);
+      __builtin_prefetch(touch + 5);  // the next line: most Gaussians have three pairs or so, few have ten
     };
     std::fill_n(counts, tiles, 0u);
     for (int64_t i = begin; i < end; ++i) {
       fetch_ahead(i);
-      const Span span = frame.spans[ids[i]];
+      const Span span = order[i];
       for (uint32_t k = 0; k < span.count; ++k) ++counts[frame.touches[span.first + k].tile];
     }
 #pragma omp barrier
@@ -91,11 +93,13 @@ void bin_frame(Frame& frame, int threads) {
     }
     for (int64_t i = begin; i < end; ++i) {
       fetch_ahead(i);
-      const Span span = frame.spans[ids[i]];
+      const Span span = order[i];
       for (uint32_t k = 0; k < span.count; ++k) {
         const uint32_t slot = span.first + k;
         const Touch touch = frame.touches[slot];
-        entries[counts[touch.tile]++] = {ids[i], slot, touch.blocks};
+        Entry& entry = entries[counts[touch.tile]++];
+        __builtin_prefetch(&entry + 5, 1);  // this tile's next line
+        entry = {touch.id, slot, touch.blocks};
       }
     }
   }

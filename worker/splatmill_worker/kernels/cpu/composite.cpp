@@ -69,7 +69,7 @@ void assign_slots(Frame& frame) {
     Entry& entry = frame.entries[k];
     Span& span = spans[entry.id];
     entry.slot = span.first + span.count++;
-    frame.touches[entry.slot] = {0, 1};
+    frame.touches[entry.slot] = {entry.id, 0, 1};
   }
 }
 

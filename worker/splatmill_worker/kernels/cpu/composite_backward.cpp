@@ -74,7 +74,10 @@ void differentiate_tile(Frame& frame, const ImageGradient& g, int tile) {
   int64_t k = frame.offsets[tile];
   const int64_t end = frame.offsets[tile + 1], walked = k + frame.walked[tile];
   for (; k < walked; ++k) {
-    if (k + kEntriesAhead < walked) __builtin_prefetch(&frame.records[frame.entries[k + kEntriesAhead].id]);
+    if (k + kEntriesAhead < walked) {
+      __builtin_prefetch(&frame.records[frame.entries[k + kEntriesAhead].id]);
+      __builtin_prefetch(&frame.pair_sums[static_cast<int64_t>(frame.entries[k + kEntriesAhead].slot) * kPairSums], 1);
+    }
     const Entry entry = frame.entries[k];
     if (!entry.blocks) {
       frame.touches[entry.slot].blocks = 0;

@@ -13,6 +13,18 @@ struct Block {
   alignas(64) float depth[kDepth ? kLanes : 1];
 };
 
+// Blocks with a pixel that is not done. Asked now and then: marking a pixel costs nothing, a branch at each would.
+constexpr int64_t kEntriesBetweenChecks = 16;
+
+template <bool kDepth>
+SPLATMILL_INLINE uint32_t still_live(const Block<kDepth>* blocks, uint32_t live) {
+  for (uint32_t left = live; left; left &= left - 1) {
+    const int b = __builtin_ctz(left);
+    if (all(load(blocks[b].T) < 0.0f)) live &= ~(1u << b);
+  }
+  return live;
+}
+
 template <bool kDepth>
 void blend_tile(Frame& frame, const Planes& image, const float background[3], int tile) {
   const Camera& cam = frame.camera;
@@ -35,7 +47,8 @@ void blend_tile(Frame& frame, const Planes& image, const float background[3], in
   uint32_t live = blocks_inside(tile_x, tile_y, cam);
   int64_t k = frame.offsets[tile];
   const int64_t begin = k, end = frame.offsets[tile + 1];
-  for (; k < end && live; ++k) {
+  for (; k < end; ++k) {
+    if ((k - begin) % kEntriesBetweenChecks == 0 && !(live = still_live(blocks, live))) break;
     if (k + kEntriesAhead < end) __builtin_prefetch(&frame.records[frame.entries[k + kEntriesAhead].id]);
     Entry& entry = frame.entries[k];
     const Record& r = frame.records[entry.id];
@@ -56,16 +69,8 @@ void blend_tile(Frame& frame, const Planes& image, const float background[3], in
       store(block.green, fma(w, green, load(block.green)));
       store(block.blue, fma(w, blue, load(block.blue)));
       if constexpr (kDepth) store(block.depth, fma(w, splat(r.depth), load(block.depth)));
-      const Float T_next = select(blended, T_after, T);
       changed |= static_cast<uint32_t>(any(blended)) << b;
-      const uint32_t stopped = bits(hit) & ~bits(blended);
-      if (__builtin_expect(stopped != 0, 0)) {
-        const Float marked = select(mask_of(stopped), -abs(T_next), T_next);
-        store(block.T, marked);
-        if (all(marked < 0.0f)) live &= ~(1u << b);
-      } else {
-        store(block.T, T_next);
-      }
+      store(block.T, mark(hit & ~blended, select(blended, T_after, T)));
     }
     entry.blocks = changed;
   }

@@ -7,8 +7,9 @@
 
 namespace splatmill {
 
-// One (Gaussian, tile) pair where it was found: the tile, and which of its sixteen 4x4-pixel blocks the ellipse reaches.
+// One (Gaussian, tile) pair where it was found, and which of the tile's sixteen 4x4-pixel blocks the ellipse reaches.
 struct Touch {
+  uint32_t id;  // Gaussian
   uint32_t tile;
   uint32_t blocks;
 };
@@ -44,7 +45,8 @@ struct Frame {
   Buffer<Span> spans;            // [count], written where visible
   Buffer<Touch> touches;         // one stretch per thread
   int64_t stretch = 0;           // touches of a thread at most
-  Buffer<uint32_t> ids, keys, ids_swap, keys_swap;  // visible Gaussians by depth
+  Buffer<Span> order, order_swap;     // the visible Gaussians' touches, by depth once sorted
+  Buffer<uint32_t> keys, keys_swap;   // their depths' bits
   Buffer<uint32_t> histogram;    // [threads][max(tiles, digits)]
   Buffer<int64_t> offsets;       // [tiles + 1]
   Buffer<Entry> entries;         // [pairs] by tile, front to back

@@ -57,21 +57,18 @@ class Reach {
   Float ux_, uy_, vy_, slope_x_, slope_y_, cut_;
 };
 
-// Calls sink(tile, blocks) for every tile that `r` reaches, row by row; bounded by the grid, whatever the extents are.
-template <class Sink>
-SPLATMILL_INLINE void for_each_tile(const Record& r, int columns, int rows, Sink sink) {
+// The tiles [x0, x1) x [y0, y1) whose pixel centres meet the box of the ellipse; bounded by the grid, whatever the extents are.
+struct TileRange {
+  int x0, x1, y0, y1;
+  int64_t tiles() const { return static_cast<int64_t>(std::max(x1 - x0, 0)) * std::max(y1 - y0, 0); }
+};
+SPLATMILL_INLINE TileRange tile_range(const Record& r, int columns, int rows) {
   const auto bounded = [](float tile, int n) {
     return static_cast<int>(std::min(std::max(tile, 0.0f), static_cast<float>(n)));
   };
   constexpr float kPerTile = 1.0f / kTile;
-  const int x0 = bounded((r.x - r.extent_x - 0.5f) * kPerTile, columns), x1 = bounded((r.x + r.extent_x - 0.5f) * kPerTile + 1.0f, columns);
-  const int y0 = bounded((r.y - r.extent_y - 0.5f) * kPerTile, rows), y1 = bounded((r.y + r.extent_y - 0.5f) * kPerTile + 1.0f, rows);
-  const Reach reach(r);
-  for (int ty = y0; ty < y1; ++ty) {
-    const Reach::Row row = reach.row(ty);
-    for (int tx = x0; tx < x1; ++tx)
-      if (const uint32_t blocks = reach.blocks(row, tx)) sink(static_cast<uint32_t>(ty * columns + tx), blocks);
-  }
+  return {bounded((r.x - r.extent_x - 0.5f) * kPerTile, columns), bounded((r.x + r.extent_x - 0.5f) * kPerTile + 1.0f, columns),
+          bounded((r.y - r.extent_y - 0.5f) * kPerTile, rows), bounded((r.y + r.extent_y - 0.5f) * kPerTile + 1.0f, rows)};
 }
 
 }  // namespace splatmill

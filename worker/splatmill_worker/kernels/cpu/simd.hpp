@@ -347,6 +347,16 @@ SPLATMILL_INLINE Float select(Mask m, Float a, Float b) {
 }
 SPLATMILL_INLINE void store(float* p, Mask m, Float x) { store(p, select(m, x, load(p))); }
 #endif
+// m ? -|a| : a
+SPLATMILL_INLINE Float mark(Mask m, Float a) {
+#if defined(__AVX512F__)
+  return {{_mm512_mask_or_ps(a.part[0], m.bits, a.part[0], _mm512_set1_ps(-0.0f))}};
+#else
+  return detail::each<Float>([&](auto i) {
+    return reinterpret_cast<NativeFloat>(reinterpret_cast<NativeInt>(a.part[i]) | (m.part[i] & INT32_MIN));
+  });
+#endif
+}
 // m ? a * b : 0, one instruction where masks are registers.
 SPLATMILL_INLINE Float keep_product(Mask m, Float a, Float b) {
 #if defined(__AVX512F__)
