@@ -1,4 +1,6 @@
-"""One of several processes that train the scene of `test_gpu_parallel` together: `python replica.py ENGINE STEPS OUT`."""
+"""One of several processes that train the scene of `test_gpu_parallel` together: `python replica.py ENGINE
+STEPS OUT`.
+"""
 
 from __future__ import annotations
 

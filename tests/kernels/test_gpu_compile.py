@@ -1,7 +1,8 @@
 """Every Triton kernel compiles for sm_80 and sm_90 on a machine without a GPU, and spills no register.
 
-All settings that the autotuner may choose are compiled for sm_90; for sm_80 the one used where nothing was measured. Says nothing
-about speed, and nothing about whether the compiled code is right: the interpreter and the device tests do that.
+All settings that the autotuner may choose are compiled for sm_90; for sm_80 the one used where nothing was
+measured. Says nothing about speed, and nothing about whether the compiled code is right: the interpreter and
+the device tests do that.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,7 +22,9 @@ pytest.importorskip(
 )
 
 SPILLS: dict[str, int] = {}
-"""Bytes of stack per thread that a kernel may use, by name; none may. A spill that pays is written down here, with the reason."""
+"""Bytes of stack per thread that a kernel may use, by name; none may. A spill that pays is written down
+here, with the reason.
+"""
 
 KERNELS = {
     "project_kernel", "color_backward_kernel", "shape_backward_kernel", "pairs_kernel", "composite_kernel",
@@ -41,14 +43,14 @@ def start(*arguments: str) -> subprocess.Popen[str]:
 
 
 @pytest.fixture(scope="module")
-def compiled() -> Iterator[list[dict[str, object]]]:
+def compiled() -> list[dict[str, object]]:
     running = [start("90"), start("--first", "80")]
     rows = []
     for process in running:
         said, complained = process.communicate(timeout=280)
         assert process.returncode == 0, complained
         rows += [json.loads(line) for line in said.splitlines()]
-    yield rows
+    return rows
 
 
 def test_every_kernel_compiles_for_both(compiled: list[dict[str, object]]) -> None:

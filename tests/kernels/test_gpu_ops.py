@@ -1,8 +1,9 @@
 """The Triton kernels against the float64 reference, forward and backward, on the shared cases.
 
-Without a GPU they run through Triton's interpreter, on thinned cases, because it takes milliseconds for every splat of a tile;
-on a machine with one, `pytest -m gpu` runs the cases whole on the device. What the interpreter does not prove: atomics under
-real concurrency, the hardware's approximate exp2 and division, and that the compiler keeps what the source says.
+Without a GPU they run through Triton's interpreter, on thinned cases, because it takes milliseconds for every
+splat of a tile; on a machine with one, `pytest -m gpu` runs the cases whole on the device. What the
+interpreter does not prove: atomics under real concurrency, the hardware's approximate exp2 and division, and
+that the compiler keeps what the source says.
 """
 
 from __future__ import annotations
@@ -74,10 +75,11 @@ def project(
 def close(
     name: str, seen: Tensor, plain: Tensor, exact: Tensor, *, slack: float = 8.0, roundings: float = 64
 ) -> None:
-    """`seen` is as near to `exact` (float64) as the reference's own arithmetic in float32 (`plain`) is, within `slack`.
+    """`seen` is as near to `exact` (float64) as the reference's own arithmetic in float32 (`plain`) is,
+    within `slack`.
 
-    That is what float32 can give for this scene; a needle may lose all digits and an ordinary splat almost none. The floor of some
-    roundings of the largest value covers sums in another order.
+    That is what float32 can give for this scene; a needle may lose all digits and an ordinary splat almost
+    none. The floor of some roundings of the largest value covers sums in another order.
     """
     if not exact.numel():
         assert not seen.numel()
@@ -176,10 +178,12 @@ def pairs(bins: Bins) -> list[tuple[int, int]]:
 
 
 def undecided(fields: Projected, bins: Bins, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Pixels [H, W] where a list comes within float32's reach of 1/255 or of the stop, and a bound of the image's error there.
+    """Pixels [H, W] where a list comes within float32's reach of 1/255 or of the stop, and a bound of the
+    image's error there.
 
-    With d the rounding of the exponent, 8 eps (|a| x^2 + 2 |b x y| + |c| y^2) / 2, the image is off by at most
-    2 max(c) sum_i w_i d_i: once for the splat's own weight and once for what is behind it, which weighs no more.
+    With d the rounding of the exponent, 8 eps (|a| x^2 + 2 |b x y| + |c| y^2) / 2, the image is off by at
+    most 2 max(c) sum_i w_i d_i: once for the splat's own weight and once for what is behind it, which weighs
+    no more.
     """
     near = torch.zeros(height, width, dtype=torch.bool)
     bound = torch.zeros(height, width, dtype=torch.float64)
@@ -220,7 +224,9 @@ SEEN_BY_PROJECTION = {
     "sub-pixel antialias",
     "needles 1e+02",
 }
-"""Cases whose point is over once they are projected: on the device they run all the same, in the interpreter they cost seconds."""
+"""Cases whose point is over once they are projected: on the device they run all the same, in the
+interpreter they cost seconds.
+"""
 
 
 @BY_DEVICE
@@ -385,7 +391,7 @@ def test_adam_agrees_with_the_definition(visible_only: bool, device: str) -> Non
                     visible=shown.to(where) if visible_only else None,
                     last_step=last if visible_only else None,
                     backend=backend,  # type: ignore[arg-type]
-                )  # fmt: skip
+                )
             )
         ends.append([x for group in state for x in group])
         refusals.append(refused)
@@ -401,5 +407,6 @@ def test_knn_agrees_with_the_definition(n: int, device: str) -> None:
     points[n // 2 :: 7] = points[0]  # duplicates are other points at distance 0
     exact = reference.knn(points.double())
     seen = ops.knn(points.to(device), backend="gpu").cpu().double()
-    # A distance is the root of three squares: four roundings, each of half an ulp, on differences that are exact to one.
+    # A distance is the root of three squares: four roundings, each of half an ulp, on differences that are
+    # exact to one.
     assert float(((seen - exact).abs() - 8 * EPS * (exact + points.abs().max())).max()) <= 0

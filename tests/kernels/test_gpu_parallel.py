@@ -1,6 +1,7 @@
 """Two processes that train one scene over gloo do what one process does with both photos in every step.
 
-For the autograd engine on the C++ kernels, and for the fused GPU step in Triton's interpreter. NCCL, and how it scales, need cards.
+For the autograd engine on the C++ kernels, and for the fused GPU step in Triton's interpreter. NCCL, and how
+it scales, need cards.
 """
 
 from __future__ import annotations
@@ -69,7 +70,8 @@ def alone(steps: int) -> tuple[dict[str, torch.Tensor], list[float], torch.Tenso
         seen = []
         for viewmat, photo in views[2 * ((step - 1) % 2) :][:2]:
             fields = ops.project(
-                *leaves[:4], torch.cat(leaves[4:], 1), viewmat.double(), replica.K.double(), replica.WIDTH, replica.HEIGHT,
+                *leaves[:4], torch.cat(leaves[4:], 1), viewmat.double(), replica.K.double(),
+                replica.WIDTH, replica.HEIGHT,
                 degree=1, backend="reference",
             )  # fmt: skip
             fields.means2d.retain_grad()
@@ -112,7 +114,8 @@ def test_two_processes_take_the_step_of_one(engine: str, tmp_path: Path) -> None
         assert torch.equal(first["parameters"][name], second["parameters"][name]), (
             f"{name} differs between the processes"
         )
-        # Adam moves by rate * m / sqrt(v): float32 gradients, good to 1e-4, leave at most 1e-4 of the largest rate a step.
+        # Adam moves by rate * m / sqrt(v): float32 gradients, good to 1e-4, leave at most 1e-4 of the largest
+        # rate a step.
         error = (first["parameters"][name] - truth).abs().max().item()
         assert error <= 5e-2 * 1e-4 * steps, f"{name}: {error}"
     assert first["losses"] == second["losses"], "the processes would judge their health differently"

@@ -1,7 +1,8 @@
-"""The GPU training step against the reference's ops in float64, over steps that miss Gaussians; its room, and that it never waits.
+"""The GPU training step against the reference's ops in float64, over steps that miss Gaussians; its room, and
+that it never waits.
 
-Runs in Triton's interpreter where there is no GPU. Does not prove that the device overlaps what the host enqueues, only that
-nothing in a step asks for a value, nor the recovery from a real allocation failure.
+Runs in Triton's interpreter where there is no GPU. Does not prove that the device overlaps what the host
+enqueues, only that nothing in a step asks for a value, nor the recovery from a real allocation failure.
 """
 
 from __future__ import annotations
@@ -139,7 +140,8 @@ def test_steps_agree_with_the_definition(case: Case) -> None:
     exact.settle(4)
     parts = [*exact.params[:4], torch.cat(exact.params[4:], 1)]
     for name, truth in zip(GROUPS, parts, strict=True):
-        # Adam's step is the rate times a ratio of moments: relative errors of 1e-4 in a gradient stay that small in it.
+        # Adam's step is the rate times a ratio of moments: relative errors of 1e-4 in a gradient stay that
+        # small in it.
         error = (here.parameters()[name].cpu() - truth).abs().max().item()
         assert error <= 2e-6, f"{name}: {error}"
     first, second = (
@@ -186,7 +188,9 @@ def test_replace_takes_moments_and_clears_scores(case: Case) -> None:
 
 
 class NoQuestions(TorchDispatchMode):
-    """Refuses every operation that would make the host wait for a value, or have a shape that depends on one."""
+    """Refuses every operation that would make the host wait for a value, or have a shape that depends on
+    one.
+    """
 
     WAITS = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "bincount", "item", "equal")
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import torch
-
 from splatmill.schema import Backend, TrainOptions
 from splatmill_worker import sfm
+from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.refusal import Refusal
 from splatmill_worker.scene import Scene, View, split
 from splatmill_worker.sfm import posed
@@ -96,11 +95,11 @@ def kernels_of(options: TrainOptions) -> Kernels:
     Raises Refusal where the ones asked for do not run.
     """
     if options.backend is Backend.auto:
-        return "gpu" if torch.cuda.is_available() else "cpu"
-    if options.backend is Backend.gpu and not torch.cuda.is_available():
+        return "gpu" if absence() is None else "cpu"
+    if options.backend is Backend.gpu and (reason := absence()) is not None:
         raise Refusal(
             "backend_unavailable",
-            "The gpu backend was asked for, and torch sees no GPU on this machine.",
+            f"The gpu backend was asked for. {reason}",
             advice="Leave backend at auto, or run a worker on a machine with a GPU.",
         )
     named: dict[Backend, Kernels] = {Backend.reference: "reference", Backend.cpu: "cpu", Backend.gpu: "gpu"}

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from splatmill.schema import (
+    Backend,
     Event,
     JobState,
     LogEvent,
@@ -24,6 +25,7 @@ from splatmill.schema import (
 from splatmill_worker import sfm
 from splatmill_worker.capture import cameras_of, held_out_of, kernels_of
 from splatmill_worker.images import load_views
+from splatmill_worker.kernels.gpu.device import absence, describe
 from splatmill_worker.refusal import Refusal
 from splatmill_worker.scene import Normalization, Scene, View
 from splatmill_worker.splat import checkpoint, initialise
@@ -70,6 +72,8 @@ def run(
     stages = Stages(workdir / "stages.json")
     try:
         kernels = kernels_of(options)
+        if kernels == "cpu" and options.backend is Backend.auto and torch.cuda.is_available():
+            emit(LogEvent(level="warning", message=f"{absence()} Training runs on the CPU."))
 
         emit(StateEvent(state=JobState.sfm))
         with stages.measured("sfm"):
@@ -153,6 +157,9 @@ def _plan(
     kernels = kernels_of(options)
     stored = workdir / "plan.json"
     facts = measure(world, views, len(held_out), probe(open_engine(gaussians, kernels), views))
+    card = describe() if kernels == "gpu" else None
+    if card is not None:
+        facts = replace(facts, memory_available=card.free_bytes)
     if stored.is_file():
         kept = json.loads(stored.read_text())
         if kept["options"] == options.model_dump(mode="json"):

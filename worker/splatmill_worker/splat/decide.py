@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from splatmill.schema import Background, Densify, Preset, Switch, TrainOptions
+from splatmill_worker.kernels.gpu.device import largest_budget
 from splatmill_worker.splat.budget import Budget
 from splatmill_worker.splat.facts import Facts, Speed
 from splatmill_worker.splat.initialise import ENOUGH_POINTS, RANDOM_GAUSSIANS
@@ -64,7 +65,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
     initial, start = _initial(facts, why)
     speed = facts.speed or UNKNOWN_SPEED
     budget, steps = _budget(facts, options, speed, pixels, start, why)
-    most = _max_gaussians(facts, options, steps, pixels, start, why)
+    most = _max_gaussians(facts, options, kernels, steps, pixels, start, why)
     densify = _densify(options, most, start, why)
     schedule = Schedule(
         budget=budget,
@@ -162,11 +163,21 @@ def _affordable_steps(seconds: float, speed: Speed, pixels: float, start: int) -
 
 
 def _max_gaussians(
-    facts: Facts, options: TrainOptions, steps: int, pixels: float, start: int, why: _Reasons
+    facts: Facts,
+    options: TrainOptions,
+    kernels: Kernels,
+    steps: int,
+    pixels: float,
+    start: int,
+    why: _Reasons,
 ) -> int:
     settled = round(1000 * steps / STEPS_PER_1000_GAUSSIANS)
     resolved = round(pixels * facts.views / PIXELS_PER_GAUSSIAN)
-    held = Plan.gaussians_within(options.max_memory or facts.memory_available // 2)
+    if kernels == "gpu":
+        photos = round(3 * pixels * (facts.views + facts.held_out))
+        held = largest_budget(options.max_memory or facts.memory_available, round(pixels), photos)
+    else:
+        held = Plan.gaussians_within(options.max_memory or facts.memory_available // 2)
     most = max(min(settled, resolved, held), min(start, held))
     if options.max_gaussians is not None and options.max_gaussians <= most:
         why.option("max_gaussians")

@@ -101,11 +101,15 @@ def open_engine(gaussians: Gaussians, kernels: ops.Backend) -> Engine:
         from splatmill_worker.splat.fused import FusedStep
 
         return FusedStep(gaussians)
+    if kernels == "gpu":
+        from splatmill_worker.splat.fused_gpu import FusedGpuStep
+
+        return FusedGpuStep(gaussians)
     from splatmill_worker.splat.autograd import AutogradStep
 
     return AutogradStep(gaussians, backend=kernels)
 
 
 def gaussians_of(engine: Engine) -> Gaussians:
-    """A copy of what the engine holds."""
-    return Gaussians(**engine.parameters())
+    """A copy of what the engine holds, on the CPU."""
+    return Gaussians(**engine.parameters()).map(lambda value: value.cpu())

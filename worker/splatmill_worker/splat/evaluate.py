@@ -60,10 +60,11 @@ def evaluate(draw: Draw, views: Sequence[TrainingView], background: Tensor) -> S
 def compare(name: str, color: Tensor, photo: Tensor, mask: Tensor | None = None) -> ViewScore:
     """Score of a rendered image [H, W, 3] against a photo uint8 [H, W, 3]; only `mask` [H, W] pixels count."""
     image = color.detach().float().clamp(0.0, 1.0)
-    truth = photo.float() / 255.0
+    truth = photo.to(image.device).float() / 255.0
     squares = (image - truth).square().mean(dim=2)
     similar = ssim_map(image, truth).mean(dim=2)
     if mask is not None and bool(mask.any()):
+        mask = mask.to(image.device)
         squares, similar = squares[mask], similar[mask]
     mse = float(squares.double().mean())
     return ViewScore(name, mse, psnr(mse), float(similar.double().mean()))

@@ -24,7 +24,8 @@ class Exposure:
 
     def applied(self, photo: int, color: Tensor) -> Tensor:
         """Colour [H, W, 3] as photo number `photo` would have taken it."""
-        return color @ self.affine[photo, :, :3].T + self.affine[photo, :, 3]
+        affine = self.affine[photo].to(color.device)
+        return color @ affine[:, :3].T + affine[:, 3]
 
     def penalty(self, photo: int) -> Tensor:
         """To be added to the loss."""

@@ -12,7 +12,9 @@ from splatmill_worker.splat.gaussians import Gaussians
 
 
 class FusedGpuStep(Step):
-    """An Engine on the Triton kernels. Photos stay on the device as uint8 for as long as their tensors live."""
+    """An Engine on the Triton kernels. Photos stay on the device as uint8 for as long as their tensors
+    live.
+    """
 
     def __init__(
         self,
@@ -39,7 +41,8 @@ class FusedGpuStep(Step):
     ) -> StepResult:
         """One step, enqueued; the numbers are those of the latest step that has been heard from.
 
-        The promise in `key` is not needed: the photo's window sums cost the device less than the memory to keep them.
+        The promise in `key` is not needed: the photo's window sums cost the device less than the memory to
+        keep them.
         """
         seen = self.train(
             viewmat, K, photo,

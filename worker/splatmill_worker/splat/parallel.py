@@ -1,8 +1,10 @@
-"""One scene on several GPUs: every process trains on its share of the views, and all of them take the same averaged step.
+"""One scene on several GPUs: every process trains on its share of the views, and all of them take the same
+averaged step.
 
-The rule is one worker per GPU, each with its own scene; this is for the scene that has to be finished sooner. Start one process per
-GPU with `torchrun`, call `join`, give `train` the views of `share` and the engine of `open_replica`. A step over P processes is a
-step over P photos: plan P times fewer steps. The budget must be in steps, since clocks differ between processes.
+The rule is one worker per GPU, each with its own scene; this is for the scene that has to be finished sooner.
+Start one process per GPU with `torchrun`, call `join`, give `train` the views of `share` and the engine of
+`open_replica`. A step over P processes is a step over P photos: plan P times fewer steps. The budget must be
+in steps, since clocks differ between processes.
 """
 
 from __future__ import annotations
@@ -47,8 +49,9 @@ class Replicas:
         dist.all_reduce(values, op=dist.ReduceOp.MAX)
 
     def share(self, views: Sequence[View]) -> list[View]:
-        """This process's views: every `count`-th. All shares are equally long, the last views coming twice where need be,
-        so that all processes draw the same random numbers and densify alike."""
+        """This process's views: every `count`-th. All shares are equally long, the last views coming twice
+        where need be, so that all processes draw the same random numbers and densify alike.
+        """
         if not views:
             raise ValueError("there are no views to share among the processes.")
         length = -(-len(views) // self.count)
@@ -64,7 +67,8 @@ class Replicas:
         dist.all_reduce(counts, op=dist.ReduceOp.MAX)
         if int(counts[0]) != -int(counts[1]) or not torch.equal(least, most):
             raise RuntimeError(
-                f"Process {self.rank} of {self.count} holds another scene than the rest ({gaussians.count} Gaussians here). "
+                f"Process {self.rank} of {self.count} holds another scene than the rest "
+                f"({gaussians.count} Gaussians here). "
                 "Start all of them from the same checkpoint, with the same seed and a budget in steps."
             )
 
@@ -87,7 +91,9 @@ def join(backend: str | None = None) -> Replicas:
 
 
 class ReplicatedStep(AutogradStep):
-    """The autograd engine, its gradients averaged over the processes before Adam; scores add up over all their views."""
+    """The autograd engine, its gradients averaged over the processes before Adam; scores add up over all
+    their views.
+    """
 
     def __init__(self, gaussians: Gaussians, replicas: Replicas, *, backend: ops.Backend) -> None:
         self._replicas = replicas

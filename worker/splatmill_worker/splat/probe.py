@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
+import torch
+
 from splatmill_worker.kernels.cpu.step import Rates
 from splatmill_worker.splat.engine import Engine
 from splatmill_worker.splat.facts import Speed
@@ -40,5 +42,7 @@ def _seconds(engine: Engine, target: Target) -> float:
         engine.train_photo(
             target.viewmat, target.K, target.rgb, degree=0, rates=STILL, step=step, mask=target.mask
         )
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()  # a GPU's step is only enqueued
         best = min(best, time.perf_counter() - started)
     return best

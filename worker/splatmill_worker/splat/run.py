@@ -25,6 +25,9 @@ from splatmill_worker.splat.views import Target, TrainingView
 SNAPSHOT_SHARE = 0.04
 """Of the budget between two copies of a good state: 2 % of the time at most, and little is lost."""
 
+MEMORY_SHRINK = 0.8
+"""Of the Gaussians there were when memory ran out."""
+
 GREY = 0.5
 
 
@@ -69,6 +72,7 @@ class Run:
         self._good: tuple[dict[str, Tensor], Tensor, Tensor] | None = None
         self._good_progress = -math.inf
         self._good_level = math.inf
+        self._most = self.plan.max_gaussians
         self._fixed = torch.full((3,), {"black": 0.0, "white": 1.0, "random": GREY}[self.plan.background])
 
     @property
@@ -91,10 +95,13 @@ class Run:
         target = self.views[number].reduced(reduction)
         rates = RateSchedule(self.extent, scale=self.rate_scale).at(progress)
         degree = schedule.degree_at(self.step, progress)
-        if self.exposure is None:
-            result = self._plain_step(number, target, degree, rates)
-        else:
-            result = self._exposed_step(self.exposure, number, target, degree, rates)
+        try:
+            if self.exposure is None:
+                result = self._plain_step(number, target, degree, rates)
+            else:
+                result = self._exposed_step(self.exposure, number, target, degree, rates)
+        except MemoryError as short:
+            raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
         self.loss = result.loss
         self.ever_saw |= result.visible > 0
         self.health.watch(self.step, result.loss, result.visible)
@@ -108,10 +115,29 @@ class Run:
         if self._good is None:
             raise failure
         self.recoveries += 1
+        if failure.name is FailureName.memory:
+            self._shrink(failure)
+            return
         self.rate_scale *= 0.5
         self.engine.replace(*self._good)
         self.health = Health(lowest=self._good_level, calm_from=self.step + len(self.views))
         self.warn(f"{failure} Went back to the last good state, with steps half as long.")
+
+    def _shrink(self, failure: TrainingFailed) -> None:
+        """Go on with four fifths of the Gaussians, the most opaque ones, and never have more again."""
+        self._most = max(1, int(MEMORY_SHRINK * self.engine.count))
+        assert self._good is not None
+        parameters, exp_avg, exp_avg_sq = self._good
+        order = torch.argsort(parameters["logit_opacities"], descending=True, stable=True)
+        kept = torch.sort(order[: self._most]).values
+        self._good = (
+            {name: value[kept] for name, value in parameters.items()},
+            exp_avg[kept],
+            exp_avg_sq[kept],
+        )
+        self.engine.replace(*self._good)
+        self.health = Health(lowest=self._good_level, calm_from=self.step + len(self.views))
+        self.warn(f"{failure} Went back to the last good state, and on with at most {self._most} Gaussians.")
 
     def shorten(self, tail: float) -> None:
         """End after another `tail` of what was spent so far: rates fall to their ends in that time."""
@@ -197,8 +223,10 @@ class Run:
         )
         color = color.detach().clone().requires_grad_()
         seen = exposure.applied(number, color)
-        loss = ops.loss(seen, target.over(background), mask=target.mask, backend=self.plan.kernels)
-        (loss + exposure.penalty(number)).backward()  # type: ignore[no-untyped-call]  # torch's own gap
+        photo = target.over(background).to(seen.device)
+        mask = None if target.mask is None else target.mask.to(seen.device)
+        loss = ops.loss(seen, photo, mask=mask, backend=self.plan.kernels)
+        (loss + exposure.penalty(number).to(loss.device)).backward()  # type: ignore[no-untyped-call]  # torch's own gap
         exposure.update(self.rate_scale)
         assert color.grad is not None
         self.engine.backward_update(color.grad, rates=rates, step=self.step)
@@ -211,10 +239,13 @@ class Run:
         return self.order.pop()
 
     def _densify(self, densifier: Densifier, progress: float) -> None:
-        allowed = self.plan.max_gaussians
+        allowed = min(self.plan.max_gaussians, self._most)
         if self.plan.max_memory is not None:
             allowed = min(allowed, self.plan.gaussians_within(self.plan.max_memory))
-        densifier.densify(self.engine, Moment(self.step, progress, self.extent, allowed), self.random)
+        try:
+            densifier.densify(self.engine, Moment(self.step, progress, self.extent, allowed), self.random)
+        except MemoryError as short:
+            raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
         if self.engine.count == 0:
             seen = "every Gaussian became transparent and was removed."
             raise TrainingFailed(FailureName.empty_scene, seen, step=self.step)

@@ -1,10 +1,13 @@
-"""Adam for the Gaussians that were seen, with the steps that a Gaussian missed made up when it is seen again."""
+"""Adam for the Gaussians that were seen, with the steps that a Gaussian missed made up when it is seen
+again.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import torch
 import triton
@@ -24,7 +27,9 @@ BLOCK = 256
 
 @lru_cache(maxsize=4)
 def correction(room: int, where: torch.device) -> Tensor:
-    """sqrt(1 - beta2^s) / (1 - beta1^s) for s = 0 .. room - 1 (0 at 0), from float64: 1 - 0.999 has few digits in float32."""
+    """sqrt(1 - beta2^s) / (1 - beta1^s) for s = 0 .. room - 1 (0 at 0), from float64: 1 - 0.999 has few
+    digits in float32.
+    """
     s = torch.arange(1, room, dtype=torch.float64)
     values = torch.sqrt(1 - BETA2**s) / (1 - BETA1**s)
     return torch.cat([torch.zeros(1, dtype=torch.float64), values]).to(where, torch.float32)
@@ -32,10 +37,11 @@ def correction(room: int, where: torch.device) -> Tensor:
 
 @triton.jit
 def drift_kernel(last_step, seen, table, travel, decay1, decay2, count, step, BLOCK: tl.constexpr):
-    """Per Gaussian what the steps it missed before `step` amount to: travel in units of rate * m / sqrt(v), and both decays.
+    """Per Gaussian what the steps it missed before `step` amount to: travel in units of rate * m / sqrt(v),
+    and both decays.
 
-    Marks every seen one as current. travel is `reference.adam.drift`: the sum over missed steps s = last + j of
-    (beta1 / sqrt(beta2))^j * correction(s).
+    Marks every seen one as current. travel is `reference.adam.drift`: the sum over missed steps s = last + j
+    of (beta1 / sqrt(beta2))^j * correction(s).
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
@@ -62,7 +68,9 @@ def adam_kernel(
     params, grads, exp_avg, exp_avg_sq, seen, travel, decay1, decay2, refused, count, rate, size, root,
     CHANNELS: tl.constexpr, VISIBLE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One step on [N, CHANNELS] rows. An entry whose gradient or its square is not finite stays as it was and is counted."""
+    """One step on [N, CHANNELS] rows. An entry whose gradient or its square is not finite stays as it was
+    and is counted.
+    """
     e = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     shown = e < count * CHANNELS
     i = e // CHANNELS
@@ -103,7 +111,9 @@ def planes_kernel(
     means_rate, scales_rate, quats_rate, opacity_rate, dc_rate, rest_rate, size, root,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One step on planes [59, stride] of a whole scene: 3 means, 3 log-scales, 4 quaternions, 1 opacity, 3 + 45 SH."""
+    """One step on planes [59, stride] of a whole scene: 3 means, 3 log-scales, 4 quaternions, 1 opacity, 3
+    + 45 SH.
+    """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     shown = here & (tl.load(seen + i, mask=here, other=0) != 0)
@@ -136,7 +146,7 @@ class CatchUp:
 
     def __init__(self, seen: Tensor, last_step: Tensor, step: int) -> None:
         count = seen.shape[0]
-        like = {"device": seen.device, "dtype": torch.float32}
+        like: dict[str, Any] = {"device": seen.device, "dtype": torch.float32}
         self.seen = seen
         self.travel, self.decay1, self.decay2 = (torch.empty(count, **like) for _ in range(3))
         table = correction(max(1024, 1 << step.bit_length()), seen.device)  # a new table per doubling
@@ -150,7 +160,9 @@ def apply(
     param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, step: int, refused: Tensor,
     missed: CatchUp | None,
 ) -> None:  # fmt: skip
-    """One step of one contiguous group [N, ...] in place; refused (int32 [1]) counts entries that were left."""
+    """One step of one contiguous group [N, ...] in place; refused (int32 [1]) counts entries that were
+    left.
+    """
     count = param.shape[0]
     entries = param.numel()
     if not entries:
@@ -164,10 +176,12 @@ def apply(
 
 
 def apply_planes(
-    params: Tensor, grads: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rates: Sequence[float], channels: int, step: int,
-    refused: Tensor, missed: CatchUp,
+    params: Tensor, grads: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rates: Sequence[float],
+    channels: int, step: int, refused: Tensor, missed: CatchUp,
 ) -> None:  # fmt: skip
-    """One step in place of the first `channels` of planes [59, N]; rates of means, log-scales, quats, opacity, SH DC and rest."""
+    """One step in place of the first `channels` of planes [59, N]; rates of means, log-scales, quats,
+    opacity, SH DC and rest.
+    """
     count = params.shape[1]
     size, root = 1 / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step)
     if count:
@@ -189,7 +203,9 @@ def adam_(
     visible: Tensor | None = None,
     last_step: Tensor | None = None,
 ) -> int:
-    """One Adam step in place as `reference.adam_` defines it; returns how many entries were refused, which waits once."""
+    """One Adam step in place as `reference.adam_` defines it; returns how many entries were refused, which
+    waits once.
+    """
     device.require(params[0])
     refused = torch.zeros(1, dtype=torch.int32, device=params[0].device)
     missed = None

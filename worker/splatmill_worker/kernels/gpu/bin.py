@@ -1,4 +1,6 @@
-"""Tile lists: visible splats only, sorted by depth once, written in that order, then sorted by tile without losing it."""
+"""Tile lists: visible splats only, sorted by depth once, written in that order, then sorted by tile
+without losing it.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ LANES = 32  # candidate tiles that a splat tests at a time: one warp each
 
 @dataclass(frozen=True)
 class Room:
-    """How many visible splats and tile pairs the buffers hold; from the view's last visit, so that nothing waits for the device."""
+    """How many visible splats and tile pairs the buffers hold; from the view's last visit, so that nothing
+    waits for the device.
+    """
 
     visible: int
     pairs: int
@@ -29,7 +33,9 @@ class Room:
 
 @triton.jit
 def tile_range(center, extent, tiles):
-    """First tile and the one after the last whose pixel centres 16 i + 0.5 .. 16 i + 15.5 meet center -+ extent."""
+    """First tile and the one after the last whose pixel centres 16 i + 0.5 .. 16 i + 15.5 meet center -+
+    extent.
+    """
     limit = tiles * 1.0
     # Bounded before it turns into an integer: what a float that does not fit becomes is undefined.
     first = tl.minimum(tl.maximum(tl.floor((center - extent - 0.5) / 16.0), 0.0), limit)
@@ -44,7 +50,9 @@ def form(a, b, c, x, y):
 
 @triton.jit
 def least(a, b, c, mx, my, column, row):
-    """The smallest d^T C d over the rectangle of a tile's pixel centres; on an edge, unless the centre is inside."""
+    """The smallest d^T C d over the rectangle of a tile's pixel centres; on an edge, unless the centre is
+    inside.
+    """
     x0 = column.to(tl.float32) * 16.0 + 0.5 - mx
     y0 = row.to(tl.float32) * 16.0 + 0.5 - my
     x1, y1 = x0 + 15.0, y0 + 15.0
@@ -63,7 +71,8 @@ def pairs_kernel(
 ):  # fmt: skip
     """One pass for counting and for writing, so that the two cannot disagree on what is a pair.
 
-    Writing past `room` is left out: the lists then lack their farthest splats, and `ends` says how many there should be.
+    Writing past `room` is left out: the lists then lack their farthest splats, and `ends` says how many there
+    should be.
     """
     slot = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = slot < tl.load(visible)
@@ -110,10 +119,12 @@ class Lists:
 
 
 def lists(records: Tensor, width: int, height: int, room: Room | None) -> Lists:
-    """Tile lists of records [N, 12]. With `room` nothing waits for the device; without it the exact sizes are read back.
+    """Tile lists of records [N, 12]. With `room` nothing waits for the device; without it the exact sizes are
+    read back.
 
-    `ids` then has `room.pairs` entries of which offsets[-1] are in use. What does not fit is left out, farthest first; the
-    caller compares `used` with the room at leisure and gives the view more on its next visit.
+    `ids` then has `room.pairs` entries of which offsets[-1] are in use. What does not fit is left out,
+    farthest first; the caller compares `used` with the room at leisure and gives the view more on its next
+    visit.
     """
     dev = records.device
     columns, rows = -(-width // TILE), -(-height // TILE)
@@ -122,7 +133,8 @@ def lists(records: Tensor, width: int, height: int, room: Room | None) -> Lists:
     rank = torch.cumsum(shown, 0)
     visible = rank[-1:] if records.shape[0] else torch.zeros(1, dtype=torch.int64, device=dev)
     most = int(visible) if room is None else min(room.visible, records.shape[0])
-    # Compaction without a data-dependent shape: the hidden and those past the room are sent to a spare last slot.
+    # Compaction without a data-dependent shape: the hidden and those past the room are sent to a spare last
+    # slot.
     slot = torch.where(shown & (rank <= most), rank - 1, most)
     packed = torch.zeros(most + 1, dtype=torch.int64, device=dev)
     packed.scatter_(0, slot, torch.arange(records.shape[0], device=dev))
@@ -160,7 +172,9 @@ def lists(records: Tensor, width: int, height: int, room: Room | None) -> Lists:
 
 
 def bin(projected: Projected, width: int, height: int) -> Bins:
-    """List for every tile the Gaussians that reach it, front to back, as `reference.bin` defines it; reads its size back once."""
+    """List for every tile the Gaussians that reach it, front to back, as `reference.bin` defines it; reads
+    its size back once.
+    """
     device.require(projected.means2d)
     with torch.no_grad():
         return lists(record.pack(projected), width, height, None).bins

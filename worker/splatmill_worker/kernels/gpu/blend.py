@@ -1,7 +1,8 @@
 """Device functions shared by the compositing passes: one splat against the 256 pixels of a tile.
 
-A program walks a tile's list with a pixel's state in registers, several pixels to a thread, so that what is the same for all
-pixels (ten numbers of a splat, read by all threads at one address) and the sums over pixels are paid once for many of them.
+A program walks a tile's list with a pixel's state in registers, several pixels to a thread, so that what is
+the same for all pixels (ten numbers of a splat, read by all threads at one address) and the sums over pixels
+are paid once for many of them.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ LOG2E = constant(1.4426950408889634)
 
 @triton.jit
 def alpha_of(dx, dy, a, b, c, opacity):
-    """min(0.999, o exp(-d^T C d / 2)) at offsets d [256]; where it is below 1/255 the caller skips it, and NaN is below."""
+    """min(0.999, o exp(-d^T C d / 2)) at offsets d [256]; where it is below 1/255 the caller skips it, and
+    NaN is below.
+    """
     power = dx * ((-0.5 * LOG2E * a) * dx + (-LOG2E * b) * dy) + ((-0.5 * LOG2E * c) * dy) * dy
     return tl.minimum(opacity * tl.exp2(power), MOST)
 
@@ -33,8 +36,8 @@ def alpha_of(dx, dy, a, b, c, opacity):
 def advance(through, alpha):
     """Weight of a splat, the transmittance after it, and whether it is blended.
 
-    A pixel that is done has a negative transmittance: no product with 1 - alpha passes the stop again, and its size is what is
-    left for the background.
+    A pixel that is done has a negative transmittance: no product with 1 - alpha passes the stop again, and
+    its size is what is left for the background.
     """
     weight = alpha * through
     after = through - weight

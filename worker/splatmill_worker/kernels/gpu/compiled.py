@@ -1,7 +1,8 @@
-"""Compile every kernel for a GPU that need not be there, and read registers, spills and shared memory from the binary.
+"""Compile every kernel for a GPU that need not be there, and read registers, spills and shared memory from
+the binary.
 
-`python -m splatmill_worker.kernels.gpu.compiled 80 90` prints one JSON line per kernel, setting and architecture; with --first
-only of the setting that is used where nothing was measured.
+`python -m splatmill_worker.kernels.gpu.compiled 80 90` prints one JSON line per kernel, setting and
+architecture; with --first only of the setting that is used where nothing was measured.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ SCALARS = {"i32", "i64", "fp32"}
 
 @dataclass(frozen=True)
 class Variant:
-    """One kernel with the constants that the product launches it with; the autotuner's settings come on top."""
+    """One kernel with the constants that the product launches it with; the autotuner's settings come on
+    top.
+    """
 
     kernel: Any
     constants: dict[str, Any]
@@ -112,7 +115,9 @@ def variants() -> Iterator[Variant]:
 
 
 def compile_variant(variant: Variant, setting: triton.Config, architecture: int) -> Compiled:
-    """Compile one kernel down to the binary of `architecture` (80 is sm_80), aligned pointers assumed as at a launch."""
+    """Compile one kernel down to the binary of `architecture` (80 is sm_80), aligned pointers assumed as
+    at a launch.
+    """
     function = variant.kernel.fn if hasattr(variant.kernel, "configs") else variant.kernel
     constants = {**variant.constants, **setting.kwargs}
     signature, attributes = {}, {}

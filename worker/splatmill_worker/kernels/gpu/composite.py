@@ -1,4 +1,6 @@
-"""Front-to-back alpha compositing, one program per tile; leaves the checkpoints that the backward pass starts from."""
+"""Front-to-back alpha compositing, one program per tile; leaves the checkpoints that the backward pass
+starts from.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,10 @@ from .blend import PIXELS, STOP, STRIDE, advance, alpha_of, tile_pixels
 from .tuning import COMPOSITE, autotune
 
 SEGMENT = 128
-"""Splats between two checkpoints, and what one program of the backward pass walks: short enough that long lists spread over the
-chip, long enough that the 5 KB of a checkpoint are little beside the 128 records read."""
+"""Splats between two checkpoints, and what one program of the backward pass walks: short enough that long
+lists spread over the chip, long enough that the 5 KB of a checkpoint are little beside the 128 records
+read.
+"""
 
 
 @autotune(COMPOSITE, key=["DEPTH", "CHECKPOINTS"])
@@ -26,7 +30,8 @@ chip, long enough that the 5 KB of a checkpoint are little beside the 128 record
 def composite_kernel(
     records, offsets, ids, background, color, transmittance, depth, checkpoints, first_segment, segment_tile,
     width, height, columns,
-    BACKGROUND: tl.constexpr, DEPTH: tl.constexpr, CHECKPOINTS: tl.constexpr, SEGMENT: tl.constexpr, BATCH: tl.constexpr,
+    BACKGROUND: tl.constexpr, DEPTH: tl.constexpr, CHECKPOINTS: tl.constexpr, SEGMENT: tl.constexpr,
+    BATCH: tl.constexpr,
 ):  # fmt: skip
     tile = tl.program_id(0)
     column, row = tile_pixels(tile, columns)
@@ -43,7 +48,7 @@ def composite_kernel(
     done = 0
     most = tl.max(through, 0)
     while (done < count) & (most > STOP):
-        if CHECKPOINTS:
+        if CHECKPOINTS:  # noqa: SIM102  (this one is decided when compiling)
             if done % SEGMENT == 0:
                 segment = tl.load(first_segment + tile) + done // SEGMENT
                 tl.store(segment_tile + segment, tile)
@@ -113,11 +118,13 @@ def blend(
     depth: bool,
     checkpoints: bool,
 ) -> Blended:
-    """Composite records [N, 12]. The buffers are sized by the room in `bins.ids`, so that nothing waits for the device."""
+    """Composite records [N, 12]. The buffers are sized by the room in `bins.ids`, so that nothing waits
+    for the device.
+    """
     columns, rows = -(-width // TILE), -(-height // TILE)
     tiles = columns * rows
-    like = {"device": records.device, "dtype": torch.float32}
-    index = {"device": records.device, "dtype": torch.int32}
+    like: dict[str, Any] = {"device": records.device, "dtype": torch.float32}
+    index: dict[str, Any] = {"device": records.device, "dtype": torch.int32}
     color = torch.empty(height, width, 3, **like)
     transmittance = torch.empty(height, width, **like)
     deep = torch.empty(height, width, **like) if depth else None
@@ -139,7 +146,7 @@ def blend(
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, depths: Tensor, extents: Tensor,
         background: Tensor | None, bins: Bins, width: int, height: int,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
@@ -157,8 +164,9 @@ class _Composite(torch.autograd.Function):
         from .composite_backward import blend_backward
 
         records, background = ctx.saved_tensors
+        width, height = ctx.size
         gradient = blend_backward(
-            records, ctx.bins, ctx.made, *ctx.size, d_color, d_alpha=d_alpha, d_depth=d_depth
+            records, ctx.bins, ctx.made, width, height, d_color, d_alpha=d_alpha, d_depth=d_depth
         )
         d_background = None
         if background is not None and ctx.needs_input_grad[6]:
@@ -170,7 +178,9 @@ class _Composite(torch.autograd.Function):
 def composite(
     projected: Projected, bins: Bins, width: int, height: int, *, background: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Blend the lists into color [H,W,3], alpha [H,W] and depth [H,W] = sum w_i z_i, as `reference.composite` defines it."""
+    """Blend the lists into color [H,W,3], alpha [H,W] and depth [H,W] = sum w_i z_i, as
+    `reference.composite` defines it.
+    """
     device.require(projected.means2d)
     background = None if background is None else background.to(projected.means2d).contiguous()
     color, alpha, depth = _Composite.apply(*projected, background, bins, width, height)

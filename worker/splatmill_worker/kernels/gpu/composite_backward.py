@@ -1,4 +1,6 @@
-"""The gradient of compositing, front to back: one program per segment of a tile's list, started from its checkpoint."""
+"""The gradient of compositing, front to back: one program per segment of a tile's list, started from its
+checkpoint.
+"""
 
 from __future__ import annotations
 
@@ -44,8 +46,9 @@ def composite_backward_kernel(
     g_green = tl.load(d_color + out * 3 + 1, mask=inside, other=0.0)
     g_blue = tl.load(d_color + out * 3 + 2, mask=inside, other=0.0)
 
-    # All that follows a splat enters its alpha's gradient through one number per pixel: sum over j > i of w_j (c_j . g),
-    # plus the transmittance left times (background . g - d_alpha). `behind` starts as the whole and loses what was passed.
+    # All that follows a splat enters its alpha's gradient through one number per pixel: sum over j > i of w_j
+    # (c_j . g), plus the transmittance left times (background . g - d_alpha). `behind` starts as the whole
+    # and loses what was passed.
     behind = tl.load(color + out * 3, mask=inside, other=0.0) * g_red
     behind += tl.load(color + out * 3 + 1, mask=inside, other=0.0) * g_green
     behind += tl.load(color + out * 3 + 2, mask=inside, other=0.0) * g_blue
@@ -130,7 +133,9 @@ def blend_backward(
     d_depth: Tensor | None = None,
     errors: Tensor | None = None,
 ) -> Tensor:
-    """Gradient records [N, 16] (see `record`) of one view; with errors [H, W] the densification sums are filled too."""
+    """Gradient records [N, 16] (see `record`) of one view; with errors [H, W] the densification sums are
+    filled too.
+    """
     if made.checkpoints is None or made.segment_tile is None:
         raise ValueError(
             "the view was composited without checkpoints; composite it again with them to differentiate it"
@@ -139,7 +144,8 @@ def blend_backward(
     composite_backward_kernel[(made.segment_tile.shape[0],)](
         records, bins.offsets, bins.ids, made.color, made.transmittance, made.depth, made.checkpoints,
         made.first_segment, made.segment_tile, d_color.contiguous(),
-        None if d_alpha is None else d_alpha.contiguous(), None if d_depth is None else d_depth.contiguous(), errors, gradient,
+        None if d_alpha is None else d_alpha.contiguous(),
+        None if d_depth is None else d_depth.contiguous(), errors, gradient,
         width, height, -(-width // TILE),
         ALPHA=d_alpha is not None, DEPTH=d_depth is not None,
         SCORES=errors is not None, SEGMENT=SEGMENT,

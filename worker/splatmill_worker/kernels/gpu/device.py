@@ -13,15 +13,20 @@ OLDEST = (8, 0)
 """Oldest compute capability that Triton compiles for without gaps (Ampere; RTX 30 and later)."""
 
 STEP_BYTES = 1300
-"""Device bytes per Gaussian of a training step: parameters and two moments 3 * 59 * 4 = 708, gradients 236, records 112, scores
-and lists 60, and room for the sort's double buffers. `memory_needed` adds the copy that densification makes."""
+"""Device bytes per Gaussian of a training step: parameters and two moments 3 * 59 * 4 = 708, gradients
+236, records 112, scores and lists 60, and room for the sort's double buffers. `memory_needed` adds the
+copy that densification makes.
+"""
 
 PAIR_BYTES = 60
-"""Device bytes per tile-Gaussian pair: key, id, their sorted copies and the sort's 64-bit index and buffers (36), and a share of
-the checkpoints of 5 floats for 256 pixels every 256 pairs (20)."""
+"""Device bytes per tile-Gaussian pair: key, id, their sorted copies and the sort's 64-bit index and
+buffers (36), and a share of the checkpoints of 5 floats for 256 pixels every 256 pairs (20).
+"""
 
 PIXEL_BYTES = 120
-"""Device bytes per pixel of a step: image, transmittance, gradients, and nine planes of the loss in float32."""
+"""Device bytes per pixel of a step: image, transmittance, gradients, and nine planes of the loss in
+float32.
+"""
 
 
 class GpuUnavailable(RuntimeError):
@@ -35,7 +40,8 @@ class GpuMemoryShort(MemoryError):
         free, total = torch.cuda.mem_get_info(where)
         held = "no" if params is None else str(params.shape[1])
         super().__init__(
-            f"The GPU ran out of memory with {held} Gaussians in training: {free / 2**30:.1f} of {total / 2**30:.1f} GiB are free. "
+            f"The GPU ran out of memory with {held} Gaussians in training: {free / 2**30:.1f} of "
+            f"{total / 2**30:.1f} GiB are free. "
             "Go on with fewer Gaussians or smaller photos, or close what else uses the GPU."
         )
 
@@ -51,7 +57,9 @@ class DeviceFacts:
 
 
 def interpreting() -> bool:
-    """Whether Triton's interpreter was asked for, which runs the kernels on CPU tensors, slowly, for proof."""
+    """Whether Triton's interpreter was asked for, which runs the kernels on CPU tensors, slowly, for
+    proof.
+    """
     return os.environ.get("TRITON_INTERPRET", "0") == "1"
 
 
@@ -69,14 +77,16 @@ def absence(device: int = 0) -> str | None:
     capability = torch.cuda.get_device_capability(device)
     if torch.version.hip is None and capability < OLDEST:
         return (
-            f"{torch.cuda.get_device_name(device)} has compute capability {capability[0]}.{capability[1]}; the kernels need "
-            f"{OLDEST[0]}.{OLDEST[1]} (GeForce RTX 30, A100) or later."
+            f"{torch.cuda.get_device_name(device)} has compute capability {capability[0]}.{capability[1]}; "
+            f"the kernels need {OLDEST[0]}.{OLDEST[1]} (GeForce RTX 30, A100) or later."
         )
     return None
 
 
 def describe(device: int = 0) -> DeviceFacts | None:
-    """Facts about GPU number `device`, or None where `absence` says why it cannot be used. Reads memory, allocates none."""
+    """Facts about GPU number `device`, or None where `absence` says why it cannot be used. Reads memory,
+    allocates none.
+    """
     if absence(device) is not None:
         return None
     free, total = torch.cuda.mem_get_info(device)
@@ -86,23 +96,29 @@ def describe(device: int = 0) -> DeviceFacts | None:
 
 
 def memory_needed(gaussians: int, pixels: int, photo_bytes: int, *, pairs_per_gaussian: float = 8.0) -> int:
-    """Device bytes that training needs at its peak, which is densification: old and new parameters exist at once.
+    """Device bytes that training needs at its peak, which is densification: old and new parameters exist at
+    once.
 
-    gaussians: how many at most; pixels: of the largest view; photo_bytes: of all resident uint8 photos. Pairs per Gaussian
-    default to what ordinary scenes show at a million Gaussians and 1080p; a step that meets more grows its lists.
+    gaussians: how many at most; pixels: of the largest view; photo_bytes: of all resident uint8 photos. Pairs
+    per Gaussian default to what ordinary scenes show at a million Gaussians and 1080p; a step that meets more
+    grows its lists.
     """
     per_gaussian = STEP_BYTES + 708 + pairs_per_gaussian * PAIR_BYTES
     return int(gaussians * per_gaussian + pixels * PIXEL_BYTES + photo_bytes)
 
 
 def largest_budget(free_bytes: int, pixels: int, photo_bytes: int, *, margin: float = 0.85) -> int:
-    """The largest number of Gaussians that fits in `margin` of the free memory; 0 when not even the photos do."""
+    """The largest number of Gaussians that fits in `margin` of the free memory; 0 when not even the photos
+    do.
+    """
     room = free_bytes * margin - memory_needed(0, pixels, photo_bytes)
     return max(0, int(room / memory_needed(1, 0, 0)))
 
 
 def require(tensor: Tensor) -> None:
-    """Raise GpuUnavailable unless kernels can run on `tensor`: on a usable GPU, or on the CPU under the interpreter."""
+    """Raise GpuUnavailable unless kernels can run on `tensor`: on a usable GPU, or on the CPU under the
+    interpreter.
+    """
     if interpreting() and not tensor.is_cuda:
         return
     if not tensor.is_cuda:

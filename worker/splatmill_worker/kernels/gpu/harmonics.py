@@ -1,4 +1,6 @@
-"""Real spherical harmonics to degree 3 and their slopes, for a block of unit directions; signs and order as in splat files."""
+"""Real spherical harmonics to degree 3 and their slopes, for a block of unit directions; signs and order
+as in splat files.
+"""
 
 from __future__ import annotations
 
@@ -102,7 +104,9 @@ def slope(x, y, z, k: tl.constexpr):
 
 @triton.jit
 def shade(sh, i, here, stride, x, y, z, COEFFICIENTS: tl.constexpr, USED: tl.constexpr, PLANAR: tl.constexpr):
-    """Colour before the clamp, and the sum of |coefficient| that says whether every one that is read is finite."""
+    """Colour before the clamp, and the sum of |coefficient| that says whether every one that is read is
+    finite.
+    """
     red = tl.zeros_like(x) + 0.5
     green = tl.zeros_like(x) + 0.5
     blue = tl.zeros_like(x) + 0.5

@@ -1,4 +1,6 @@
-"""Mean distance to the three nearest other points, every pair tried: N^2 of nothing but arithmetic suits a GPU well."""
+"""Mean distance to the three nearest other points, every pair tried: N^2 of nothing but arithmetic suits a
+GPU well.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ def knn_kernel(points, result, count, nearest, ROWS: tl.constexpr, OTHERS: tl.co
         squared = dx * dx + dy * dy + dz * dz
         squared = tl.where(there[None, :] & (i[:, None] != j[None, :]), squared, FAR)
         for _ in tl.static_range(3):
-            # Take one smallest entry out of the block, even where several are equal, and sort it into the three.
+            # Take one smallest entry out of the block, even where several are equal, and sort it into the
+            # three.
             small = tl.min(squared, axis=1)
             which = tl.min(tl.where(squared == small[:, None], tl.arange(0, OTHERS)[None, :], OTHERS), axis=1)
             squared = tl.where(tl.arange(0, OTHERS)[None, :] == which[:, None], FAR, squared)

@@ -1,8 +1,9 @@
-"""L1 plus D-SSIM from the 8-bit photo, value and gradient in four kernels: the window across, then down, and both again.
+"""L1 plus D-SSIM from the 8-bit photo, value and gradient in four kernels: the window across, then down, and
+both again.
 
-The 11-tap window is separable, and its eleven shifted reads fall into the first-level cache; what goes to memory between the
-kernels is three planes per channel. Everything is float32: the variance is a difference of nearly equal windows, and SSIM
-divides by it plus 9e-4.
+The 11-tap window is separable, and its eleven shifted reads fall into the first-level cache; what goes to
+memory between the kernels is three planes per channel. Everything is float32: the variance is a difference of
+nearly equal windows, and SSIM divides by it plus 9e-4.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ S1, S2 = constant(C1), constant(C2)
 
 @triton.jit
 def load_pair(color, photo, mask, place, channel, inside, MASK: tl.constexpr):
-    """Rendered and seen values of one channel, both 0 where not `inside` and not under the mask, and where they are used."""
+    """Rendered and seen values of one channel, both 0 where not `inside` and not under the mask, and where
+    they are used.
+    """
     used = inside
     if MASK:
         used = inside & (tl.load(mask + place, mask=inside, other=0) != 0)
@@ -43,7 +46,9 @@ def across_kernel(
     color, photo, mask, taps, planes, width, height,
     MASK: tl.constexpr, STATS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """x, x^2, xy, and without the photo's own part also y, y^2, windowed along rows: planes [3 or 5, 3, H, W]."""
+    """x, x^2, xy, and without the photo's own part also y, y^2, windowed along rows: planes [3 or 5, 3, H,
+    W].
+    """
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     channel = tl.program_id(1)
     plane = width * height
@@ -88,7 +93,9 @@ def value_kernel(
     color, photo, mask, mean, variance, taps, planes, slopes, sums, width, height,
     MASK: tl.constexpr, STATS: tl.constexpr, SLOPES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Sums of |x - y| and of SSIM per program, and SSIM's derivatives by the windowed x, x^2 and xy (slopes [3, 3, H, W])."""
+    """Sums of |x - y| and of SSIM per program, and SSIM's derivatives by the windowed x, x^2 and xy
+    (slopes [3, 3, H, W]).
+    """
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     channel = tl.program_id(1)
     plane = width * height
@@ -141,7 +148,9 @@ def gradient_kernel(
     color, photo, mask, taps, planes, used_pixels, d_color, width, height, weight,
     MASK: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The slopes windowed along rows and put on the pixels, plus the sign of L1; 0 where a pixel is not used."""
+    """The slopes windowed along rows and put on the pixels, plus the sign of L1; 0 where a pixel is not
+    used.
+    """
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     channel = tl.program_id(1)
     plane = width * height
@@ -182,14 +191,16 @@ def loss_and_gradient(
     stats: PhotoStats | None,
     gradient: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """The loss, its L1 and its SSIM as 0-d tensors on the device, and d loss / d color [H, W, 3] or None. Waits for nothing."""
+    """The loss, its L1 and its SSIM as 0-d tensors on the device, and d loss / d color [H, W, 3] or None.
+    Waits for nothing.
+    """
     height, width = color.shape[:2]
     pixels = height * width
     if pixels * 15 >= 2**31:
         raise ValueError(
             f"an image of {width}x{height}: offsets into its planes are 32-bit; use fewer than 143 megapixels"
         )
-    like = {"device": color.device, "dtype": torch.float32}
+    like: dict[str, Any] = {"device": color.device, "dtype": torch.float32}
     if mask is not None:
         mask = mask.to(torch.uint8).contiguous()
         count = torch.count_nonzero(mask).to(torch.float32)
@@ -225,7 +236,7 @@ def loss_and_gradient(
 
 class _Loss(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any,
         color: Tensor,
         photo: Tensor,
@@ -255,7 +266,9 @@ def loss(
     mask: Tensor | None = None,
     stats: PhotoStats | None = None,
 ) -> Tensor:
-    """(1 - w) mean |color - photo/255| + w (1 - mean SSIM), as `reference.loss` defines it, differentiable by color."""
+    """(1 - w) mean |color - photo/255| + w (1 - mean SSIM), as `reference.loss` defines it, differentiable
+    by color.
+    """
     device.require(color)
     value: Tensor = _Loss.apply(color, photo, dssim_weight, mask, stats)
     return value
@@ -263,7 +276,9 @@ def loss(
 
 @torch.no_grad()
 def photo_stats(photo: Tensor, *, mask: Tensor | None = None) -> PhotoStats:
-    """Windowed mean and variance of a photo (uint8 [H,W,3]) under a mask, each [H,W,3]; 24 bytes a pixel when kept."""
+    """Windowed mean and variance of a photo (uint8 [H,W,3]) under a mask, each [H,W,3]; 24 bytes a pixel
+    when kept.
+    """
     device.require(photo)
     height, width = photo.shape[:2]
     mask = None if mask is None else mask.to(torch.uint8).contiguous()

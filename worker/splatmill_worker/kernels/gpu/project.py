@@ -1,4 +1,6 @@
-"""Gaussians to the image plane in one kernel: activations, covariance factor, exact extents, SH colour, culling."""
+"""Gaussians to the image plane in one kernel: activations, covariance factor, exact extents, SH colour,
+culling.
+"""
 
 from __future__ import annotations
 
@@ -101,7 +103,7 @@ def project_kernel(
 
 
 def project_records(
-    groups: tuple[Tensor, Tensor, Tensor, Tensor, Tensor],
+    groups: tuple[Tensor, ...],
     viewmat: Tensor,
     K: Tensor,
     width: int,
@@ -112,7 +114,9 @@ def project_records(
     antialias: bool,
     planar: int | None = None,
 ) -> Tensor:
-    """Records [N, 12] of the five parameter groups; `planar` is the plane stride when channels lie in planes, else rows do."""
+    """Records [N, 12] of the five parameter groups; `planar` is the plane stride when channels lie in
+    planes, else rows do.
+    """
     count = groups[3].shape[0]
     if count * 64 >= 2**31:
         raise ValueError(
@@ -130,7 +134,7 @@ def project_records(
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quats: Tensor, logit_opacities: Tensor, sh: Tensor,
         viewmat: Tensor, K: Tensor, width: int, height: int, degree: int, near: float, antialias: bool,
     ) -> tuple[Tensor, ...]:  # fmt: skip
@@ -152,12 +156,13 @@ class _Project(torch.autograd.Function):
         from .project_backward import project_backward
 
         *groups, viewmat, K, records = ctx.saved_tensors
+        width, height = ctx.size
         gradient = torch.zeros(records.shape[0], record.GRADIENT_WIDTH, device=records.device)
         for place, given in zip(record.fields(gradient)[:5], d_fields[:5], strict=True):
             if given is not None:
                 place.copy_(given)
         grads, d_viewmat = project_backward(
-            tuple(groups), viewmat, K, *ctx.size, records, gradient,
+            tuple(groups), viewmat, K, width, height, records, gradient,
             degree=ctx.degree, antialias=ctx.antialias, with_viewmat=ctx.needs_input_grad[5],
         )  # fmt: skip
         return *grads, d_viewmat, None, None, None, None, None, None

@@ -50,7 +50,9 @@ def color_backward_kernel(
     means, sh, viewmat, K, records, gradient, d_means, d_sh, count, stride,
     COEFFICIENTS: tl.constexpr, USED: tl.constexpr, PLANAR: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """From colour to the SH coefficients, and by the direction to the mean: that part alone is left in d_means."""
+    """From colour to the SH coefficients, and by the direction to the mean: that part alone is left in
+    d_means.
+    """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     seen = here & (tl.load(records + i.to(tl.int64) * STRIDE + 10, mask=here, other=0.0) > 0.0)
@@ -101,7 +103,9 @@ def shape_backward_kernel(
     d_means, d_log_scales, d_quats, d_logits, d_viewmat, count, stride, width, height,
     PLANAR: tl.constexpr, ANTIALIAS: tl.constexpr, VIEWMAT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """From mean, conic, opacity and depth on the image to the mean, shape and opacity in the world, and to the camera."""
+    """From mean, conic, opacity and depth on the image to the mean, shape and opacity in the world, and to
+    the camera.
+    """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     row = records + i.to(tl.int64) * STRIDE
@@ -146,8 +150,8 @@ def shape_backward_kernel(
         d_logit = d_logit * tl.sqrt_rn(tl.maximum(sharp / det, COMPENSATION_MIN))
     tl.store(d_logits + i, d_logit, mask=here)
 
-    # Conic c/det, -b/det, a/det by the rows p, q of M. The determinant's part goes through the minors n = p x q as the forward
-    # pass does: -X dX X is the same, but cancels for needles.
+    # Conic c/det, -b/det, a/det by the rows p, q of M. The determinant's part goes through the minors n = p x
+    # q as the forward pass does: -X dX X is the same, but cancels for needles.
     d_det = -(g_a * (c / det) - g_b * (b / det) + g_c * (a / det)) / det
     d_tr0, d_tr1, d_b = g_c / det + BLUR * d_det, g_a / det + BLUR * d_det, -g_b / det
     n0, n1, n2 = p1 * q2 - p2 * q1, p2 * q0 - p0 * q2, p0 * q1 - p1 * q0
@@ -234,7 +238,8 @@ def project_backward(
     planar: int | None = None,
     into: tuple[Tensor, ...] | None = None,
 ) -> tuple[tuple[Tensor, ...], Tensor | None]:
-    """Gradients of the five groups, shaped and laid out like them (written to `into` if given), and of viewmat [4,4] or None.
+    """Gradients of the five groups, shaped and laid out like them (written to `into` if given), and of
+    viewmat [4,4] or None.
 
     gradient [N, 16] as `composite_backward` fills it. Culled rows get exactly zero.
     """

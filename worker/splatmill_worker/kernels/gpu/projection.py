@@ -1,4 +1,6 @@
-"""Device functions that both projection passes share: one block of Gaussians from world to the image plane."""
+"""Device functions that both projection passes share: one block of Gaussians from world to the image
+plane.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ def load4(pointer, i, here, stride, PLANAR: tl.constexpr):
 
 @triton.jit
 def load_camera(viewmat, K):
-    """Rows of the rotation, the translation, and fx, fy, cx, cy; read on the device, so that no launch waits for them."""
+    """Rows of the rotation, the translation, and fx, fy, cx, cy; read on the device, so that no launch
+    waits for them.
+    """
     return (
         tl.load(viewmat), tl.load(viewmat + 1), tl.load(viewmat + 2),
         tl.load(viewmat + 4), tl.load(viewmat + 5), tl.load(viewmat + 6),
@@ -53,7 +57,9 @@ def load_camera(viewmat, K):
 
 @triton.jit
 def normalised(w, x, y, z):
-    """Unit quaternion and the norm it had. Scaled by the largest part first: the square of 1e-30 is 0 in float32."""
+    """Unit quaternion and the norm it had. Scaled by the largest part first: the square of 1e-30 is 0 in
+    float32.
+    """
     largest = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
     w, x, y, z = w / largest, x / largest, y / largest, z / largest
     norm = tl.sqrt_rn(w * w + x * x + y * y + z * z)
@@ -85,7 +91,8 @@ def through(r0, r1, r2, r00, r01, r02, r10, r11, r12, r20, r21, r22):
 
 @triton.jit
 def covariance(p0, p1, p2, q0, q1, q2):
-    """a, b, c of M M^T + 0.3 I from the rows of the factor M, det M M^T by Cauchy-Binet, and the whole determinant.
+    """a, b, c of M M^T + 0.3 I from the rows of the factor M, det M M^T by Cauchy-Binet, and the whole
+    determinant.
 
     a c - b b in float32 loses every digit for needles; the sum of squared minors of the factor loses none.
     """

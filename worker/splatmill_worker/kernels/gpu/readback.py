@@ -13,7 +13,9 @@ AHEAD = 8
 
 
 class Numbers(NamedTuple):
-    """What one step measured. `key` says of which parameters and view: a generation, and the view's own key."""
+    """What one step measured. `key` says of which parameters and view: a generation, and the view's own
+    key.
+    """
 
     key: tuple[int, tuple[int, int, int]]
     loss: float
@@ -38,7 +40,8 @@ class Readback:
         self._latest: Numbers | None = None
 
     def post(self, key: tuple[int, tuple[int, int, int]], values: Tensor) -> list[Numbers]:
-        """Send values [6] (loss, L1, SSIM, visible, pairs, refused; float64) on their way; returns all that has arrived since.
+        """Send values [6] (loss, L1, SSIM, visible, pairs, refused; float64) on their way; returns all that
+        has arrived since.
 
         Waits only when nothing has ever arrived, or the host is `AHEAD` steps in front.
         """

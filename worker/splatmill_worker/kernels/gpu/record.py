@@ -1,4 +1,6 @@
-"""The 48-byte record of a projected Gaussian that the kernels gather, and its gradient's 64-byte counterpart."""
+"""The 48-byte record of a projected Gaussian that the kernels gather, and its gradient's 64-byte
+counterpart.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +9,12 @@ from torch import Tensor
 
 from ..records import Projected
 
-# mean x, y | conic a, b, c | opacity | colour r, g, b | depth | extent x, y. Together, because compositing gathers by index and
-# pays by the 32-byte sector: one record is two sectors, six separate arrays would be at least six.
+# mean x, y | conic a, b, c | opacity | colour r, g, b | depth | extent x, y. Together, because compositing
+# gathers by index and pays by the 32-byte sector: one record is two sectors, six separate arrays would be at
+# least six.
 WIDTH = 12
-# The gradient of the first ten, then sum |d mean x|, sum |d mean y|, sum weight * |colour error|, and padding to 64 bytes.
+# The gradient of the first ten, then sum |d mean x|, sum |d mean y|, sum weight * |colour error|, and padding
+# to 64 bytes.
 GRADIENT_WIDTH = 16
 ABS_X, ABS_Y, ERROR = 10, 11, 12
 

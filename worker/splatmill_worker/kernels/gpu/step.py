@@ -1,4 +1,6 @@
-"""One scene under optimisation on the GPU: parameters in planes, and a training step that never waits for the device."""
+"""One scene under optimisation on the GPU: parameters in planes, and a training step that never waits for
+the device.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ ViewKey = tuple[int, int, int]  # address of the camera's matrix, width, height
 CHANNELS = 59
 PARTS = {"means": (0, 3), "log_scales": (3, 6), "quats": (6, 10), "logit_opacities": (10, 11), "sh": (11, 59)}
 SLACK, SPARE = 1.25, 4096
-"""Room for a view's lists over what its last visit used: views change little from visit to visit, parameters move slowly."""
+"""Room for a view's lists over what its last visit used: views change little from visit to visit,
+parameters move slowly.
+"""
 
 
 class Rates(Protocol):
@@ -47,7 +51,9 @@ class Rates(Protocol):
 
 
 class Together(Protocol):
-    """Several processes that train one scene; each call changes a tensor in place, to the same bits in all of them."""
+    """Several processes that train one scene; each call changes a tensor in place, to the same bits in all
+    of them.
+    """
 
     def average_(self, values: Tensor) -> None: ...
     def add_(self, values: Tensor) -> None: ...
@@ -55,7 +61,9 @@ class Together(Protocol):
 
 
 class StepResult(NamedTuple):
-    """Of the latest step whose numbers have arrived, up to `readback.AHEAD` steps ago: waiting for them would idle the GPU."""
+    """Of the latest step whose numbers have arrived, up to `readback.AHEAD` steps ago: waiting for them
+    would idle the GPU.
+    """
 
     loss: float  # (1 - w) l1 + w (1 - ssim)
     l1: float
@@ -67,7 +75,9 @@ class StepResult(NamedTuple):
 
 @triton.jit
 def scores_kernel(gradient, records, scores, count, half_width, half_height, per_image, BLOCK: tl.constexpr):
-    """Add one view to scores [5, N]: plain and absolute gradient of the mean in NDC units, visits, largest extent, error."""
+    """Add one view to scores [5, N]: plain and absolute gradient of the mean in NDC units, visits, largest
+    extent, error.
+    """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     source = records + i.to(tl.int64) * 12
@@ -112,12 +122,14 @@ class _View:
 class Step:
     """Parameters, Adam moments and densification scores of one scene, and the training step over them.
 
-    The interface of `kernels.cpu.step.Step`. Tensors that come from the host (photos, cameras) are copied once and kept as long
-    as the caller keeps them; the first visit of a view reads its list sizes back, later ones use room from the visit before.
-    Adam moves the Gaussians that a view shows; the others are brought up to date when they are seen again, or read.
+    The interface of `kernels.cpu.step.Step`. Tensors that come from the host (photos, cameras) are copied
+    once and kept as long as the caller keeps them; the first visit of a view reads its list sizes back, later
+    ones use room from the visit before. Adam moves the Gaussians that a view shows; the others are brought up
+    to date when they are seen again, or read.
 
-    together: the processes whose views a step is averaged over; see `splat.parallel`. Raises GpuUnavailable where
-    these kernels cannot run, and GpuMemoryShort when memory runs out, with the scene as it was before the call.
+    together: the processes whose views a step is averaged over; see `splat.parallel`. Raises GpuUnavailable
+    where these kernels cannot run, and GpuMemoryShort when memory runs out, with the scene as it was before
+    the call.
     """
 
     def __init__(
@@ -138,7 +150,7 @@ class Step:
             raise device.GpuUnavailable(reason)
         self._together = together
         self._rooms: dict[ViewKey, Room] = {}
-        self._resident: WeakTensorKeyDictionary = WeakTensorKeyDictionary()  # type: ignore[type-arg]
+        self._resident: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
         self._readback = Readback(steady=together is not None)
         self._steps = 0
         self._generation = (
@@ -249,7 +261,9 @@ class Step:
         antialias: bool = False,
         near: float = 0.01,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Colour [H, W, 3], alpha [H, W] and depth [H, W] on the device; `backward_update` takes it from here."""
+        """Colour [H, W, 3], alpha [H, W] and depth [H, W] on the device; `backward_update` takes it from
+        here.
+        """
         with self._sparing():
             self._view = self._shown(
                 viewmat, K, width, height, degree, background, antialias, near, depth=True
@@ -318,7 +332,8 @@ class Step:
         return StepResult(*self._readback.latest[1:])
 
     def _shown(
-        self, viewmat: Tensor, K: Tensor, width: int, height: int, degree: int, background: Tensor | None, antialias: bool, near: float,
+        self, viewmat: Tensor, K: Tensor, width: int, height: int, degree: int, background: Tensor | None,
+        antialias: bool, near: float,
         *, depth: bool,
     ) -> _View:  # fmt: skip
         key = (viewmat.data_ptr(), width, height)
@@ -441,7 +456,9 @@ class Step:
 
     @contextmanager
     def _sparing(self) -> Iterator[None]:
-        """Turn the allocator's failure into one that says what to do; nothing is changed before all is allocated."""
+        """Turn the allocator's failure into one that says what to do; nothing is changed before all is
+        allocated.
+        """
         try:
             yield
         except torch.OutOfMemoryError as error:

@@ -1,4 +1,6 @@
-"""Launch settings: what the autotuner may choose from, measured once per kernel and card and kept in Triton's cache on disk."""
+"""Launch settings: what the autotuner may choose from, measured once per kernel and card and kept in
+Triton's cache on disk.
+"""
 
 from __future__ import annotations
 
@@ -30,10 +32,11 @@ def autotune(
     *,
     reset: Sequence[str] = (),
 ) -> Callable[[Any], Any]:
-    """Triton's autotuner with its results on disk; `reset` names accumulators (or None) to zero between trials.
+    """Triton's autotuner with its results on disk; `reset` names accumulators (or None) to zero between
+    trials.
 
-    Under the interpreter timing means nothing, and the first setting is taken. `reset` must not name an array whose contents
-    before the launch matter: the tuner zeroes it also before the launch that counts.
+    Under the interpreter timing means nothing, and the first setting is taken. `reset` must not name an array
+    whose contents before the launch matter: the tuner zeroes it also before the launch that counts.
     """
 
     def before(arguments: Mapping[str, Any], reset_only: bool = False) -> None:
@@ -42,4 +45,7 @@ def autotune(
                 arguments[name].zero_()
 
     choices = [configs[0]] if interpreting() else list(configs)
-    return triton.autotune(configs=choices, key=list(key), pre_hook=before, cache_results=True)
+    tuner: Callable[[Any], Any] = triton.autotune(
+        configs=choices, key=list(key), pre_hook=before, cache_results=True
+    )
+    return tuner

@@ -45,7 +45,9 @@ class Mcmc:
         added = max(0, min(wanted, room))
         if added:
             chance = torch.sigmoid(rows.gaussians.logit_opacities)
-            source = torch.multinomial(chance, added, replacement=True, generator=random)
+            source = torch.multinomial(chance.cpu(), added, replacement=True, generator=random).to(
+                chance.device
+            )
             copies = torch.bincount(source, minlength=rows.gaussians.count) + 1
             shared(rows.gaussians, copies)
             changed = copies > 1
@@ -71,7 +73,7 @@ def walk(gaussians: Gaussians, random: torch.Generator) -> Tensor:
     """One move [N, 3]: within the Gaussian's own covariance, and only for those that are nearly transparent."""
     opacity = torch.sigmoid(gaussians.logit_opacities)
     free = torch.sigmoid(-100.0 * (opacity - prune.MIN_OPACITY))
-    noise = torch.randn(gaussians.count, 3, generator=random)
+    noise = torch.randn(gaussians.count, 3, generator=random).to(gaussians.means)
     turn = rotations(gaussians.quats)
     variances = (2.0 * gaussians.log_scales).exp()
     local = variances * torch.einsum("nij,ni->nj", turn, noise)

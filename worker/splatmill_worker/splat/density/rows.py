@@ -55,5 +55,6 @@ def rotations(quats: Tensor) -> Tensor:
 
 def offsets(gaussians: Gaussians, random: torch.Generator) -> Tensor:
     """One random displacement per Gaussian [N, 3], drawn from the Gaussian itself."""
-    local = torch.randn(gaussians.count, 3, generator=random, dtype=gaussians.means.dtype)
+    # Drawn on the CPU, so that a seed means the same on every device.
+    local = torch.randn(gaussians.count, 3, generator=random).to(gaussians.means)
     return torch.einsum("nij,nj->ni", rotations(gaussians.quats), local * gaussians.log_scales.exp())
