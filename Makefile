@@ -18,7 +18,8 @@ help: ## list the targets
 install: $(VENV)/.installed ## set up .venv with the three parts and the compiled kernels
 
 demo: install ## photos in, splats out, into demo/ (PHOTOS=path takes your own)
-	@$(BIN)/python examples/demo.py $(if $(PHOTOS),"$(PHOTOS)") --out demo
+	@test -n "$(PHOTOS)" || $(BIN)/python -m splatmill_worker.synthetic demo/photos
+	@$(BIN)/splatmill train "$(or $(PHOTOS),demo/photos)" -o demo --novel-view --orbit
 
 test: $(VENV)/.installed-dev ## run all tests
 	$(BIN)/python -m pytest $(PYTEST_ARGS)

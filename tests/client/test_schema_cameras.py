@@ -172,3 +172,22 @@ def test_canonical_bytes_know_the_picture_not_its_spelling():
     assert RenderRequest(camera=one).canonical() == RenderRequest(camera=same).canonical()
     assert RenderRequest(camera=one).canonical() != RenderRequest(camera=one, quality=50).canonical()
     assert RenderRequest(camera=one).canonical() != RenderRequest(camera=one.scaled_to(32)).canonical()
+
+
+def test_between_two_cameras_stands_in_the_middle_and_is_rigid():
+    a = CameraSpec.looking_at((3, 0, 1), (0, 0, 0), width=64, height=48)
+    b = CameraSpec.looking_at((2, 2, 1), (0, 0, 0), width=64, height=48)
+    middle = CameraSpec.between(a, b)
+    assert [row[3] for row in middle.camera_to_world[:3]] == [2.5, 1.0, 1.0]
+    forward = [row[2] for row in middle.camera_to_world[:3]]
+    toward_a, toward_b = ([row[2] for row in c.camera_to_world[:3]] for c in (a, b))
+    cosines = [sum(x * y for x, y in zip(forward, other, strict=True)) for other in (toward_a, toward_b)]
+    assert cosines[0] == pytest.approx(cosines[1], abs=1e-6)
+    assert middle.pinhole() == pytest.approx(a.pinhole())
+
+
+def test_between_cameras_that_look_away_from_each_other_is_refused():
+    a = CameraSpec.looking_at((3, 0, 0), (0, 0, 0), width=64, height=48)
+    b = CameraSpec.looking_at((-3, 0, 0), (0, 0, 0), width=64, height=48)
+    with pytest.raises(ValueError, match="too far apart"):
+        CameraSpec.between(a, b)

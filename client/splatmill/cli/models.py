@@ -27,6 +27,20 @@ def download_files(model: "ModelHandle", folder: Path) -> list[Path]:
     return [model.download(folder / name, file=name) for name in wanted]
 
 
+def write_novel_view(model: "ModelHandle", path: Path) -> Path:
+    """Render from half-way between two cameras in the middle of the capture; returns the picture's path."""
+    from splatmill.downloads import write_whole
+    from splatmill.schema import CameraSpec
+
+    cameras = [entry.camera for entry in model.cameras()]
+    if len(cameras) < 2:
+        raise typer.BadParameter(
+            "The model has fewer than two cameras to stand between.", param_hint="--novel-view"
+        )
+    middle = len(cameras) // 2
+    return write_whole(path, model.render(CameraSpec.between(cameras[middle - 1], cameras[middle])))
+
+
 def download(
     model_id: ModelId,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write to.")] = Path("splat"),

@@ -12,7 +12,7 @@ import typer
 from splatmill.cli.embedded import embedded_service
 from splatmill.cli.exits import Exit
 from splatmill.cli.follow import LeftBehind, follow
-from splatmill.cli.models import download_files
+from splatmill.cli.models import download_files, write_novel_view
 from splatmill.cli.progress import make_display
 from splatmill.cli.schema_options import with_training_options
 from splatmill.cli.servers import connect
@@ -48,6 +48,9 @@ def train(
     orbit: Annotated[
         bool, typer.Option("--orbit", help="Also leave a video that circles the scene.")
     ] = False,
+    novel_view: Annotated[
+        bool, typer.Option("--novel-view", help="Also leave a picture from where no photo was taken.")
+    ] = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Show the plan and all log lines.")
     ] = False,
@@ -72,6 +75,8 @@ def train(
             return
         model = _follow(client, capture, title, checked, verbose)
         written = download_files(model, out)
+        if novel_view:
+            written.append(write_novel_view(model, out / "novel_view.png"))
         if orbit:
             written.append(model.orbit(out / "orbit.mp4"))
     _summary(model, written)

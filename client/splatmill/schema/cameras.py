@@ -79,6 +79,26 @@ class CameraSpec(Request):
         matrix: Matrix = (rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0))
         return cls(camera_to_world=matrix, width=width, height=height, fov_y_deg=fov_y_deg)
 
+    @classmethod
+    def between(cls, a: "CameraSpec", b: "CameraSpec") -> Self:
+        """A view that no photo took: half-way between two cameras, with the lens and size of `a`.
+
+        The axes are the mean of both, made rigid again. Raises ValueError for cameras that look away from each other.
+        """
+        m, n = a.opencv_to_world(), b.opencv_to_world()
+        down, forward = ([m[i][j] + n[i][j] for i in range(3)] for j in (1, 2))
+        if sum(x * x for x in forward) < 1.0 or sum(x * x for x in down) < 1.0:
+            raise ValueError(
+                "The two cameras look in directions too far apart; there is no view between them."
+            )
+        z = _unit(forward, "")
+        x = _unit(_cross(down, z), "The two cameras are turned against each other about the view axis.")
+        y = _cross(z, x)
+        rows = [(x[i], y[i], z[i], (m[i][3] + n[i][3]) / 2) for i in range(3)]
+        fx, fy, cx, cy = a.pinhole()
+        matrix: Matrix = (rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0))
+        return cls(camera_to_world=matrix, width=a.width, height=a.height, fx=fx, fy=fy, cx=cx, cy=cy)
+
     def opencv_to_world(self) -> Matrix:
         """The camera-to-world matrix with OpenCV axes, whichever convention it came in."""
         if self.convention is Convention.opencv:
