@@ -180,6 +180,8 @@ def _solve(run: Run) -> Progress:
             best = progress
         if _placed(best)[0] >= ENOUGH * run.count:
             break
+        if effort.name != LEAN.name and not _edges(progress):
+            break  # not one pair matched on three times the features: more of them only take longer
     assert best is not None  # _efforts gives at least one
     return best
 
