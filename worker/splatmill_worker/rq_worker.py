@@ -30,6 +30,7 @@ from splatmill_worker import attempt, recovery
 from splatmill_worker.attempt import Attempt, HandedBack
 from splatmill_worker.ending import Ending, oom_kills
 from splatmill_worker.lock import Held, JobLock
+from splatmill_worker.sweep import sweep
 
 STOP_GRACE = 15.0
 """Seconds an attempt has to save its state when the worker is told to stop; then it is killed, and the next
@@ -37,6 +38,7 @@ attempt goes on from the checkpoint before."""
 
 _GONE = (RedisConnectionError, RedisTimeoutError)
 _RETRY_SECONDS = 0.5
+_SWEEP_SECONDS = 3600.0
 
 
 class AttemptWorker(Worker):
@@ -61,6 +63,7 @@ class AttemptWorker(Worker):
         self._lock: JobLock | None = None
         self._kill_at: float | None = None
         self._given_away = False
+        self._sweep_at = 0.0
 
     # Birth and heartbeat
 
@@ -68,6 +71,15 @@ class AttemptWorker(Worker):
         super().register_birth()  # type: ignore[no-untyped-call]  # rq's own gap, here and below
         recovery.sign(self)
         recovery.adopt(self)
+
+    def run_maintenance_tasks(self) -> None:
+        super().run_maintenance_tasks()  # type: ignore[no-untyped-call]
+        if time.monotonic() >= self._sweep_at:
+            self._sweep_at = time.monotonic() + _SWEEP_SECONDS
+            for job_id in sweep(self.connection):
+                self.log.info(
+                    "Worker %s: removed the work folder of job %s, which is gone", self.name, job_id
+                )
 
     def get_heartbeat_ttl(self, job: Job) -> int:
         return backplane.MONITORING_INTERVAL + backplane.HEARTBEAT_SLACK

@@ -15,7 +15,6 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage, StorageError
@@ -23,6 +22,9 @@ from splatmill_worker.places import work_folder
 
 MIRROR_SECONDS = 15.0
 """Between two looks for new checkpoints to copy; one more loss than the checkpoint interval itself."""
+
+LOCK_SECONDS = 10.0
+"""How long to wait for a process that is being killed to let go of the folder."""
 
 MIRRORED = ("checkpoints", "sfm", "plan.json", "stages.json")
 _RECONSTRUCTION = "sfm"
@@ -65,6 +67,10 @@ class Workspace:
         if self.storage.root is not None or self.run.is_dir():
             return []
         return self.storage.download_prefix(layout.job_work(self.job_id), self.run)
+
+    def close(self) -> None:
+        """Let go of the folder and leave it as it is."""
+        os.close(self._lock)
 
     def remove(self) -> None:
         """The job is over: nothing here is needed again."""
@@ -137,16 +143,19 @@ def _files_of(paths: list[Path]) -> list[Path]:
     return sorted(path for path in (*paths, *below) if path.is_file())
 
 
-def _locked(path: Path) -> IO[str]:
-    """Hold an exclusive lock on a file for the life of this process; wait while a dying one still has it."""
-    file = path.open("a")
-    deadline = time.monotonic() + 10
+def _locked(path: Path) -> int:
+    """Hold an exclusive lock on a file until its descriptor is closed, at the latest with this process; wait while
+    a dying one still has it."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
+    path.touch()  # its time says when the last attempt began
+    deadline = time.monotonic() + LOCK_SECONDS
     while True:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return file
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return descriptor
         except BlockingIOError:
             if time.monotonic() > deadline:
+                os.close(descriptor)
                 raise RuntimeError(f"Another process works in {path.parent}; it holds {path.name}.") from None
             time.sleep(0.05)
 

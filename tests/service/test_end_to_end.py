@@ -1,0 +1,128 @@
+"""The true pipeline through the embedded service: photos of the built-in still life in, a model and its views out.
+
+The photos come with their poses, so that the test stays short; how well cameras are recovered is proven in
+tests/worker, and how good models get is measured by worker/bench.
+"""
+
+import io
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from splatmill_worker import synthetic
+from splatmill_worker.scene import Camera
+
+from .conftest import Up, gone, wait_for
+
+COUNT, WIDTH, HEIGHT = 10, 160, 120
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Camera]]:
+    folder = tmp_path_factory.mktemp("photos")
+    return folder, synthetic.capture(folder, COUNT, WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def true_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
+    up = Up(tmp_path_factory.mktemp("true") / "data")
+    del up.environment["SPLATMILL_PIPELINE"]
+    yield up.start()
+    up.close()
+
+
+def upload(up: Up, folder: Path) -> str:
+    capture = str(up.http.post("/v1/captures", json={}).json()["id"])
+    for path in sorted(folder.glob("*.jpg")):
+        answer = up.http.put(f"/v1/captures/{capture}/images/{path.name}", content=path.read_bytes())
+        assert answer.status_code == 201, answer.text
+    return capture
+
+
+def transforms(cameras: dict[str, Camera]) -> bytes:
+    """The cameras as a nerfstudio transforms.json: camera-to-world with OpenGL axes."""
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = [
+        {"file_path": f"images/{name}", "transform_matrix": (np.linalg.inv(c.viewmat) @ flip).tolist()}
+        for name, c in cameras.items()
+    ]
+    one = next(iter(cameras.values()))
+    lens = {"w": one.width, "h": one.height, "fl_x": one.fx, "fl_y": one.fy, "cx": one.cx, "cy": one.cy}
+    return json.dumps(lens | {"frames": frames}).encode()
+
+
+def psnr(image: np.ndarray, photo: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / np.mean((image.astype(float) - photo.astype(float)) ** 2)))
+
+
+def test_posed_photos_become_a_model_whose_views_match_them(
+    true_service: Up, photos: tuple[Path, dict[str, Camera]]
+) -> None:
+    up, (folder, cameras) = true_service, photos
+    capture = upload(up, folder)
+    answer = up.http.put(f"/v1/captures/{capture}/poses/transforms.json", content=transforms(cameras))
+    assert answer.status_code == 201, answer.text
+    answer = up.http.post("/v1/jobs", json={"capture": capture, "options": {"steps": 150}})
+    job_id = answer.json()["id"]
+    job = up.ended(job_id, 200)
+    assert job["state"] == "succeeded", job["problem"]
+
+    model = up.http.get(f"/v1/models/{job_id}").json()
+    assert model["gaussians"] > 500
+    report = up.http.get(f"/v1/jobs/{job_id}/report").json()
+    assert report["curve"][-1]["psnr"] > 14
+    assert report["curve"][-1]["psnr"] > report["curve"][0]["psnr"]
+
+    held_out = [
+        c for c in up.http.get(f"/v1/models/{job_id}/cameras").json()["cameras"] if c["split"] == "test"
+    ]
+    assert [camera["name"] for camera in held_out] == sorted(cameras)[::8]
+    for camera in held_out:
+        view = up.http.post(f"/v1/models/{job_id}/render", json={"camera": camera["camera"]})
+        assert view.status_code == 200, view.text
+        image = np.asarray(Image.open(io.BytesIO(view.content)))
+        photo = np.asarray(Image.open(folder / camera["name"]).resize((image.shape[1], image.shape[0])))
+        assert psnr(image, photo) == pytest.approx(camera["psnr"], abs=0.2)
+
+    wish = {"seconds": 0.5, "fps": 8, "width": 64, "height": 48}
+    video = up.http.post(f"/v1/models/{job_id}/orbit", json=wish)
+    assert video.headers["content-type"] == "video/mp4"
+    assert video.content[4:8] == b"ftyp"
+
+
+def test_cancel_during_reconstruction_takes_under_two_seconds(
+    true_service: Up, photos: tuple[Path, dict[str, Camera]]
+) -> None:
+    up = true_service
+    capture = upload(up, photos[0])
+    job_id = up.http.post("/v1/jobs", json={"capture": capture}).json()["id"]
+
+    def inside() -> list[int]:
+        progress = up.job(job_id)["progress"]
+        busy = progress is not None and progress["stage"] not in ("images", "training")
+        return [child.pid for child in up.tree() if child.ppid() == up.worker] if busy else []
+
+    processes = wait_for(inside, 60)
+    began = time.monotonic()
+    up.http.post(f"/v1/jobs/{job_id}/cancel")
+    assert up.ended(job_id)["state"] == "cancelled"
+    assert time.monotonic() - began < 2.0
+    assert gone(processes)
+
+
+def test_a_capture_that_cannot_become_a_scene_says_why(true_service: Up, tmp_path: Path) -> None:
+    for name in ("a.jpg", "b.jpg"):
+        Image.new("RGB", (200, 150), "grey").save(tmp_path / name)
+    Image.new("RGB", (200, 150), "white").save(tmp_path / "b.jpg")
+    capture = upload(true_service, tmp_path)
+    job_id = true_service.http.post("/v1/jobs", json={"capture": capture}).json()["id"]
+    job = true_service.ended(job_id, 100)
+    assert job["state"] == "failed"
+    assert job["attempt"] == 1, "what would fail again must not be tried again"
+    assert job["problem"]["code"].startswith(("sfm_", "too_few"))
+    assert job["problem"]["advice"]

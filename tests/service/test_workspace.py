@@ -1,0 +1,171 @@
+"""The local folder of a job: staging in, what another machine needs, what a sweep may remove, and mishaps by name.
+
+A remote storage is played by a local one that does not say where its files lie: every copy then really happens.
+"""
+
+import errno
+import os
+import time
+from pathlib import Path
+
+import pytest
+import redis
+
+from splatmill.backplane import keys, layout
+from splatmill.backplane.storage import Storage, StorageError, StorageFullError
+from splatmill.schema import Role
+from splatmill_worker import sweep, workspace
+from splatmill_worker.mishap import Transient, problem_of
+from splatmill_worker.workspace import Mirror, Workspace, in_use
+
+JOB, CAPTURE = "job00001", "capture1"
+
+
+@pytest.fixture
+def local(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Storage:
+    monkeypatch.setenv("SPLATMILL_DATA", str(tmp_path / "data"))
+    storage = Storage((tmp_path / "storage").as_uri())
+    for name in ("a.jpg", "deep/b.jpg"):
+        storage.put(layout.capture_file(CAPTURE, Role.images, name), name.encode())
+    storage.put(layout.capture_file(CAPTURE, Role.masks, "a.png"), b"mask")
+    return storage
+
+
+@pytest.fixture
+def remote(local: Storage) -> Storage:
+    local.root = None
+    return local
+
+
+def staged(space: Workspace) -> dict[str, bytes]:
+    files = [path for path in space.capture.rglob("*") if path.is_file()]
+    return {path.relative_to(space.capture).as_posix(): path.read_bytes() for path in files}
+
+
+EXPECTED = {"images/a.jpg": b"a.jpg", "images/deep/b.jpg": b"deep/b.jpg", "masks/a.png": b"mask"}
+
+
+def test_a_local_capture_is_linked_and_outlives_its_deletion(local: Storage) -> None:
+    space = Workspace(local, JOB, CAPTURE)
+    assert space.stage_in() == 3
+    assert (space.capture / "images/a.jpg").stat().st_nlink == 2
+    local.delete_prefix(layout.capture(CAPTURE))
+    assert staged(space) == EXPECTED
+
+
+def test_a_remote_capture_is_copied(remote: Storage) -> None:
+    space = Workspace(remote, JOB, CAPTURE)
+    space.stage_in()
+    assert staged(space) == EXPECTED
+
+
+def test_what_left_the_capture_leaves_the_folder(local: Storage) -> None:
+    space = Workspace(local, JOB, CAPTURE)
+    space.stage_in()
+    local.delete(layout.capture_file(CAPTURE, Role.images, "a.jpg"))
+    space.stage_in()
+    assert set(staged(space)) == set(EXPECTED) - {"images/a.jpg"}
+
+
+def test_checkpoints_reach_an_attempt_on_another_machine(
+    remote: Storage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    space = Workspace(remote, JOB, CAPTURE)
+    for name in ("checkpoints/checkpoint.pt", "sfm/abc/scene.json", "plan.json", "out/model.ply"):
+        (space.run / name).parent.mkdir(parents=True, exist_ok=True)
+        (space.run / name).write_text(name)
+    warnings: list[str] = []
+    Mirror(space, warnings.append).close(copy=True)
+    assert warnings == []
+
+    monkeypatch.setenv("SPLATMILL_DATA", str(tmp_path / "another machine"))
+    there = Workspace(remote, JOB, CAPTURE)
+    assert sorted(there.restore()) == ["checkpoints/checkpoint.pt", "plan.json", "sfm/abc/scene.json"]
+    assert (there.run / "checkpoints/checkpoint.pt").read_text() == "checkpoints/checkpoint.pt"
+    assert there.restore() == [], "what this machine has is newer"
+    there.remove()
+    assert not there.folder.exists()
+    assert list(remote.entries(layout.job(JOB))) == []
+
+
+def test_starting_over_keeps_the_cameras(local: Storage) -> None:
+    space = Workspace(local, JOB, CAPTURE)
+    for name in ("checkpoints/checkpoint.pt", "sfm/scene.json", "plan.json"):
+        (space.run / name).parent.mkdir(parents=True, exist_ok=True)
+        (space.run / name).write_text(name)
+    space.start_over()
+    assert [path.name for path in space.run.iterdir()] == ["sfm"]
+
+
+def test_two_processes_never_share_a_folder(local: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
+    space = Workspace(local, JOB, CAPTURE)
+    assert in_use(space.folder)
+    monkeypatch.setattr(workspace, "LOCK_SECONDS", 0.1)
+    with pytest.raises(RuntimeError, match="Another process works in"):
+        Workspace(local, JOB, CAPTURE)
+
+
+def test_the_sweep_takes_only_what_nobody_will_miss(local: Storage, connection: redis.Redis) -> None:
+    old = time.time() - 2 * sweep.KEEP_SECONDS
+    folders = {}
+    for job_id in ("deleted0", "known000", "recent00", "working0"):  # the last stays open
+        space = Workspace(local, job_id, CAPTURE)
+        if job_id != "working0":
+            space.close()
+        if job_id != "recent00":
+            os.utime(space.folder / "lock", (old, old))
+        folders[job_id] = space
+    connection.hset(keys.job("known000"), "id", "known000")
+    assert sweep.sweep(connection) == ["deleted0"]
+    assert not folders["deleted0"].folder.exists()
+    assert sweep.sweep(connection) == []
+
+
+class Named(Exception):
+    code = "sfm_no_parallax"
+    message = "The camera turned but did not move."
+    facts = {"parallax_deg": 0.2}  # noqa: RUF012
+    advice = "Walk around the thing."
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (Named(), "sfm_no_parallax"),
+        (MemoryError(), "out_of_memory"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "out_of_memory"),
+        (OSError(errno.ENOSPC, "No space left on device", "x"), "storage_full"),
+        (OSError(errno.EFBIG, "File too large", "x"), "storage_full"),
+        (PermissionError(errno.EACCES, "Permission denied", "x"), "storage_unwritable"),
+        (StorageFullError("Storage is full: could not write x."), "storage_full"),
+        (ZeroDivisionError("division by zero"), "internal_error"),
+    ],
+)
+def test_every_mishap_has_a_name_and_advice(error: Exception, code: str) -> None:
+    problem = problem_of(error)
+    assert problem.code == code
+    assert problem.advice
+
+
+def test_a_named_failure_keeps_its_facts() -> None:
+    assert problem_of(Named()).facts == {"parallax_deg": 0.2}
+
+
+def test_numerical_failures_get_the_codes_of_the_wire() -> None:
+    from splatmill_worker.splat.failure import FailureName, TrainingFailed
+
+    codes = {
+        name: problem_of(TrainingFailed(name, "Something was seen.", step=7)).code for name in FailureName
+    }
+    assert codes == {
+        FailureName.non_finite: "non_finite",
+        FailureName.divergence: "diverged",
+        FailureName.empty_scene: "empty_scene",
+        FailureName.memory: "out_of_memory",
+    }
+
+
+def test_a_storage_that_is_away_is_tried_again() -> None:
+    with pytest.raises(Transient) as caught:
+        problem_of(StorageError("Storage could not read x: connection refused."))
+    assert caught.value.problem.code == "storage_unavailable"
