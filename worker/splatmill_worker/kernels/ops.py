@@ -232,6 +232,10 @@ def _op(backend: Backend, stem: str, function: str | None = None) -> Callable[..
     try:
         found = getattr(importlib.import_module(module), function or stem)
     except ModuleNotFoundError as error:
+        if error.name == "triton":
+            from .gpu.device import GpuUnavailable, absence
+
+            raise GpuUnavailable(absence() or str(error)) from None
         if error.name is not None and module.startswith(error.name):
             raise NotImplementedError(
                 f"The {backend} backend has no op '{stem}'; choose backend='reference' or another that has it."
