@@ -1,0 +1,390 @@
+"""Cameras against time: scenes x settings, pose error, registered share, and what a short training makes of them.
+
+    python -m splatmill_worker bench sfm                          # all scenes, with training; about 15 minutes
+    python -m splatmill_worker bench sfm --scenes fox kermit --settings auto --no-train
+    python -m splatmill_worker bench sfm --growth                 # 25 to 200 generated photos, and the fit
+
+Rows go to results/sfm.jsonl (results/sfm_growth.jsonl), the figures to figures/, the tables to results/*.md.
+Rules: photos come from ../shared/data, and a scene that is not there gets no row; every run starts from an empty
+folder; a failed run gets no point in the figure and is named in the table. Pose errors are medians after the best
+similarity to the reference: for fox COLMAP's model of the full-size photos (itself no truth: its principal point
+was held), for generated photos the true cameras, for lund the GPS places (10 m accurate), positions only.
+Held-out PSNR is that of the default pipeline trained for --train seconds on the cameras, longest side 480.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import _rows
+import numpy as np
+import numpy.typing as npt
+from _plot import axes, save
+
+from splatmill.schema import TrainOptions
+from splatmill_worker import pipeline, sfm, synthetic
+from splatmill_worker.colmap import pycolmap
+from splatmill_worker.images import prepare
+from splatmill_worker.scene import Camera, Scene
+from splatmill_worker.sfm import colmap_model, pairs, posed
+from splatmill_worker.sfm.files import ImageFiles
+
+Float = npt.NDArray[np.float64]
+HERE = Path(__file__).resolve().parent
+DATA = HERE.parents[1].parent / "shared" / "data"
+FOLDERS = {
+    "fox": "fox_540x960",
+    "lund": "lund_1024x768_gps",
+    "kermit": "kermit_640x480",
+    "unrelated": "failure_unrelated_640",
+    "rotation": "failure_pure_rotation",
+}
+GROWTH = (25, 50, 100, 200)
+TRAIN_SIDE = 480
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one setting made of a scene: the posed scene or the failure's name, and seconds by stage."""
+
+    scene: Scene | None
+    failure: str | None
+    seconds: dict[str, float]
+    facts: dict[str, Any]
+
+
+def ours(options: sfm.SfmOptions) -> Callable[[Path, Path], Result]:
+    def run(images: Path, workdir: Path) -> Result:
+        try:
+            scene = sfm.reconstruct(images, None, workdir, options, lambda *_: None, lambda: False)
+        except sfm.SfmFailed as failed:
+            return Result(None, failed.code, {}, failed.facts)
+        return Result(scene, None, scene.facts["seconds"], scene.facts)
+
+    return run
+
+
+def defaults(images: Path, workdir: Path) -> Result:
+    """What people run: COLMAP's own pipeline at 1000 pixels and 4096 features, all pairs, one camera, incremental."""
+    workdir.mkdir(parents=True)
+    database, models = workdir / "database.db", workdir / "models"
+    models.mkdir()
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size, extraction.sift.max_num_features = 1000, 4096
+    seconds, clock = {}, time.perf_counter()
+
+    def lap(stage: str) -> None:
+        nonlocal clock
+        seconds[stage], clock = round(time.perf_counter() - clock, 3), time.perf_counter()
+
+    pycolmap.extract_features(
+        database, images, camera_mode=pycolmap.CameraMode.SINGLE, extraction_options=extraction
+    )
+    lap("features")
+    pycolmap.match_exhaustive(database)
+    lap("matching")
+    made = pycolmap.incremental_mapping(database, images, models)
+    lap("mapping")
+    if not made:
+        return Result(None, "no model", seconds, {"registered": 0})
+    model = max(made.values(), key=lambda model: model.num_reg_images())
+    if model.num_reg_images() < 3:
+        return Result(
+            None, f"{model.num_reg_images()} registered", seconds, {"registered": model.num_reg_images()}
+        )
+    folder = workdir / "largest"
+    folder.mkdir()
+    model.write_binary(folder)
+    scene = colmap_model.load(folder, ImageFiles.under(images.parent))
+    facts = {
+        "registered": len(scene.views),
+        "points": len(scene.points),
+        "reprojection_pixels": round(model.compute_mean_reprojection_error(), 3),
+    }
+    return Result(scene, None, seconds, facts)
+
+
+SETTINGS: dict[str, Callable[[Path, Path], Result]] = {
+    "COLMAP defaults": defaults,
+    "auto": ours(sfm.SfmOptions()),
+    "lean": ours(sfm.SfmOptions(effort="lean")),
+    "standard": ours(sfm.SfmOptions(effort="standard")),
+    "lean, all pairs": ours(sfm.SfmOptions(effort="lean", matcher="exhaustive")),
+    "lean, global": ours(sfm.SfmOptions(effort="lean", mapper="global")),
+}
+
+
+def aligned(ours: Float, theirs: Float) -> tuple[Float, Float]:
+    """Distances [n] in the unit of `theirs` after the best similarity (Umeyama 1991), and its rotation [3,3]."""
+    a, b = ours - ours.mean(0), theirs - theirs.mean(0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    turn = u @ sign @ vt
+    scale = float(np.trace(np.diag(s) @ sign) / (a**2).sum())
+    return np.linalg.norm(scale * a @ turn.T - b, axis=1), turn
+
+
+def pose_error(scene: Scene, truth: dict[str, Camera]) -> dict[str, float]:
+    """Median and largest rotation error in degrees, and position error in per cent of the cameras' spread."""
+    views = [view for view in scene.views if view.name in truth]
+    if len(views) < 3:
+        return {}
+    centers = np.array([truth[view.name].center for view in views])
+    distance, turn = aligned(np.array([view.camera.center for view in views]), centers)
+    angles = [
+        math.degrees(
+            math.acos(
+                np.clip(
+                    (np.trace(v.camera.viewmat[:3, :3] @ turn.T @ truth[v.name].viewmat[:3, :3].T) - 1) / 2,
+                    -1,
+                    1,
+                )
+            )
+        )
+        for v in views
+    ]
+    spread = np.linalg.norm(centers - centers.mean(0), axis=1).max()
+    return {
+        "rotation_deg": round(float(np.median(angles)), 3),
+        "rotation_deg_max": round(float(np.max(angles)), 3),
+        "position_percent": round(100 * float(np.median(distance) / spread), 3),
+        "position_percent_max": round(100 * float(distance.max() / spread), 3),
+    }
+
+
+def gps_error(scene: Scene, images: Path, workdir: Path) -> dict[str, float]:
+    """Median distance in metres from the photos' GPS places; nothing where they have none."""
+    photos = {photo.name: photo for photo in prepare(images, None, workdir).photos}
+    views = [view for view in scene.views if view.name in photos]
+    places = pairs.positions([photos[view.name] for view in views])
+    if len(views) < 4 or not np.isfinite(places).all():
+        return {}
+    places[:, 2] = 0.0  # heights are too noisy to compare with
+    distance, _ = aligned(np.array([view.camera.center for view in views]), places)
+    return {"gps_metres": round(float(np.median(distance)), 2)}
+
+
+def trained_psnr(scene: Scene, seconds: float, workdir: Path) -> dict[str, float]:
+    """Held-out PSNR after `seconds` of training the default pipeline on these cameras."""
+    capture = workdir / "capture"
+    model_folder = capture / "sparse" / "0"
+    model_folder.mkdir(parents=True)
+    (capture / "images").symlink_to(scene.views[0].image.parent)
+    as_model(scene).write_binary(model_folder)
+    options = TrainOptions(time_budget=seconds, image_size=TRAIN_SIDE)
+    outcome = pipeline.run(capture, workdir / "train", options, lambda _: None, lambda: False)
+    score = outcome.trained.held_out if outcome.trained is not None else None
+    return {} if score is None else {"psnr": round(score.psnr, 3), "ssim": round(score.ssim, 4)}
+
+
+def as_model(scene: Scene) -> pycolmap.Reconstruction:
+    """The scene as a COLMAP model under the photos' own names, with its points but without its tracks."""
+    model = pycolmap.Reconstruction()
+    for number, view in enumerate(scene.views, 1):
+        camera = view.camera
+        if view.lens is None:
+            params = [camera.fx, camera.fy, camera.cx, camera.cy]
+            made = pycolmap.Camera(
+                model="PINHOLE", width=camera.width, height=camera.height, params=params, camera_id=number
+            )
+        else:
+            lens = view.lens
+            made = pycolmap.Camera(
+                model=lens.model,
+                width=lens.width,
+                height=lens.height,
+                params=list(lens.params),
+                camera_id=number,
+            )
+        model.add_camera_with_trivial_rig(made)
+        image = pycolmap.Image(name=view.name, camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.viewmat[:3]))
+    assert scene.point_views is not None
+    offsets, seen = scene.point_views
+    places: dict[int, list[Float]] = {number: [] for number in range(1, len(scene.views) + 1)}
+    elements: list[list[tuple[int, int]]] = []
+    for index in range(len(scene.points)):
+        row = []
+        for view_index in seen[offsets[index] : offsets[index + 1]]:
+            image_id = int(view_index) + 1
+            row.append((image_id, len(places[image_id])))
+            places[image_id].append(np.zeros(2))
+        elements.append(row)
+    for image_id, points in places.items():
+        model.images[image_id].points2D = pycolmap.Point2DList([pycolmap.Point2D(place) for place in points])
+    for index, row in enumerate(elements):
+        track = pycolmap.Track([pycolmap.TrackElement(*element) for element in row])
+        model.add_point3D(scene.points[index], track, scene.colors[index])
+    return model
+
+
+def measure(
+    name: str, images: Path, setting: str, truth: dict[str, Camera], train: float | None
+) -> dict[str, Any]:
+    """One row: a run of `setting` from an empty folder, its errors, and the training on top."""
+    with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
+        wall, cpu = time.perf_counter(), time.process_time()
+        result = SETTINGS[setting](images, Path(folder) / "sfm")
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        row: dict[str, Any] = {
+            "scene": name,
+            "setting": setting,
+            "photos": len([path for path in images.iterdir() if path.is_file()]),
+            "registered": result.facts.get("registered", 0),
+            "outcome": result.failure or "placed",
+            "seconds": round(wall, 2),
+            "cpu_seconds": round(cpu, 2),
+            "stages": result.seconds,
+            "points": result.facts.get("points", 0),
+            "reprojection_pixels": result.facts.get("reprojection_pixels"),
+            "effort": result.facts.get("effort"),
+            "mapper": result.facts.get("mapper"),
+        }
+        if result.scene is not None:
+            row |= pose_error(result.scene, truth) | gps_error(result.scene, images, Path(folder) / "look")
+            if train is not None:
+                row |= trained_psnr(result.scene, train, Path(folder))
+        return row
+
+
+def reference(name: str) -> dict[str, Camera]:
+    """The cameras that poses of this scene are compared with."""
+    found = posed.find(DATA / FOLDERS[name])
+    return {view.name: view.camera for view in found.load().views} if found is not None else {}
+
+
+def scenes_bench(scenes: list[str], settings: list[str], train: float | None) -> list[dict[str, Any]]:
+    rows = []
+    for name in scenes:
+        images = DATA / FOLDERS[name] / "images"
+        if not images.is_dir():
+            print(f"{name} is not here ({images}); no row for it.", file=sys.stderr)
+            continue
+        for setting in settings:
+            rows.append(measure(name, images, setting, reference(name), train))
+            print(rows[-1], flush=True)
+    return rows
+
+
+def growth_bench(counts: tuple[int, ...], setting: str) -> list[dict[str, Any]]:
+    """Generated sets of growing size: evenly spread subsets would change the overlap, so each is its own orbit."""
+    rows = []
+    for count in counts:
+        with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
+            truth = synthetic.capture(Path(folder) / "images", count, 480, 360)
+            rows.append(measure(f"still life {count}", Path(folder) / "images", setting, truth, None))
+            print(rows[-1], flush=True)
+    return rows
+
+
+def exponent(rows: list[dict[str, Any]], key: str = "cpu_seconds") -> float:
+    """The slope of log seconds over log photos, by least squares."""
+    photos = np.log([row["photos"] for row in rows])
+    return float(np.polyfit(photos, np.log([row[key] for row in rows]), 1)[0])
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    columns = {
+        "scene": "scene",
+        "setting": "setting",
+        "outcome": "outcome",
+        "seconds": "s",
+        "cpu_seconds": "CPU s",
+        "points": "points",
+        "reprojection_pixels": "reproj. px",
+        "rotation_deg": "rotation °",
+        "position_percent": "position %",
+        "gps_metres": "GPS m",
+        "psnr": "PSNR dB",
+    }
+    lines = ["| " + " | ".join(["photos", *columns.values()]) + " |", "|" + "---|" * (len(columns) + 1)]
+    for row in rows:
+        share = f"{row['registered']} of {row['photos']}"
+        cells = [str(row[key]) if row.get(key) is not None else "" for key in columns]
+        lines.append("| " + " | ".join([share, *cells]) + " |")
+    return "\n".join(lines) + "\n\n" + _rows.footer([row | _rows.origin() for row in rows]) + "\n"
+
+
+def scenes_figure(rows: list[dict[str, Any]], path: Path) -> None:
+    """Left: held-out PSNR, right: pose error, both over the seconds that the cameras took."""
+    figure, (left, right) = axes(2)
+    colors = {name: f"C{index}" for index, name in enumerate(FOLDERS)}
+    markers = dict(zip(SETTINGS, "sovD^P", strict=True))
+    for row in rows:
+        if row["outcome"] != "placed":
+            continue
+        style = {"color": colors[row["scene"]], "marker": markers[row["setting"]], "s": 48}
+        label = f"{row['scene']}, {row['setting']}"
+        if "psnr" in row:
+            left.scatter(row["seconds"], row["psnr"], label=label, **style)
+        if "rotation_deg" in row:
+            right.scatter(row["seconds"], row["rotation_deg"], label=label, **style)
+    left.set(xscale="log", xlabel="seconds for the cameras", ylabel="held-out PSNR, dB")
+    right.set(xscale="log", xlabel="seconds for the cameras", ylabel="median rotation error, degrees")
+    (left if left.has_data() else right).legend(fontsize=7)
+    failed = [
+        f"{row['scene']}, {row['setting']}: {row['outcome']}" for row in rows if row["outcome"] != "placed"
+    ]
+    note = f" · no point for: {'; '.join(failed)}" if failed else ""
+    save(figure, path, _rows.footer([row | _rows.origin() for row in rows]) + note)
+
+
+def growth_figure(rows: list[dict[str, Any]], path: Path) -> None:
+    figure, (axis,) = axes(1)
+    photos = np.array([row["photos"] for row in rows], float)
+    for key, label in (("seconds", "wall"), ("cpu_seconds", "CPU")):
+        seconds = np.array([row[key] for row in rows])
+        slope = exponent(rows, key)
+        axis.plot(photos, seconds, "o", label=f"{label}: n^{slope:.2f}")
+        axis.plot(
+            photos, np.exp(np.log(seconds).mean() + slope * (np.log(photos) - np.log(photos).mean())), lw=1
+        )
+    axis.set(xscale="log", yscale="log", xlabel="photos", ylabel="seconds for the cameras")
+    axis.legend()
+    save(figure, path, _rows.footer([row | _rows.origin() for row in rows]))
+
+
+def main(argv: list[str]) -> int:
+    parser = argparse.ArgumentParser(
+        prog="bench sfm", description=__doc__.splitlines()[0] if __doc__ else None
+    )
+    parser.add_argument("--scenes", nargs="+", choices=FOLDERS, default=list(FOLDERS))
+    parser.add_argument(
+        "--settings", nargs="+", choices=SETTINGS, default=["COLMAP defaults", "auto", "lean, all pairs"]
+    )
+    parser.add_argument("--train", type=float, default=20.0, help="seconds of training on top of the cameras")
+    parser.add_argument("--no-train", action="store_true")
+    parser.add_argument("--growth", action="store_true", help="generated sets of growing size instead")
+    parser.add_argument("--counts", nargs="+", type=int, default=GROWTH)
+    chosen = parser.parse_args(argv)
+    name = "sfm_growth" if chosen.growth else "sfm"
+    if chosen.growth:
+        rows = growth_bench(tuple(chosen.counts), "auto")
+    else:
+        rows = scenes_bench(chosen.scenes, chosen.settings, None if chosen.no_train else chosen.train)
+    if not rows:
+        print("No scene was there to measure.", file=sys.stderr)
+        return 1
+    _rows.write(name, rows)
+    text = table(rows)
+    if chosen.growth:
+        wall, cpu = exponent(rows, "seconds"), exponent(rows)
+        text += f"\nFit: wall seconds grow as n^{wall:.2f}, CPU seconds as n^{cpu:.2f}.\n"
+        growth_figure(rows, HERE / "figures" / "sfm_growth.png")
+    else:
+        scenes_figure(rows, HERE / "figures" / "sfm.png")
+    (HERE / "results" / f"{name}.md").write_text(text)
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
