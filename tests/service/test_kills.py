@@ -110,6 +110,6 @@ def test_a_killed_api_and_renderer_answer_again(service: Up) -> None:
     os.kill(api, signal.SIGKILL)
     wait_for(lambda: gone([api]))
     # The port stays open, so that a new connection waits for the next API instead of being refused.
-    assert httpx.get(f"{service.http.base_url}healthz", timeout=30).status_code == 200
+    assert httpx.get(service.http.base_url.join("/healthz"), timeout=30).status_code == 200
     os.kill(service.child("renderer"), signal.SIGKILL)
     wait_for(lambda: service.http.get("/readyz").json()["checks"]["renderer"] == "ok")

@@ -16,7 +16,7 @@ from splatmill.backplane.storage import Storage, StorageError, StorageFullError
 from splatmill.schema import Role
 from splatmill_worker import sweep, workspace
 from splatmill_worker.mishap import Transient, problem_of
-from splatmill_worker.workspace import Mirror, Workspace, in_use
+from splatmill_worker.workspace import FolderInUseError, Mirror, Workspace, in_use
 
 JOB, CAPTURE = "job00001", "capture1"
 
@@ -101,8 +101,10 @@ def test_two_processes_never_share_a_folder(local: Storage, monkeypatch: pytest.
     space = Workspace(local, JOB, CAPTURE)
     assert in_use(space.folder)
     monkeypatch.setattr(workspace, "LOCK_SECONDS", 0.1)
-    with pytest.raises(RuntimeError, match="Another process works in"):
+    with pytest.raises(FolderInUseError) as caught:
         Workspace(local, JOB, CAPTURE)
+    with pytest.raises(Transient):
+        problem_of(caught.value)
 
 
 def test_the_sweep_takes_only_what_nobody_will_miss(local: Storage, connection: redis.Redis) -> None:
@@ -165,7 +167,15 @@ def test_numerical_failures_get_the_codes_of_the_wire() -> None:
     }
 
 
-def test_a_storage_that_is_away_is_tried_again() -> None:
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (StorageError("Storage could not read x: connection refused."), "storage_unavailable"),
+        (redis.ConnectionError("Connection refused"), "queue_unavailable"),
+        (redis.TimeoutError("Timeout reading from socket"), "queue_unavailable"),
+    ],
+)
+def test_what_is_only_away_is_tried_again(error: Exception, code: str) -> None:
     with pytest.raises(Transient) as caught:
-        problem_of(StorageError("Storage could not read x: connection refused."))
-    assert caught.value.problem.code == "storage_unavailable"
+        problem_of(error)
+    assert caught.value.problem.code == code

@@ -150,6 +150,7 @@ def _fail(this: Attempt, error: Exception, outbox: Outbox) -> None:
         problem = problem_of(error)
     except Transient as transient:
         problem = transient.problem
+        outbox.flush()  # waits for Redis, if that is what went away
         entry = get_current_job(connection=this.connection)
         if entry is not None and entry.should_retry:
             outbox.put(LogEvent(level="warning", message=f"{problem.detail} Trying again."))

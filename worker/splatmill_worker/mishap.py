@@ -4,8 +4,12 @@ import errno
 import traceback
 from typing import Any
 
+from redis.exceptions import ConnectionError as RedisConnectionError
+from redis.exceptions import TimeoutError as RedisTimeoutError
+
 from splatmill.backplane.storage import StorageError, StorageFullError
 from splatmill.schema import PROBLEMS, Problem
+from splatmill_worker.workspace import FolderInUseError
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NO_MEMORY = (
@@ -57,6 +61,14 @@ def problem_of(error: BaseException) -> Problem:
         raise Transient(
             Problem.of("storage_unavailable", str(error), advice="Check the storage, then restart the job.")
         )
+    if isinstance(error, RedisConnectionError | RedisTimeoutError):
+        advice = "Check Redis, then restart the job."
+        raise Transient(
+            Problem.of("queue_unavailable", f"Redis could not be reached: {error}.", advice=advice)
+        )
+    if isinstance(error, FolderInUseError):
+        advice = "Look for a process that was left over on the worker's machine, then restart the job."
+        raise Transient(Problem.of("worker_lost", str(error), advice=advice))
     if isinstance(error, OSError) and error.errno in _NO_ROOM:
         return Problem.of(
             "storage_full",

@@ -30,6 +30,10 @@ MIRRORED = ("checkpoints", "sfm", "plan.json", "stages.json")
 _RECONSTRUCTION = "sfm"
 
 
+class FolderInUseError(RuntimeError):
+    """Another process works at the same job on this machine."""
+
+
 class Workspace:
     """The folder of one job, locked for this process. `run` and `capture` are the pipeline's two folders."""
 
@@ -156,7 +160,7 @@ def _locked(path: Path) -> int:
         except BlockingIOError:
             if time.monotonic() > deadline:
                 os.close(descriptor)
-                raise RuntimeError(f"Another process works in {path.parent}; it holds {path.name}.") from None
+                raise FolderInUseError(f"Another process works in {path.parent}.") from None
             time.sleep(0.05)
 
 

@@ -44,7 +44,7 @@ def _watch(parent: int, sig: signal.Signals) -> None:
 class ProcessIdentity:
     """A process, told apart from every other one that ever had its number.
 
-    machine is the host's id or name, boot the kernel's id of this boot, namespace that of the process numbers,
+    machine is the host's id and name, boot the kernel's id of this boot, namespace that of the process numbers,
     started the process's start in clock ticks since boot. Fields a platform does not tell are empty.
     """
 
@@ -122,7 +122,8 @@ def wait_gone(pid: int, started: str | None, seconds: float) -> bool:
 
 
 def _machine() -> str:
-    return _first_line("/etc/machine-id") or os.uname().nodename
+    # Containers of one image may share the id, and machines of two networks the name.
+    return f"{_first_line('/etc/machine-id')}/{os.uname().nodename}"
 
 
 def _boot() -> str:

@@ -1,6 +1,7 @@
 """The embedded service as a whole: which children there are, how they start, and in what order they end."""
 
 import http.client
+import importlib.util
 import json
 import os
 import selectors
@@ -16,6 +17,8 @@ from splatmill_server.up import redis_server
 from splatmill_server.up.child import Child
 from splatmill_server.up.folder import DataFolder, UpError
 
+WORKER = "splatmill_worker"
+
 READY_SECONDS = 60.0
 """A first start on a cold disk reads a few hundred megabytes of libraries."""
 
@@ -25,9 +28,16 @@ _GIVE_UP_DEATHS = 5
 
 
 class Service:
-    """Children of one data folder behind one listening socket. `say` takes lines for the operator."""
+    """Children of one data folder behind one listening socket. `say` takes lines for the operator.
+
+    Raises UpError when a part or Redis is not installed.
+    """
 
     def __init__(self, folder: DataFolder, listener: socket.socket, say: Callable[[str], None]) -> None:
+        if importlib.util.find_spec(WORKER) is None:
+            raise UpError(
+                "The part splatmill-worker, which trains and renders, is not installed: pip install splatmill-worker."
+            )
         self.folder = folder
         self.say = say
         self._address = listener.getsockname()[:2]
@@ -46,8 +56,8 @@ class Service:
             return Child(name, command, environment, lambda: folder.log(name), patience, **more)  # type: ignore[arg-type]
 
         python = sys.executable
-        self.worker = child("worker", [python, "-m", "splatmill_worker", "train"], _WORKER_PATIENCE)
-        renderer = [python, "-m", "splatmill_worker", "renderer", "--uds", str(folder.renderer_socket)]
+        self.worker = child("worker", [python, "-m", WORKER, "train"], _WORKER_PATIENCE)
+        renderer = [python, "-m", WORKER, "renderer", "--uds", str(folder.renderer_socket)]
         self.renderer = child("renderer", renderer, 3.0)
         api = [python, "-m", "splatmill_server.up.api", str(listener.fileno())]
         self.api = child("api", api, 6.0, inherited=(listener.fileno(),))
