@@ -212,6 +212,12 @@ def test_gps_neighbours_are_the_nearest_ones() -> None:
     assert all(index != 6 for pair in pairs.spatial(places, 3) for index in pair)
 
 
+def test_numbered_photos_are_followed_in_order() -> None:
+    names = [f"walk/IMG_{k}.jpg" for k in (10, 9, 8, 11, 12)] + ["other.jpg", "IMG_1.jpg"]
+    assert pairs.bursts([usable(name) for name in names]) == [[2, 1, 0, 3, 4]]
+    assert pairs.sequential([2, 1, 0, 3, 4], (1,)) == {(1, 2), (0, 1), (0, 3), (3, 4)}
+
+
 def test_a_broken_view_graph_is_bridged_by_the_likeliest_pairs() -> None:
     parts = pairs.components(6, [(0, 1), (1, 2), (3, 4)])
     assert parts == [[0, 1, 2], [3, 4], [5]]

@@ -75,7 +75,8 @@ def match_pairs(
     for done, (pair, (matches, geometry)) in enumerate(zip(fresh, pool.map(work, fresh), strict=True), 1):
         stop_if(cancelled)
         first, second = ids[pair[0]], ids[pair[1]]
-        database.write_matches(first, second, matches)
+        if not database.exists_matches(first, second):  # there if an earlier run was killed between the two
+            database.write_matches(first, second, matches)
         if geometry is None:
             geometry = pycolmap.TwoViewGeometry()
         database.write_two_view_geometry(first, second, geometry)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
@@ -24,6 +25,9 @@ LOOK_PARTNERS = 30  # candidates for the quick look in sets beyond LOOK_AT_ALL
 LOOK_AT_ALL = 60  # photos: up to here every pair gets a quick look
 MIN_LOOK = 4  # matches in the quick look: fewer are chance
 SURE_PARTNERS = 3  # the best of each photo are matched however few their matches
+NUMBERED = re.compile(r"(.*?)(\d+)\.[^.]+$")
+MIN_BURST = 5  # photos
+BURST_STEPS = (1, 2)
 EARTH_RADIUS = 6_371_000.0  # metres
 
 
@@ -46,6 +50,20 @@ def sequences(photos: Sequence[Usable]) -> list[list[int]]:
         if photo.sequence is not None:
             videos.setdefault(photo.sequence, []).append(index)
     return list(videos.values())
+
+
+def bursts(photos: Sequence[Usable]) -> list[list[int]]:
+    """Runs of numbered photos (a common start of the name, then a number), by number.
+
+    Photos with consecutive numbers were mostly taken one after another, so their neighbours are worth a match
+    whatever a quick look says.
+    """
+    runs: dict[str, list[tuple[int, int]]] = {}
+    for index, photo in enumerate(photos):
+        found = NUMBERED.match(photo.name) if photo.sequence is None else None
+        if found is not None:
+            runs.setdefault(found[1], []).append((int(found[2]), index))
+    return [[index for _, index in sorted(run)] for run in runs.values() if len(run) >= MIN_BURST]
 
 
 def positions(photos: Sequence[Usable]) -> npt.NDArray[np.float64]:

@@ -212,6 +212,11 @@ def _attempt(run: Run, effort: Effort) -> Progress:
     try:
         with run.clock("features"):
             progress.ids, progress.features = features.load(database)
+        if len(progress.ids) < run.count:
+            raise OSError(
+                f"COLMAP could read only {len(progress.ids)} of the {run.count} reduced photos in "
+                f"{progress.place.images}. Is the disk full?"
+            )
         _require_features(run, progress)
         chosen = _choose(run, progress)
         _match(run, progress, chosen, database)
@@ -266,6 +271,10 @@ def _choose(run: Run, progress: Progress) -> set[pairs.Pair]:
     if matcher == "sequential":
         runs = [list(range(run.count))]
     likely = {pair for order in runs for pair in pairs.sequential(order)}
+    if matcher == "auto":
+        likely |= {
+            pair for order in pairs.bursts(photos) for pair in pairs.sequential(order, pairs.BURST_STEPS)
+        }
     if has_gps and matcher in ("auto", "spatial"):
         likely |= pairs.spatial(places, partners if matcher == "spatial" else partners // 2)
     with run.clock("pairs"):
