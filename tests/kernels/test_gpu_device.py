@@ -48,7 +48,9 @@ def test_a_machine_without_triton_is_told_how_to_get_it(monkeypatch: pytest.Monk
     assert "pip install" in reason
 
 
-def test_tensors_on_the_cpu_are_refused_unless_the_interpreter_was_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tensors_on_the_cpu_are_refused_unless_the_interpreter_was_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("TRITON_INTERPRET", "0")
     with pytest.raises(device.GpuUnavailable, match='use "cpu"'):
         device.require(torch.zeros(1))
@@ -78,6 +80,11 @@ def test_importing_the_package_imports_no_triton_and_starts_no_gpu() -> None:
     )
     environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
     done = subprocess.run(
-        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False, timeout=120
+        [sys.executable, "-c", program],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
     )
     assert done.returncode == 0, done.stderr

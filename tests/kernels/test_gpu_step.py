@@ -8,7 +8,6 @@ enqueues, only that nothing in a step asks for a value, nor the recovery from a 
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -16,9 +15,6 @@ import pytest
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-
-if not torch.cuda.is_available():
-    os.environ.setdefault("TRITON_INTERPRET", "1")  # before Triton is first imported
 
 pytest.importorskip(
     "triton", reason="Triton comes with torch's GPU builds; pip install triton to prove the kernels here"
