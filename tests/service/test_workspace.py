@@ -14,7 +14,7 @@ import redis
 from splatmill.backplane import keys, layout
 from splatmill.backplane.storage import Storage, StorageError, StorageFullError
 from splatmill.schema import Role
-from splatmill_worker import sweep, workspace
+from splatmill_worker import reconstruction, sweep, workspace
 from splatmill_worker.mishap import Transient, problem_of
 from splatmill_worker.workspace import FolderInUseError, Mirror, Workspace, in_use
 
@@ -71,7 +71,7 @@ def test_checkpoints_reach_an_attempt_on_another_machine(
     remote: Storage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     space = Workspace(remote, JOB, CAPTURE)
-    for name in ("checkpoints/checkpoint.pt", "sfm/abc/scene.json", "plan.json", "out/model.ply"):
+    for name in ("checkpoints/checkpoint.pt", "plan.json", "out/model.ply"):
         (space.run / name).parent.mkdir(parents=True, exist_ok=True)
         (space.run / name).write_text(name)
     warnings: list[str] = []
@@ -80,12 +80,32 @@ def test_checkpoints_reach_an_attempt_on_another_machine(
 
     monkeypatch.setenv("SPLATMILL_DATA", str(tmp_path / "another machine"))
     there = Workspace(remote, JOB, CAPTURE)
-    assert sorted(there.restore()) == ["checkpoints/checkpoint.pt", "plan.json", "sfm/abc/scene.json"]
+    assert sorted(there.restore()) == ["checkpoints/checkpoint.pt", "plan.json"]
     assert (there.run / "checkpoints/checkpoint.pt").read_text() == "checkpoints/checkpoint.pt"
     assert there.restore() == [], "what this machine has is newer"
     there.remove()
     assert not there.folder.exists()
     assert list(remote.entries(layout.job(JOB))) == []
+
+
+def test_recovered_cameras_serve_the_next_job_on_the_capture(remote: Storage, tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    whole, unfinished = first / "sfm/photos/model-1", first / "sfm/photos/model-2"
+    for folder, names in ((whole, ("a.bin", "facts.json", "points3D.bin")), (unfinished, ("a.bin",))):
+        folder.mkdir(parents=True)
+        for name in names:
+            (folder / name).write_text(name)
+    (first / "sfm/photos/database.db").write_text("only of use while the cameras are being recovered")
+    assert reconstruction.fetch(remote, CAPTURE, second) == 0
+    assert reconstruction.share(remote, CAPTURE, first) == 1
+    assert reconstruction.share(remote, CAPTURE, first) == 0
+    assert reconstruction.fetch(remote, CAPTURE, second) == 1
+    assert reconstruction.fetch(remote, CAPTURE, second) == 0
+    files = [path.relative_to(second).as_posix() for path in second.rglob("*") if path.is_file()]
+    assert sorted(files) == [f"sfm/photos/model-1/{name}" for name in ("a.bin", "facts.json", "points3D.bin")]
+    # A copy that broke off before its last file is no model, and is completed by the next.
+    (second / "sfm/photos/model-1/facts.json").unlink()
+    assert reconstruction.fetch(remote, CAPTURE, second) == 1
 
 
 def test_starting_over_keeps_the_cameras(local: Storage) -> None:

@@ -20,7 +20,7 @@ from splatmill.backplane.fold import fold
 from splatmill.backplane.row import JobRow
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import Event, JobState, LogEvent, PreviewEvent, StateEvent, TrainOptions
-from splatmill_worker import attempt, publish
+from splatmill_worker import attempt, publish, reconstruction
 from splatmill_worker.attempt import Attempt, HandedBack
 from splatmill_worker.lock import Held
 from splatmill_worker.mishap import Transient, problem_of
@@ -102,6 +102,8 @@ def _work(this: Attempt, request: JobRow, storage: Storage, outbox: Outbox) -> N
         log.info("Taking up what an attempt elsewhere left: %d files.", len(restored))
     if not space.stage_in():
         raise NothingUploadedError(request.capture)
+    if reconstruction.fetch(storage, request.capture, space.run):
+        log.info("The cameras of this capture were recovered before; they are used again.")
     mirror = Mirror(space, log.warning)
     try:
         run = cast(Pipeline, importlib.import_module(PIPELINE).run)
@@ -140,6 +142,12 @@ def _pass_on(event: Event, space: Workspace, outbox: Outbox) -> None:
             return
         event = PreviewEvent(path=target, step=event.step)
     outbox.put(event)
+    if isinstance(event, StateEvent) and event.state is JobState.training:
+        try:
+            reconstruction.share(space.storage, space.capture_id, space.run)
+        except StorageError as error:
+            # Only later jobs would have been the faster for it.
+            outbox.put(LogEvent(level="warning", message=f"The cameras could not be shared: {error}"))
 
 
 def _fail(this: Attempt, error: Exception, outbox: Outbox) -> None:

@@ -26,7 +26,9 @@ MIRROR_SECONDS = 15.0
 LOCK_SECONDS = 10.0
 """How long to wait for a process that is being killed to let go of the folder."""
 
-MIRRORED = ("checkpoints", "sfm", "plan.json", "stages.json")
+MIRRORED = ("checkpoints", "plan.json", "stages.json")
+"""Cameras are not among them: `reconstruction` shares those with every job on the capture."""
+
 _RECONSTRUCTION = "sfm"
 
 
