@@ -12,6 +12,8 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.cancellation import stop_if
 
 Mapper = Literal["incremental", "global"]
+LENS_PHOTOS = 8
+LENS_OBSERVATIONS = 2000
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,29 @@ def _global(threads: int, seed: int, fixed: bool) -> pycolmap.GlobalPipelineOpti
         options.mapper.bundle_adjustment.refine_focal_length = False
         options.mapper.bundle_adjustment.refine_extra_params = False
     return options
+
+
+def refine_lenses(model: pycolmap.Reconstruction) -> bool:
+    """Turns cameras that enough photos speak for into OPENCV ones (k1, k2, p1, p2), in place; whether any was.
+
+    Mapping runs on one radial coefficient, which few photos can determine; the last adjustment then finds the
+    lens as it is (on fox the focal length moves by 0.5 per cent, onto that of the reference).
+    """
+    photos: dict[int, int] = {}
+    observations: dict[int, int] = {}
+    for image_id in model.reg_image_ids():
+        image = model.images[image_id]
+        photos[image.camera_id] = photos.get(image.camera_id, 0) + 1
+        observations[image.camera_id] = observations.get(image.camera_id, 0) + image.num_points3D
+    changed = False
+    for camera_id, camera in model.cameras.items():
+        enough = photos.get(camera_id, 0) >= LENS_PHOTOS and observations[camera_id] >= LENS_OBSERVATIONS
+        if enough and camera.model == pycolmap.CameraModelId.SIMPLE_RADIAL:
+            focal, cx, cy, k1 = camera.params
+            camera.model = pycolmap.CameraModelId.OPENCV
+            camera.params = [focal, focal, cx, cy, k1, 0.0, 0.0, 0.0]
+            changed = True
+    return changed
 
 
 def polish(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import os
@@ -29,7 +30,7 @@ from splatmill_worker.sfm.features import Features, Workspace
 from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions, fitted
 
 OnProgress = Callable[[str, int, int, str], None]
-VERSION = 1  # of what is cached; another one means the cache of an older program is not read
+VERSION = 2  # of what is cached; another one means the cache of an older program is not read
 REPAIR_ROUNDS = 2
 ENOUGH = 0.9  # of the photos registered: below, more effort is spent
 GLOBAL_FROM = 400  # photos: from here on the global mapper goes first where the view graph is dense
@@ -378,7 +379,7 @@ def _store(run: Run, progress: Progress, target: Path) -> None:
     model, fixed = _with_possible_intrinsics(run, progress, model)
     misplaced = checks.drop_misplaced(model)
     with run.clock("polish"):
-        mapping.polish(model, run.threads, fixed_intrinsics=fixed, cancelled=run.cancelled)
+        model = _polished(run, model, fixed)
     facts |= checks.model_facts(model, run.count)
     checks.require_usable(facts)
     reasons = {
@@ -400,6 +401,18 @@ def _store(run: Run, progress: Progress, target: Path) -> None:
     (partial / "facts.json").write_text(json.dumps(document, indent=1), "utf-8")
     shutil.rmtree(target, ignore_errors=True)
     partial.rename(target)
+
+
+def _polished(run: Run, model: pycolmap.Reconstruction, fixed: bool) -> pycolmap.Reconstruction:
+    """The model after its last bundle adjustment, with finer lenses where that leads to lenses that exist."""
+    if not fixed and run.options.camera_model == "auto":
+        finer = copy.deepcopy(model)
+        if mapping.refine_lenses(finer):
+            mapping.polish(finer, run.threads, fixed_intrinsics=False, cancelled=run.cancelled)
+            if checks.absurd_intrinsics(finer) is None:
+                return finer
+    mapping.polish(model, run.threads, fixed_intrinsics=fixed, cancelled=run.cancelled)
+    return model
 
 
 def _with_possible_intrinsics(
