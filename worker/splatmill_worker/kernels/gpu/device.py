@@ -29,6 +29,9 @@ float32.
 """
 
 
+_found_usable: set[int] = set()
+
+
 class GpuUnavailable(RuntimeError):
     """The GPU engine was asked for and cannot run here; the message says why and what to do."""
 
@@ -125,6 +128,15 @@ def require(tensor: Tensor) -> None:
         raise GpuUnavailable(
             f'backend "gpu" was asked for, but the tensors are on {tensor.device}; move them to a GPU, or use "cpu".'
         )
-    reason = absence(tensor.device.index or 0)
-    if reason is not None:
-        raise GpuUnavailable(f'{reason} Use backend "cpu" on this machine.')
+    index = tensor.device.index or 0
+    if index not in _found_usable:
+        reason = absence(index)
+        if reason is not None:
+            raise GpuUnavailable(f'{reason} Use backend "cpu" on this machine.')
+        _found_usable.add(index)
+    if index != torch.cuda.current_device():
+        # Triton launches on the current device, whatever its arguments' device is.
+        raise GpuUnavailable(
+            f"The tensors are on {tensor.device}, but the current GPU is number {torch.cuda.current_device()}; "
+            f"call torch.cuda.set_device({index}) first."
+        )

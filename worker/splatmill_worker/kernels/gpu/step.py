@@ -148,6 +148,10 @@ class Step:
         self.device = torch.device(where)
         if self.device.type != "cpu" and (reason := device.absence(self.device.index or 0)) is not None:
             raise device.GpuUnavailable(reason)
+        if self.device.type == "cuda" and self.device.index is None:
+            self.device = torch.device(
+                "cuda", torch.cuda.current_device()
+            )  # as the tensors' own device reads
         self._together = together
         self._rooms: dict[ViewKey, Room] = {}
         self._resident: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
@@ -338,7 +342,7 @@ class Step:
     ) -> _View:  # fmt: skip
         key = (viewmat.data_ptr(), width, height)
         viewmat, K = self._here(viewmat).float().contiguous(), self._here(K).float().contiguous()
-        background = None if background is None else background.to(self.device, torch.float32).contiguous()
+        background = None if background is None else self._sent(background.float())
         records = project_records(
             self._groups(self._params), viewmat, K, width, height, degree=degree, near=near, antialias=antialias,
             planar=self.count,
@@ -445,10 +449,18 @@ class Step:
             return tensor.contiguous()
         held = self._resident.get(tensor)
         if held is None:
-            held = tensor.to(self.device).contiguous()
+            held = self._sent(tensor)
             self._resident[tensor] = held
         assert isinstance(held, Tensor)
         return held
+
+    def _sent(self, tensor: Tensor) -> Tensor:
+        """A copy on this device. From pinned memory, because a copy from any other waits for all that is
+        enqueued.
+        """
+        if tensor.device.type == "cpu" and self.device.type == "cuda":
+            return tensor.contiguous().pin_memory().to(self.device, non_blocking=True)
+        return tensor.to(self.device).contiguous()
 
     def _groups(self, planes: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         a, b, c, d, e = (planes[first:last] for first, last in PARTS.values())
