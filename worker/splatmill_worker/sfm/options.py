@@ -41,7 +41,7 @@ class Effort:
 
 
 LEAN = Effort("lean", 800, 1500, 0, 1, 10)
-STANDARD = Effort("standard", 800, 3000, -1, 1, 10)
+STANDARD = Effort("standard", 800, 2500, -1, 1, 10)
 HIGH = Effort("high", 1400, 6000, -1, 2, 16)
 EFFORTS = {effort.name: effort for effort in (LEAN, STANDARD, HIGH)}
 # Photos this small give too few features at their own size and cost little at twice it.

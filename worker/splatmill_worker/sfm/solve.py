@@ -30,7 +30,7 @@ from splatmill_worker.sfm.features import Features, Workspace
 from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions, fitted
 
 OnProgress = Callable[[str, int, int, str], None]
-VERSION = 2  # of what is cached; another one means the cache of an older program is not read
+VERSION = 3  # of what is cached; another one means the cache of an older program is not read
 REPAIR_ROUNDS = 2
 ENOUGH = 0.9  # of the photos registered: below, more effort is spent
 GLOBAL_FROM = 400  # photos: from here on the global mapper goes first where the view graph is dense
@@ -64,6 +64,7 @@ class Run:
     scores: dict[pairs.Pair, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    best_mapper: mapping.Mapper | None = None  # that did best on what was matched so far
 
     @property
     def count(self) -> int:
@@ -303,6 +304,7 @@ def _match(run: Run, progress: Progress, chosen: set[pairs.Pair], database: pyco
             progress.features,
             progress.ids,
             database,
+            progress.effort.features,
             run.options.seed,
             run.pool,
             lambda done, _: run.on_progress("matching", before + done, total, "pairs"),
@@ -320,6 +322,8 @@ def _map(run: Run, progress: Progress) -> mapping.Mapped:
     first: mapping.Mapper = "incremental"
     if asked != "auto":
         first = asked
+    elif run.best_mapper is not None:
+        first = run.best_mapper
     elif run.count >= GLOBAL_FROM and len(_edges(progress)) >= 5 * run.count:
         first = "global"
     trials: list[tuple[mapping.Mapper, bool]] = [(first, False)]
@@ -347,6 +351,7 @@ def _map(run: Run, progress: Progress) -> mapping.Mapped:
             if most >= ENOUGH * run.count:
                 break
     assert best is not None  # there is at least one trial
+    run.best_mapper = best.mapper
     return best
 
 
