@@ -1,0 +1,70 @@
+"""The training loop runs on the GPU engine as it is, with densification and evaluation, and ends where the
+CPU engine ends.
+
+Four steps on twelve lines of pixels, in Triton's interpreter where there is no GPU: the seam, not the quality.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from splatmill_worker.scene import Camera
+from splatmill_worker.splat.budget import Budget
+from splatmill_worker.splat.engine import open_engine
+from splatmill_worker.splat.plan import Kernels, Plan
+from splatmill_worker.splat.schedule import Schedule
+from splatmill_worker.splat.train import Trained, train
+from splatmill_worker.splat.views import Target, TrainingView
+
+from . import replica
+
+pytest.importorskip(
+    "triton", reason="Triton comes with torch's GPU builds; pip install triton to prove this here"
+)
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::RuntimeWarning"
+)  # the interpreter's numpy, in lanes that are masked
+STEPS = 4
+
+
+def views() -> list[TrainingView]:
+    found = []
+    for number, (viewmat, photo) in enumerate(replica.views()):
+        camera = Camera(
+            replica.WIDTH, replica.HEIGHT, float(replica.K[0, 0]), float(replica.K[1, 1]), float(replica.K[0, 2]),
+            float(replica.K[1, 2]), viewmat.double().numpy(),
+        )  # fmt: skip
+        found.append(
+            TrainingView(f"{number}.png", {1: Target(camera, viewmat, replica.K, photo, None, None)})
+        )
+    return found
+
+
+def run(kernels: Kernels) -> Trained:
+    schedule = Schedule(
+        budget=Budget(STEPS, None), resolution=((0, 1),), degree=1, degree_every=2, densify_from=2, densify_every=2,
+        densify_until=0.9,
+    )  # fmt: skip
+    plan = Plan(
+        schedule=schedule, image_size=replica.WIDTH, max_gaussians=14, densify="absolute", initial="points",
+        kernels=kernels, background="black", exposure=False, antialias=False, target_psnr=None, max_memory=None,
+        stops_when_flat=False, seed=0,
+    )  # fmt: skip
+    shown = views()
+    return train(open_engine(replica.scene(), kernels), shown[1:], shown[:1], plan, extent=1.1)
+
+
+def test_training_on_the_gpu_engine_ends_where_the_cpu_engine_ends() -> None:
+    gpu, cpu = run("gpu"), run("cpu")
+    assert gpu.steps == cpu.steps == STEPS
+    assert gpu.gaussians.count == cpu.gaussians.count > replica.scene().count, "nothing was densified"
+    for name, value in cpu.gaussians.parameters().items():
+        seen = gpu.gaussians.parameters()[name]
+        assert seen.device.type == "cpu", "what is handed on must not live on the device"
+        # Four Adam steps with float32 gradients in another order of summation.
+        assert (seen - value).abs().max().item() <= 1e-4, name
+    assert gpu.held_out is not None
+    assert cpu.held_out is not None
+    assert gpu.held_out.psnr == pytest.approx(cpu.held_out.psnr, abs=1e-2)
+    assert torch.isfinite(torch.tensor([row.loss for row in gpu.rows])).all()
