@@ -55,7 +55,7 @@ def errors(scene: Scene, truth: dict[str, Camera]) -> tuple[np.ndarray, np.ndarr
 @pytest.fixture(scope="module")
 def still_life(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Camera]]:
     folder = tmp_path_factory.mktemp("still") / "images"
-    return folder, synthetic.capture(folder, 12, 400, 300)
+    return folder, synthetic.capture(folder, 16, 480, 360)
 
 
 @pytest.fixture(scope="module")
@@ -70,16 +70,16 @@ def test_cameras_of_generated_photos_match_the_truth(
     still_life: tuple[Path, dict[str, Camera]], solved: tuple[Scene, Path]
 ) -> None:
     scene, _ = solved
-    assert len(scene.views) == 12
+    assert len(scene.views) == 16
     rotations, positions = errors(scene, still_life[1])
     assert np.median(rotations) < 0.3
     assert np.median(positions) < 0.01
     true = next(iter(still_life[1].values()))
     assert scene.views[0].camera.fx == pytest.approx(true.fx, rel=0.03)
-    assert scene.facts["registered"] == 12
+    assert scene.facts["registered"] == 16
     assert scene.colors.std() > 10  # painted from the photos, not left black
     assert scene.point_views is not None
-    assert scene.point_views.views.max() < 12
+    assert scene.point_views.views.max() < 16
 
 
 def test_a_restart_reads_the_cameras_back(
@@ -110,7 +110,7 @@ def test_cancelling_ends_it_and_a_restart_goes_on(
     before = len(seen)
     scene = sfm.reconstruct(still_life[0], None, tmp_path, sfm.SfmOptions(), watch, lambda: False)
     assert "features" not in seen[before:]
-    assert len(scene.views) == 12
+    assert len(scene.views) == 16
 
 
 def test_the_global_mapper_can_be_asked_for(
@@ -118,7 +118,7 @@ def test_the_global_mapper_can_be_asked_for(
 ) -> None:
     scene = reconstruct(still_life[0], solved[1], mapper="global")
     assert scene.facts["mapper"] == "global"
-    assert len(scene.views) >= 10
+    assert len(scene.views) >= 14
     assert np.median(errors(scene, still_life[1])[0]) < 0.5
 
 

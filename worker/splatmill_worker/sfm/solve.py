@@ -32,7 +32,7 @@ from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, 
 OnProgress = Callable[[str, int, int, str], None]
 VERSION = 3  # of what is cached; another one means the cache of an older program is not read
 REPAIR_ROUNDS = 2
-ENOUGH = 0.9  # of the photos registered: below, more effort is spent
+ENOUGH = 0.95  # of the photos surely placed: below, more effort is spent
 GLOBAL_FROM = 400  # photos: from here on the global mapper goes first where the view graph is dense
 
 
