@@ -23,9 +23,13 @@ EXP2_ERROR = 2e-5  # relative error the engines allow their vector 2^x on [-8, 0
 
 
 def backends() -> list[object]:
-    """Every backend that can run here: the builds of the CPU engine, and gpu on a device or in Triton's interpreter."""
+    """Every backend that can run here: the builds of the CPU engine, and gpu where there is one.
+
+    Triton's interpreter needs minutes for what takes a device seconds: it is proven on a few scenes by test_gpu_ops, and on
+    all of these where SPLATMILL_PROVE_INTERPRETER=1 asks for it.
+    """
     found: list[object] = [f"cpu:{name}" for name in isa.supported()]
-    if torch.cuda.is_available() or os.environ.get("TRITON_INTERPRET") == "1":
+    if torch.cuda.is_available() or os.environ.get("SPLATMILL_PROVE_INTERPRETER") == "1":
         found.append(pytest.param("gpu", marks=pytest.mark.gpu))
     return found
 

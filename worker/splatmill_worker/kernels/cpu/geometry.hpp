@@ -145,7 +145,7 @@ SPLATMILL_INLINE Factor conic_factor(const Float& b, const Float& c, const Float
 // Gradients that arrive at a projected Gaussian.
 struct ProjectedGradient {
   Float x2d, y2d;        // to the 2-D mean, 1 / pixels
-  Float Gaa, Gab, Gcc;   // to Sigma' as a symmetric matrix [[Gaa, Gab], [Gab, Gcc]]
+  Float Quu, Quv, Qvv;   // to Sigma': dL/dSigma' = F^T Q F with the conic's factor F, so that no needle's digits cancel
   Float logit;           // to the logit of the opacity
   Float color[3];        // to the clamped colour
   Float depth;
@@ -163,17 +163,24 @@ SPLATMILL_INLINE void project_backward(const float* p, const Camera& cam, int de
                                        const ProjectedGradient& d, float* g, CameraGradient* camera) {
   store(g + kLogit * kLanes, d.logit);
 
-  // Sigma' = M M^T + 0.3 I, M = T R S.
-  Float dT0[3], dT1[3], dR[3][3];
+  // Sigma' = M M^T + 0.3 I, M = T R S, so dL/dM = 2 F^T Q (F M). For a needle F M is small where M is large: its first row,
+  // ux (m0 - b/c m1), is taken as ux/c (0.3 m0 + m1 x minors), in which nothing cancels.
+  const Factor f = conic_factor(o.b, o.c, o.det);
+  const Float minor[3] = {o.M0[1] * o.M1[2] - o.M0[2] * o.M1[1], o.M0[2] * o.M1[0] - o.M0[0] * o.M1[2],
+                          o.M0[0] * o.M1[1] - o.M0[1] * o.M1[0]};
+  const Float ux_c = f.ux / o.c;
+  Float dT0[3], dT1[3], dR[3][3], with_scale = splat(0.0f);
   for (int n = 0; n < 3; ++n) dT0[n] = dT1[n] = splat(0.0f);
   for (int n = 0; n < 3; ++n) {
-    const Float dM0 = (d.Gaa * o.M0[n] + d.Gab * o.M1[n]) * 2.0f;
-    const Float dM1 = (d.Gab * o.M0[n] + d.Gcc * o.M1[n]) * 2.0f;
-    Float d_log_scale = splat(0.0f);
+    const int n1 = (n + 1) % 3, n2 = (n + 2) % 3;
+    const Float u = ux_c * fma(kBlur, o.M0[n], o.M1[n1] * minor[n2] - o.M1[n2] * minor[n1]), v = f.vy * o.M1[n];
+    const Float to_u = fma(d.Quu, u, d.Quv * v) * 2.0f, to_v = fma(d.Quv, u, d.Qvv * v) * 2.0f;
+    const Float dM0 = f.ux * to_u, dM1 = fma(f.uy, to_u, f.vy * to_v);
+    const Float d_log_scale = fma(u, to_u, v * to_v);
+    with_scale += d_log_scale;
     for (int m = 0; m < 3; ++m) {
       const Float rs = o.R[m][n] * o.scale[n];
       const Float dF = fma(o.T0[m], dM0, o.T1[m] * dM1);  // to (R S)[m][n]
-      d_log_scale = fma(dF, rs, d_log_scale);
       dR[m][n] = dF * o.scale[n];
       dT0[m] = fma(dM0, rs, dT0[m]);
       dT1[m] = fma(dM1, rs, dT1[m]);
@@ -199,8 +206,8 @@ SPLATMILL_INLINE void project_backward(const float* p, const Camera& cam, int de
   const Float held_v = fma(dT1[0], splat(cam.R[6]), fma(dT1[1], splat(cam.R[7]), dT1[2] * cam.R[8])) * fy_z;
   const Float du = cam.fx * d.x2d - keep(o.u_free, held_u);
   const Float dv = cam.fy * d.y2d - keep(o.v_free, held_v);
-  Float with_inv_z = du * o.u + dv * o.v;
-  for (int n = 0; n < 3; ++n) with_inv_z = fma(dT0[n], o.T0[n], fma(dT1[n], o.T1[n], with_inv_z));
+  // 1/z scales T, and with it M, as the three scales together do.
+  const Float with_inv_z = fma(du, o.u, fma(dv, o.v, with_scale));
   const Float dx = du * o.inv_z, dy = dv * o.inv_z, dz = fnma(with_inv_z, o.inv_z, d.depth);
   Float d_mean[3];
   for (int n = 0; n < 3; ++n)

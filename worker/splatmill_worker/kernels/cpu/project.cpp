@@ -129,15 +129,17 @@ void project_rows_backward(const float* blocks, int64_t count, int degree, const
         lanes[5][l] = d.opacities[i];
         lanes[9][l] = d.depths[i];
       }
-      const Float A = o.c / o.det, B = -(o.b / o.det), C = o.a / o.det;
+      // dL/dSigma' = -C dC C, and C = 2 ln 2 F^T F.
+      const Factor f = conic_factor(o.b, o.c, o.det);
+      constexpr float k = -4.0f * kLn2 * kLn2;
       const Float da = load(lanes[2]), half_db = load(lanes[3]) * 0.5f, dc = load(lanes[4]);
-      const Float p0 = da * A + half_db * B, p1 = da * B + half_db * C, q0 = half_db * A + dc * B, q1 = half_db * B + dc * C;
+      const Float row_a = fma(f.ux, da, f.uy * half_db), row_b = fma(f.ux, half_db, f.uy * dc);
       ProjectedGradient to;
       to.x2d = load(lanes[0]);
       to.y2d = load(lanes[1]);
-      to.Gaa = -(A * p0 + B * q0);
-      to.Gab = -(A * p1 + B * q1);
-      to.Gcc = -(B * p1 + C * q1);
+      to.Quu = fma(row_a, f.ux, row_b * f.uy) * k;
+      to.Quv = row_b * f.vy * k;
+      to.Qvv = f.vy * f.vy * dc * k;
       to.logit = load(lanes[5]) * o.opacity * (1.0f - o.sigmoid);
       for (int c = 0; c < 3; ++c) to.color[c] = load(lanes[6 + c]);
       to.depth = load(lanes[9]);

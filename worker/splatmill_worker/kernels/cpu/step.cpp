@@ -54,9 +54,9 @@ SPLATMILL_INLINE ProjectedGradient gradient_from_sums(const Float* s, const Proj
   ProjectedGradient d;
   d.x2d = f.ux * s[kSumQU] * k1;
   d.y2d = fma(f.uy, s[kSumQU], f.vy * s[kSumQV]) * k1;
-  d.Gaa = f.ux * f.ux * uu * k2;
-  d.Gab = f.ux * fma(f.uy, uu, f.vy * uv) * k2;
-  d.Gcc = fma(f.uy * f.uy, uu, fma(f.uy * f.vy * 2.0f, uv, f.vy * f.vy * vv)) * k2;
+  d.Quu = uu * k2;
+  d.Quv = uv * k2;
+  d.Qvv = vv * k2;
   d.logit = s[kSumQ] * (1.0f - o.sigmoid);
   for (int c = 0; c < 3; ++c) d.color[c] = s[kSumRed + c];
   d.depth = s[kSumDepth];

@@ -1,0 +1,80 @@
+"""Rows of a benchmark: JSON lines that carry the commit, machine and versions they were measured with."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatmill_worker.kernels.cpu import isa
+
+HERE = Path(__file__).resolve().parent
+Row = dict[str, Any]
+
+
+@cache
+def origin() -> Row:
+    """Commit (with + where the tree differs from it), machine and versions."""
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(
+            ["git", *arguments], cwd=HERE, capture_output=True, text=True, check=False
+        ).stdout.strip()
+
+    commit = git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain", "--", "..") else "")
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = [
+            x.split(":")[1].strip() for x in cpuinfo.read_text().splitlines() if x.startswith("model name")
+        ]
+        model = names[0] if names else model
+    versions = {"python": platform.python_version(), "torch": torch.__version__}
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"commit": commit, "machine": f"{model}, {cores} cores, {isa.chosen()}", "versions": versions}
+
+
+def footer(rows: list[Row]) -> str:
+    """One line under a figure or table: what the rows were measured on."""
+    first = rows[0]
+    versions = ", ".join(f"{k} {v}" for k, v in first["versions"].items())
+    return f"{first['machine']} · {versions} · commit {first['commit']}"
+
+
+def write(name: str, rows: list[Row]) -> Path:
+    """results/NAME.jsonl, replaced whole."""
+    path = HERE / "results" / f"{name}.jsonl"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("".join(json.dumps({**row, **origin()}) + "\n" for row in rows))
+    return path
+
+
+def read(name: str) -> list[Row]:
+    return [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
+
+
+@contextmanager
+def build(name: str) -> Iterator[None]:
+    """Let every CPU op in this process run one build of the engine: avx512, avx2 or baseline."""
+    from splatmill_worker.kernels.cpu import bin, composite, loss, project, step  # noqa: F401
+
+    engine = isa.load(name)
+    prefix = "splatmill_worker.kernels.cpu"
+    modules = [m for k, m in sys.modules.items() if k.startswith(prefix) and hasattr(m, "engine")]
+    before = [m.engine for m in modules]
+    for m in modules:
+        m.engine = engine  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        for m, old in zip(modules, before, strict=True):
+            m.engine = old  # type: ignore[attr-defined]
