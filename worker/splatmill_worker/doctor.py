@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from splatmill.schema import format_bytes
 from splatmill_worker import places
@@ -202,15 +202,12 @@ def _storage() -> Iterator[Finding]:
 
 
 def _gpu() -> Iterator[Finding]:
-    torch: Any = importlib.import_module("torch")
-    if not torch.cuda.is_available():
-        why = "this torch is built without CUDA" if torch.version.cuda is None else "no driver or no card"
+    device = importlib.import_module("splatmill_worker.kernels.gpu.device")
+    why = device.absence()
+    if why is not None:
         present = Path("/proc/driver/nvidia/version").exists()
-        advice = (
-            "There is an NVIDIA driver: install a CUDA build of torch to use the card." if present else ""
-        )
-        yield Finding("gpu", "warning" if present else "ok", f"none ({why}); the CPU does the work", advice)
+        advice = "There is an NVIDIA driver here, so a card is being left unused." if present else ""
+        yield Finding("gpu", "warning" if present else "ok", f"none; the CPU does the work. {why}", advice)
         return
-    for index in range(torch.cuda.device_count()):
-        card = torch.cuda.get_device_properties(index)
-        yield Finding("gpu", "ok", f"{card.name}, {format_bytes(card.total_memory)}")
+    facts = device.describe()
+    yield Finding("gpu", "ok", f"{facts.name}, {format_bytes(facts.total_bytes)}")
