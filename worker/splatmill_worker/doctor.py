@@ -124,7 +124,7 @@ def _threads() -> Iterator[Finding]:
 def _memory() -> Iterator[Finding]:
     import psutil
 
-    now = psutil.virtual_memory()  # type: ignore[no-untyped-call]  # psutil carries no types
+    now = psutil.virtual_memory()  # psutil carries no types
     total, free = now.total, now.available
     limit = _cgroup_limit()
     usable = min(free, limit) if limit else free

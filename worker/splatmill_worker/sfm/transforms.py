@@ -182,7 +182,7 @@ def _sparse_points(path: Path) -> tuple[tuple[npt.NDArray[np.float64], npt.NDArr
     """Points of nerfstudio's sparse .ply (in the world of the transforms), and a note where it is not usable."""
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     try:
-        vertex = PlyData.read(path)["vertex"]  # type: ignore[no-untyped-call]  # plyfile has no types
+        vertex = PlyData.read(path)["vertex"]  # plyfile has no types
         points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
         names = {name.name for name in vertex.properties}
         grey = np.full(points.shape, 128, np.uint8)

@@ -61,12 +61,17 @@ class AutogradStep:
         background: Tensor | None = None,
         antialias: bool = False,
     ) -> tuple[Tensor, Tensor, Tensor]:
+        gaussians = self._gaussians
         projected = ops.project(
-            **self._gaussians.parameters(),
-            viewmat=viewmat,
-            K=K,
-            width=width,
-            height=height,
+            gaussians.means,
+            gaussians.log_scales,
+            gaussians.quats,
+            gaussians.logit_opacities,
+            gaussians.sh,
+            viewmat,
+            K,
+            width,
+            height,
             degree=degree,
             antialias=antialias,
             backend=self._backend,

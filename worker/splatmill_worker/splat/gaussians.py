@@ -76,7 +76,7 @@ class Gaussians:
 
     def finite(self) -> Tensor:
         """bool [N]: rows whose every parameter is finite and whose quaternion has a direction."""
-        keep = torch.linalg.vector_norm(self.quats, dim=1) > 0
+        keep: Tensor = torch.linalg.vector_norm(self.quats, dim=1) > 0
         for value in self:
             keep &= torch.isfinite(value.reshape(self.count, -1)).all(dim=1)
         return keep

@@ -53,11 +53,15 @@ def render(
     if background is not None:
         background = torch.as_tensor(background).to(gaussians.means.device, gaussians.means.dtype)
     projected = ops.project(
-        **gaussians.parameters(),
-        viewmat=viewmat,
-        K=intrinsics,
-        width=camera.width,
-        height=camera.height,
+        gaussians.means,
+        gaussians.log_scales,
+        gaussians.quats,
+        gaussians.logit_opacities,
+        gaussians.sh,
+        viewmat,
+        intrinsics,
+        camera.width,
+        camera.height,
         degree=gaussians.degree if degree is None else min(degree, gaussians.degree),
         antialias=antialias,
         backend=backend,

@@ -43,7 +43,7 @@ def write_report(
     warnings: Sequence[str],
 ) -> dict[str, Any]:
     """Write report.json, report.png and report.html into `out`; returns the report."""
-    report = {
+    report: dict[str, Any] = {
         "curve": [asdict(row) for row in trained.rows],
         "result": _result(trained, written),
         "seconds": {

@@ -20,7 +20,7 @@ class PhotoStats(NamedTuple):
     mean: Tensor  # float32 [3, height, stride] windowed mean
     variance: Tensor  # float32 [3, height, stride] windowed variance
     width: int
-    count: float  # pixels that count
+    weight: float  # pixels that count
 
 
 def photo_stats(photo: Tensor, *, mask: Tensor | None = None) -> PhotoStats:
@@ -70,7 +70,7 @@ class _Loss(torch.autograd.Function):
             stats.variance,
             width,
             height,
-            stats.count,
+            stats.weight,
             dssim_weight,
             gradient,
         )

@@ -252,7 +252,7 @@ class Step:
             stats.variance,
             width,
             height,
-            stats.count,
+            stats.weight,
             dssim_weight,
             self._gradient,
             self.threads,

@@ -40,13 +40,14 @@ def project(
     with torch.no_grad():
         every = _project_all(*groups, viewmat, K, width, height, degree, antialias)
         kept = torch.nonzero(_kept(groups, every, width, height, near)).squeeze(1)
-    rows = _project_all(*(g[kept] for g in groups), viewmat, K, width, height, degree, antialias)
+    visible = (means[kept], log_scales[kept], quats[kept], logit_opacities[kept], groups[4][kept])
+    rows = _project_all(*visible, viewmat, K, width, height, degree, antialias)
     n = means.shape[0]
 
     def spread(x: Tensor) -> Tensor:
         return torch.zeros((n, *x.shape[1:]), dtype=x.dtype, device=x.device).index_copy(0, kept, x)
 
-    return Projected(*(spread(x) for x in rows[:5]), spread(rows.extents).detach())
+    return Projected(*(spread(x) for x in rows))._replace(extents=spread(rows.extents).detach())
 
 
 def _project_all(
