@@ -91,6 +91,16 @@ def _needles(ratio: float) -> Case:
     return _with_scales(case, f"needles {ratio:.0e}", log_scales)
 
 
+def _long_needles(ratio: float) -> Case:
+    """Needles of which only the long axis is wider than the blur: the projected axes differ by `ratio`."""
+    case = scene("", 60, seed=26)
+    log_scales = torch.full((60, 3), -20.0)
+    log_scales[:, 0] = math.log(0.03 * ratio)
+    return _with_scales(
+        replace(case, logit_opacities=torch.full((60,), -1.5)), f"long needles {ratio:.0e}", log_scales
+    )
+
+
 def _discs() -> Case:
     case = scene("", 120, seed=4)
     log_scales = torch.full((120, 3), math.log(0.3))
@@ -207,6 +217,9 @@ _MAKERS: list[Callable[[], Case]] = [
     lambda: _needles(1e2),
     lambda: _needles(1e4),
     lambda: _needles(1e6),
+    lambda: _long_needles(1e2),
+    lambda: _long_needles(1e4),
+    lambda: _long_needles(1e6),
     _discs,
     lambda: _with_scales(scene("", seed=17), "sub-pixel", torch.full((200, 3), math.log(1e-4))),
     lambda: replace(

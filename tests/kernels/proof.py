@@ -25,8 +25,8 @@ EXP2_ERROR = 2e-5  # relative error the engines allow their vector 2^x on [-8, 0
 def backends() -> list[object]:
     """Every backend that can run here: the builds of the CPU engine, and gpu where there is one.
 
-    Triton's interpreter needs minutes for what takes a device seconds: it is proven on a few scenes by test_gpu_ops, and on
-    all of these where SPLATMILL_PROVE_INTERPRETER=1 asks for it.
+    Triton's interpreter needs minutes for what takes a device seconds: it is proven on a few scenes by test_gpu_ops,
+    and on all of these where SPLATMILL_PROVE_INTERPRETER=1 asks for it.
     """
     found: list[object] = [f"cpu:{name}" for name in isa.supported()]
     if torch.cuda.is_available() or os.environ.get("SPLATMILL_PROVE_INTERPRETER") == "1":
@@ -112,10 +112,11 @@ def define(case: Case) -> Run:
 def alpha_error(case: Case, exact: Projected) -> Tensor:
     """How far, relatively, float32 may put each Gaussian's alpha [N], to first order, from the definition.
 
-    alpha = o 2^(-q/2 log2 e), q = d^T C d <= 2 ln 255 = 11. A camera-space coordinate is a sum of four products, known to
-    4 eps (|mean| + |t|). Divided by z it moves the centre by that times f/z (1 + |u|), and rounding the pixel coordinate
-    by 2 eps |coordinate|; alpha's slope along q is at most sqrt(11 lambda_max(C)) <= 6 per pixel. Relative errors of the
-    covariance, 2 dz/z + 16 eps, act on q <= 11. The vector 2^x adds its own error, the sigmoid and the products 8 eps.
+    alpha = o 2^(-q/2 log2 e), q = d^T C d <= 2 ln 255 = 11. A camera-space coordinate is a sum of four products,
+    known to 4 eps (|mean| + |t|). Divided by z it moves the centre by that times f/z (1 + |u|), and rounding the
+    pixel coordinate by 2 eps |coordinate|; alpha's slope along q is at most sqrt(11 lambda_max(C)) <= 6 per pixel.
+    Relative errors of the covariance, 2 dz/z + 16 eps, act on q <= 11. The vector 2^x adds its own error, the sigmoid
+    and the products 8 eps.
     """
     coordinate = 4 * EPS * (case.means.double().abs().sum(1) + case.viewmat[:3, 3].double().abs().sum())
     z = exact.depths.detach()

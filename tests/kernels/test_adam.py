@@ -1,4 +1,5 @@
-"""Adam: every backend against the float64 definition, the definition against torch's own, and catch-up against dense steps.
+"""Adam: every backend against the float64 definition, the definition against torch's own, and catch-up against dense
+steps.
 
 Whether visible-only steps train as well as dense ones is a measurement (worker/bench), not a test.
 """
@@ -77,8 +78,8 @@ def test_steps_are_the_definitions(n: int, sparse: bool, backend: str) -> None:
     for a, b, m, m64, v, v64, rate in zip(
         got[0], want[0], got[1], want[1], got[2], want[2], RATES, strict=True
     ):
-        # Each step rounds the parameter once (eps |p|, |p| <= 5) and its update, of at most about 10 rates after a catch-up, to
-        # 24 eps; the moments gather 4 eps of their largest term a step.
+        # Each step rounds the parameter once (eps |p|, |p| <= 5) and its update, of at most about 10 rates after a
+        # catch-up, to 24 eps; the moments gather 4 eps of their largest term a step.
         assert float((a.cpu() - b).abs().max()) <= steps * (6 * EPS + 240 * EPS * rate)
         assert torch.allclose(m.cpu().double(), m64, rtol=steps * 4 * EPS, atol=steps * 4 * EPS)
         assert torch.allclose(v.cpu().double(), v64, rtol=steps * 6 * EPS, atol=1e-30)
@@ -126,7 +127,8 @@ def test_a_gradient_that_is_not_finite_is_refused_and_counted(backend: str) -> N
 
 @pytest.mark.parametrize("backend", backends())
 def test_state_of_rarely_seen_rows_neither_underflows_nor_leaps(backend: str) -> None:
-    """One gradient of any size, thousands of steps of nothing, then the same again: no step beyond Adam's own bound."""
+    """One gradient of any size, thousands of steps of nothing, then the same again: no step beyond Adam's own
+    bound."""
     device = "cuda" if backend == "gpu" and torch.cuda.is_available() else "cpu"
     sizes = torch.logspace(-30, 15, 46)
     params, m, v = (
@@ -152,8 +154,8 @@ def test_state_of_rarely_seen_rows_neither_underflows_nor_leaps(backend: str) ->
             )
             travel = (params[0] - before).abs()
             assert torch.isfinite(travel).all()
-            # A gradient after silence moves (1 - beta1) / sqrt(1 - beta2) = 3.17 rates; the drift that follows, and that the
-            # next visit catches up on, is 9.05 times as much: dense Adam's own bound.
+            # A gradient after silence moves (1 - beta1) / sqrt(1 - beta2) = 3.17 rates; the drift that follows, and
+            # that the next visit catches up on, is 9.05 times as much: dense Adam's own bound.
             assert float(travel.max()) <= 3.17 * 10.05
             seen = (sizes > 1e-12).to(device)
             assert float(travel[seen].min()) >= 0.5, "a gradient above eps moves its parameter"

@@ -1,4 +1,5 @@
-"""Mean distance to the three nearest others: every backend against all pairs in float64, on points of every awkward kind."""
+"""Mean distance to the three nearest others: every backend against all pairs in float64, on points of every awkward
+kind."""
 
 from __future__ import annotations
 
@@ -96,5 +97,5 @@ def test_no_points_give_no_distances(backend: str) -> None:
     ids=["one", "two columns", "integers", "nan", "inf"],
 )
 def test_bad_points_are_named(points: Tensor, backend: str) -> None:
-    with use(backend) as op, pytest.raises((TypeError, ValueError), match="^points"):
+    with use(backend) as op, pytest.raises((TypeError, ValueError), match=r"^points"):
         ops.knn(points, backend=op)

@@ -1,4 +1,5 @@
-"""L1 + D-SSIM and its gradient: every backend against the float64 definition, and the definition against a plain window sum.
+"""L1 + D-SSIM and its gradient: every backend against the float64 definition, and the definition against a plain
+window sum.
 
 The order of the definition's gradient is measured in test_reference_order.
 """
@@ -53,8 +54,9 @@ def test_loss_is_the_definitions(size: tuple[int, int], kind: str, masked: bool,
     with use(backend) as op:
         mine = ops.loss(got, photo.to(device), mask=None if mask is None else mask.to(device), backend=op)
         (gradient,) = torch.autograd.grad(mine, got)
-    # A windowed moment of values up to 1 is known to 12 eps, a variance (a difference of two) to 24 eps; over C2 = 9e-4, that
-    # is 24 eps / 9e-4 = 1.6e-3 at worst where nothing varies, times the weight 0.2. Averages over pixels lose much of it.
+    # A windowed moment of values up to 1 is known to 12 eps, a variance (a difference of two) to 24 eps; over C2 =
+    # 9e-4, that is 24 eps / 9e-4 = 1.6e-3 at worst where nothing varies, times the weight 0.2. Averages over pixels
+    # lose much of it.
     flat = 24 * EPS / 9e-4
     assert float(mine.detach().cpu().double() - value.detach()) == pytest.approx(0.0, abs=0.2 * flat)
     off = (gradient.cpu().double() - expected).abs()

@@ -1,7 +1,8 @@
 """Every backend differentiates every case as the definition does: the chain of ops, and project and composite alone.
 
-The definition is the float64 reference; that its gradient is right is shown by test_reference_order. Pixels within the error
-of float32 of a threshold get no weight here, since the gradient jumps there; test_proof_forward shows that they are few.
+The definition is the float64 reference; that its gradient is right is shown by test_reference_order. Pixels within
+the error of float32 of a threshold get no weight here, since the gradient jumps there; test_proof_forward shows that
+they are few.
 """
 
 from __future__ import annotations
@@ -48,8 +49,9 @@ def test_gradient_is_the_definitions(name: str, backend: str) -> None:
         got = run(case, op).gradients(*weights)
     error = alpha_error(case, want.projected)
     rho = float(error.max()) if len(error) else 0.0
-    # A gradient is a sum over pixels of products of alpha (relative error rho), of d (its error is in rho) and of what lies
-    # behind, C_final - C_before (two images, each within rho): 4 rho in all, and 64 eps for the products of the chain rule.
+    # A gradient is a sum over pixels of products of alpha (relative error rho), of d (its error is in rho) and of
+    # what lies behind, C_final - C_before (two images, each within rho): 4 rho in all, and 64 eps for the products of
+    # the chain rule.
     relative = 4 * rho + 64 * EPS
     size = {k: float(g.norm()) for k, g in expected.items()}
     # Terms that cancel leave their rounding: each log-scale's are alpha dL/dalpha q with q <= 11; a quaternion's are
@@ -108,8 +110,9 @@ def test_project_alone(name: str, backend: str) -> None:
     expected = gradients("reference", torch.float64)
     with use(backend) as op:
         got = gradients(op, torch.float32)
-    # Every factor of the chain rule carries a few eps, and 1/z carries the error of the camera coordinate, to the third
-    # power at most. Between the two axes of a conic terms cancel in proportion to their ratio, the root of its condition.
+    # Every factor of the chain rule carries a few eps, and 1/z carries the error of the camera coordinate, to the
+    # third power at most. Between the two axes of a conic terms cancel in proportion to their ratio, the root of its
+    # condition.
     p = define(case).projected
     z = torch.where(p.depths > 0, p.depths, 1.0).detach()
     coordinate = 4 * EPS * (case.means.double().abs().sum(1) + case.viewmat[:3, 3].double().abs().sum())

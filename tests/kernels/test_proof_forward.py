@@ -1,6 +1,7 @@
 """Every backend draws every case as the definition does, within the error that float32 arithmetic allows.
 
-The definition is the float64 reference; that it is right is shown by test_reference_*. Nothing here is about gradients.
+The definition is the float64 reference; that it is right is shown by test_reference_*. Nothing here is about
+gradients.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ def test_image_is_the_definitions(name: str, backend: str) -> None:
     rho = float(error.max()) if len(error) else 0.0
     near = margins(want.projected, want.bins, case.width, case.height, error).jump <= 1.0
     # Errors of alpha reach the pixel through weights that sum to at most 1 and colours that differ by at most the
-    # brightest: |dC| <= rho * brightest; the colours' own rounding is 64 eps of the sum of up to 17 terms, depths' 8 eps.
+    # brightest: |dC| <= rho * brightest; the colours' own rounding is 64 eps of the sum of up to 17 terms, depths' 8
+    # eps.
     color, depth = brightest(want)
     for label, a, b, largest, own in (
         ("color", got.color, want.color, color, 64 * EPS),
@@ -45,7 +47,8 @@ def test_image_is_the_definitions(name: str, backend: str) -> None:
         assert not wrong.any(), (
             f"{label}: {float(off[wrong].max()):.2e} over {bound:.2e} away from any threshold"
         )
-        # A crossing may drop or add one splat at the cut (weight 1/255), or all that is left at the end (weight 1e-4).
+        # A crossing may drop or add one splat at the cut (weight 1/255), or all that is left at the end (weight
+        # 1e-4).
         assert float(off.max()) <= bound + 2 * (1 / 255) * largest, f"{label}: more than a crossing explains"
     # Crossings are rare, or they would hide an error; the piles put one threshold on many pixels at once.
     if not name.startswith("pile") and near.numel() > 500:

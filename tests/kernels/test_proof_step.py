@@ -1,4 +1,5 @@
-"""The fused CPU training step is the ops one after another: the same image, gradients and Adam update, on every build.
+"""The fused CPU training step is the ops one after another: the same image, gradients and Adam update, on every
+build.
 
 That the ops are right is shown elsewhere; here is only that fusing them changed nothing.
 """
@@ -56,8 +57,9 @@ def test_image_and_gradients_are_the_ops(name: str, build: str) -> None:
             background=case.background,
             antialias=case.antialias,
         )
-        # Alone, composite gets conics that were rounded to three numbers; fused, it gets the factor. Both are within rho of
-        # the definition, so within 2 rho of one another; a pixel at a threshold may differ by the splat at stake.
+        # Alone, composite gets conics that were rounded to three numbers; fused, it gets the factor. Both are within
+        # rho of the definition, so within 2 rho of one another; a pixel at a threshold may differ by the splat at
+        # stake.
         color, depth = brightest(want)
         for got, other, largest in (
             (image[0], alone.color, color),
@@ -128,8 +130,8 @@ def test_train_is_forward_loss_gradient_and_adam(build: str) -> None:
             moments[1].append(sh_v)
             after = parts.parameters()
             for k, p, rate in zip(GROUPS, [*params, sh], [*rates, RATES.sh_dc], strict=True):
-                # Rounding of the parameter itself, of the update's 16 operations, and of gradients that Adam's quotient
-                # magnifies where both moments cancel.
+                # Rounding of the parameter itself, of the update's 16 operations, and of gradients that Adam's
+                # quotient magnifies where both moments cancel.
                 bound = 2 * EPS * p.abs() + 1e-4 * rate
                 assert ((after[k].double() - p).abs() <= bound).all(), k
         for k, x in fused.parameters().items():

@@ -1,8 +1,9 @@
 """The definition draws what an independent implementation draws: gsplat's plain-torch code, on the CPU.
 
-gsplat supplies projection, compensation, spherical harmonics and the alpha of every (pixel, Gaussian) pair. Its compositing
-calls the package nerfacc, which needs a GPU to build; the two published formulas it calls are written here. gsplat has no
-1/255 ellipse lists, stop or culls of ours: all pairs are tried, and cut and stop applied by their definitions.
+gsplat supplies projection, compensation, spherical harmonics and the alpha of every (pixel, Gaussian) pair. Its
+compositing calls the package nerfacc, which needs a GPU to build; the two published formulas it calls are written
+here. gsplat has no 1/255 ellipse lists, stop or culls of ours: all pairs are tried, and cut and stop applied by their
+definitions.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def drawn_by_gsplat(case: Case, monkeypatch: pytest.MonkeyPatch) -> tuple[Tensor
     means, log_scales, quats, logits, sh = case.groups(torch.float64)
     V, K = case.camera(torch.float64)
     covars, _ = gs._quat_scale_to_covar_preci(quats, log_scales.exp(), compute_preci=False)
-    radii, means2d, depths, conics, compensations = gs._fully_fused_projection(
+    _, means2d, depths, conics, compensations = gs._fully_fused_projection(
         means,
         covars,
         V[None],

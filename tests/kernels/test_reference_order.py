@@ -1,7 +1,7 @@
 """The definition's gradients are right: finite differences, and errors that fall as h^2, op by op and group by group.
 
-In float64, with the jump at 1/255 replaced by a smooth ramp and the stop left out. The hard cut itself is covered where it
-acts on values (test_proof_forward); its gradient, zero on either side of a jump, has no order to measure.
+In float64, with the jump at 1/255 replaced by a smooth ramp and the stop left out. The hard cut itself is covered
+where it acts on values (test_proof_forward); its gradient, zero on either side of a jump, has no order to measure.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Scenes the kernel benchmarks run on: fox's SfM points, the same densified, and synthetic clouds. All deterministic."""
+"""Scenes of the kernel benchmarks: fox's SfM points, the same densified, synthetic clouds. All deterministic."""
 
 from __future__ import annotations
 
@@ -59,10 +59,13 @@ def morton(points: Tensor) -> Tensor:
 
 
 def densified(groups: list[Tensor], n: int) -> list[Tensor]:
-    """A stand-in for training's densification: copies drawn from each Gaussian's own shape, narrowed so that the volume that
-    they fill stays as it was (scale / copies^(1/3)), opacity raised to 0.3 to 0.7, a slight view dependence."""
+    """A stand-in for training's densification: copies drawn from each Gaussian's own shape.
+
+    They are narrowed so that the volume they fill stays as it was (scale / copies^(1/3)), get an opacity of 0.4 to 0.6
+    and a slight dependence on the view.
+    """
     g = torch.Generator().manual_seed(0)
-    means, log_scales, quats, _, sh = groups
+    means, log_scales, _, _, sh = groups
     source = torch.arange(n) % len(means)
     copies = n / len(means)
     narrow = log_scales[source] - math.log(copies) / 3 + 0.2 * torch.randn(n, 3, generator=g)
@@ -70,7 +73,7 @@ def densified(groups: list[Tensor], n: int) -> list[Tensor]:
     turned = torch.randn(n, 4, generator=g)
     shaded = sh[source].clone()
     shaded[:, 1:] = 0.03 * torch.randn(n, 15, 3, generator=g)
-    out = [moved, narrow, turned, 0.8 * torch.rand(n, generator=g) - 0.8 + 0.4, shaded]
+    out = [moved, narrow, turned, 0.8 * torch.rand(n, generator=g) - 0.4, shaded]
     order = morton(moved)
     return [x[order].contiguous() for x in out]
 

@@ -83,12 +83,14 @@ SPLATMILL_INLINE Float load(const float* p) {
 SPLATMILL_INLINE void store(float* p, Float x) {
   for (int i = 0; i < kParts; ++i) *reinterpret_cast<NativeFloat*>(p + i * kNative) = x.part[i];
 }
+// Part by part: a memcpy of the whole goes through the stack in pieces that the processor cannot forward to the next load.
+typedef float UnalignedFloat __attribute__((vector_size(kNative * 4), aligned(4), may_alias));
 SPLATMILL_INLINE Float load_unaligned(const float* p) {
-  Float x;
-  std::memcpy(&x, p, sizeof x);
-  return x;
+  return detail::each<Float>([&](auto i) { return NativeFloat(*reinterpret_cast<const UnalignedFloat*>(p + i * kNative)); });
 }
-SPLATMILL_INLINE void store_unaligned(float* p, Float x) { std::memcpy(p, &x, sizeof x); }
+SPLATMILL_INLINE void store_unaligned(float* p, Float x) {
+  for (int i = 0; i < kParts; ++i) *reinterpret_cast<UnalignedFloat*>(p + i * kNative) = x.part[i];
+}
 SPLATMILL_INLINE Int load_int(const int32_t* p) {
   Int x;
   std::memcpy(&x, p, sizeof x);
