@@ -26,6 +26,7 @@ class AutogradStep:
 
     def __init__(self, gaussians: Gaussians, *, backend: ops.Backend) -> None:
         self._backend = backend
+        self.keep_scores = True  # autograd has them anyway
         self.replace(gaussians.padded(3).parameters(), None, None)
 
     @property

@@ -26,8 +26,10 @@ class Engine(Protocol):
     Scores are sums since the last `replace`, one value per Gaussian: `plain_sum` and `abs_sum` of the norm of
     the gradient of the projected mean in NDC units (the absolute one adds magnitudes over pixels; None where a
     backend has none), `visible_count` of steps that saw it, `max_extent` its largest half size over
-    half the photo's longer side.
+    half the photo's longer side. `keep_scores` False says that nobody will read them.
     """
+
+    keep_scores: bool
 
     @property
     def count(self) -> int: ...

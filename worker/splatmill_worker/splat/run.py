@@ -105,6 +105,8 @@ class Run:
         self.loss = result.loss
         self.ever_saw |= result.visible > 0
         self.health.watch(self.step, result.loss, result.visible)
+        # What nobody will read is not summed.
+        self.engine.keep_scores = self.densifier is not None and progress < schedule.densify_until
         if self.densifier is not None:
             self.densifier.after_step(self.engine, rates.means, self.random)
             if schedule.densifies(self.step, progress):

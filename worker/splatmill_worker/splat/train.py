@@ -26,7 +26,9 @@ MEASURED_AT = (0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8,
 """Shares of the budget at which the held-out views are rendered: close together where the curve is steep."""
 
 FLAT_GAIN = 0.02
-"""dB over the last quarter of what was spent; training that gains less is not worth its time."""
+"""dB on the held-out views; training that gains less over FLAT_SHARE of its time is not worth it."""
+
+FLAT_SHARE, FLAT_ROWS = 0.4, 3
 
 FLAT_TAIL = 0.1
 
@@ -220,12 +222,17 @@ def _enough(run: Run, plan: Plan) -> str:
 
 
 def _flat(rows: Sequence[Row]) -> bool:
-    """Whether the last quarter of the time gained less than FLAT_GAIN on the held-out views."""
-    now = rows[-1]
-    before = [row for row in rows if row.seconds <= 0.75 * now.seconds and row.step >= 500]
-    if not before or now.psnr is None or before[-1].psnr is None:
+    """Whether none of the last rows, over FLAT_SHARE of the time, gained FLAT_GAIN on the best one before them.
+
+    One row is no evidence: the curve dips where Gaussians were just added or the photos became larger.
+    """
+    scores = [(row.seconds, row.psnr) for row in rows if row.psnr is not None]
+    if not scores or rows[-1].step < 500:
         return False
-    return now.psnr - before[-1].psnr < FLAT_GAIN
+    since = (1.0 - FLAT_SHARE) * scores[-1][0]
+    before = [psnr for seconds, psnr in scores if seconds <= since]
+    after = [psnr for seconds, psnr in scores if seconds > since]
+    return bool(before) and len(after) >= FLAT_ROWS and max(after) < max(before) + FLAT_GAIN
 
 
 def _tick(run: Run) -> Tick:

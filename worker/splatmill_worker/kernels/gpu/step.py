@@ -143,6 +143,7 @@ class Step:
         where: torch.device | str | None = None,
         together: Together | None = None,
     ) -> None:
+        self.keep_scores = True  # a pass of its own here, which costs next to nothing beside the others
         if where is None:
             where = "cpu" if device.interpreting() else "cuda"
         self.device = torch.device(where)
