@@ -54,7 +54,7 @@ def test_steps_are_the_definitions(n: int, sparse: bool, backend: str) -> None:
     device = "cuda" if backend == "gpu" and torch.cuda.is_available() else "cpu"
     got, want = start(n, torch.float32, device), start(n, torch.float64)
     last, last64 = torch.zeros(n, dtype=torch.int32, device=device), torch.zeros(n, dtype=torch.int32)
-    steps = 40
+    steps = 12
     with use(backend) as op:
         for step in range(1, steps + 1):
             grads = gradients(n, step)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import torch
-from tests.kernels.cases import GROUPS, Case, scene
+from .cases import GROUPS, Case, scene
 from torch import Tensor
 
 from splatmill_worker.kernels import ops

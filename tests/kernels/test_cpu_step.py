@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.kernels.cases import GROUPS, Case, scene
+from .cases import GROUPS, Case, scene
 from torch import Tensor
 
 from splatmill_worker.kernels import ops

@@ -43,7 +43,8 @@ def start_from(points: Tensor, colors: Tensor) -> list[Tensor]:
     quats = torch.zeros(n, 4)
     quats[:, 0] = 1.0
     sh = torch.zeros(n, 16, 3)
-    sh[:, 0] = (colors.float() / 255 - 0.5) / SH_C0
+    # The middle of an 8-bit step: black would stand on the kink of the colour's clamp at 0.
+    sh[:, 0] = ((colors.float() + 0.5) / 256 - 0.5) / SH_C0
     return [points, log_scales, quats, torch.full((n,), math.log(0.1 / 0.9)), sh]
 
 

@@ -22,6 +22,7 @@ struct Projection {
   Float M0[3], M1[3];          // rows of M
   Float a, b, c, det;          // Sigma' (pixels^2) and its determinant
   Float sigmoid, opacity;      // before and after the antialias compensation
+  Float complement;            // 1 - sigmoid, with all its digits
   Float x2d, y2d;              // pixels
   Float cut;                   // log2(255 opacity)
   Float extent_x, extent_y;    // pixels
@@ -100,7 +101,9 @@ SPLATMILL_INLINE void project_geometry(const float* p, const Camera& cam, Projec
   o.det = fma(kBlur, trace0 + trace1, sharp) + kBlur * kBlur;
   o.visible &= is_finite(o.det) & is_finite(o.a) & is_finite(o.c);  // b is bounded by both
 
-  o.sigmoid = 1.0f / (exp(-row(p, kLogit)) + 1.0f);
+  const Float odds_against = exp(-row(p, kLogit));
+  o.sigmoid = 1.0f / (odds_against + 1.0f);
+  o.complement = odds_against * o.sigmoid;  // 1 - sigmoid would lose its digits from a logit of 10 on
   o.opacity = o.sigmoid;
   // Detached from the covariance: through det the gradient explodes where a splat degenerates, and makes more of those.
   if (cam.antialias) o.opacity = o.opacity * sqrt(max(sharp / o.det, kCompensationMin));

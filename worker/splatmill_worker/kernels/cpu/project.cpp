@@ -140,7 +140,7 @@ void project_rows_backward(const float* blocks, int64_t count, int degree, const
       to.Quu = fma(row_a, f.ux, row_b * f.uy) * k;
       to.Quv = row_b * f.vy * k;
       to.Qvv = f.vy * f.vy * dc * k;
-      to.logit = load(lanes[5]) * o.opacity * (1.0f - o.sigmoid);
+      to.logit = load(lanes[5]) * o.opacity * o.complement;
       for (int c = 0; c < 3; ++c) to.color[c] = load(lanes[6 + c]);
       to.depth = load(lanes[9]);
       CameraGradient camera;

@@ -57,7 +57,7 @@ SPLATMILL_INLINE ProjectedGradient gradient_from_sums(const Float* s, const Proj
   d.Quu = uu * k2;
   d.Quv = uv * k2;
   d.Qvv = vv * k2;
-  d.logit = s[kSumQ] * (1.0f - o.sigmoid);
+  d.logit = s[kSumQ] * o.complement;
   for (int c = 0; c < 3; ++c) d.color[c] = s[kSumRed + c];
   d.depth = s[kSumDepth];
   return d;
