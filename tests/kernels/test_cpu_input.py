@@ -12,11 +12,12 @@ from typing import Any
 
 import pytest
 import torch
-from .cases import GROUPS, Case, scene
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu.step import Rates, Step
+
+from .cases import GROUPS, Case, scene
 
 RATES = Rates(1e-3, 1e-3, 1e-3, 1e-2, 1e-3, 1e-4)
 

@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from .cases import GROUPS, Case, scene
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
@@ -17,6 +16,8 @@ from splatmill_worker.kernels.cpu import engine
 from splatmill_worker.kernels.cpu.loss import photo_stats
 from splatmill_worker.kernels.cpu.step import Rates, Step
 from splatmill_worker.kernels.reference import adam_ as reference_adam_
+
+from .cases import GROUPS, Case, scene
 
 RATES = Rates(means=1e-3, log_scales=5e-3, quats=1e-3, logit_opacities=5e-2, sh_dc=2.5e-3, sh_rest=1.25e-4)
 
