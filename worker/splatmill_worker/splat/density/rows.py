@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splatmill_worker.kernels.cpu.order import morton_order
 from splatmill_worker.splat.engine import Engine
 from splatmill_worker.splat.gaussians import Gaussians, concatenate
 
@@ -39,9 +38,8 @@ class Rows:
         )
 
     def into(self, engine: Engine) -> None:
-        """Hand the rows back to the engine, neighbours in space side by side; its scores start again at zero."""
-        rows = self.keep(morton_order(self.gaussians.means.cpu()).to(self.exp_avg.device))
-        engine.replace(rows.gaussians.parameters(), rows.exp_avg, rows.exp_avg_sq)
+        """Hand the rows back to the engine; its scores start again at zero."""
+        engine.replace(self.gaussians.parameters(), self.exp_avg, self.exp_avg_sq)
 
 
 def rotations(quats: Tensor) -> Tensor:

@@ -1,0 +1,195 @@
+"""Proves the whole path on small posed captures: events, files, resuming, cancelling, refusals, and that files agree.
+
+Does not prove SfM (its own tests do), nor quality on real photos beyond a floor where the shared data is present.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import stillife
+import torch
+from PIL import Image
+
+from splatmill.schema import Event, JobState, ModelCameras, Report, TrainOptions
+from splatmill_worker import pipeline
+from splatmill_worker.refusal import Refusal
+from splatmill_worker.scene import Camera
+from splatmill_worker.splat import ply
+from splatmill_worker.splat.evaluate import compare
+from splatmill_worker.splat.render import render
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+def options(**values: object) -> TrainOptions:
+    return TrainOptions.model_validate({"steps": 150, "seed": 1, **values})
+
+
+def run(
+    capture: Path, work: Path, asked: TrainOptions, cancelled: Callable[[], bool] = lambda: False
+) -> tuple[pipeline.Outcome, list[Event]]:
+    events: list[Event] = []
+    return pipeline.run(capture, work, asked, events.append, cancelled), events
+
+
+def test_a_posed_capture_becomes_a_model_with_its_reports(tmp_path: Path) -> None:
+    capture = stillife.posed_capture(tmp_path / "capture")
+    outcome, events = run(capture, tmp_path / "work", options())
+    assert outcome.ended == "succeeded"
+    kinds = [event.type for event in events]
+    states = [event.state for event in events if event.type == "state"]
+    assert states == [JobState.sfm, JobState.training, JobState.exporting]
+    assert kinds.count("plan") == 1
+    assert kinds.count("metric") >= 5
+    assert "preview" in kinds
+
+    out = outcome.out
+    assert {path.name for path in out.iterdir()} == {
+        "model.ply", "cameras.json", "preview.jpg", "report.json", "report.png", "report.html",
+    }  # fmt: skip
+    written = json.loads((out / "report.json").read_text())
+    report = Report.model_validate(written)
+    assert [row.step for row in report.curve] == sorted(row.step for row in report.curve)
+    assert report.curve[-1].step == 150
+    assert report.curve[-1].psnr == pytest.approx(written["result"]["psnr"])
+    assert report.seconds.train > 0
+    assert report.seconds.evaluate > 0
+    assert report.plan["reasons"]
+    assert any("alpha" in row.get("what", "") for row in report.left_out)
+    assert report.machine["cores"] >= 1
+    assert report.versions["backend"] == "cpu"
+    assert len([row for row in written["views"] if row["split"] == "test"]) == 2
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/") >= 4
+    assert "http://" not in page
+    assert "https://" not in page
+    with Image.open(out / "report.png") as drawn:
+        assert drawn.size[0] > 500
+
+
+def test_the_model_shows_the_photos_at_the_reported_error_in_the_captures_own_world(tmp_path: Path) -> None:
+    capture = stillife.posed_capture(tmp_path / "capture")
+    out = run(capture, tmp_path / "work", options(steps=120))[0].out
+    scene = ply.read(out / "model.ply")
+    assert bool(scene.finite().all())
+    cameras = ModelCameras.model_validate_json((out / "cameras.json").read_text()).cameras
+    judged = [row for row in cameras if row.split == "test"]
+    assert {row.name for row in judged} == {"00.png", "08.png"}
+    assert len(cameras) == stillife.COUNT
+    for row in judged:
+        fx, fy, cx, cy = row.camera.pinhole()
+        viewmat = np.array(row.camera.viewmat())
+        true = stillife.pictures()[int(row.name[:2])][0]
+        assert np.allclose(viewmat, true.viewmat, atol=1e-5)
+        camera = Camera(row.camera.width, row.camera.height, fx, fy, cx, cy, viewmat)
+        with Image.open(capture / "images" / row.name) as opened:
+            photo = torch.from_numpy(np.asarray(opened).copy())
+        seen = compare(row.name, render(scene, camera).color, photo)
+        assert row.psnr is not None
+        assert seen.psnr == pytest.approx(row.psnr, abs=0.05)
+
+
+def test_a_cancelled_run_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = stillife.posed_capture(tmp_path / "capture")
+    monkeypatch.setattr("splatmill_worker.splat.train.Hooks.checkpoint_seconds", 0.0)
+    metrics = 0
+
+    def count(event: Event) -> None:
+        nonlocal metrics
+        metrics += event.type == "metric"
+
+    first = pipeline.run(capture, tmp_path / "work", options(), count, lambda: metrics >= 8)
+    assert first.ended == "cancelled"
+    assert not (first.out / "model.ply").exists()
+    second, events = run(capture, tmp_path / "work", options())
+    assert second.ended == "succeeded"
+    steps = [event.step for event in events if event.type == "metric"]
+    assert steps[0] > 50
+    report = json.loads((second.out / "report.json").read_text())
+    assert len(report["curve"]) == len({row["step"] for row in report["curve"]}) == 14
+    seconds = [row["seconds"] for row in report["curve"]]
+    assert seconds == sorted(seconds)
+
+
+def test_a_finished_run_asked_again_gives_the_same_model(tmp_path: Path) -> None:
+    capture = stillife.posed_capture(tmp_path / "capture")
+    asked = options(steps=60)
+    first = (run(capture, tmp_path / "a", asked)[0].out / "model.ply").read_bytes()
+    assert (run(capture, tmp_path / "b", asked)[0].out / "model.ply").read_bytes() == first
+
+
+def test_nothing_held_out_is_reported_as_such(tmp_path: Path) -> None:
+    capture = stillife.posed_capture(tmp_path / "capture")
+    out = run(capture, tmp_path / "work", options(steps=40, holdout=0))[0].out
+    report = json.loads((out / "report.json").read_text())
+    assert report["result"]["psnr"] is None
+    assert report["result"]["train_psnr"] > 10
+    assert all(row["psnr"] is None for row in report["curve"])
+    assert (out / "report.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize(
+    ("asked", "code"),
+    [
+        ({"test_views": ["nowhere.png"]}, "holdout_empty"),
+        ({"holdout": 1}, "holdout_empty"),
+        ({"pose_refinement": "on"}, "option_out_of_range"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_by_code(tmp_path: Path, asked: dict[str, object], code: str) -> None:
+    capture = stillife.posed_capture(tmp_path / "capture")
+    with pytest.raises(Refusal) as refused:
+        run(capture, tmp_path / "work", options(**asked))
+    assert refused.value.code == code
+    assert refused.value.advice
+
+
+def test_poses_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
+    capture = stillife.posed_capture(tmp_path / "capture")
+    (capture / "poses" / "transforms.json").write_text("{")
+    with pytest.raises(Refusal) as refused:
+        run(capture, tmp_path / "work", options())
+    assert refused.value.code == "poses_invalid"
+
+
+def test_far_from_the_origin_the_model_keeps_local_coordinates(tmp_path: Path) -> None:
+    """At northing 5e6 float32 has steps of half a metre; the offset is taken out and reported."""
+    capture = stillife.posed_capture(tmp_path / "capture")
+    path = capture / "poses" / "transforms.json"
+    document = json.loads(path.read_text())
+    for frame in document["frames"]:
+        frame["transform_matrix"][0][3] += 450_000.0
+        frame["transform_matrix"][1][3] += 5_400_000.0
+    path.write_text(json.dumps(document))
+    out = run(capture, tmp_path / "work", options(steps=60))[0].out
+    report = json.loads((out / "report.json").read_text())
+    assert report["offset"] == pytest.approx([450_000.0, 5_400_000.0, 2.0], abs=3.0)
+    assert report["result"]["train_psnr"] > 13.0
+    assert float(ply.read(out / "model.ply").means.abs().median()) < 20.0
+
+
+@pytest.mark.skipif(not (DATA / "fox_540x960").is_dir(), reason="the shared photos are not on this machine")
+def test_real_photos_with_their_cameras(tmp_path: Path) -> None:
+    asked = TrainOptions.model_validate({"image_size": 160, "steps": 400})
+    out = run(DATA / "fox_540x960", tmp_path / "work", asked)[0].out
+    report = json.loads((out / "report.json").read_text())
+    assert report["result"]["psnr"] > 23.0
+    assert report["facts"]["views"] == 43
+    assert report["seconds"]["sfm"] < 5
+
+
+@pytest.mark.skipif(not (DATA / "lego_400").is_dir(), reason="the shared photos are not on this machine")
+def test_a_blender_set_with_alpha_and_its_own_split(tmp_path: Path) -> None:
+    asked = TrainOptions.model_validate({"image_size": 100, "steps": 400})
+    out = run(DATA / "lego_400", tmp_path / "work", asked)[0].out
+    report = json.loads((out / "report.json").read_text())
+    assert report["facts"]["views"] == 100
+    assert report["facts"]["transparent"] == 100
+    assert len([row for row in report["views"] if row["split"] == "test"]) == 25
+    assert report["plan"]["background"] == "random"
+    assert report["result"]["psnr"] > 20.0
