@@ -47,7 +47,7 @@ def test_every_command_and_flag_named_exists(page: str):
     group = get_command(app)
     commands = {name: group.get_command(None, name) for name in group.list_commands(None)}
     flags = {flag for command in commands.values() for option in command.params for flag in option.opts}
-    flags |= {
+    flags |= {"--help"} | {
         flag for command in commands.values() for option in command.params for flag in option.secondary_opts
     }
     for line in re.findall(
