@@ -49,7 +49,12 @@ def invoke(*arguments: str | Path):
 def spawn(*arguments: str | Path, **settings) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "splatmill", *map(str, arguments)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | settings
-    return subprocess.Popen(command, env=os.environ | WIDE, **pipes)
+    # A runner in the background of a shell ignores Ctrl-C, and its children would inherit that.
+    return subprocess.Popen(command, env=os.environ | WIDE, preexec_fn=_hear_interrupts, **pipes)
+
+
+def _hear_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def eventually(found: Callable[[], object], seconds: float = 20.0) -> object:

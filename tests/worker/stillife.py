@@ -54,7 +54,7 @@ def training_views(alpha: bool = False) -> list[TrainingView]:
     views = []
     for view, (camera, rgb, depth) in zip(scene().views, pictures(), strict=True):
         cover = np.where(depth < 6.5, 255, 0).astype(np.uint8) if alpha else None
-        views.append(TrainingView.of(Photo(view, camera, rgb, cover, None), frame))
+        views.append(TrainingView.of(Photo(view, camera, rgb.copy(), cover, None), frame))
     return views
 
 

@@ -7,7 +7,6 @@ from collections.abc import Hashable
 from torch import Tensor
 
 from splatmill_worker.kernels.cpu.loss import PhotoStats, photo_stats
-from splatmill_worker.kernels.cpu.order import morton_order
 from splatmill_worker.kernels.cpu.step import Rates, Step
 from splatmill_worker.splat.engine import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
@@ -23,17 +22,6 @@ class FusedStep(Step):
         super().__init__(**gaussians.padded(3).parameters(), threads=threads)
         self._kept: dict[Hashable, PhotoStats] = {}
         self._kept_bytes = 0
-
-    def replace(
-        self, params: dict[str, Tensor], exp_avg: Tensor | None, exp_avg_sq: Tensor | None
-    ) -> None:
-        """Take over other parameters and moments, neighbours in space side by side: their order is not kept."""
-        order = morton_order(params["means"])
-        super().replace(
-            {name: value[order] for name, value in params.items()},
-            None if exp_avg is None else exp_avg[order],
-            None if exp_avg_sq is None else exp_avg_sq[order],
-        )
 
     def train_photo(
         self,
