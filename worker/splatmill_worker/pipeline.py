@@ -59,12 +59,19 @@ class Outcome:
 
 
 def run(
-    capture: Path, workdir: Path, options: TrainOptions, emit: Emit, cancelled: Callable[[], bool]
+    capture: Path,
+    workdir: Path,
+    options: TrainOptions,
+    emit: Emit,
+    cancelled: Callable[[], bool],
+    *,
+    revise: Callable[[Plan], Plan] = lambda plan: plan,
 ) -> Outcome:
     """Train a scene from `capture` and leave model.ply, cameras.json and the reports in `workdir/out`.
 
     `workdir` survives attempts: what is there is gone on from. Events are emitted as things happen; states are
-    sfm, training and exporting, the final one is the caller's to say. Raises Refusal, sfm.SfmFailed and
+    sfm, training and exporting, the final one is the caller's to say. `revise` changes the plan once it is made,
+    which is how an ablation takes one decision back. Raises Refusal, sfm.SfmFailed and
     TrainingFailed, each with a sentence for the person who asked.
     """
     out = workdir / "out"
@@ -92,7 +99,7 @@ def run(
             views, held_out = _loaded(train_views, size, frame), _loaded(test_views, size, frame)
         with stages.measured("plan"):
             gaussians = _first_gaussians(world, views, options)
-            plan, facts = _plan(world, views, held_out, gaussians, options, workdir)
+            plan, facts = _plan(world, views, held_out, gaussians, options, workdir, revise)
         emit(PlanEvent(plan=plan.as_dict()))
         if plan.image_size < max(facts.width, facts.height):
             with stages.measured("load"):
@@ -152,6 +159,7 @@ def _plan(
     gaussians: Gaussians,
     options: TrainOptions,
     workdir: Path,
+    revise: Callable[[Plan], Plan],
 ) -> tuple[Plan, Facts]:
     """The plan, made once: an attempt that goes on keeps the one it started with."""
     kernels = kernels_of(options)
@@ -165,7 +173,7 @@ def _plan(
         if kept["options"] == options.model_dump(mode="json"):
             return Plan.from_dict(kept["plan"]), facts
     try:
-        plan = decide(facts, options, kernels)
+        plan = revise(decide(facts, options, kernels))
     except ValueError as error:
         raise Refusal(
             "option_out_of_range", str(error), advice="Change the option and start again."

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from splatmill_worker.splat.budget import Budget
+from splatmill_worker.splat.rates import Annealing
 from splatmill_worker.splat.schedule import Schedule
 
 Strategy = Literal["classic", "absolute", "mcmc"]
@@ -53,6 +54,7 @@ class Plan:
         """What `as_dict(whole=True)` gave, after a trip through JSON."""
         course = dict(values["schedule"])
         course["budget"] = Budget(**course["budget"])
+        course["annealing"] = Annealing(**course["annealing"])
         course["resolution"] = tuple((first, factor) for first, factor in course["resolution"])
         fields = {**values, "schedule": Schedule(**course), "forced": tuple(values["forced"])}
         return Plan(**fields)

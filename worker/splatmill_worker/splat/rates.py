@@ -12,26 +12,36 @@ POSITION_START = 1.6e-4
 
 
 @dataclass(frozen=True)
-class RateSchedule:
-    """Rates as functions of the share of the budget that is spent.
+class Annealing:
+    """How the rates fall over a run.
 
     The position rate falls exponentially from `POSITION_START * extent` by `position_fall`; the others keep the
     paper's values until `hold` of the budget is spent, then fall by a half cosine to `rest_fall` of them: with
-    Adam, what is left of the step size at the end is noise in the parameters. `scale` shortens every step,
-    which is how a run goes on after a divergence.
+    Adam, what is left of the step size at the end is noise in the parameters.
     """
 
-    extent: float
     position_fall: float = 0.01
     hold: float = 0.6
     rest_fall: float = 0.1
+
+
+@dataclass(frozen=True)
+class RateSchedule:
+    """Rates as functions of the share of the budget that is spent.
+
+    `scale` shortens every step, which is how a run goes on after a divergence.
+    """
+
+    extent: float
+    annealing: Annealing = Annealing()
     scale: float = 1.0
 
     def at(self, progress: float) -> Rates:
         """Rates at `progress` in 0..1."""
-        position = POSITION_START * self.extent * math.exp(math.log(self.position_fall) * progress)
-        late = min(1.0, max(0.0, (progress - self.hold) / (1.0 - self.hold)))
-        rest = self.scale * (self.rest_fall + (1.0 - self.rest_fall) * 0.5 * (1.0 + math.cos(math.pi * late)))
+        fall = self.annealing
+        position = POSITION_START * self.extent * math.exp(math.log(fall.position_fall) * progress)
+        late = min(1.0, max(0.0, (progress - fall.hold) / (1.0 - fall.hold)))
+        rest = self.scale * (fall.rest_fall + (1.0 - fall.rest_fall) * 0.5 * (1.0 + math.cos(math.pi * late)))
         return Rates(
             means=self.scale * position,
             log_scales=rest * 5e-3,

@@ -93,7 +93,7 @@ class Run:
             self.health.disturbed(self.step)
         number = self._next_view()
         target = self.views[number].reduced(reduction)
-        rates = RateSchedule(self.extent, scale=self.rate_scale).at(progress)
+        rates = RateSchedule(self.extent, schedule.annealing, self.rate_scale).at(progress)
         degree = schedule.degree_at(self.step, progress)
         try:
             if self.exposure is None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from splatmill_worker.splat.budget import Budget
+from splatmill_worker.splat.rates import Annealing
 
 
 @dataclass(frozen=True)
@@ -14,6 +15,7 @@ class Schedule:
 
     resolution: (first step, reduction) pairs; photos are reduced by 4, then 2, then not at all, because early
     steps gain as much from a small photo as from a large one. degree_every: steps between SH degrees.
+    degree_by: share of the budget in which a short one reaches its last degree; None: by steps alone.
     densify_from / densify_every in steps, densify_until as a share: after it, positions and colours settle.
     """
 
@@ -24,15 +26,17 @@ class Schedule:
     densify_from: int
     densify_every: int
     densify_until: float
+    degree_by: float | None = 1.0 / 3.0
+    annealing: Annealing = field(default_factory=Annealing)
 
     def reduction(self, step: int) -> int:
         """By how much photos are reduced at `step` (1-based)."""
         return [factor for first, factor in self.resolution if first < step][-1]
 
     def degree_at(self, step: int, progress: float) -> int:
-        """SH degree in use; a short budget reaches its last degree by its first third."""
+        """SH degree in use."""
         by_steps = (step - 1) // self.degree_every
-        by_share = int(progress * 3.0 * self.degree)
+        by_share = 0 if self.degree_by is None else int(progress * self.degree / self.degree_by)
         return min(self.degree, max(by_steps, by_share))
 
     def densifies(self, step: int, progress: float) -> bool:
