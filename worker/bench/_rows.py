@@ -30,7 +30,11 @@ def origin() -> Row:
             ["git", *arguments], cwd=HERE, capture_output=True, text=True, check=False
         ).stdout.strip()
 
-    commit = git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain", "--", "..") else "")
+    # Rows and what is drawn from them are the outcome, not what is measured.
+    sources = ("..", ":!results", ":!figures", ":!*.md")
+    commit = git("rev-parse", "--short", "HEAD") + (
+        "+" if git("status", "--porcelain", "--", *sources) else ""
+    )
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -56,6 +60,23 @@ def write(name: str, rows: list[Row]) -> Path:
     path.parent.mkdir(exist_ok=True)
     path.write_text("".join(json.dumps({**row, **origin()}) + "\n" for row in rows))
     return path
+
+
+def append(path: Path, row: Row) -> None:
+    """One more line, on the disk before this returns; what an interrupted write left of a line is cut off first."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("ab+") as stream:
+        stream.seek(0)
+        stream.truncate(stream.read().rfind(b"\n") + 1)
+        stream.write(json.dumps(row).encode() + b"\n")
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def lines(path: Path) -> list[Row]:
+    """The rows of a file, none where there is no file; a last line without its end was cut short and does not count."""
+    text = path.read_text() if path.is_file() else ""
+    return [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
 
 
 def read(name: str) -> list[Row]:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
+from _data import FOLDERS, SHARED
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
 
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "fox_540x960"
+DATA = SHARED / FOLDERS["fox"]
 SH_C0 = 0.28209479177387814
 
 

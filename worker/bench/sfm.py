@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import _data
 import _rows
 import numpy as np
 import numpy.typing as npt
@@ -39,14 +40,7 @@ from splatmill_worker.sfm.files import ImageFiles
 
 Float = npt.NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
-DATA = HERE.parents[1].parent / "shared" / "data"
-FOLDERS = {
-    "fox": "fox_540x960",
-    "lund": "lund_1024x768_gps",
-    "kermit": "kermit_640x480",
-    "unrelated": "failure_unrelated_640",
-    "rotation": "failure_pure_rotation",
-}
+FOLDERS = {name: _data.FOLDERS[name] for name in ("fox", "lund", "kermit", "unrelated", "rotation")}
 GROWTH = (25, 50, 100, 200)
 TRAIN_SIDE = 480
 
@@ -257,14 +251,14 @@ def measure(
 
 def reference(name: str) -> dict[str, Camera]:
     """The cameras that poses of this scene are compared with."""
-    found = posed.find(DATA / FOLDERS[name])
+    found = posed.find(_data.SHARED / FOLDERS[name])
     return {view.name: view.camera for view in found.load().views} if found is not None else {}
 
 
 def scenes_bench(scenes: list[str], settings: list[str], train: float | None) -> list[dict[str, Any]]:
     rows = []
     for name in scenes:
-        images = DATA / FOLDERS[name] / "images"
+        images = _data.SHARED / FOLDERS[name] / "images"
         if not images.is_dir():
             print(f"{name} is not here ({images}); no row for it.", file=sys.stderr)
             continue

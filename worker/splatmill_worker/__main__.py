@@ -61,7 +61,7 @@ def main(argv: list[str] | None = None) -> int:
     return _bench(chosen.name, chosen.arguments)
 
 
-def _give_memory_back() -> None:
+def give_memory_back() -> None:
     """Keep glibc from holding on to what was freed; other C libraries are left as they are."""
     mmap_threshold, arena_max = -3, -8  # malloc.h
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
@@ -71,7 +71,7 @@ def _give_memory_back() -> None:
 
 
 def _train(stop_grace: float | None) -> int:
-    _give_memory_back()
+    give_memory_back()
     # The imports of this process are those of every attempt it forks: nothing with threads of its own.
     import redis
 

@@ -1,0 +1,15 @@
+"""Where the shared captures lie: beside the project, never inside it (their licences forbid that)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
+FOLDERS = {
+    "fox": "fox_540x960",
+    "lego": "lego_400",
+    "lund": "lund_1024x768_gps",
+    "kermit": "kermit_640x480",
+    "unrelated": "failure_unrelated_640",
+    "rotation": "failure_pure_rotation",
+}

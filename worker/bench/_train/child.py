@@ -1,0 +1,68 @@
+"""Starting a process for one job: every row has its own memory, threads and clock."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from _rows import Row
+
+from _train.rows import Run
+from _train.scenes import Scene
+
+LAST_WORDS = 2000
+"""Characters of a dead process's errors that are shown."""
+
+
+class Fault(Exception):
+    """A process ended without an answer; the message holds its last words."""
+
+
+def prepared(scene: Scene, work: Path) -> Row:
+    """How many views and points the scene has, its cameras recovered and kept; `failure` says why there are none."""
+    return _ask({"do": "prepare", **_of(scene, work), "options": scene.options})
+
+
+def measured(run: Run, work: Path) -> Row:
+    """The row of a run, a failure by name included. Raises Fault."""
+    return _ask(
+        {
+            "do": "measure",
+            **_of(run.scene, work),
+            "identity": run.identity(),
+            "budget": run.budget.options,
+        }
+    )
+
+
+def judged(scene: Scene, name: str, model: Path, seconds: float, work: Path) -> Row:
+    """The row of a peer's model; `failure` says why it cannot be judged. Raises Fault."""
+    job = {"scene": scene.name, "options": scene.options, "name": name, "model": str(model)}
+    return _ask({"do": "judge", **_of(scene, work), **job, "seconds": seconds})
+
+
+def _of(scene: Scene, work: Path) -> Row:
+    kept = work / scene.name / "sfm"
+    return {"capture": str(scene.folder), "made": scene.made, "sfm": str(kept.resolve())}
+
+
+def _ask(job: Row) -> Row:
+    with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
+        answer = Path(folder) / "answer.json"
+        command = [sys.executable, "-m", "splatmill_worker", "bench", "train", "--job"]
+        done = subprocess.run(
+            [*command, json.dumps(job | {"answer": str(answer)})],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+        if not answer.is_file():
+            raise Fault(
+                f"the process ended with status {done.returncode} and left no row:\n{done.stderr[-LAST_WORDS:]}"
+            )
+        found: Row = json.loads(answer.read_text())
+        return found

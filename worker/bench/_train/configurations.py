@@ -1,0 +1,85 @@
+"""What is trained differently: one switch each, as data, so that a row says exactly what it changed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any
+
+from splatmill_worker.splat.plan import Plan
+
+DEFAULT = "default"
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """One switch against what the plan decides by itself.
+
+    what: the switch in words. options: fields of TrainOptions. plan: fields of the plan that was made, with dots
+    into its parts ("schedule.degree_every"). alpha: the switch means something on transparent photos only.
+    """
+
+    what: str
+    options: dict[str, Any] = field(default_factory=dict)
+    plan: dict[str, Any] = field(default_factory=dict)
+    alpha: bool = False
+
+
+CONFIGURATIONS = {
+    DEFAULT: Configuration("what the plan decides"),
+    "no-coarse-to-fine": Configuration(
+        "photos at full size from the first step", plan={"schedule.resolution": [[0, 1]]}
+    ),
+    "no-densification": Configuration("the Gaussians to start with stay as many", {"densify": "off"}),
+    "absolute": Configuration("densification by absolute gradients", {"densify": "absolute"}),
+    "mcmc": Configuration("MCMC relocation and noise", {"densify": "mcmc"}),
+    "sh-at-once": Configuration(
+        "the last SH degree from the start", plan={"schedule.degree_every": 1, "schedule.degree_by": None}
+    ),
+    "sh-slow": Configuration(
+        "1000 steps for each SH degree", plan={"schedule.degree_every": 1000, "schedule.degree_by": None}
+    ),
+    "sh-0": Configuration("colour does not change with the view", {"sh_degree": 0}),
+    "sh-3": Configuration("SH degree 3 whatever the views' angles", {"sh_degree": 3}),
+    "no-annealing": Configuration(
+        "rates stay as they start",
+        plan={"schedule.annealing.position_fall": 1.0, "schedule.annealing.rest_fall": 1.0},
+    ),
+    "position-annealing-only": Configuration(
+        "only the position rate falls, as in the paper", plan={"schedule.annealing.rest_fall": 1.0}
+    ),
+    "antialias": Configuration("opacities compensated for the 0.3 px dilation", {"antialias": "on"}),
+    "exposure": Configuration("an affine colour for each photo", {"exposure": "on"}),
+    "no-random-background": Configuration(
+        "white behind transparent photos", {"background": "white"}, alpha=True
+    ),
+}
+"""Name to switch. A name keeps its meaning: rows already measured carry it."""
+
+
+def named(name: str) -> Configuration:
+    """The configuration of a name. Raises ValueError, as a sentence, for an unknown one."""
+    if name not in CONFIGURATIONS:
+        raise ValueError(f"There is no configuration {name!r}; there are {', '.join(CONFIGURATIONS)}.")
+    return CONFIGURATIONS[name]
+
+
+def revised(plan: Plan, changes: dict[str, Any]) -> Plan:
+    """`plan` with the fields at dotted paths replaced, and said to be forced.
+
+    Raises ValueError for a path that leads to no field.
+    """
+    for path, value in changes.items():
+        plan = _with(plan, path.split("."), value, path)
+    return replace(plan, forced=(*plan.forced, *changes))
+
+
+def _with(part: Any, names: list[str], value: Any, path: str) -> Any:
+    known = [each.name for each in fields(part)] if is_dataclass(part) else []
+    if names[0] not in known:
+        where = type(part).__name__
+        raise ValueError(f"{path} leads to no field: {where} has {', '.join(known) or 'none'}.")
+    if len(names) > 1:
+        value = _with(getattr(part, names[0]), names[1:], value, path)
+    elif isinstance(value, list):
+        value = tuple(tuple(each) if isinstance(each, list) else each for each in value)
+    return replace(part, **{names[0]: value})

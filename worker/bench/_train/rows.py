@@ -1,0 +1,142 @@
+"""Rows of `bench train`: what makes two of them the same run, and which of them are compared."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from _rows import Row
+
+import splatmill.schema
+import splatmill_worker
+from _train.budgets import Budget
+from _train.configurations import CONFIGURATIONS, DEFAULT, named
+from _train.scenes import Scene
+
+_WORKER = Path(splatmill_worker.__file__).parent
+_COMPUTES = [
+    *(_WORKER / name for name in ("images", "kernels", "sfm", "splat")),
+    *(_WORKER / f"{name}.py" for name in ("capture", "colmap", "pipeline", "scene", "synthetic", "textures")),
+    Path(splatmill.schema.__file__).parent / "options.py",
+]
+
+
+@cache
+def code_version() -> str:
+    """A digest of the sources that a result depends on: the same code, the same row, whatever the commit is called."""
+    digest = hashlib.sha256()
+    for place in _COMPUTES:
+        files = [place] if place.is_file() else sorted(place.rglob("*"))
+        for path in files:
+            if path.suffix in {".py", ".cpp", ".hpp", ".h"}:
+                digest.update(f"{path.relative_to(place.parent)}\0".encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run to do: a scene trained by one configuration within one budget from one seed."""
+
+    scene: Scene
+    config: str
+    budget: Budget
+    seed: int
+
+    def identity(self) -> Row:
+        """The fields that a row starts with, and by which it is found again."""
+        configuration = named(self.config)
+        return {
+            "kind": "run",
+            "scene": self.scene.name,
+            "config": self.config,
+            "budget": self.budget.name,
+            "seed": self.seed,
+            "options": self.scene.options | configuration.options,
+            "revised": configuration.plan,
+        }
+
+    def __str__(self) -> str:
+        return f"{self.scene.name}, {self.config}, {self.budget.name}, seed {self.seed}"
+
+
+_IDENTITY = ("kind", "scene", "config", "budget", "seed", "options", "revised", "code")
+
+
+def key(row: Row) -> str:
+    """The same for two rows of the same run on the same code."""
+    return json.dumps([row.get(name) for name in _IDENTITY], sort_keys=True)
+
+
+def runs_of(
+    scenes: Iterable[Scene], configs: Iterable[str], budgets: Iterable[Budget], seeds: Iterable[int]
+) -> list[Run]:
+    """Every combination that means something, seeds outermost: an interrupted run leaves whole seeds behind."""
+    scenes, configs, budgets = list(scenes), list(configs), list(budgets)
+    return [
+        Run(scene, config, budget, seed)
+        for seed in seeds
+        for budget in budgets
+        for scene in scenes
+        for config in configs
+        if scene.transparent or not CONFIGURATIONS[config].alpha
+    ]
+
+
+def missing(runs: list[Run], rows: list[Row]) -> list[Run]:
+    """Those of `runs` that have no row of today's code."""
+    there = {key(row) for row in rows}
+    return [run for run in runs if key(run.identity() | {"code": code_version()}) not in there]
+
+
+def failed(row: Row) -> bool:
+    """A failed run gets no point; it is counted instead."""
+    return bool(row["outcome"] != "trained")
+
+
+def latest_default(rows: list[Row]) -> list[Row]:
+    """Of each scene the default's rows of the last code it ran with: those timed, or else those counted in steps."""
+    defaults = [row for row in rows if row["kind"] == "run" and row["config"] == DEFAULT]
+    timed = {row["scene"] for row in defaults if by_time(row)}
+    mine = [row for row in defaults if by_time(row) or row["scene"] not in timed]
+    last = {row["scene"]: row["code"] for row in mine}
+    return once([row for row in mine if row["code"] == last[row["scene"]]])
+
+
+def by_time(row: Row) -> bool:
+    """Whether the budget was seconds, not steps."""
+    return not row["budget"].endswith("steps")
+
+
+def once(rows: list[Row]) -> list[Row]:
+    """The last row of every run."""
+    return list({key(row): row for row in rows}.values())
+
+
+def compared(rows: list[Row]) -> dict[tuple[str, str, str], list[tuple[Row, Row]]]:
+    """(scene, budget, configuration) to pairs of rows: the default's and the configuration's, of one seed and code.
+
+    Of several codes the last one counts that has both.
+    """
+    runs = once([row for row in rows if row["kind"] == "run"])
+    defaults: dict[Any, Row] = {}
+    for row in runs:
+        if row["config"] == DEFAULT:
+            defaults[_place(row)] = row
+    found: dict[tuple[str, str, str], list[tuple[Row, Row]]] = {}
+    for row in runs:
+        if row["config"] != DEFAULT and _place(row) in defaults:
+            group = found.setdefault((row["scene"], row["budget"], row["config"]), [])
+            group.append((defaults[_place(row)], row))
+    return {
+        group: [pair for pair in pairs if pair[1]["code"] == pairs[-1][1]["code"]]
+        for group, pairs in found.items()
+    }
+
+
+def _place(row: Row) -> tuple[Any, ...]:
+    return row["scene"], row["budget"], row["seed"], row["code"]

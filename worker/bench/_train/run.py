@@ -1,0 +1,181 @@
+"""What one process does, clean of what ran before: recover cameras, measure one row, or judge a peer's model."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from _rows import Row, origin
+from torch import Tensor
+
+from _train.configurations import revised
+from _train.rows import code_version
+from splatmill.schema import TrainOptions
+from splatmill_worker import pipeline, sfm, synthetic
+from splatmill_worker.__main__ import give_memory_back
+from splatmill_worker.capture import cameras_of, held_out_of, kernels_of
+from splatmill_worker.images import load_views
+from splatmill_worker.refusal import Refusal
+from splatmill_worker.scene import Normalization
+from splatmill_worker.sfm import posed
+from splatmill_worker.splat import ply
+from splatmill_worker.splat.evaluate import evaluate
+from splatmill_worker.splat.failure import TrainingFailed
+from splatmill_worker.splat.plan import Plan
+from splatmill_worker.splat.render import render
+from splatmill_worker.splat.report import plain
+from splatmill_worker.splat.views import Target, TrainingView
+
+NAMED = (Refusal, TrainingFailed, sfm.SfmFailed)
+"""Failures that carry a name and a sentence; they are results, and anything else is a fault."""
+
+RESULT = ("psnr", "ssim", "mse", "train_psnr", "steps", "gaussians", "recoveries", "stopped")
+
+PHOTOS = 40
+"""Of the still life, in 640 x 480, as `make demo` takes them."""
+
+
+def _quiet(*_: object) -> None:
+    """Nobody watches."""
+
+
+def prepare(job: Row) -> Row:
+    """Photograph what is ours to photograph, and recover cameras where none were given, into the kept `sfm` folder."""
+    capture = Path(job["capture"])
+    if job["made"] and not (capture / "images").is_dir():
+        part = capture / "images.part"
+        synthetic.capture(part, PHOTOS)
+        part.rename(capture / "images")
+    options = TrainOptions.model_validate(job["options"])
+    try:
+        with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
+            scene = cameras_of(capture, _with_cameras(Path(folder), job), options, _quiet, lambda: False)
+            train, test = held_out_of(scene, options)
+    except NAMED as failure:
+        return {"failure": str(failure)}
+    return {"views": len(train), "held_out": len(test), "points": len(scene.points)}
+
+
+def measure(job: Row) -> Row:
+    """One row: the capture trained through the pipeline from an empty folder."""
+    give_memory_back()
+    capture, seed = Path(job["capture"]), job["identity"]["seed"]
+    options = TrainOptions.model_validate(job["identity"]["options"] | job["budget"])
+    if posed.find(capture) is not None:
+        # Cameras that are recovered would be recovered again by another seed: there, only training is seeded.
+        options = options.model_copy(update={"seed": seed})
+
+    def revise(plan: Plan) -> Plan:
+        return replace(revised(plan, job["identity"]["revised"]), seed=seed)
+
+    row = {**job["identity"], "bench": "train", "code": code_version(), **origin()}
+    with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
+        workdir = _with_cameras(Path(folder), job)
+        wall, cpu = time.perf_counter(), time.process_time()
+        try:
+            outcome = pipeline.run(capture, workdir, options, _quiet, lambda: False, revise=revise)
+        except NAMED as failure:
+            spent = {"wall_seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
+            return row | {"outcome": f"failed: {failure}", "curve": []} | spent
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        report = json.loads((outcome.out / "report.json").read_text())
+    result, seconds = report["result"], report["seconds"]
+    recovered = report["sfm"].get("seconds", {}) if report["facts"]["source"] == "sfm" else {}
+    values = {
+        "outcome": "trained" if result["failure"] is None else f"failed: {result['failure']}",
+        **{name: result[name] for name in RESULT},
+        "seconds": {**seconds, "sfm": sum(recovered.values())},
+        "wall_seconds": wall,
+        "cpu_seconds": cpu,
+        "peak_memory": report["peak_memory"],
+        "backend": report["versions"]["backend"],
+        "views": {"train": report["facts"]["views"], "test": report["facts"]["held_out"]},
+        "size": [report["facts"]["width"], report["facts"]["height"]],
+        "plan": {name: value for name, value in report["plan"].items() if name != "reasons"},
+        "warnings": report["warnings"],
+        "curve": report["curve"],
+    }  # fmt: skip
+    return row | rounded(values)
+
+
+def judge(job: Row) -> Row:
+    """A peer's finished model on the held-out views that runs are judged on, at their size, over white."""
+    path = Path(job["model"])
+    try:
+        gaussians = ply.read(path)
+    except ply.PlyUnreadableError as unreadable:
+        return {"failure": str(unreadable)}
+    options = TrainOptions.model_validate(job["options"])
+    with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
+        scene = cameras_of(
+            Path(job["capture"]), _with_cameras(Path(folder), job), options, _quiet, lambda: False
+        )
+    _, test = held_out_of(scene, options)
+    if not test or options.image_size is None:
+        return {"failure": f"{job['scene']} holds out no view, so that nothing can be judged on it."}
+    # The training world, for the same near plane and the same float32 rounding as a run's own evaluation.
+    frame = Normalization.of(scene)
+    moved = gaussians.moved(frame.scale, torch.from_numpy(frame.translation))
+    backend = kernels_of(options)
+
+    def draw(target: Target, background: Tensor) -> Tensor:
+        return render(moved, target.camera, background=background, backend=backend).color
+
+    views = [TrainingView.of(photo, frame) for photo in load_views(test, options.image_size)]
+    with torch.no_grad():
+        score = evaluate(draw, views, torch.ones(3))
+    return rounded(
+        {
+            "kind": "peer",
+            "scene": job["scene"],
+            "options": job["options"],
+            "name": job["name"],
+            "seconds": job["seconds"],
+            "psnr": score.psnr,
+            "ssim": score.ssim,
+            "mse": score.mse,
+            "gaussians": gaussians.count,
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "code": code_version(),
+            **origin(),
+        }
+    )
+
+
+JOBS: dict[str, Callable[[Row], Row]] = {"prepare": prepare, "measure": measure, "judge": judge}
+
+
+def main(text: str) -> int:
+    """Do the job of a JSON document, and leave what came out in the file that it names."""
+    job = json.loads(text)
+    answer = JOBS[job["do"]](job)
+    path = Path(job["answer"])
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(plain(answer)))
+    os.replace(part, path)
+    return 0
+
+
+def _with_cameras(workdir: Path, job: Row) -> Path:
+    """`workdir` with the scene's recovered cameras in the place where the pipeline looks for them."""
+    kept = Path(job["sfm"])
+    kept.mkdir(parents=True, exist_ok=True)
+    (workdir / "sfm").symlink_to(kept)
+    return workdir
+
+
+def rounded(value: Any) -> Any:
+    """Numbers to six significant digits: rows are read by people and kept in the repository."""
+    if isinstance(value, dict):
+        return {name: rounded(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [rounded(each) for each in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value

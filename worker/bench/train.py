@@ -1,0 +1,266 @@
+"""Error against run time of whole trainings: scenes x configurations x budgets x seeds, one process a row.
+
+    splatmill bench train                                   # every scene for 10 and 30 s, one seed: under 10 minutes
+    splatmill bench train --scenes fox lego --budgets 10s,1m,2m,5m --seeds 0,1,2
+    splatmill bench train --scenes fox lund lego synthetic --configs all --budgets 1000steps --seeds 0,1,2
+    splatmill bench train --scenes fox --peer "OpenSplat=splat.ply@449"
+    splatmill bench train --plot-only
+
+A row that is there already, for the same code, is not measured again: run the same command again to go on. Rows go to
+results/train.jsonl, the tables to train.md, the figure to figures/train.png. The machine has to be quiet: other work
+on the same cores takes quality from every run that is budgeted in seconds.
+
+Rules: seconds are training seconds; cameras, loading and evaluation are clocked apart. Every point of the figure is a
+run of its own, laid out for its budget. Held out is what the data set says, else every 8th photo by name. A failed run
+gets no point and is counted. Cameras are recovered once for a scene and kept, so that seeds differ in training alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from _rows import HERE, Row, append, lines
+from _train import budgets, child, configurations, estimate, figure, scenes, tables
+from _train.rows import Run, failed, missing, runs_of
+from _train.scenes import Scene
+
+from splatmill.schema.quantities import format_duration
+
+CACHE = HERE.parent / "build" / "bench"
+DEFAULT_BUDGETS = ["10s", "30s"]
+REFERENCES = HERE / "results" / "train_references.jsonl"
+LOST = 12.0
+"""dB under which a peer's model is probably not in the frame of the scene's cameras."""
+
+
+@dataclass(frozen=True)
+class Files:
+    """Where the rows are, and where what is made of them goes."""
+
+    rows: Path
+    tables: Path
+    figure: Path
+
+    @staticmethod
+    def of(given: Path | None) -> Files:
+        """The repository's own, or all three beside a file of rows that was named."""
+        if given is None:
+            return Files(HERE / "results" / "train.jsonl", HERE / "train.md", HERE / "figures" / "train.png")
+        return Files(given, given.with_suffix(".md"), given.with_suffix(".png"))
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A finished model of another trainer on a scene, and the training seconds it took."""
+
+    scene: Scene
+    name: str
+    model: Path
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a call asks for; `absent` has a sentence for each scene whose data is not there."""
+
+    runs: list[Run]
+    peers: list[Peer]
+    absent: list[str]
+
+
+def main(argv: list[str]) -> int:
+    """Measure what is missing, then draw everything; 1 where something could not be had, 2 for bad input."""
+    parser = _parser()
+    asked = parser.parse_args(argv)
+    if asked.job is not None:
+        from _train.run import main as do_job  # loads COLMAP, which only the processes of rows need
+
+        return do_job(asked.job)
+    try:
+        wanted = _wanted(asked)
+    except ValueError as error:
+        parser.error(str(error))
+    files = Files.of(asked.results)
+    whole = True
+    if not asked.plot_only:
+        for sentence in wanted.absent:
+            print(sentence, file=sys.stderr)
+        try:
+            whole = _measure(wanted, files.rows, asked.work) and not wanted.absent
+        except KeyboardInterrupt:
+            print(f"\nStopped. Finished rows are in {files.rows}; the same command goes on.", file=sys.stderr)
+            return 130
+    found, references = lines(files.rows), lines(REFERENCES)
+    if not found:
+        print(f"There are no rows in {files.rows}, so nothing is drawn.", file=sys.stderr)
+        return 1
+    figure.draw(found, references, files.figure)
+    files.tables.write_text(tables.document(found, references, files.rows, files.tables, files.figure))
+    print(f"Tables: {files.tables}\nFigure: {files.figure}")
+    return 0 if whole else 1
+
+
+def _wanted(asked: argparse.Namespace) -> Wanted:
+    """Raises ValueError, as a sentence, for input that names nothing."""
+    known, absent = [], []
+    for name in _split(asked.scenes) or list(scenes.KNOWN):
+        try:
+            known.append(scenes.named(name, asked.work))
+        except FileNotFoundError as error:
+            absent.append(str(error))
+    names = _split(asked.configs) or [configurations.DEFAULT]
+    if names == ["all"]:
+        names = list(configurations.CONFIGURATIONS)
+    for name in names:
+        configurations.named(name)
+    limits = [budgets.parse(text) for text in _split(asked.budgets) or DEFAULT_BUDGETS]
+    seeds = [_seed(text) for text in _split(asked.seeds) or ["0"]]
+    if asked.peer:
+        if len(_split(asked.scenes)) != 1:
+            raise ValueError("--peer is judged on one scene: name it with --scenes, and no other.")
+        return Wanted([], [_peer(text, scene) for text in asked.peer for scene in known], absent)
+    return Wanted(runs_of(known, dict.fromkeys(names), limits, dict.fromkeys(seeds)), [], absent)
+
+
+def _measure(wanted: Wanted, path: Path, work: Path) -> bool:
+    """Append the rows that are not there yet to the file at `path`; False where one could not be had."""
+    found = lines(path)
+    todo = missing(wanted.runs, found)
+    if wanted.runs:
+        print(f"{len(wanted.runs) - len(todo)} of {len(wanted.runs)} rows are there; {len(todo)} to measure.")
+    involved = {run.scene.name: run.scene for run in todo} | {p.scene.name: p.scene for p in wanted.peers}
+    unusable = {name for name, scene in involved.items() if not _usable(scene, work)}
+    todo = [run for run in todo if run.scene.name not in unusable]
+    whole = not unusable
+    if todo:
+        left = format_duration(estimate.seconds_left(todo, found))
+        print(f"About {left}. Ctrl-C loses the row in work at most; the same command goes on.", flush=True)
+    for number, run in enumerate(todo):
+        try:
+            row = child.measured(run, work)
+        except child.Fault as fault:
+            print(f"{run}: {fault}", file=sys.stderr)
+            whole = False
+            continue
+        append(path, row)
+        found.append(row)
+        left = format_duration(estimate.seconds_left(todo[number + 1 :], found))
+        print(f"[{number + 1}/{len(todo)}] {run}: {_said(row)}; about {left} left", flush=True)
+    for peer in wanted.peers:
+        whole &= peer.scene.name not in unusable and _judge(peer, path, work)
+    return whole
+
+
+def _usable(scene: Scene, work: Path) -> bool:
+    """Whether the scene has cameras and views; recovered ones are kept for all rows."""
+    try:
+        answer = child.prepared(scene, work)
+    except child.Fault as fault:
+        answer = {"failure": str(fault)}
+    if "failure" in answer:
+        print(f"{scene.name} cannot be trained: {answer['failure']}", file=sys.stderr)
+        return False
+    print(
+        f"{scene.name}: {answer['views']} training views, {answer['held_out']} held out, {answer['points']} points",
+        flush=True,
+    )
+    return True
+
+
+def _judge(peer: Peer, path: Path, work: Path) -> bool:
+    """Append the row of a peer's model; False, with a sentence, where it cannot be judged."""
+    try:
+        row = child.judged(peer.scene, peer.name, peer.model, peer.seconds, work)
+    except child.Fault as fault:
+        row = {"failure": str(fault)}
+    if "failure" in row:
+        print(f"{peer.name}: {row['failure']}", file=sys.stderr)
+        return False
+    append(path, row)
+    print(f"{peer.name} on {peer.scene.name}: {row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}")
+    if row["psnr"] < LOST:
+        print(f"Is {peer.model} in the frame of the scene's cameras? It shows hardly anything of the photos.")
+    return True
+
+
+def _said(row: Row) -> str:
+    if failed(row):
+        return str(row["outcome"])
+    score = "nothing held out" if row["psnr"] is None else f"{row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}"
+    return f"{score} after {row['seconds']['train']:.1f} s of training ({row['wall_seconds']:.0f} s in all)"
+
+
+def _split(given: list[str] | None) -> list[str]:
+    """`a b,c` as three names."""
+    return [name for text in given or [] for name in text.split(",") if name]
+
+
+def _seed(text: str) -> int:
+    if not text.isascii() or not text.isdigit():
+        raise ValueError(f"{text!r} is no seed; give whole numbers from 0: --seeds 0,1,2.")
+    return int(text)
+
+
+def _peer(text: str, scene: Scene) -> Peer:
+    name, _, rest = text.partition("=")
+    model, _, seconds = rest.rpartition("@")
+    try:
+        spent = float(seconds.removesuffix("s"))
+    except ValueError:
+        spent = 0.0
+    if not name or not model or not spent > 0.0:
+        raise ValueError(f"{text!r} is no peer; write NAME=model.ply@SECONDS, e.g. OpenSplat=splat.ply@449.")
+    if not Path(model).is_file():
+        raise ValueError(f"{name}'s model {model} is not there.")
+    return Peer(scene, name, Path(model).resolve(), spent)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="splatmill bench train",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    several = {"nargs": "+", "metavar": "NAME"}
+    parser.add_argument(
+        "--scenes",
+        **several,
+        help=f"of {', '.join(scenes.KNOWN)} (default: all), or folders with a capture of your own",
+    )
+    switches = "; ".join(f"{name}: {each.what}" for name, each in configurations.CONFIGURATIONS.items())
+    parser.add_argument("--configs", **several, help=f"default when left out, `all`, or any of {switches}")
+    parser.add_argument(
+        "--budgets", **several, help="training steps or seconds, e.g. 600steps,10s,2m (default: 10s,30s)"
+    )
+    parser.add_argument("--seeds", nargs="+", metavar="N", help="e.g. 0,1,2 (default: 0)")
+    parser.add_argument(
+        "--peer",
+        action="append",
+        default=[],
+        metavar="NAME=MODEL.ply@SECONDS",
+        help="judge another trainer's finished model on the held-out views of the one scene named, as a point of the "
+        "figure; it has to be in the frame of the scene's own cameras (for tools that move the scene, ask them to "
+        "keep its coordinates); nothing is trained then",
+    )
+    parser.add_argument(
+        "--plot-only", action="store_true", help="draw tables and figure from the rows there are"
+    )
+    parser.add_argument(
+        "--results", type=Path, metavar="FILE", help="another file of rows; tables and figure go beside it"
+    )
+    parser.add_argument(
+        "--work",
+        type=Path,
+        default=CACHE,
+        metavar="DIR",
+        help="where recovered cameras and made photos are kept",
+    )
+    parser.add_argument("--job", help=argparse.SUPPRESS)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
