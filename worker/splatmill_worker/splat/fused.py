@@ -36,6 +36,7 @@ class FusedStep(Step):
         mask: Tensor | None = None,
         antialias: bool = False,
         key: Hashable | None = None,
+        pose_gradient: bool = False,
     ) -> StepResult:
         seen = self.train(
             viewmat,
@@ -47,6 +48,7 @@ class FusedStep(Step):
             background=background,
             photo_stats=self._stats(photo, mask, key),
             antialias=antialias,
+            pose_gradient=pose_gradient,
         )
         return StepResult(seen.loss, seen.visible, seen.pairs)
 

@@ -53,6 +53,7 @@ struct Frame {
   Buffer<float> final_T;         // [tiles][16 blocks][16 pixels]
   Buffer<int32_t> walked;        // [tiles] entries of the list that the forward pass looked at
   Buffer<float> pair_sums;       // [slots][kPairSums]
+  Buffer<double> pose_sums;      // [chunks of the update][kPoseSums], where the camera's gradient is asked for
 
   int tiles() const { return camera.columns() * camera.rows(); }
 };

@@ -5,6 +5,7 @@
 
 #include "arguments.hpp"
 #include "geometry.hpp"
+#include "pose.hpp"
 #include "rows.hpp"
 #include "shuffles.hpp"
 #include "touches.hpp"
@@ -105,7 +106,7 @@ void project_rows_backward(const float* blocks, int64_t count, int degree, const
                            float* grad_blocks, float* d_viewmat, int threads) {
   constexpr int64_t kChunk = 64;  // blocks whose camera gradients are added together first: a fixed cut, whatever the threads
   const int64_t n = blocks_for(count), chunks = (n + kChunk - 1) / kChunk;
-  std::vector<double> partial(static_cast<size_t>(chunks) * 12);
+  std::vector<double> partial(static_cast<size_t>(chunks) * kPoseSums);
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
   for (int64_t chunk = 0; chunk < chunks; ++chunk) {
     const FlushDenormals flush;
@@ -147,19 +148,13 @@ void project_rows_backward(const float* blocks, int64_t count, int degree, const
       project_backward<true>(p, cam, degree, o, to, g, &camera);
       const int rows = kSh + 3 * (degree + 1) * (degree + 1);
       for (int r = 0; r < rows; ++r) store(g + r * kLanes, keep(o.visible, load(g + r * kLanes)));
-      double* sums = &partial[static_cast<size_t>(chunk) * 12];
-      for (int m = 0; m < 3; ++m) {
-        for (int k = 0; k < 3; ++k) sums[4 * m + k] += sum(keep(o.visible, camera.R[3 * m + k]));
-        sums[4 * m + 3] += sum(keep(o.visible, camera.t[m]));
-      }
+      add_camera_gradient(camera, o.visible, &partial[static_cast<size_t>(chunk) * kPoseSums]);
     }
   }
-  for (int k = 0; k < 12; ++k) {
-    double total = 0;
-    for (int64_t chunk = 0; chunk < chunks; ++chunk) total += partial[static_cast<size_t>(chunk) * 12 + k];
-    d_viewmat[k] = static_cast<float>(total);
-  }
-  for (int k = 12; k < 16; ++k) d_viewmat[k] = 0.0f;
+  double total[kPoseSums];
+  add_parts(partial.data(), chunks, total);
+  for (int k = 0; k < kPoseSums; ++k) d_viewmat[k] = static_cast<float>(total[k]);
+  for (int k = kPoseSums; k < 16; ++k) d_viewmat[k] = 0.0f;
 }
 
 }  // namespace

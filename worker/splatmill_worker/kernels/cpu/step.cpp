@@ -6,6 +6,7 @@
 #include "bin.hpp"
 #include "composite.hpp"
 #include "geometry.hpp"
+#include "pose.hpp"
 #include "project.hpp"
 #include "shuffles.hpp"
 #include "threads.hpp"
@@ -89,9 +90,10 @@ SPLATMILL_INLINE void clear_unused(Float* sums, const ImageGradient& g) {
   if (!g.with_alpha_and_depth) sums[kSumDepth] = splat(0.0f);
 }
 
-// One block; returns how many gradient values Adam refused.
-template <bool kAdam>
-int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, int64_t b) {
+// One block; returns how many gradient values Adam refused. With kPose the camera's gradient is added to `pose`.
+template <bool kAdam, bool kPose>
+int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, int64_t b,
+                     double* pose) {
   const int rows = kSh + 3 * (scene.degree + 1) * (scene.degree + 1);
   const float* p = scene.params + b * kBlockFloats;
   const uint32_t seen = frame.visible[b];
@@ -105,7 +107,9 @@ int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& sc
     project_geometry(p, frame.camera, o);
     const ProjectedGradient d = gradient_from_sums(sums, o);
     if (g.scores) add_scores(update, frame.camera, b, sums, o, d, visible);
-    project_backward<false>(p, frame.camera, scene.degree, o, d, gradient, nullptr);
+    CameraGradient camera;
+    project_backward<kPose>(p, frame.camera, scene.degree, o, d, gradient, &camera);
+    if constexpr (kPose) add_camera_gradient(camera, visible, pose);
   }
   if constexpr (!kAdam) {
     float* out = update.gradients + b * kBlockFloats;
@@ -129,22 +133,33 @@ int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& sc
   }
 }
 
-template <bool kAdam>
-int64_t update_scene(const Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, int threads) {
-  const int64_t n = blocks_for(frame.count);
+constexpr int64_t kUpdateChunk = 16;  // blocks dealt out together, and added together where the camera's gradient is asked for
+
+// `pose` null: the camera's gradient is not computed; else its sums [kPoseSums] are written there.
+template <bool kAdam, bool kPose>
+int64_t update_scene(Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, double* pose, int threads) {
+  const int64_t n = blocks_for(frame.count), chunks = (n + kUpdateChunk - 1) / kUpdateChunk;
+  double* partial = kPose ? frame.pose_sums.reserve(chunks * kPoseSums) : nullptr;
   int64_t refused = 0;
 #pragma omp parallel num_threads(threads) reduction(+ : refused)
   {
     const FlushDenormals flush;
-#pragma omp for schedule(dynamic, 16)
-    for (int64_t b = 0; b < n; ++b) refused += update_block<kAdam>(frame, g, scene, update, b);
+#pragma omp for schedule(dynamic, 1)
+    for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+      double* sums = kPose ? partial + chunk * kPoseSums : nullptr;
+      if constexpr (kPose) std::fill_n(sums, kPoseSums, 0.0);
+      for (int64_t b = chunk * kUpdateChunk; b < std::min(n, (chunk + 1) * kUpdateChunk); ++b)
+        refused += update_block<kAdam, kPose>(frame, g, scene, update, b, sums);
+    }
   }
+  if constexpr (kPose) add_parts(partial, chunks, pose);
   return refused;
 }
 
 using Bytes3 = Tensor<const uint8_t, nb::shape<3, -1, -1>>;
 using Bytes2 = Tensor<const uint8_t, nb::shape<-1, -1>>;
 using ScoreRows = Tensor<float, nb::shape<kScoreRows, -1>>;
+using Twist = Tensor<float, nb::shape<6>>;
 
 class Stopwatch {
  public:
@@ -186,7 +201,7 @@ void bind_step(nb::module_& m) {
       "update",
       [](Frame& frame, Blocks params, Blocks exp_avg, Blocks exp_avg_sq, int degree, Image image, Image gradient,
          std::optional<Bytes3> photo, std::optional<Bytes2> used, const std::vector<float>& rates, int64_t step,
-         std::optional<ScoreRows> scores, int threads) {
+         std::optional<ScoreRows> scores, int threads, std::optional<Twist> pose) {
         Update update;
         update.params = params.data(), update.exp_avg = exp_avg.data(), update.exp_avg_sq = exp_avg_sq.data();
         const AdamStep scale(step);
@@ -200,14 +215,23 @@ void bind_step(nb::module_& m) {
         Stopwatch watch;
         composite_backward(frame, g, threads);
         frame.seconds.backward = watch.lap();
-        const int64_t refused = update_scene<true>(frame, g, {params.data(), degree}, update, threads);
+        const Scene scene{params.data(), degree};
+        int64_t refused;
+        if (pose) {
+          double sums[kPoseSums];
+          refused = update_scene<true, true>(frame, g, scene, update, sums, threads);
+          motion_gradient(frame.camera, sums, pose->data());
+        } else {
+          refused = update_scene<true, false>(frame, g, scene, update, nullptr, threads);
+        }
         frame.seconds.update = watch.lap();
         return refused;
       },
       "frame"_a, "params"_a.noconvert(), "exp_avg"_a.noconvert(), "exp_avg_sq"_a.noconvert(), "degree"_a,
       "image"_a.noconvert(), "gradient"_a.noconvert(), "photo"_a.noconvert().none(), "used"_a.noconvert().none(), "rates"_a,
-      "step"_a, "scores"_a.noconvert().none(), "threads"_a,
-      "Backward pass of the last render and one Adam step; returns how many gradient values were refused as not finite.");
+      "step"_a, "scores"_a.noconvert().none(), "threads"_a, "pose"_a.noconvert().none() = nb::none(),
+      "Backward pass of the last render and one Adam step; returns how many gradient values were refused as not finite. Fills "
+      "`pose` [6], where given, with the gradient to a motion of the camera (pose.hpp).");
   m.def(
       "gradients",
       [](Frame& frame, Blocks params, int degree, Image image, Image gradient, Blocks gradients, int threads) {
@@ -216,7 +240,7 @@ void bind_step(nb::module_& m) {
         const ImageGradient g{planes_of(image, frame.camera), planes_of(gradient, frame.camera), gradient.shape(0) == 5};
         nb::gil_scoped_release release;
         composite_backward(frame, g, threads);
-        update_scene<false>(frame, g, {params.data(), degree}, update, threads);
+        update_scene<false, false>(frame, g, {params.data(), degree}, update, nullptr, threads);
       },
       "frame"_a, "params"_a.noconvert(), "degree"_a, "image"_a.noconvert(), "gradient"_a.noconvert(), "gradients"_a.noconvert(),
       "threads"_a, "Backward pass of the last render: gradients in blocks, nothing moves.");

@@ -85,6 +85,7 @@ class Step:
         self._size = (0, 0)
         self._degree = 0
         self.visibility = Visibility(0, 0)
+        self.pose_gradient: Tensor | None = None
         self.replace(
             {
                 "means": means,
@@ -201,14 +202,19 @@ class Step:
         *,
         rates: Rates,
         step: int,
+        pose_gradient: bool = False,
     ) -> int:
         """Differentiate the last `forward` and move everything by Adam's step number `step`, from 1.
 
         Returns how many gradient values were refused as not finite.
         d_color [H,W,3], d_alpha [H,W], d_depth [H,W]: the loss's gradient to what `forward` gave.
+        pose_gradient: leave the camera's gradient in `self.pose_gradient`, float32 [6] = (rho, phi): that of the
+        loss with the camera at exp(xi^) viewmat, xi = (rho, phi), at xi = 0. A point p in camera space then moves by
+        rho + phi x p; rho is in world units, phi in radians. Not finite where gradient values were refused. When not
+        asked for, `self.pose_gradient` is None.
         """
         gradient = self._take_gradient(d_color, d_alpha, d_depth)
-        return self._update(gradient, None, rates, step)
+        return self._update(gradient, None, rates, step, pose_gradient)
 
     def gradients(
         self, d_color: Tensor, d_alpha: Tensor | None = None, d_depth: Tensor | None = None
@@ -235,11 +241,13 @@ class Step:
         photo_stats: PhotoStats | None = None,
         antialias: bool = False,
         near: float = 0.01,
+        pose_gradient: bool = False,
     ) -> StepResult:
         """One step on one photo: render, L1 + D-SSIM, gradients, scores, Adam.
 
         photo uint8 [H,W,3] with mask [H,W] (nonzero = used), or photo_stats made of both by `loss.photo_stats` (then
         photo and mask may be None): keep those, making them costs as much as the loss. step counts from 1.
+        pose_gradient: as in `backward_update`.
         """
         stats = _stats(photo, mask) if photo_stats is None else photo_stats
         height, width = stats.pixels.shape[1], stats.width
@@ -257,7 +265,7 @@ class Step:
             self._gradient,
             self.threads,
         )
-        refused = self._update(self._gradient, stats, rates, step)
+        refused = self._update(self._gradient, stats, rates, step, pose_gradient)
         total = (1 - dssim_weight) * l1 + dssim_weight * (1 - ssim)
         return StepResult(total, l1, ssim, *self.visibility, refused)
 
@@ -301,9 +309,12 @@ class Step:
                 gradient[i].zero_()
         return gradient
 
-    def _update(self, gradient: Tensor, stats: PhotoStats | None, rates: Rates, step: int) -> int:
+    def _update(
+        self, gradient: Tensor, stats: PhotoStats | None, rates: Rates, step: int, pose_gradient: bool
+    ) -> int:
         if step < 1:
             raise ValueError(f"step: counts from 1, got {step}")
+        self.pose_gradient = torch.empty(6) if pose_gradient else None
         refused: int = engine.update(
             self._frame,
             self.blocks,
@@ -318,6 +329,7 @@ class Step:
             step,
             self._scores if self.keep_scores else None,
             self.threads,
+            self.pose_gradient,
         )
         self._rendered = False  # what was rendered is of the Gaussians before they moved
         return refused

@@ -1,0 +1,121 @@
+"""The fused step's gradient to a motion of the camera is that of the ops and of the float64 definition, on every build.
+
+Not proven here: that a pose refinement built on it converges.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from splatmill_worker.kernels import ops
+from splatmill_worker.kernels.cpu import isa
+from splatmill_worker.kernels.cpu.step import Rates, Step
+
+from .cases import Case, scene
+from .proof import use
+
+STILL = Rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def motion(xi: Tensor) -> Tensor:
+    """exp(xi^) [4,4] of a twist (rho, phi)."""
+    rho, phi = xi[:3], xi[3:]
+    zero = torch.zeros((), dtype=xi.dtype)
+    rows = [
+        torch.stack([zero, -phi[2], phi[1], rho[0]]),
+        torch.stack([phi[2], zero, -phi[0], rho[1]]),
+        torch.stack([-phi[1], phi[0], zero, rho[2]]),
+        torch.stack([zero] * 4),
+    ]
+    return torch.linalg.matrix_exp(torch.stack(rows))
+
+
+def slopes(case: Case) -> list[Tensor]:
+    g = torch.Generator().manual_seed(3)
+    h, w = case.height, case.width
+    return [torch.randn(h, w, *more, generator=g) for more in ((3,), (), ())]
+
+
+def by_ops(case: Case, backend: ops.Backend, dtype: torch.dtype) -> Tensor:
+    xi = torch.zeros(6, dtype=dtype, requires_grad=True)
+    viewmat, K = case.camera(dtype)
+    p = ops.project(
+        *case.groups(dtype), motion(xi) @ viewmat, K, case.width, case.height,
+        degree=case.degree, antialias=case.antialias, backend=backend,
+    )  # fmt: skip
+    bins = ops.bin(p, case.width, case.height, backend=backend)
+    image = ops.composite(p, bins, case.width, case.height, backend=backend)
+    torch.autograd.backward(image, [s.to(dtype) for s in slopes(case)])
+    assert xi.grad is not None
+    return xi.grad
+
+
+def by_step(case: Case, threads: int = 2) -> Tensor:
+    step = Step(*case.groups(), threads=threads)
+    step.forward(*case.camera(), case.width, case.height, degree=case.degree, antialias=case.antialias)
+    step.backward_update(*slopes(case), rates=STILL, step=1, pose_gradient=True)
+    assert step.pose_gradient is not None
+    return step.pose_gradient
+
+
+@pytest.mark.parametrize("build", isa.supported())
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_it_is_that_of_the_ops_and_of_the_definition(degree: int, antialias: bool, build: str) -> None:
+    case = replace(scene("pose", 150), degree=degree, antialias=antialias)
+    exact = by_ops(case, "reference", torch.float64)
+    with use(f"cpu {build}"):
+        fused, separate = by_step(case), by_ops(case, "cpu", torch.float32)
+    # As for the parameters' gradients (test_cpu_step): the roundings of the conic, and the exponential's error.
+    assert float((fused - separate).norm() / exact.norm()) < 2e-5
+    assert float((fused.double() - exact).norm() / exact.norm()) < 1e-4
+
+
+def test_the_loss_falls_along_it_by_its_length() -> None:
+    """A photo taken from elsewhere: a motion h along the unit gradient changes the step's own loss by h |gradient|."""
+    case = scene("pose photo", 150)
+    viewmat, K = case.camera()
+    elsewhere = motion(torch.tensor([0.02, -0.01, 0.03, 0.004, 0.006, -0.01])) @ viewmat
+    taker = Step(*case.groups())
+    color, _, _ = taker.forward(elsewhere, K, case.width, case.height, degree=3)
+    photo = (color.clamp(0, 1) * 255).round().to(torch.uint8)
+
+    def loss_at(h: float) -> tuple[float, Tensor]:
+        step = Step(*case.groups())
+        seen = step.train(
+            motion(h * direction) @ viewmat, K, photo, degree=3, rates=STILL, step=1, pose_gradient=True
+        )
+        assert step.pose_gradient is not None
+        return seen.loss, step.pose_gradient
+
+    direction = torch.zeros(6)
+    gradient = loss_at(0.0)[1]
+    direction = -gradient / gradient.norm()
+    h = 4e-4
+    fall = (loss_at(-h)[0] - loss_at(h)[0]) / (2 * h)
+    # L1 has kinks where a pixel's difference changes sign; a few of eight thousand values do within 4e-4.
+    assert fall == pytest.approx(float(gradient.norm()), rel=0.02)
+
+
+@pytest.mark.parametrize("gaussians", [15, 17, 1000])
+def test_same_bytes_on_any_number_of_threads(gaussians: int) -> None:
+    case = scene("pose threads", gaussians, width=130, height=70, seed=gaussians)
+    first, *others = (by_step(case, threads) for threads in (1, 2, 3))
+    assert first.abs().max() > 0
+    for other in others:
+        assert torch.equal(first, other)
+
+
+def test_asking_for_it_changes_nothing_else() -> None:
+    case = scene("pose apart", 70)
+    rates = Rates(1e-3, 5e-3, 1e-3, 5e-2, 2.5e-3, 1.25e-4)
+    asked, plain = (Step(*case.groups()) for _ in range(2))
+    for step in (asked, plain):
+        step.forward(*case.camera(), case.width, case.height, degree=3)
+        step.backward_update(*slopes(case), rates=rates, step=1, pose_gradient=step is asked)
+    assert torch.equal(asked.blocks, plain.blocks)
+    assert plain.pose_gradient is None
