@@ -1,4 +1,4 @@
-"""`python -m splatmill_worker train | renderer | doctor | bench NAME`."""
+"""`python -m splatmill_worker train | renderer | fit-image | doctor | bench NAME`."""
 
 import argparse
 import ctypes
@@ -40,6 +40,10 @@ def main(argv: list[str] | None = None) -> int:
     renderer.add_argument(
         "--backend", choices=["reference", "cpu", "gpu"], help="what computes (default: cpu)"
     )
+    fit_image = programs.add_parser("fit-image", help="fit one picture by Gaussians in a plane")
+    fit_image.add_argument("photo", type=Path)
+    fit_image.add_argument("--out", type=Path, required=True, help="folder for the results")
+    fit_image.add_argument("--options", default="{}", help="FitImageOptions as JSON")
     doctor = programs.add_parser("doctor", help="check this machine and say what to do")
     doctor.add_argument("--json", action="store_true", help="one JSON document instead of lines")
     bench = programs.add_parser("bench", help="run worker/bench/NAME.py (source tree only)")
@@ -54,6 +58,10 @@ def main(argv: list[str] | None = None) -> int:
         from splatmill_worker.renderer import serve
 
         return serve(chosen.host, chosen.port, chosen.uds, chosen.backend)
+    if chosen.program == "fit-image":
+        from splatmill_worker.fit_image import main as fit_image_main
+
+        return fit_image_main(chosen.photo, chosen.out, chosen.options)
     if chosen.program == "doctor":
         from splatmill_worker.doctor import report
 

@@ -1,12 +1,11 @@
-"""The camera path of an orbit video, laid through where the photos were taken, and the video itself."""
+"""The camera path of an orbit video, laid through where the photos were taken."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -106,32 +105,6 @@ def of_model(stored: ModelCameras | None, points: Float, wish: OrbitRequest) -> 
     poses = np.array([camera.camera.opencv_to_world() for camera in stored.cameras])
     path = path_through(poses[:, :3, 3], poses[:, :3, 2], -poses[:, :3, 1])
     return cameras_along(path, wish, wish.fov_y_deg or _field_of_view(stored, wish))
-
-
-class Video:
-    """An MP4 (H.264, 4:2:0) written frame by frame; `close` it."""
-
-    def __init__(self, path: Path, wish: OrbitRequest) -> None:
-        import av
-
-        self._av = av
-        self._container = av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"})
-        self._stream: Any = self._container.add_stream("libx264", rate=wish.fps)
-        self._stream.width, self._stream.height = wish.width, wish.height
-        self._stream.pix_fmt = "yuv420p"
-        self._stream.options = {"crf": "20", "preset": "veryfast"}
-
-    def add(self, pixels: npt.NDArray[np.uint8]) -> None:
-        """Append a frame, RGB [H, W, 3]."""
-        frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
-        for packet in self._stream.encode(frame):
-            self._container.mux(packet)
-
-    def close(self) -> None:
-        """Write what the encoder still holds, and the index."""
-        for packet in self._stream.encode():
-            self._container.mux(packet)
-        self._container.close()
 
 
 def _nearest_to_axes(centers: Float, forwards: Float) -> Float:

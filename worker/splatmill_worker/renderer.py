@@ -152,7 +152,8 @@ class Renderer:
         self, request: Request, model_id: str, wish: OrbitRequest, headers: dict[str, str]
     ) -> Response:
         """Frame by frame, so that pictures come in between, and a client that left is noticed."""
-        from splatmill_worker import orbit, picture
+        from splatmill_worker import picture
+        from splatmill_worker.film import Film
 
         model = await self.turns.run(lambda: self.cache.get(model_id))
         cameras = await run_in_threadpool(self._orbit_cameras, model, wish)
@@ -160,7 +161,7 @@ class Renderer:
         os.close(descriptor)
         path = Path(name)
         try:
-            video = orbit.Video(path, wish)
+            video = Film(path, wish.width, wish.height, wish.fps)
             try:
                 for camera in cameras:
                     if await request.is_disconnected():

@@ -1,4 +1,4 @@
-"""The training options of the command line, made from the schema: same names, ranges and help."""
+"""Options of the command line made from the schema: same names, ranges and help."""
 
 import inspect
 from collections.abc import Callable
@@ -6,7 +6,8 @@ from typing import Any, Literal
 
 import typer
 
-from splatmill.schema.options import OptionHelp, describe_options
+from splatmill.schema.base import Request
+from splatmill.schema.options import OptionHelp, TrainOptions, describe_options
 
 PANELS = {
     "budget": "How long, how good",
@@ -21,18 +22,24 @@ _TYPES: dict[str, Any] = {
     "duration": str,
     "bytes": str,
     "list": list[str],
+    "flag": bool,
 }
 
 
 def with_training_options(function: Callable[..., None]) -> Callable[..., None]:
-    """Replace the `**options` of a command by one option per training setting.
+    """Replace the `**options` of a command by one option per training setting."""
+    return with_options_of(TrainOptions, function)
+
+
+def with_options_of(model: type[Request], function: Callable[..., None]) -> Callable[..., None]:
+    """Replace the `**options` of a command by one option per field of `model`.
 
     All are None where they are not given, so that only what a person said is sent and the server's own defaults
     hold for the rest.
     """
     signature = inspect.signature(function, eval_str=True)
     fixed = [p for p in signature.parameters.values() if p.kind is not inspect.Parameter.VAR_KEYWORD]
-    made = [_parameter(option) for option in describe_options()]
+    made = [_parameter(option) for option in describe_options(model)]
     # typer reads the signature; there is no other place where it takes parameters that are not written out.
     function.__signature__ = signature.replace(parameters=[*fixed, *made])  # type: ignore[attr-defined]
     return function
@@ -45,7 +52,8 @@ def _parameter(option: OptionHelp) -> inspect.Parameter:
         settings |= {"min": option.minimum, "max": option.maximum}
     if option.type in ("duration", "bytes"):
         settings["metavar"] = option.type.upper()
-    default = "" if option.default is None else f" (default: {option.default})"
+    decided = option.default is None or option.default is False
+    default = "" if decided else f" (default: {option.default})"
     return inspect.Parameter(
         option.name,
         inspect.Parameter.KEYWORD_ONLY,

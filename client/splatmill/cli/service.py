@@ -11,22 +11,22 @@ from splatmill.cli.embedded import SUPERVISOR, require
 def up(context: typer.Context) -> None:
     """Run the whole service on this machine; Ctrl-C ends it. Takes --host, --port, --data and more: up --help."""
     require("splatmill_server", "`splatmill up`")
-    _become(SUPERVISOR, *context.args)
+    become(SUPERVISOR, *context.args)
 
 
 def doctor(context: typer.Context) -> None:
     """Check what this machine has: backends, threads, memory, Redis, storage."""
     require("splatmill_worker", "`splatmill doctor`")
-    _become("splatmill_worker", "doctor", *context.args)
+    become("splatmill_worker", "doctor", *context.args)
 
 
 def bench(context: typer.Context) -> None:
     """Measure error against run time: kernels, stability, sfm, train. More: bench --help."""
     require("splatmill_worker", "`splatmill bench`")
-    _become("splatmill_worker", "bench", *context.args)
+    become("splatmill_worker", "bench", *context.args)
 
 
-def _become(module: str, *arguments: str) -> None:
+def become(module: str, *arguments: str) -> None:
     """Replace this process, so that signals and the exit code are those of the program itself."""
     sys.stdout.flush()
     sys.stderr.flush()

@@ -51,6 +51,7 @@ from splatmill.schema.events import (
     ProgressEvent,
     StateEvent,
 )
+from splatmill.schema.fit_image import FitImageOptions
 from splatmill.schema.info import (
     DEFAULT_PORT,
     Health,
@@ -140,6 +141,7 @@ __all__ = [
     "Event",
     "EventRecord",
     "FileName",
+    "FitImageOptions",
     "Format",
     "Health",
     "Info",

@@ -218,7 +218,7 @@ class TrainOptions(Request):
         return names
 
 
-OptionType = Literal["integer", "number", "text", "list", "choice", "duration", "bytes"]
+OptionType = Literal["integer", "number", "text", "list", "choice", "duration", "bytes", "flag"]
 
 
 class OptionHelp(Response):
@@ -226,7 +226,7 @@ class OptionHelp(Response):
 
     name: str
     type: OptionType
-    default: int | float | str | list[str] | None = Field(
+    default: bool | int | float | str | list[str] | None = Field(
         description="The value when left out; null where it is decided from the photos."
     )
     minimum: int | float | None = None
@@ -256,12 +256,12 @@ class OptionList(Response):
     options: list[OptionHelp]
 
 
-def describe_options() -> list[OptionHelp]:
-    """Every field of `TrainOptions`, in order, with its type, default, range or choices, group and help."""
-    return [_describe(name, field) for name, field in TrainOptions.model_fields.items()]
+def describe_options(model: type[Request] = TrainOptions) -> list[OptionHelp]:
+    """Every field of `model`, in order, with its type, default, range or choices, group and help."""
+    return [_describe(name, field) for name, field in model.model_fields.items()]
 
 
-_SCALARS: dict[Any, OptionType] = {int: "integer", float: "number", str: "text"}
+_SCALARS: dict[Any, OptionType] = {int: "integer", float: "number", str: "text", bool: "flag"}
 
 
 def _describe(name: str, field: FieldInfo) -> OptionHelp:

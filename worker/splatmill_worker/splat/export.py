@@ -68,7 +68,7 @@ def export(
         ModelCamera(
             name=view.name,
             split=split,
-            camera=_spec(frame.camera(view.full.camera)),
+            camera=spec_of(frame.camera(view.full.camera)),
             psnr=errors.get(view.name),
         )
         for split, group in (("train", views), ("test", held_out))
@@ -79,7 +79,8 @@ def export(
     return written
 
 
-def _spec(camera: Camera) -> CameraSpec:
+def spec_of(camera: Camera) -> CameraSpec:
+    """The wire's camera for one of the engine."""
     inverse = np.eye(4)
     inverse[:3, :3] = camera.viewmat[:3, :3].T
     inverse[:3, 3] = camera.center

@@ -15,8 +15,17 @@ QUANTISATION_PSNR = 58.9
 """dB between a photo and its own 8-bit copy: nothing can be measured to be better."""
 
 
-def draw_curve(path: Path, curve: Sequence[dict[str, Any]], seconds: dict[str, float]) -> None:
-    """Held-out PSNR and the number of Gaussians against training seconds; the training loss without held-out views."""
+def draw_curve(
+    path: Path,
+    curve: Sequence[dict[str, Any]],
+    seconds: dict[str, float],
+    *,
+    measured: str = "held-out PSNR (dB)",
+) -> None:
+    """PSNR (of what `measured` says) and the number of Gaussians against training seconds.
+
+    Without any PSNR in the curve, the training loss is drawn.
+    """
     figure = Figure(figsize=(7.2, 4.0), dpi=130, layout="constrained")
     axes = figure.subplots()
     times = [row["seconds"] for row in curve]
@@ -34,7 +43,7 @@ def draw_curve(path: Path, curve: Sequence[dict[str, Any]], seconds: dict[str, f
             ha="right",
             fontsize=9,
         )
-        axes.set_ylabel("held-out PSNR (dB)")
+        axes.set_ylabel(measured)
     else:
         axes.plot(times, [row["loss"] for row in curve], "o-", color="#1f6f8b", ms=4)
         axes.set_ylabel("training loss (no photo was held out)")

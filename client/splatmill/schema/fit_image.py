@@ -1,0 +1,57 @@
+"""Every setting of `splatmill fit-image`, once: type, default, range and help text."""
+
+from typing import Any
+
+from pydantic import Field
+
+from splatmill.schema.base import Request
+from splatmill.schema.quantities import Duration
+
+_BUDGET: dict[str, Any] = {"group": "budget"}
+_PHOTOS: dict[str, Any] = {"group": "photos"}
+_ENGINE: dict[str, Any] = {"group": "engine"}
+
+
+class FitImageOptions(Request):
+    """How to fit one picture by Gaussians in a plane."""
+
+    gaussians: int | None = Field(
+        default=None,
+        ge=1,
+        le=2_000_000,
+        description="Use at most this many Gaussians. Left out: one for every 16 pixels.",
+        json_schema_extra=_BUDGET,
+    )
+    steps: int | None = Field(
+        default=None,
+        ge=1,
+        le=1_000_000,
+        description="Stop after this many steps.",
+        json_schema_extra=_BUDGET,
+    )
+    time_budget: Duration | None = Field(
+        default=None,
+        ge=1,
+        le=86400,
+        description="Stop after this long (90s, 5m, or seconds). With neither this nor steps: 60s.",
+        json_schema_extra=_BUDGET | {"kind": "duration"},
+    )
+    image_size: int = Field(
+        default=1024,
+        ge=16,
+        le=8192,
+        description="Longest side in pixels; a larger picture is scaled down, a smaller one never enlarged.",
+        json_schema_extra=_PHOTOS,
+    )
+    video: bool = Field(
+        default=False,
+        description="Also leave a video of the picture as it emerges.",
+        json_schema_extra=_PHOTOS,
+    )
+    seed: int = Field(
+        default=0,
+        ge=0,
+        le=2**31 - 1,
+        description="Seed of every random choice; with steps, the same seed gives the same bytes.",
+        json_schema_extra=_ENGINE,
+    )
