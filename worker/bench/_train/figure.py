@@ -34,7 +34,7 @@ def draw(rows: list[Row], references: list[Row], path: Path) -> None:
     _points(quality, structure, rows, references)
     for panel in (quality, structure):
         panel.set(xscale="log", xlabel="training seconds (cameras, loading and evaluation are not in them)")
-        _decades(panel.xaxis)
+        _decades(panel.xaxis, (1.0, 3.0))
     quality.set(ylabel="held-out PSNR, dB")
     structure.set(yscale="log", ylabel="held-out 1 - SSIM")
     _decades(structure.yaxis)
@@ -42,7 +42,14 @@ def draw(rows: list[Row], references: list[Row], path: Path) -> None:
     error.set_ylabel("mean squared error that this PSNR stands for")
     _decades(error.yaxis)
     if quality.has_data():
-        quality.legend(fontsize=7, loc="lower right")
+        handles, labels = quality.get_legend_handles_labels()
+        scenes_first = sorted(range(len(labels)), key=lambda i: "," in labels[i])
+        quality.legend(
+            [handles[i] for i in scenes_first],
+            [labels[i] for i in scenes_first],
+            fontsize=7,
+            loc="lower right",
+        )
     quality.set_title(
         "points: separate runs, median and range over seeds; thin: the course of the longest", fontsize=8
     )
@@ -79,11 +86,11 @@ def _line(panel: Axes, rows: list[Row], what: str, color: str, label: str) -> No
 def _points(quality: Axes, structure: Axes, rows: list[Row], references: list[Row]) -> None:
     """Peers judged here are filled, figures from elsewhere hollow."""
     judged = {(row["scene"], row["name"]): row for row in rows if row["kind"] == "peer"}
-    published = [row for row in references if row["kind"] == "reference"]
+    earlier = [row for row in references if row["kind"] == "reference"]
     drawn = {row["scene"] for row in rows}
     marks = dict(
         zip(
-            dict.fromkeys([row["name"] for row in judged.values()] + [row["who"] for row in published]),
+            dict.fromkeys([row["name"] for row in judged.values()] + [row["who"] for row in earlier]),
             PEERS * 4,
             strict=False,
         )
@@ -97,8 +104,8 @@ def _points(quality: Axes, structure: Axes, rows: list[Row], references: list[Ro
         }
         quality.scatter(row["seconds"], row["psnr"], label=f"{row['scene']}, {row['name']}", **style)
         structure.scatter(row["seconds"], 1.0 - row["ssim"], **style)
-    for who in dict.fromkeys(row["who"] for row in published):
-        mine = [row for row in published if row["who"] == who and row["scene"] in drawn]
+    for who in dict.fromkeys(row["who"] for row in earlier):
+        mine = [row for row in earlier if row["who"] == who and row["scene"] in drawn]
         for scene in dict.fromkeys(row["scene"] for row in mine):
             of_scene = [row for row in mine if row["scene"] == scene]
             style = {
@@ -120,9 +127,9 @@ def _points(quality: Axes, structure: Axes, rows: list[Row], references: list[Ro
             )
 
 
-def _decades(axis: Axis) -> None:
-    """Ticks at 1, 2 and 5 of every decade, as plain numbers."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+def _decades(axis: Axis, at: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
+    """Ticks at the same places of every decade, as plain numbers."""
+    axis.set_major_locator(LogLocator(subs=at))
     axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_formatter(NullFormatter())
 

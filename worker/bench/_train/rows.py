@@ -122,20 +122,28 @@ def compared(rows: list[Row]) -> dict[tuple[str, str, str], list[tuple[Row, Row]
 
     Of several codes the last one counts that has both.
     """
-    runs = once([row for row in rows if row["kind"] == "run"])
-    defaults: dict[Any, Row] = {}
-    for row in runs:
-        if row["config"] == DEFAULT:
-            defaults[_place(row)] = row
+    defaults, others = _sides(rows)
     found: dict[tuple[str, str, str], list[tuple[Row, Row]]] = {}
-    for row in runs:
-        if row["config"] != DEFAULT and _place(row) in defaults:
+    for row in others:
+        if _place(row) in defaults:
             group = found.setdefault((row["scene"], row["budget"], row["config"]), [])
             group.append((defaults[_place(row)], row))
     return {
         group: [pair for pair in pairs if pair[1]["code"] == pairs[-1][1]["code"]]
         for group, pairs in found.items()
     }
+
+
+def lonely(rows: list[Row]) -> int:
+    """How many rows of a switch have no default to be compared with."""
+    defaults, others = _sides(rows)
+    return sum(_place(row) not in defaults for row in others)
+
+
+def _sides(rows: list[Row]) -> tuple[dict[Any, Row], list[Row]]:
+    runs = once([row for row in rows if row["kind"] == "run"])
+    defaults = {_place(row): row for row in runs if row["config"] == DEFAULT}
+    return defaults, [row for row in runs if row["config"] != DEFAULT]
 
 
 def _place(row: Row) -> tuple[Any, ...]:

@@ -10,11 +10,14 @@ from pathlib import Path
 from _rows import Row, footer
 
 from _train.configurations import CONFIGURATIONS, DEFAULT
-from _train.rows import by_time, compared, failed, latest_default, once
+from _train.rows import by_time, compared, failed, latest_default, lonely, once
 from _train.spread import Spread, seconds_to
 
 TOLERANCE = 0.05
 """Of a time budget, by which a run may end early or late."""
+
+QUIET = 0.1
+"""Of a run's own CPU seconds, which other programs may take beside it before its seconds say too little."""
 
 COMMAND = "splatmill bench train"
 
@@ -54,7 +57,7 @@ def budgets(timed: list[Row]) -> str:
         [row for row in _whole(timed) if by_time(row)], lambda row: (row["scene"], row["budget"])
     )
     head = "scene|budget|seeds|training s|PSNR dB|SSIM|Gaussians|steps|all wall s|all CPU s|peak MB|cameras s"
-    lines, late, worse = [], [], []
+    lines, late, worse, disturbed = [], [], [], []
     course: dict[str, list[tuple[float, float, str]]] = {}
     for (scene, budget), group in groups.items():
         seconds = float(budget.removesuffix("s"))
@@ -64,6 +67,7 @@ def budgets(timed: list[Row]) -> str:
         early = any("held-out" in row["stopped"] for row in group)
         if off > TOLERANCE and not early:
             late.append(f"{scene} at {budget} is {100 * off:.1f} % off")
+        disturbed += [f"{scene} at {budget}, seed {row['seed']}" for row in group if _disturbed(row)]
         course.setdefault(scene, []).append((seconds, quality.median, budget))
         lines.append(
             [
@@ -96,6 +100,8 @@ def budgets(timed: list[Row]) -> str:
         f"- Every run ends within {100 * TOLERANCE:.0f} % of its budget: "
         + ("yes." if not late else f"NO: {'; '.join(late)}."),
         "- More time never gives a worse median: " + ("yes." if not worse else f"NO: {'; '.join(worse)}."),
+        f"- No other work on the machine beyond {100 * QUIET:.0f} % of the run's own: "
+        + ("none." if not disturbed else f"NO: {'; '.join(disturbed)}."),
     ]
     return table(head, lines) + "\n\n" + "\n".join(verdicts)
 
@@ -225,7 +231,9 @@ def ablation(rows: list[Row]) -> str:
             ]
         )
     head = "switch|what|scene|budget|seeds|PSNR, dB|SSIM|training time, %|quality against the default"
-    return "\n\n".join([ONE_SWITCH, table(head, lines), defaults(pairs)])
+    alone = lonely(rows)
+    note = [f"{alone} rows of a switch have no default of the same code, and are not shown."] if alone else []
+    return "\n\n".join([ONE_SWITCH, table(head, lines), *note, defaults(pairs)])
 
 
 def defaults(pairs: dict[tuple[str, str, str], list[tuple[Row, Row]]]) -> str:
@@ -299,6 +307,10 @@ def table(head: str, lines: Iterable[Iterable[object]]) -> str:
 
 def _section(title: str, text: str) -> list[str]:
     return [f"## {title}", text] if text else []
+
+
+def _disturbed(row: Row) -> bool:
+    return bool(row["others_cpu_seconds"] > QUIET * row["cpu_seconds"])
 
 
 def _whole(rows: list[Row]) -> list[Row]:
