@@ -131,7 +131,7 @@ def _measure(wanted: Wanted, path: Path, work: Path) -> bool:
     todo = missing(wanted.runs, found)
     if wanted.runs:
         print(f"{len(wanted.runs) - len(todo)} of {len(wanted.runs)} rows are there; {len(todo)} to measure.")
-    involved = {run.scene.name: run.scene for run in todo} | {p.scene.name: p.scene for p in wanted.peers}
+    involved = {run.scene.name: run.scene for run in todo}
     unusable = {name for name, scene in involved.items() if not _usable(scene, work)}
     todo = [run for run in todo if run.scene.name not in unusable]
     whole = not unusable
@@ -150,7 +150,7 @@ def _measure(wanted: Wanted, path: Path, work: Path) -> bool:
         left = format_duration(estimate.seconds_left(todo[number + 1 :], found))
         print(f"[{number + 1}/{len(todo)}] {run}: {_said(row)}; about {left} left", flush=True)
     for peer in wanted.peers:
-        whole &= peer.scene.name not in unusable and _judge(peer, path, work)
+        whole &= _judge(peer, path, work)
     return whole
 
 

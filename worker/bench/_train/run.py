@@ -25,7 +25,7 @@ from splatmill_worker.__main__ import give_memory_back
 from splatmill_worker.capture import cameras_of, held_out_of, kernels_of
 from splatmill_worker.images import load_views
 from splatmill_worker.refusal import Refusal
-from splatmill_worker.scene import Normalization
+from splatmill_worker.scene import Normalization, Scene
 from splatmill_worker.sfm import posed
 from splatmill_worker.splat import ply
 from splatmill_worker.splat.evaluate import evaluate
@@ -49,17 +49,11 @@ def _quiet(*_: object) -> None:
 
 
 def prepare(job: Row) -> Row:
-    """Photograph what is ours to photograph, and recover cameras where none were given, into the kept `sfm` folder."""
-    capture = Path(job["capture"])
-    if job["made"] and not (capture / "images").is_dir():
-        part = capture / "images.part"
-        synthetic.capture(part, PHOTOS)
-        part.rename(capture / "images")
+    """What the scene holds; its cameras are kept in the `sfm` folder for the rows that follow."""
     options = TrainOptions.model_validate(job["options"])
     try:
-        with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
-            scene = cameras_of(capture, _with_cameras(Path(folder), job), options, _quiet, lambda: False)
-            train, test = held_out_of(scene, options)
+        scene = _posed(job, options)
+        train, test = held_out_of(scene, options)
     except NAMED as failure:
         return {"failure": str(failure)}
     return {"views": len(train), "held_out": len(test), "points": len(scene.points)}
@@ -110,18 +104,15 @@ def measure(job: Row) -> Row:
 
 
 def judge(job: Row) -> Row:
-    """A peer's finished model on the held-out views that runs are judged on, at their size, over white."""
+    """A peer's finished model on the held-out views that runs are judged on, at their size."""
     path = Path(job["model"])
+    options = TrainOptions.model_validate(job["options"])
     try:
         gaussians = ply.read(path)
-    except ply.PlyUnreadableError as unreadable:
-        return {"failure": str(unreadable)}
-    options = TrainOptions.model_validate(job["options"])
-    with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
-        scene = cameras_of(
-            Path(job["capture"]), _with_cameras(Path(folder), job), options, _quiet, lambda: False
-        )
-    _, test = held_out_of(scene, options)
+        scene = _posed(job, options)
+        _, test = held_out_of(scene, options)
+    except (ply.PlyUnreadableError, *NAMED) as failure:
+        return {"failure": str(failure)}
     if not test or options.image_size is None:
         return {"failure": f"{job['scene']} holds out no view, so that nothing can be judged on it."}
     # The training world, for the same near plane and the same float32 rounding as a run's own evaluation.
@@ -133,8 +124,10 @@ def judge(job: Row) -> Row:
         return render(moved, target.camera, background=background, backend=backend).color
 
     views = [TrainingView.of(photo, frame) for photo in load_views(test, options.image_size)]
+    # As runs are judged: white behind transparent photos; opaque ones are trained over black, by everybody.
+    backdrop = torch.full((3,), float(any(view.full.alpha is not None for view in views)))
     with torch.no_grad():
-        score = evaluate(draw, views, torch.ones(3))
+        score = evaluate(draw, views, backdrop)
     return rounded(
         {
             "kind": "peer",
@@ -165,6 +158,17 @@ def main(text: str) -> int:
     part.write_text(json.dumps(plain(answer)))
     os.replace(part, path)
     return 0
+
+
+def _posed(job: Row, options: TrainOptions) -> Scene:
+    """The scene of a capture, photographed first where that is ours to do; recovered cameras are kept."""
+    capture = Path(job["capture"])
+    if job["made"] and not (capture / "images").is_dir():
+        part = capture / "images.part"
+        synthetic.capture(part, PHOTOS)
+        part.rename(capture / "images")
+    with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
+        return cameras_of(capture, _with_cameras(Path(folder), job), options, _quiet, lambda: False)
 
 
 def _with_cameras(workdir: Path, job: Row) -> Path:

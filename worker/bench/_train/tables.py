@@ -196,11 +196,12 @@ def ablation(rows: list[Row]) -> str:
     if not pairs:
         return ""
     lines = []
+    verdicts: dict[str, dict[str, Spread]] = {}
     order = {name: number for number, name in enumerate(CONFIGURATIONS)}
     for (scene, budget, config), group in sorted(
         pairs.items(), key=lambda item: (order.get(item[0][2], len(order)), item[0])
     ):
-        whole = [(default, row) for default, row in group if not failed(default) and not failed(row)]
+        whole = [pair for pair in group if len(_whole(list(pair))) == 2]
         lost = len(group) - len(whole)
         name, what = (
             f"`{config}`",
@@ -213,6 +214,7 @@ def ablation(rows: list[Row]) -> str:
             lines.append([name, what, scene, budget, len(whole), "", "", "", "the plan is the same"])
             continue
         quality = Spread.of(row["psnr"] - default["psnr"] for default, row in whole)
+        verdicts.setdefault(config, {})[f"{scene}, {budget}"] = quality
         structure = Spread.of(row["ssim"] - default["ssim"] for default, row in whole)
         time = Spread.of(
             100 * (row["seconds"]["train"] / default["seconds"]["train"] - 1) for default, row in whole
@@ -233,12 +235,25 @@ def ablation(rows: list[Row]) -> str:
     head = "switch|what|scene|budget|seeds|PSNR, dB|SSIM|training time, %|quality against the default"
     alone = lonely(rows)
     note = [f"{alone} rows of a switch have no default of the same code, and are not shown."] if alone else []
-    return "\n\n".join([ONE_SWITCH, table(head, lines), *note, defaults(pairs)])
+    return "\n\n".join([ONE_SWITCH, summary(verdicts), table(head, lines), *note, defaults(pairs)])
+
+
+def summary(verdicts: dict[str, dict[str, Spread]]) -> str:
+    """Each switch over all scenes and budgets: how often it was better or worse, and its median difference there."""
+    lines = []
+    for config, places in verdicts.items():
+        said = {place: verdict(difference) for place, difference in places.items()}
+        over = Spread.of(difference.median for difference in places.values())
+        named = [", ".join(place for place in said if said[place] == word) for word in ("better", "worse")]
+        lines.append(
+            [f"`{config}`", len(places), *(name or "nowhere" for name in named), over.text(2, signed=True)]
+        )
+    return table("switch|scenes and budgets|better on|worse on|median PSNR difference over them, dB", lines)
 
 
 def defaults(pairs: dict[tuple[str, str, str], list[tuple[Row, Row]]]) -> str:
     """What the switches are compared with, and how far seeds alone move it."""
-    rows = once([default for group in pairs.values() for default, _ in group if not failed(default)])
+    rows = once([default for group in pairs.values() for default, _ in group if _whole([default])])
     lines = [
         [
             scene,
