@@ -108,8 +108,12 @@ def test_options_force(asked: dict[str, object], field: str, value: object) -> N
 
 
 def test_what_cannot_be_followed_is_refused() -> None:
-    with pytest.raises(ValueError, match="pose_refinement"):
-        planned(pose_refinement="on")
+    with pytest.raises(ValueError, match="gpu kernels"):
+        decide(FACTS, options(pose_refinement="on"), "gpu")
+    with pytest.raises(ValueError, match="two photos"):
+        planned(replace(FACTS, views=1), pose_refinement="on")
+    with pytest.raises(ValueError, match="sky=on needs points"):
+        planned(sky="on")
 
 
 def test_more_time_allows_more_steps_and_more_gaussians() -> None:

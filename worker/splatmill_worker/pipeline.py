@@ -23,16 +23,18 @@ from splatmill.schema import (
     TrainOptions,
 )
 from splatmill_worker import sfm
-from splatmill_worker.capture import cameras_of, held_out_of, kernels_of
+from splatmill_worker.capture import cameras_of, held_out_of, kernels_of, start_file
 from splatmill_worker.images import load_views
 from splatmill_worker.kernels.gpu.device import absence, describe
+from splatmill_worker.progress_film import ProgressFilm
 from splatmill_worker.refusal import Refusal
 from splatmill_worker.scene import Normalization, Scene, View
 from splatmill_worker.splat import checkpoint, initialise
 from splatmill_worker.splat.decide import decide, loading_size
+from splatmill_worker.splat.depths import DepthHints
 from splatmill_worker.splat.engine import Engine, open_engine
 from splatmill_worker.splat.export import Frame, export
-from splatmill_worker.splat.facts import Facts, measure
+from splatmill_worker.splat.facts import ENOUGH_POINTS, Facts, measure
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.picture import save_jpeg
 from splatmill_worker.splat.plan import Plan
@@ -40,6 +42,8 @@ from splatmill_worker.splat.probe import probe
 from splatmill_worker.splat.report import write_report
 from splatmill_worker.splat.run import Row
 from splatmill_worker.splat.stages import Stages
+from splatmill_worker.splat.start import Start, StartUnusableError, judge, strongest
+from splatmill_worker.splat.start import read as read_start
 from splatmill_worker.splat.train import Cancelled, Hooks, Tick, Trained, drawer, evaluation_background, train
 from splatmill_worker.splat.views import TrainingView
 
@@ -98,8 +102,13 @@ def run(
             size = loading_size(options, kernels)
             views, held_out = _loaded(train_views, size, frame), _loaded(test_views, size, frame)
         with stages.measured("plan"):
-            gaussians = _first_gaussians(world, views, options)
-            plan, facts = _plan(world, views, held_out, gaussians, options, workdir, revise)
+            start = _start(capture, workdir, options, frame, views)
+            if start is not None and start.facts.doubtful:
+                emit(LogEvent(level="warning", message=_doubt(start.facts)))
+            gaussians = _first_gaussians(world, views, options) if start is None else start.gaussians
+            known = None if start is None else start.facts
+            plan, facts = _plan(world, views, held_out, gaussians, known, options, workdir, revise)
+            gaussians = strongest(gaussians, plan.max_gaussians)
         emit(PlanEvent(plan=plan.as_dict()))
         if plan.image_size < max(facts.width, facts.height):
             with stages.measured("load"):
@@ -108,7 +117,12 @@ def run(
                     _loaded(test_views, plan.image_size, frame),
                 )
 
-        engine = open_engine(gaussians, plan.kernels)
+        engine = open_engine(initialise.completed(gaussians, world, views, plan), plan.kernels)
+        resumable = _resumable(workdir, views)
+        film = None
+        if options.progress_video:
+            anew = resumable is None
+            film = ProgressFilm(workdir / "film", (held_out or views)[0], plan, anew=anew)
         teller = _Teller(emit, workdir, plan, (held_out or views)[0])
         trained = train(
             engine,
@@ -116,27 +130,66 @@ def run(
             held_out,
             plan,
             extent=EXTENT,
+            hints=DepthHints.of(world, views) if plan.depth_hints else None,
             hooks=Hooks(
                 tick=teller.tick,
                 measured=teller.measured,
                 warn=teller.warn,
                 cancelled=cancelled,
                 checkpoint=lambda state: checkpoint.save(workdir / "checkpoints", state),
+                watcher=film,
             ),
-            resume_from=_resumable(workdir, views),
+            resume_from=resumable,
         )
     except (Cancelled, sfm.Cancelled):
         return Outcome("cancelled", out)
 
+    views = list(trained.views)
     emit(StateEvent(state=JobState.exporting))
     with stages.measured("export"):
         home = Frame.of(frame, scene)
         written = export(out, trained, plan, home, views, held_out)
         teller.preview(engine, trained.steps)
+    if film is not None:
+        film.develop(out / "progress.mp4")
+        stages.add("film", film.seconds)
     write_report(
         out, trained, plan, facts, scene, stages, written, home, engine, views, held_out, teller.warnings
     )
     return Outcome("succeeded", out, trained)
+
+
+@dataclass(frozen=True)
+class _Model:
+    """The model to start from, in the training world, and what is known of it."""
+
+    gaussians: Gaussians
+    facts: Start
+
+
+def _start(
+    capture: Path, workdir: Path, options: TrainOptions, frame: Normalization, views: list[TrainingView]
+) -> _Model | None:
+    """The model given: a file beside the capture's poses, or the one that was fetched into `workdir`."""
+    path = start_file(capture, workdir, options)
+    if path is None:
+        return None
+    try:
+        gaussians = read_start(path, frame)
+        return _Model(gaussians, judge(gaussians, views))
+    except StartUnusableError as error:
+        raise Refusal(
+            "start_unusable",
+            str(error),
+            advice="Give a 3D Gaussian .ply that was trained on cameras of the same capture, or leave start out.",
+        ) from error
+
+
+def _doubt(start: Start) -> str:
+    return (
+        f"The model given shows the training photos at {start.psnr:.1f} dB, hardly better than one colour per photo "
+        f"({start.one_color:.1f} dB). If it is of another scene, train without it."
+    )
 
 
 def _loaded(views: tuple[View, ...], size: int, frame: Normalization) -> list[TrainingView]:
@@ -144,7 +197,7 @@ def _loaded(views: tuple[View, ...], size: int, frame: Normalization) -> list[Tr
 
 
 def _first_gaussians(world: Scene, views: list[TrainingView], options: TrainOptions) -> Gaussians:
-    if len(world.points) >= initialise.ENOUGH_POINTS:
+    if len(world.points) >= ENOUGH_POINTS:
         points, colors = torch.from_numpy(world.points), torch.from_numpy(world.colors)
     else:
         targets = [view.full for view in views]
@@ -157,6 +210,7 @@ def _plan(
     views: list[TrainingView],
     held_out: list[TrainingView],
     gaussians: Gaussians,
+    start: Start | None,
     options: TrainOptions,
     workdir: Path,
     revise: Callable[[Plan], Plan],
@@ -168,6 +222,7 @@ def _plan(
     card = describe() if kernels == "gpu" else None
     if card is not None:
         facts = replace(facts, memory_available=card.free_bytes)
+    facts = replace(facts, start=start)
     if stored.is_file():
         kept = json.loads(stored.read_text())
         if kept["options"] == options.model_dump(mode="json"):

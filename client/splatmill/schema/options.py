@@ -3,6 +3,7 @@
 `/v1/options`, the OpenAPI document and the command line's help are generated from this model.
 """
 
+import re
 from enum import StrEnum
 from types import NoneType
 from typing import Any, Literal, get_args
@@ -12,7 +13,11 @@ from pydantic import Field, field_validator
 from pydantic.fields import FieldInfo
 
 from splatmill.schema.base import Request, Response
+from splatmill.schema.captures import safe_name
 from splatmill.schema.quantities import ByteSize, Duration
+
+
+_MODEL_ID = re.compile(r"[a-z0-9]{8,40}", re.ASCII)
 
 
 class Preset(StrEnum):
@@ -150,6 +155,18 @@ class TrainOptions(Request):
         description="How many frames to take from a video, the sharpest ones.",
         json_schema_extra=_PHOTOS,
     )
+    start: str | None = Field(
+        default=None,
+        max_length=512,
+        description="Start from a trained model instead of points: the id of a model on the server, or the name of "
+        "a .ply file among the capture's poses. It must be in the world of the capture's cameras.",
+        json_schema_extra=_PHOTOS,
+    )
+    progress_video: bool = Field(
+        default=False,
+        description="Also leave a video of one view as it is trained.",
+        json_schema_extra=_PHOTOS,
+    )
     background: Background = Field(
         default=Background.auto,
         description="What lies behind the scene; random keeps transparent photos transparent.",
@@ -158,6 +175,21 @@ class TrainOptions(Request):
     exposure: Switch = Field(
         default=Switch.auto,
         description="Fit an affine colour per photo, for photos whose exposure or white balance differ.",
+        json_schema_extra=_PHOTOS,
+    )
+    sky: Switch = Field(
+        default=Switch.auto,
+        description="Put a far shell of Gaussians where photos show sky.",
+        json_schema_extra=_PHOTOS,
+    )
+    gaps: Switch = Field(
+        default=Switch.auto,
+        description="Put Gaussians where photos show what no point of the reconstruction describes.",
+        json_schema_extra=_PHOTOS,
+    )
+    depth_hints: Switch = Field(
+        default=Switch.auto,
+        description="Pull depths to those of the reconstruction's points while the scene takes shape.",
         json_schema_extra=_PHOTOS,
     )
     mapper: Mapper = Field(
@@ -209,6 +241,25 @@ class TrainOptions(Request):
         description="Seed of every random choice; the same seed on the same machine gives the same bytes.",
         json_schema_extra=_ENGINE,
     )
+
+    @field_validator("start")
+    @classmethod
+    def _model_or_file(cls, start: str | None) -> str | None:
+        if start is None or _MODEL_ID.fullmatch(start):
+            return start
+        if not start.lower().endswith(".ply"):
+            raise ValueError(f"{start[:80]!r} is neither a model's id nor the name of a .ply file")
+        return safe_name(start)
+
+    @property
+    def start_file(self) -> str | None:
+        """The file among the capture's poses that `start` names, if it names one."""
+        return self.start if self.start is not None and self.start.lower().endswith(".ply") else None
+
+    @property
+    def start_model(self) -> str | None:
+        """The model that `start` names, if it names one."""
+        return None if self.start_file is not None else self.start
 
     @field_validator("test_views")
     @classmethod

@@ -77,6 +77,17 @@ def _pinhole_of(lens: Lens) -> tuple[float, float, float, float, float]:
     return fx, fy, cx, cy, zoom
 
 
+@lru_cache(maxsize=4096)
+def distortion(lens: Lens) -> float:
+    """The farthest that the lens moves a pixel on the photo's border from where a pinhole would have put it."""
+    camera = colmap_camera(lens)
+    center = np.array([camera.principal_point_x, camera.principal_point_y])
+    corner = np.array([[0.0, 0.0], [lens.width, 0.0], [0.0, lens.height], [lens.width, lens.height]])
+    frame = np.concatenate([corner, (corner + corner[[1, 3, 0, 2]]) / 2])
+    seen = project(camera, (frame - center) / (camera.focal_length_x, camera.focal_length_y))
+    return float(np.linalg.norm(seen - frame, axis=1).max())
+
+
 def colmap_camera(lens: Lens) -> pycolmap.Camera:
     """The COLMAP camera with this lens."""
     return pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))

@@ -11,6 +11,7 @@ from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu.step import Rates
 from splatmill_worker.splat.engine import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.poses import motion
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
@@ -27,6 +28,8 @@ class AutogradStep:
     def __init__(self, gaussians: Gaussians, *, backend: ops.Backend) -> None:
         self._backend = backend
         self.keep_scores = True  # autograd has them anyway
+        self.keep_pose_gradient = False
+        self.pose_gradient: Tensor | None = None
         self.replace(gaussians.padded(3).parameters(), None, None)
 
     @property
@@ -49,6 +52,7 @@ class AutogradStep:
         self.plain_sum = torch.zeros(self.count)
         self.visible_count = torch.zeros(self.count)
         self.max_extent = torch.zeros(self.count)
+        self._twist: Tensor | None = None
         self._pending: tuple[ops.Projected, Tensor, Tensor, Tensor] | None = None
 
     def forward(
@@ -63,6 +67,10 @@ class AutogradStep:
         antialias: bool = False,
     ) -> tuple[Tensor, Tensor, Tensor]:
         gaussians = self._gaussians
+        self._twist = None
+        if self.keep_pose_gradient and torch.is_grad_enabled():
+            self._twist = torch.zeros(6, requires_grad=True)
+            viewmat = motion(self._twist) @ viewmat
         projected = ops.project(
             gaussians.means,
             gaussians.log_scales,
@@ -107,6 +115,7 @@ class AutogradStep:
         torch.autograd.backward([out for out, _ in wanted], [grad for _, grad in wanted])
         height, width = outputs[0].shape[:2]
         self._score(projected, width, height)
+        self.pose_gradient = None if self._twist is None else self._twist.grad
         self._adam(rates, step)
         self._pending = None
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import replace
 from typing import Literal
 
 from splatmill.schema import Background, Densify, Preset, Switch, TrainOptions
 from splatmill_worker.kernels.gpu.device import largest_budget
 from splatmill_worker.splat.budget import Budget
-from splatmill_worker.splat.facts import Facts, Speed
-from splatmill_worker.splat.initialise import ENOUGH_POINTS, RANDOM_GAUSSIANS
+from splatmill_worker.splat.facts import ENOUGH_POINTS, Facts, Speed
+from splatmill_worker.splat.initialise import RANDOM_GAUSSIANS
+from splatmill_worker.splat.needs import needs_of
 from splatmill_worker.splat.plan import Kernels, Plan, Strategy
+from splatmill_worker.splat.reasons import Reasons
 from splatmill_worker.splat.schedule import Schedule
+from splatmill_worker.splat.start import Start
 
 PRESET_STEPS = {Preset.draft: 1000, Preset.balanced: 3000, Preset.quality: 10_000}
 PRESET_SIZE: dict[Kernels, dict[Preset, int]] = {
@@ -27,21 +30,13 @@ PIXELS_PER_GAUSSIAN = 20
 
 UNKNOWN_SPEED = Speed(per_pixel=3e-8, per_gaussian=1e-7)
 BLURRED = 1.5  # grey levels of 255; below the noise of a phone's photo
-EXPOSURES_DIFFER = 0.06  # log brightness: 6 %, which the eye sees side by side
+EXPOSURES_DIFFER = 0.2
+"""Log brightness. At 10 % (a phone's photos of one table) fitting exposures cost 1.6 dB: they follow other errors."""
+
+TINTS_DIFFER = 0.1
 DISTANCES_DIFFER = 4.0
-
-
-@dataclass
-class _Reasons:
-    """Collects sentences while a plan is made."""
-
-    chosen: dict[str, str] = field(default_factory=dict)
-    left_out: dict[str, str] = field(default_factory=dict)
-    forced: list[str] = field(default_factory=list)
-
-    def option(self, name: str) -> None:
-        self.chosen[name] = "Set by option."
-        self.forced.append(name)
+CONTINUED_FROM = 0.5
+"""Share of the rates' fall that a model given has behind it: at full rates a trained scene is first shaken apart."""
 
 
 def loading_size(options: TrainOptions, kernels: Kernels) -> int:
@@ -54,15 +49,14 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
 
     Raises ValueError, as a sentence, for an option that this engine cannot follow.
     """
-    if options.pose_refinement is Switch.on:
-        raise ValueError(
-            "pose_refinement=on is not possible: training keeps the cameras as they are. Leave it at auto."
-        )
-    why = _Reasons()
+    why = Reasons()
     image_size = _image_size(facts, options, why)
     shrunk = (image_size / max(facts.width, facts.height)) ** 2
     pixels = facts.pixels * min(1.0, shrunk)
     initial, start = _initial(facts, why)
+    needs = needs_of(facts, options, kernels, why)
+    if initial == "points":
+        start += needs.added
     speed = facts.speed or UNKNOWN_SPEED
     budget, steps = _budget(facts, options, speed, pixels, start, why)
     most = _max_gaussians(facts, options, kernels, steps, pixels, start, why)
@@ -76,6 +70,8 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         densify_every=max(40, min(100, steps // 20)),
         densify_until=0.7,
     )
+    if facts.start is not None:
+        schedule = _continued(schedule, facts.start, why)
     _undistortion(facts, why)
     return Plan(
         schedule=schedule,
@@ -91,13 +87,17 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         max_memory=options.max_memory,
         stops_when_flat=options.steps is None and options.time_budget is None,
         seed=options.seed,
+        sky=needs.sky,
+        gaps=needs.gaps,
+        depth_hints=needs.depth_hints,
+        pose_refinement=needs.pose_refinement,
         reasons=why.chosen,
         left_out=why.left_out,
         forced=tuple(why.forced),
     )
 
 
-def _image_size(facts: Facts, options: TrainOptions, why: _Reasons) -> int:
+def _image_size(facts: Facts, options: TrainOptions, why: Reasons) -> int:
     longest = max(facts.width, facts.height)
     if options.image_size is not None:
         why.option("image_size")
@@ -114,7 +114,13 @@ def _image_size(facts: Facts, options: TrainOptions, why: _Reasons) -> int:
     return longest
 
 
-def _initial(facts: Facts, why: _Reasons) -> tuple[Literal["points", "random"], int]:
+def _initial(facts: Facts, why: Reasons) -> tuple[Literal["points", "random", "model"], int]:
+    if facts.start is not None:
+        why.chosen["initial"] = (
+            f"The {facts.start.gaussians} Gaussians of the model given show the photos at {facts.start.psnr:.1f} dB."
+        )
+        why.forced.append("initial")
+        return "model", facts.start.gaussians
     if facts.points >= ENOUGH_POINTS:
         why.chosen["initial"] = f"The reconstruction has {facts.points} points."
         return "points", facts.points
@@ -125,7 +131,7 @@ def _initial(facts: Facts, why: _Reasons) -> tuple[Literal["points", "random"], 
 
 
 def _budget(
-    facts: Facts, options: TrainOptions, speed: Speed, pixels: float, start: int, why: _Reasons
+    facts: Facts, options: TrainOptions, speed: Speed, pixels: float, start: int, why: Reasons
 ) -> tuple[Budget, int]:
     """The budget, and the number of steps it is expected to allow."""
     if options.time_budget is not None:
@@ -169,7 +175,7 @@ def _max_gaussians(
     steps: int,
     pixels: float,
     start: int,
-    why: _Reasons,
+    why: Reasons,
 ) -> int:
     settled = round(1000 * steps / STEPS_PER_1000_GAUSSIANS)
     resolved = round(pixels * facts.views / PIXELS_PER_GAUSSIAN)
@@ -193,7 +199,7 @@ def _max_gaussians(
     return most
 
 
-def _densify(options: TrainOptions, most: int, start: int, why: _Reasons) -> Strategy | None:
+def _densify(options: TrainOptions, most: int, start: int, why: Reasons) -> Strategy | None:
     if options.densify is Densify.off:
         why.forced.append("densify")
         why.left_out["densify"] = "Left out by option."
@@ -213,7 +219,7 @@ def _densify(options: TrainOptions, most: int, start: int, why: _Reasons) -> Str
     return "classic"
 
 
-def _resolution(steps: int, image_size: int, why: _Reasons) -> tuple[tuple[int, int], ...]:
+def _resolution(steps: int, image_size: int, why: Reasons) -> tuple[tuple[int, int], ...]:
     first, second = max(20, min(200, steps // 8)), max(50, min(500, steps // 3))
     if image_size < 100:
         why.left_out["coarse_to_fine"] = f"Photos of {image_size} pixels are coarse already."
@@ -223,7 +229,23 @@ def _resolution(steps: int, image_size: int, why: _Reasons) -> tuple[tuple[int, 
     return ((0, 4), (first, 2), (second, 1))
 
 
-def _degree(facts: Facts, options: TrainOptions, why: _Reasons) -> int:
+def _continued(schedule: Schedule, start: Start, why: Reasons) -> Schedule:
+    """The course of a scene that was trained before: what its beginning is for is done."""
+    why.left_out["coarse_to_fine"] = "The model given is trained already; small photos would blur it."
+    degree = schedule.degree
+    if "sh_degree" not in why.forced and start.degree > degree:
+        degree = start.degree
+        why.chosen["sh_degree"] = f"The model given has spherical harmonics of degree {degree}."
+    return replace(
+        schedule,
+        resolution=((0, 1),),
+        degree=degree,
+        first_degree=min(degree, start.degree),
+        annealing=replace(schedule.annealing, skipped=CONTINUED_FROM),
+    )
+
+
+def _degree(facts: Facts, options: TrainOptions, why: Reasons) -> int:
     if options.sh_degree is not None:
         why.option("sh_degree")
         return options.sh_degree
@@ -236,7 +258,7 @@ def _degree(facts: Facts, options: TrainOptions, why: _Reasons) -> int:
     return degree
 
 
-def _background(facts: Facts, options: TrainOptions, why: _Reasons) -> Literal["black", "white", "random"]:
+def _background(facts: Facts, options: TrainOptions, why: Reasons) -> Literal["black", "white", "random"]:
     if options.background is not Background.auto:
         why.option("background")
         named: dict[Background, Literal["black", "white", "random"]] = {
@@ -255,7 +277,7 @@ def _background(facts: Facts, options: TrainOptions, why: _Reasons) -> Literal["
     return "black"
 
 
-def _exposure(facts: Facts, options: TrainOptions, why: _Reasons) -> bool:
+def _exposure(facts: Facts, options: TrainOptions, why: Reasons) -> bool:
     if options.exposure is not Switch.auto:
         why.forced.append("exposure")
         place = why.chosen if options.exposure is Switch.on else why.left_out
@@ -272,13 +294,19 @@ def _exposure(facts: Facts, options: TrainOptions, why: _Reasons) -> bool:
             f"The same points differ by {100 * spread:.0f} % in brightness between photos."
         )
         return True
+    tint = facts.tint_spread
+    if tint is not None and tint > TINTS_DIFFER:
+        why.chosen["exposure"] = (
+            f"White balances differ: the same points by {100 * tint:.0f} % between photos."
+        )
+        return True
     why.left_out["exposure"] = (
         f"Exposures agree: the same points differ by {100 * spread:.1f} % between photos."
     )
     return False
 
 
-def _antialias(facts: Facts, options: TrainOptions, why: _Reasons) -> bool:
+def _antialias(facts: Facts, options: TrainOptions, why: Reasons) -> bool:
     if options.antialias is not Switch.auto:
         why.forced.append("antialias")
         place = why.chosen if options.antialias is Switch.on else why.left_out
@@ -297,13 +325,11 @@ def _antialias(facts: Facts, options: TrainOptions, why: _Reasons) -> bool:
     return False
 
 
-def _undistortion(facts: Facts, why: _Reasons) -> None:
+def _undistortion(facts: Facts, why: Reasons) -> None:
     if facts.distorted:
-        why.chosen["undistortion"] = f"{facts.distorted} photos were taken through a lens with distortion."
+        far = "" if facts.lens_residual is None else f" that moves pixels by up to {facts.lens_residual:.1f}"
+        why.chosen["undistortion"] = f"{facts.distorted} photos were taken through a lens{far}."
     else:
         why.left_out["undistortion"] = "All cameras are pinholes already."
     if not facts.masked:
         why.left_out["masks"] = "No photo has pixels that are masked."
-    error = facts.reprojection
-    fits = "are taken as given" if error is None else f"fit their points to {error:.2f} pixels"
-    why.left_out["pose_refinement"] = f"The cameras {fits}."

@@ -27,9 +27,14 @@ class Engine(Protocol):
     the gradient of the projected mean in NDC units (the absolute one adds magnitudes over pixels; None where a
     backend has none), `visible_count` of steps that saw it, `max_extent` its largest half size over
     half the photo's longer side. `keep_scores` False says that nobody will read them.
+
+    With `keep_pose_gradient`, every step leaves in `pose_gradient` [6] the loss's gradient to a twist (rho, phi) of the
+    camera exp(twist^) viewmat, as `kernels.cpu.step` defines it.
     """
 
     keep_scores: bool
+    keep_pose_gradient: bool
+    pose_gradient: Tensor | None
 
     @property
     def count(self) -> int: ...

@@ -12,11 +12,22 @@ import numpy.typing as npt
 import psutil
 import torch
 
+from splatmill_worker.images.lens import distortion
 from splatmill_worker.scene import Scene
+from splatmill_worker.splat.cells import cells_of
+from splatmill_worker.splat.gaps import filled, gap_share
+from splatmill_worker.splat.sky import shell, sky_share
+from splatmill_worker.splat.start import Start
 from splatmill_worker.splat.views import TrainingView
 
 Float = npt.NDArray[np.float64]
 MAX_POINTS = 4000  # enough for a median, and a fraction of a second
+ENOUGH_POINTS = 20
+"""With fewer, the reconstruction says too little about where things are."""
+
+DARK = 4.0  # grey levels: below, ratios are noise
+SAME = 0.02  # log brightness: sightings nearer to their mean than this agree
+ROUNDS = 30
 
 
 @dataclass(frozen=True)
@@ -39,7 +50,11 @@ class Facts:
     halving_loss: median RMS difference, in grey levels of 255, between a photo and its half-size copy enlarged.
     view_angle: median over points of the largest angle between two views of it, in degrees. distance_ratio:
     90th percentile over points of largest over smallest pixel footprint. depth_ratio: 95th over 5th percentile
-    of depths. reprojection: median error of the points in pixels.
+    of depths. reprojection: median error of the points in pixels of this size. lens_residual: the farthest that
+    distortion moves a pixel of this size. tint_spread: as exposure_spread, of the log ratios of red and blue to
+    green. sightings: median number of points that a photo shows. sky_share, gap_share: shares of the photos that look
+    like sky, and that (sky apart) have no point near; sky_points, gap_points: what would stand for them.
+    start: the model to start from, if one was given.
     """
 
     views: int
@@ -60,6 +75,14 @@ class Facts:
     reprojection: float | None
     memory_available: int
     speed: Speed | None = None
+    start: Start | None = None
+    tint_spread: float | None = None
+    lens_residual: float | None = None
+    sightings: float | None = None
+    sky_share: float | None = None
+    gap_share: float | None = None
+    sky_points: int = 0
+    gap_points: int = 0
 
     @property
     def pixels(self) -> int:
@@ -89,12 +112,15 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
         distorted=sum(view.lens is not None for view in scene.views),
         halving_loss=float(np.median([halving_loss(view.full.rgb) for view in views])),
         exposure_spread=None if seen is None else exposure_spread(seen),
+        tint_spread=None if seen is None else tint_spread(seen),
         view_angle=None if seen is None else seen.view_angle(),
         distance_ratio=None if seen is None else seen.distance_ratio(),
         depth_ratio=None if seen is None else seen.depth_ratio(),
-        reprojection=_median(scene.point_errors),
+        reprojection=_reprojection(scene, max(width, height)),
+        lens_residual=_lens_residual(scene, max(width, height)),
         memory_available=int(psutil.virtual_memory().available),
         speed=speed,
+        **_coverage(scene, views),
     )
 
 
@@ -109,33 +135,77 @@ def halving_loss(rgb: torch.Tensor) -> float:
     return float((again - planes).square().mean().sqrt())
 
 
-def exposure_spread(seen: _Sightings) -> float | None:
-    """Spread of the photos' log exposures, from points that several photos show.
+def _coverage(scene: Scene, views: Sequence[TrainingView]) -> dict[str, Any]:
+    """What the points leave open; nothing is known without enough of them, or where photos are transparent."""
+    if len(scene.points) < ENOUGH_POINTS or any(view.full.alpha is not None for view in views):
+        return {}
+    cells = cells_of(scene, views)
+    return {
+        "sightings": float(np.median([len(grid.points) for grid in cells])),
+        "sky_share": sky_share(cells),
+        "gap_share": gap_share(cells),
+        "sky_points": len(shell(cells, scene.points)[0]),
+        "gap_points": len(filled(cells)[0]),
+    }
 
-    Each sighting's log brightness is a point's own plus its photo's; the photos' parts are solved for by
-    alternating medians, which outliers (highlights, occlusions) do not move.
+
+def _reprojection(scene: Scene, longest: int) -> float | None:
+    """Median error of the points, from pixels of the photos that the cameras were recovered from to `longest`."""
+    if scene.point_errors is None or not len(scene.point_errors):
+        return None
+    sizes = [view.camera if view.lens is None else view.lens for view in scene.views]
+    own = float(np.median([max(size.width, size.height) for size in sizes]))
+    return float(np.median(scene.point_errors)) * longest / own
+
+
+def _lens_residual(scene: Scene, longest: int) -> float | None:
+    """The farthest that any photo's distortion moves a pixel on its border, in pixels of a photo `longest` wide."""
+    lenses = {view.lens for view in scene.views if view.lens is not None}
+    moves = [distortion(lens) * longest / max(lens.width, lens.height) for lens in lenses]
+    return max(moves, default=None)
+
+
+def exposure_spread(seen: _Sightings) -> float | None:
+    """Spread between the photos of their log exposures; None with too few sightings."""
+    return _spread(seen, np.log(np.maximum(seen.color.mean(axis=1), DARK)))
+
+
+def tint_spread(seen: _Sightings) -> float | None:
+    """Spread between the photos of their white balance: the larger one of red and of blue over green, in logs."""
+    red, green, blue = np.log(np.maximum(seen.color.astype(np.float64), DARK)).T
+    spreads = [_spread(seen, red - green), _spread(seen, blue - green)]
+    return max((spread for spread in spreads if spread is not None), default=None)
+
+
+def _spread(seen: _Sightings, log: Float) -> float | None:
+    """Spread between the photos of the part that is theirs in `log` (one value per sighting).
+
+    Each value is a point's own plus its photo's. Both are solved for by alternating means whose weights fall with
+    what is left over, so that outliers (highlights, occlusions) move little.
     """
-    log = np.log(np.maximum(seen.brightness, 4.0))
-    exposure = np.zeros(seen.photos)
-    for _ in range(8):
-        point = _group_median(log - exposure[seen.photo], seen.point, seen.points)
-        exposure = _group_median(log - point[seen.point], seen.photo, seen.photos)
-        exposure -= np.median(exposure)
+    share = np.zeros(seen.photos)
+    weight = np.ones(len(log))
+    for _ in range(ROUNDS):
+        point = _group_mean(log - share[seen.photo], weight, seen.point, seen.points)
+        share = _group_mean(log - point[seen.point], weight, seen.photo, seen.photos)
+        share -= np.median(share)
+        left = log - point[seen.point] - share[seen.photo]
+        weight = 1.0 / np.maximum(np.abs(left), SAME)
     enough = np.bincount(seen.photo, minlength=seen.photos) >= 10
     if enough.sum() < 3:
         return None
-    return float(1.4826 * np.median(np.abs(exposure[enough] - np.median(exposure[enough]))))
+    return float(1.4826 * np.median(np.abs(share[enough] - np.median(share[enough]))))
 
 
 @dataclass(frozen=True)
 class _Sightings:
-    """Which photo shows which point, one row each: indices, brightness 0..255, distance over focal length."""
+    """Which photo shows which point, one row each: indices, colour 0..255, distance over focal length."""
 
     points: int
     photos: int
     point: npt.NDArray[np.int64]
     photo: npt.NDArray[np.int64]
-    brightness: Float
+    color: npt.NDArray[np.uint8]
     depth: Float
     footprint: Float
     direction: Float
@@ -164,8 +234,9 @@ class _Sightings:
             on = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
             away = scene.points[rows[on]] - camera.center
             direction = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-            bright = rgb[v[on], u[on]].mean(axis=1)
-            columns.append((rows[on], np.full(on.sum(), i), bright, z[on], z[on] / camera.fx, direction))
+            columns.append(
+                (rows[on], np.full(on.sum(), i), rgb[v[on], u[on]], z[on], z[on] / camera.fx, direction)
+            )
         joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
         if len(joined[0]) < 40:
             return None
@@ -195,16 +266,8 @@ def _widest(directions: Float) -> float:
     return float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0))))
 
 
-def _median(values: npt.NDArray[Any] | None) -> float | None:
-    return None if values is None or not len(values) else float(np.median(values))
-
-
-def _group_median(values: Float, group: npt.NDArray[np.int64], groups: int) -> Float:
-    """Median of `values` per group; 0 where a group is empty."""
-    order = np.lexsort((values, group))
-    counts = np.bincount(group, minlength=groups)
-    starts = np.cumsum(counts) - counts
-    result = np.zeros(groups)
-    filled = counts > 0
-    result[filled] = values[order][starts[filled] + counts[filled] // 2]
-    return result
+def _group_mean(values: Float, weights: Float, group: npt.NDArray[np.int64], groups: int) -> Float:
+    """Weighted mean of `values` per group; 0 where a group is empty."""
+    total = np.bincount(group, weights, minlength=groups)
+    mean: Float = np.bincount(group, weights * values, minlength=groups) / np.maximum(total, 1e-12)
+    return mean

@@ -20,8 +20,22 @@ class FusedStep(Step):
 
     def __init__(self, gaussians: Gaussians, *, threads: int | None = None) -> None:
         super().__init__(**gaussians.padded(3).parameters(), threads=threads)
+        self.keep_pose_gradient = False
         self._kept: dict[Hashable, PhotoStats] = {}
         self._kept_bytes = 0
+
+    def backward_update(
+        self,
+        d_color: Tensor,
+        d_alpha: Tensor | None = None,
+        d_depth: Tensor | None = None,
+        *,
+        rates: Rates,
+        step: int,
+        pose_gradient: bool = False,
+    ) -> int:
+        asked = pose_gradient or self.keep_pose_gradient
+        return super().backward_update(d_color, d_alpha, d_depth, rates=rates, step=step, pose_gradient=asked)
 
     def train_photo(
         self,
@@ -36,7 +50,6 @@ class FusedStep(Step):
         mask: Tensor | None = None,
         antialias: bool = False,
         key: Hashable | None = None,
-        pose_gradient: bool = False,
     ) -> StepResult:
         seen = self.train(
             viewmat,
@@ -48,7 +61,7 @@ class FusedStep(Step):
             background=background,
             photo_stats=self._stats(photo, mask, key),
             antialias=antialias,
-            pose_gradient=pose_gradient,
+            pose_gradient=self.keep_pose_gradient,
         )
         return StepResult(seen.loss, seen.visible, seen.pairs)
 

@@ -23,6 +23,10 @@ class FusedGpuStep(Step):
         where: str | None = None,
         together: Together | None = None,
     ) -> None:
+        self.keep_pose_gradient = (
+            False  # the plan refuses to refine poses here: these kernels have no such gradient
+        )
+        self.pose_gradient: Tensor | None = None
         super().__init__(**gaussians.padded(3).parameters(), where=where, together=together)
 
     def train_photo(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,18 +12,19 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.scene import Camera
-from splatmill_worker.splat.gaussians import SH_C0, Gaussians
-from splatmill_worker.splat.views import Target
+from splatmill_worker.scene import Camera, Scene
+from splatmill_worker.splat import gaps, sky
+from splatmill_worker.splat.cells import cells_of
+from splatmill_worker.splat.facts import ENOUGH_POINTS
+from splatmill_worker.splat.gaussians import SH_C0, Gaussians, concatenate
+from splatmill_worker.splat.plan import Plan
+from splatmill_worker.splat.views import Target, TrainingView
 
 Float = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Pixels = npt.NDArray[np.uint8]
 
 INITIAL_OPACITY = 0.1
-
-ENOUGH_POINTS = 20
-"""With fewer, the reconstruction says too little about where things are."""
 
 RANDOM_GAUSSIANS = 20_000
 
@@ -57,9 +59,52 @@ def round_ones(points: Tensor, width: Tensor, colors: Tensor) -> Gaussians:
         points.float(),
         width.float().log()[:, None].expand(n, 3).contiguous(),
         quats,
-        torch.full((n,), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))),
+        torch.full((n,), _logit(INITIAL_OPACITY)),
         sh,
     )
+
+
+def _logit(opacity: float) -> float:
+    return math.log(opacity / (1.0 - opacity))
+
+
+def completed(
+    gaussians: Gaussians,
+    scene: Scene,
+    views: Sequence[TrainingView],
+    plan: Plan,
+    *,
+    backend: ops.Backend | None = None,
+) -> Gaussians:
+    """`gaussians` made from the points of `scene`, with what the plan adds before training: the sky, and the gaps.
+
+    No more than `plan.max_gaussians` result; what does not fit is left out evenly, the gaps before the sky.
+    """
+    if plan.initial != "points" or not (plan.sky or plan.gaps):
+        return gaussians
+    cells = cells_of(scene, views)
+    room = max(0, plan.max_gaussians - gaussians.count)
+    parts = [gaussians]
+    if plan.sky:
+        points, colors = _at_most(room, *sky.shell(cells, scene.points))
+        room -= len(points)
+        if len(points) > 1:
+            far = from_points(torch.from_numpy(points), torch.from_numpy(colors), backend=backend)
+            parts.append(replace(far, logit_opacities=torch.full((far.count,), _logit(sky.OPACITY))))
+    if plan.gaps:
+        points, colors = _at_most(room, *gaps.filled(cells))
+        # As wide as their distance to each other: those of the reconstruction are elsewhere.
+        if len(points) > 1:
+            parts.append(from_points(torch.from_numpy(points), torch.from_numpy(colors), backend=backend))
+    return concatenate(*parts)
+
+
+def _at_most(room: int, points: Float, colors: Pixels) -> tuple[Float, Pixels]:
+    """Evenly chosen rows where there are more than `room`."""
+    if len(points) <= room:
+        return points, colors
+    rows = np.linspace(0, len(points), room, endpoint=False).astype(np.int64)
+    return points[rows], colors[rows]
 
 
 def in_frusta(targets: Sequence[Target], count: int, seed: int) -> tuple[Tensor, Tensor]:

@@ -21,15 +21,17 @@ class Plan:
     """The whole course of a run. What is not needed is None or absent.
 
     image_size: longest side in pixels. background: what is put behind transparent photos while training.
-    `reasons` has one sentence per field; `left_out` one per thing that this scene does not need; `forced` names
-    the fields that an option fixed.
+    sky: a far shell of Gaussians stands for it. gaps: Gaussians are put where photos show what no point describes.
+    depth_hints: the reconstruction's points pull rendered depths to theirs. pose_refinement: training cameras are
+    corrected. `reasons` has one sentence per field; `left_out` one per thing that this scene does not need; `forced`
+    names the fields that an option fixed.
     """
 
     schedule: Schedule
     image_size: int
     max_gaussians: int
     densify: Strategy | None
-    initial: Literal["points", "random"]
+    initial: Literal["points", "random", "model"]
     kernels: Kernels
     background: Literal["black", "white", "random"]
     exposure: bool
@@ -38,6 +40,10 @@ class Plan:
     max_memory: int | None
     stops_when_flat: bool
     seed: int
+    sky: bool = False
+    gaps: bool = False
+    depth_hints: bool = False
+    pose_refinement: bool = False
     reasons: dict[str, str] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     forced: tuple[str, ...] = ()

@@ -14,11 +14,13 @@ from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu.step import Rates
 from splatmill_worker.splat.budget import Budget, Clock
 from splatmill_worker.splat.density.interface import Densifier, Moment
+from splatmill_worker.splat.depths import DepthHints
 from splatmill_worker.splat.engine import Engine, StepResult
 from splatmill_worker.splat.exposure import Exposure
 from splatmill_worker.splat.failure import FailureName, TrainingFailed
 from splatmill_worker.splat.health import Health
 from splatmill_worker.splat.plan import Plan
+from splatmill_worker.splat.poses import Poses
 from splatmill_worker.splat.rates import RateSchedule
 from splatmill_worker.splat.views import Target, TrainingView
 
@@ -54,6 +56,8 @@ class Run:
     densifier: Densifier | None
     exposure: Exposure | None
     warn: Callable[[str], None]
+    poses: Poses | None = None
+    hints: DepthHints | None = None
     clock: Clock = field(default_factory=Clock)
     step: int = 0
     loss: float = math.nan
@@ -96,13 +100,17 @@ class Run:
         rates = RateSchedule(self.extent, schedule.annealing, self.rate_scale).at(progress)
         degree = schedule.degree_at(self.step, progress)
         try:
-            if self.exposure is None:
+            if self.poses is not None:
+                target = target._replace(viewmat=self.poses.viewmat(number))
+            if self.exposure is None and self.hints is None:
                 result = self._plain_step(number, target, degree, rates)
             else:
-                result = self._exposed_step(self.exposure, number, target, degree, rates)
+                result = self._composed_step(number, target, degree, rates)
         except MemoryError as short:
             raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
         self.loss = result.loss
+        if self.poses is not None and self.engine.pose_gradient is not None:
+            self.poses.update(number, self.engine.pose_gradient, progress, self.rate_scale)
         self.ever_saw |= result.visible > 0
         self.health.watch(self.step, result.loss, result.visible)
         # What nobody will read is not summed.
@@ -175,6 +183,7 @@ class Run:
             "random": self.random.get_state(),
             "views": [view.name for view in self.views],
             "exposure": None if self.exposure is None else self.exposure.state(),
+            "poses": None if self.poses is None else self.poses.state(),
             "budget": asdict(self.budget),
             "shortened": self.shortened,
         }
@@ -194,6 +203,8 @@ class Run:
         self.health.disturbed(self.step)
         if self.exposure is not None:
             self.exposure.restore(state["exposure"])
+        if self.poses is not None:
+            self.poses.restore(state["poses"])
 
     def _plain_step(self, number: int, target: Target, degree: int, rates: Rates) -> StepResult:
         background = self.background(target)
@@ -210,11 +221,10 @@ class Run:
             key=(number, self.reduction) if target.alpha is None else None,
         )
 
-    def _exposed_step(
-        self, exposure: Exposure, number: int, target: Target, degree: int, rates: Rates
-    ) -> StepResult:
+    def _composed_step(self, number: int, target: Target, degree: int, rates: Rates) -> StepResult:
+        """A step whose loss is more than that of the photo: exposures are fitted, or depths are hinted at."""
         background = self.background(target)
-        color, alpha, _ = self.engine.forward(
+        color, alpha, depth = self.engine.forward(
             target.viewmat,
             target.K,
             target.camera.width,
@@ -223,16 +233,24 @@ class Run:
             background=background,
             antialias=self.plan.antialias,
         )
+        visible = int(bool((alpha > 0).any()))
+        pulls: tuple[Tensor | None, Tensor | None] = (None, None)
+        if self.hints is not None:
+            pulls = self.hints.gradient(number, target, alpha, depth, self.progress)
         color = color.detach().clone().requires_grad_()
-        seen = exposure.applied(number, color)
+        seen = color if self.exposure is None else self.exposure.applied(number, color)
         photo = target.over(background).to(seen.device)
         mask = None if target.mask is None else target.mask.to(seen.device)
         loss = ops.loss(seen, photo, mask=mask, backend=self.plan.kernels)
-        (loss + exposure.penalty(number).to(loss.device)).backward()  # type: ignore[no-untyped-call]  # torch's own gap
-        exposure.update(self.rate_scale)
+        total = loss
+        if self.exposure is not None:
+            total = loss + self.exposure.penalty(number).to(loss.device)
+        total.backward()  # type: ignore[no-untyped-call]  # torch's own gap
+        if self.exposure is not None:
+            self.exposure.update(self.rate_scale)
         assert color.grad is not None
-        self.engine.backward_update(color.grad, rates=rates, step=self.step)
-        return StepResult(float(loss.detach()), int(bool((alpha > 0).any())), 0)
+        self.engine.backward_update(color.grad, *pulls, rates=rates, step=self.step)
+        return StepResult(float(loss.detach()), visible, 0)
 
     def _next_view(self) -> int:
         """Every photo once in random order, then again."""

@@ -5,17 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
+from splatmill_worker.splat.depths import DepthHints
 from splatmill_worker.splat.engine import Engine, gaussians_of
 from splatmill_worker.splat.evaluate import Score, evaluate
 from splatmill_worker.splat.exposure import Exposure
 from splatmill_worker.splat.failure import FailureName, TrainingFailed
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan import Plan
+from splatmill_worker.splat.poses import Poses, typical_depth
 from splatmill_worker.splat.run import Row, Run
 from splatmill_worker.splat.strategies import densifier_of
 from splatmill_worker.splat.views import Target, TrainingView
@@ -49,6 +51,16 @@ class Tick:
     eta: float
 
 
+class Watcher(Protocol):
+    """Who looks at the scene at moments of its own, while the training clock stands still."""
+
+    def due(self, progress: float) -> bool:
+        """Whether to look at this share of the budget."""
+
+    def take(self, engine: Engine, progress: float, seconds: float) -> None:
+        """Look, `seconds` into the training."""
+
+
 @dataclass
 class Hooks:
     """What a caller watches and decides. `checkpoint` gets plain values and tensors to store."""
@@ -59,11 +71,15 @@ class Hooks:
     cancelled: Callable[[], bool] = lambda: False
     checkpoint: Callable[[dict[str, Any]], None] | None = None
     checkpoint_seconds: float = 20.0
+    watcher: Watcher | None = None
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What came out. `gaussians` are in the training world; `stopped` says why the run ended."""
+    """What came out. `gaussians` are in the training world; `stopped` says why the run ended.
+
+    `views` are the training views with their cameras as the run left them.
+    """
 
     gaussians: Gaussians
     rows: tuple[Row, ...]
@@ -75,6 +91,7 @@ class Trained:
     stopped: str
     failure: TrainingFailed | None
     recoveries: int
+    views: Sequence[TrainingView]
 
 
 @dataclass
@@ -93,19 +110,25 @@ def train(
     plan: Plan,
     *,
     extent: float,
+    hints: DepthHints | None = None,
     hooks: Hooks | None = None,
     resume_from: dict[str, Any] | None = None,
 ) -> Trained:
     """Optimise what `engine` holds until it shows `views`, as `plan` says.
 
-    extent: radius of the cameras in the training world, the unit of the position rate. resume_from: a state that
+    extent: radius of the cameras in the training world, the unit of the position rate. hints: depths of points, where
+    the plan asks for them. resume_from: a state that
     `hooks.checkpoint` was given by an earlier attempt with the same plan. Evaluation and checkpoints are not on
     the training clock. Raises TrainingFailed when nothing usable was reached, Cancelled on request.
     """
     hooks = hooks or Hooks()
     exposure = Exposure(len(views)) if plan.exposure else None
     warm_up(engine, views[0], plan)
-    run = Run(engine, plan, views, extent, densifier_of(plan), exposure, hooks.warn)
+    poses = None
+    if plan.pose_refinement:
+        poses = Poses(views, _depth_seen(engine, views, plan))
+        engine.keep_pose_gradient = True
+    run = Run(engine, plan, views, extent, densifier_of(plan), exposure, hooks.warn, poses, hints)
     if resume_from is not None:
         run.resume(resume_from)
     measuring = _Measuring(done=sum(share <= run.progress for share in MEASURED_AT))
@@ -131,6 +154,9 @@ def train(
                 row = _measure(run, held_out, measuring)
                 hooks.measured(row, engine)
             stopped = _enough(run, plan)
+        if hooks.watcher is not None and hooks.watcher.due(run.progress):
+            with run.clock.stopped():
+                hooks.watcher.take(engine, run.progress, run.clock.seconds)
         now = time.monotonic()
         if now - last_tick >= TICK_SECONDS:
             last_tick = now
@@ -144,7 +170,9 @@ def train(
     draw = drawer(engine, plan)
     backdrop = evaluation_background(plan)
     final = evaluate(draw, held_out, backdrop) if held_out else None
-    sample = views[:: max(1, len(views) // 16)]
+    engine.keep_pose_gradient = False
+    seen_from = list(views) if poses is None else poses.corrected(views)
+    sample = seen_from[:: max(1, len(views) // 16)]
     on_training = evaluate(draw, sample, backdrop)
     return Trained(
         gaussians_of(engine).padded(plan.schedule.degree),
@@ -157,6 +185,7 @@ def train(
         stopped,
         failure,
         run.recoveries,
+        seen_from,
     )
 
 
@@ -182,6 +211,23 @@ def drawer(engine: Engine, plan: Plan) -> Callable[[Target, Tensor], Tensor]:
 def evaluation_background(plan: Plan) -> Tensor:
     """White behind transparent photos unless the plan says black: what published results are judged on."""
     return torch.zeros(3) if plan.background == "black" else torch.ones(3)
+
+
+def _depth_seen(engine: Engine, views: Sequence[TrainingView], plan: Plan) -> float:
+    """Mean depth of what some of the views show before training."""
+    depths = []
+    for view in views[:: max(1, len(views) // 8)]:
+        target = view.full
+        _, alpha, depth = engine.forward(
+            target.viewmat,
+            target.K,
+            target.camera.width,
+            target.camera.height,
+            degree=0,
+            antialias=plan.antialias,
+        )
+        depths.append(typical_depth(depth, alpha))
+    return sorted(depths)[len(depths) // 2]
 
 
 def warm_up(engine: Engine, view: TrainingView, plan: Plan) -> None:

@@ -1,0 +1,105 @@
+"""Photos as coarse grids: which cells show a point of the reconstruction, and which do not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from splatmill_worker.scene import Camera, Scene
+from splatmill_worker.splat.views import TrainingView
+
+Float = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+Pixels = npt.NDArray[np.uint8]
+
+CELLS = 48
+"""Cells along a photo's longer side: about as many as SfM has points across a well covered photo."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """One photo as a coarse grid [h, w]: the camera at that size, colours [h, w, 3], and what each cell shows.
+
+    covered: a known point lies in the cell or beside it. used: most of the cell's pixels count. `points` [k, 3] are
+    the known points in the photo, as column and row in cells, and depth.
+    """
+
+    camera: Camera
+    color: Pixels
+    covered: Flags
+    used: Flags
+    points: Float
+
+    @staticmethod
+    def of(view: TrainingView, points: Float) -> Cells:
+        """The grid of a photo that shows `points` [k, 3], in the same world as its camera."""
+        target = view.full
+        factor = min(1.0, CELLS / max(target.camera.width, target.camera.height))
+        width = max(1, round(target.camera.width * factor))
+        height = max(1, round(target.camera.height * factor))
+        camera = target.camera.scaled_to(width, height)
+
+        def area(planes: torch.Tensor) -> npt.NDArray[np.float32]:  # [C, H, W] float to [C, h, w]
+            small = torch.nn.functional.interpolate(planes[None], size=(height, width), mode="area")[0]
+            array: npt.NDArray[np.float32] = small.numpy()
+            return array
+
+        color = (area(target.rgb.permute(2, 0, 1).float()) + 0.5).astype(np.uint8).transpose(1, 2, 0)
+        used = np.ones((height, width), bool)
+        if target.mask is not None:
+            used = area(target.mask[None].float())[0] > 0.5
+        seen = projected(camera, points)
+        return Cells(camera, color, marked(seen, (height, width), spread=1), used, seen)
+
+    def at(self, cells: Index, depth: Float) -> Float:
+        """Points [k, 3] in the world at camera depths [k] behind the middles of `cells` [k, 2] (row, column)."""
+        camera = self.camera
+        x = (cells[:, 1] + 0.5 - camera.cx) / camera.fx * depth
+        y = (cells[:, 0] + 0.5 - camera.cy) / camera.fy * depth
+        local = np.stack([x, y, depth], axis=1)
+        world: Float = (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+        return world
+
+
+def cells_of(scene: Scene, views: Sequence[TrainingView]) -> list[Cells]:
+    """The grid of every view, in the world of `scene`. Without tracks, every point counts in every view."""
+    return [Cells.of(view, points) for view, points in zip(views, points_of(scene, views), strict=True)]
+
+
+def points_of(scene: Scene, views: Sequence[TrainingView]) -> list[Float]:
+    """The points [k, 3] that each view shows, by the reconstruction's tracks; all of them where it has none."""
+    if scene.point_views is None:
+        return [scene.points for _ in views]
+    tracks = scene.point_views
+    point = np.repeat(np.arange(len(scene.points)), np.diff(tracks.offsets))
+    order = np.argsort(tracks.views, kind="stable")
+    ends = np.cumsum(np.bincount(tracks.views, minlength=len(scene.views)))
+    of_view = np.split(point[order], ends[:-1])
+    number = {view.name: i for i, view in enumerate(scene.views)}
+    return [scene.points[of_view[number[view.name]]] for view in views]
+
+
+def projected(camera: Camera, points: Float) -> Float:
+    """Column, row and depth [k, 3] of those `points` [n, 3] that fall into the picture of `camera`."""
+    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    z = np.maximum(local[:, 2], 1e-9)
+    u = local[:, 0] / z * camera.fx + camera.cx
+    v = local[:, 1] / z * camera.fy + camera.cy
+    on = (local[:, 2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    return np.stack([u[on], v[on], z[on]], axis=1)
+
+
+def marked(seen: Float, shape: tuple[int, int], *, spread: int) -> Flags:
+    """bool [h, w]: cells with one of `seen` (column, row, ...) in them or within `spread` cells."""
+    height, width = shape
+    marks = np.zeros((height + 2 * spread, width + 2 * spread), bool)
+    column, row = seen[:, 0].astype(np.int64), seen[:, 1].astype(np.int64)
+    for down in range(2 * spread + 1):
+        for right in range(2 * spread + 1):
+            marks[row + down, column + right] = True
+    return marks[spread : spread + height, spread : spread + width]

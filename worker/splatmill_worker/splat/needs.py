@@ -1,0 +1,108 @@
+"""What a scene needs beside Gaussians on its points: the sky, the gaps between points, depth hints, better cameras."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from splatmill.schema import Switch, TrainOptions
+from splatmill_worker.splat.facts import Facts
+from splatmill_worker.splat.plan import Kernels
+from splatmill_worker.splat.reasons import Reasons
+
+MUCH_SKY = 0.05
+"""Of all photos; less is a window or a white wall."""
+
+OUTDOORS = 6.0
+"""Far over near depths; a table or a room has less, a street more."""
+
+MANY_GAPS = 0.1
+
+FEW_VIEWS = 12
+
+POSES_OFF = 1.0
+"""Pixels at the training size: below, cameras err by less than the photos resolve."""
+
+
+class Needs(NamedTuple):
+    """Fields of the plan, and the Gaussians that they add before the first step."""
+
+    sky: bool
+    gaps: bool
+    depth_hints: bool
+    pose_refinement: bool
+    added: int
+
+
+def needs_of(facts: Facts, options: TrainOptions, kernels: Kernels, why: Reasons) -> Needs:
+    """The needs that the facts show or the options force, each with its sentence in `why`.
+
+    Raises ValueError, as a sentence, for an option that this scene cannot follow.
+    """
+    sky = why.switch("sky", options.sky, *_sky(facts))
+    gaps = why.switch("gaps", options.gaps, *_gaps(facts))
+    hints = why.switch("depth_hints", options.depth_hints, *_hints(facts))
+    poses = why.switch("pose_refinement", options.pose_refinement, *_poses(facts, kernels))
+    for name, asked in (("sky", options.sky), ("gaps", options.gaps), ("depth_hints", options.depth_hints)):
+        if asked is Switch.on and facts.sightings is None:
+            raise ValueError(
+                f"{name}=on needs points that the photos show, and there are none. Leave it at auto."
+            )
+    if poses and kernels == "gpu":
+        raise ValueError(
+            "pose_refinement=on needs the gradient to cameras, which the gpu kernels do not give. Use backend=cpu."
+        )
+    if poses and facts.views < 2:
+        raise ValueError(
+            "pose_refinement=on needs at least two photos: one alone shows any error of its camera."
+        )
+    return Needs(sky, gaps, hints, poses, sky * facts.sky_points + gaps * facts.gap_points)
+
+
+def _sky(facts: Facts) -> tuple[bool, str]:
+    share, ratio = facts.sky_share, facts.depth_ratio
+    if share is None or ratio is None:
+        return False, "Whether the photos show sky cannot be told without points in them."
+    seen = f"{100 * share:.0f} % of the photos look like sky"
+    if share < MUCH_SKY:
+        return False, f"{seen}."
+    if ratio < OUTDOORS:
+        return False, f"{seen}, but depths differ by a factor of {ratio:.1f} only: this is not outdoors."
+    return (
+        True,
+        f"{seen}, and depths differ by a factor of {ratio:.0f}: {facts.sky_points} far Gaussians stand for it.",
+    )
+
+
+def _gaps(facts: Facts) -> tuple[bool, str]:
+    if facts.gap_share is None:
+        return False, "Where points are missing cannot be told without points in the photos."
+    seen = f"{100 * facts.gap_share:.0f} % of what the photos show has no point near it"
+    if facts.gap_share < MANY_GAPS:
+        return False, f"Only {seen}."
+    return True, f"{seen}: {facts.gap_points} Gaussians are put there, as deep as the nearest points."
+
+
+def _hints(facts: Facts) -> tuple[bool, str]:
+    if facts.views >= FEW_VIEWS:
+        return False, f"{facts.views} photos tell depths by themselves."
+    if facts.sightings is None:
+        return False, "There are no points to take depths from."
+    return (
+        True,
+        f"{facts.views} photos leave depths open; each shows {facts.sightings:.0f} points that tell some.",
+    )
+
+
+def _poses(facts: Facts, kernels: Kernels) -> tuple[bool, str]:
+    error = facts.reprojection
+    if error is None:
+        return False, "The cameras are taken as given: there are no points to test them on."
+    seen = f"The cameras fit their points to {error:.2f} pixels"
+    if error < POSES_OFF:
+        return False, f"{seen}."
+    if kernels == "gpu":
+        return (
+            False,
+            f"{seen}, which would call for correcting them; the gpu kernels give no gradient to cameras.",
+        )
+    return True, f"{seen}: those of training photos are corrected, held-out ones are judged as they came."
