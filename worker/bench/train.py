@@ -231,7 +231,11 @@ def _parser() -> argparse.ArgumentParser:
         help=f"of {', '.join(scenes.KNOWN)} (default: all), or folders with a capture of your own",
     )
     switches = "; ".join(f"{name}: {each.what}" for name, each in configurations.CONFIGURATIONS.items())
-    parser.add_argument("--configs", **several, help=f"default when left out, `all`, or any of {switches}")
+    parser.add_argument(
+        "--configs",
+        **several,
+        help=f"default when left out, `all`, or any of {switches}".replace("%", "%%"),
+    )
     parser.add_argument(
         "--budgets", **several, help="training steps or seconds, e.g. 600steps,10s,2m (default: 10s,30s)"
     )
