@@ -32,7 +32,7 @@ def test_every_field_is_described_once_with_help_and_group():
     for option in OPTIONS.values():
         assert option.help.endswith(".")
         assert option.group in {"budget", "photos", "cameras", "engine"}
-        assert option.type == "list" or option.range_text, option.name
+        assert option.type in ("list", "text", "flag") or option.range_text, option.name
 
 
 def test_description_survives_json():

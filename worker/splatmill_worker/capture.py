@@ -31,7 +31,9 @@ def cameras_of(
     given = posed.find(capture)
     if given is not None:
         try:
-            return given.load()
+            scene = given.load()
+            on_progress("stereo", 0, len(scene.views), "points between those given")
+            return posed.completed(scene, workdir, cancelled)
         except (ValueError, OSError) as error:
             raise Refusal(
                 "poses_invalid",
@@ -87,6 +89,25 @@ def held_out_of(scene: Scene, options: TrainOptions) -> tuple[tuple[View, ...], 
             advice="Hold out fewer photos.",
         )
     return train, test
+
+
+def start_file(capture: Path, workdir: Path, options: TrainOptions) -> Path | None:
+    """The .ply to start from: named among the capture's poses, or a model's own, fetched as start.ply; None without.
+
+    Raises Refusal where the capture has no such file.
+    """
+    if options.start is None:
+        return None
+    if options.start_file is None:
+        return workdir / "start.ply"
+    for folder in (capture / "poses", capture):
+        if (folder / options.start_file).is_file():
+            return folder / options.start_file
+    raise Refusal(
+        "start_unusable",
+        f"The capture has no file {options.start_file!r} among its poses.",
+        advice="Upload the .ply to the capture's poses, or leave start out.",
+    )
 
 
 def kernels_of(options: TrainOptions) -> Kernels:

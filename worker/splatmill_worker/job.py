@@ -104,6 +104,8 @@ def _work(this: Attempt, request: JobRow, storage: Storage, outbox: Outbox) -> N
         raise NothingUploadedError(request.capture)
     if reconstruction.fetch(storage, request.capture, space.run):
         log.info("The cameras of this capture were recovered before; they are used again.")
+    if request.options.start_model is not None:
+        space.stage_start(request.options.start_model)
     mirror = Mirror(space, log.warning)
     try:
         run = cast(Pipeline, importlib.import_module(PIPELINE).run)

@@ -26,7 +26,7 @@ MIRROR_SECONDS = 15.0
 LOCK_SECONDS = 10.0
 """How long to wait for a process that is being killed to let go of the folder."""
 
-MIRRORED = ("checkpoints", "plan.json", "stages.json")
+MIRRORED = ("checkpoints", "plan.json", "stages.json", "film")
 """Cameras are not among them: `reconstruction` shares those with every job on the capture."""
 
 _RECONSTRUCTION = "sfm"
@@ -34,6 +34,16 @@ _RECONSTRUCTION = "sfm"
 
 class FolderInUseError(RuntimeError):
     """Another process works at the same job on this machine."""
+
+
+class StartGoneError(RuntimeError):
+    """The model to start from is not, or no longer, in storage."""
+
+    code = "model_not_found"
+    advice = "Start from another model, or leave start out."
+
+    def __init__(self, model_id: str) -> None:
+        super().__init__(f"The model {model_id[:80]!r} to start from is not stored.")
 
 
 class Workspace:
@@ -67,6 +77,20 @@ class Workspace:
             else:
                 _link(source, target)
         return len(entries)
+
+    def stage_start(self, model_id: str) -> None:
+        """Bring a finished model's .ply here to start from, as run/start.ply. Raises StartGoneError without one."""
+        target = self.run / "start.ply"
+        if target.is_file():
+            return
+        path = layout.model_file(model_id, "model.ply") if layout.is_id(model_id) else None
+        if path is None or self.storage.head(path) is None:
+            raise StartGoneError(model_id)
+        source = self.storage.local_path(path)
+        if source is None:
+            self.storage.download(path, target)
+        else:
+            _link(source, target)
 
     def restore(self) -> list[str]:
         """Fetch what an attempt on another machine left, if this one has nothing of its own. Returns the names."""

@@ -24,6 +24,7 @@ MODEL_FILES = {
     "cameras.json": "application/json",
     "job.json": "application/json",
     "preview.jpg": "image/jpeg",
+    "progress.mp4": "video/mp4",
 }
 """Names a model may hold, with the media type each is served under."""
 

@@ -16,14 +16,18 @@ ModelId = Annotated[
 ]
 
 FILES = ("model.ply", "report.json", "report.png", "report.html", "cameras.json")
-"""What `train` and `download` leave in the output folder; preview.jpg comes along where there is one."""
+"""What `train` and `download` leave in the output folder."""
+
+SOMETIMES = ("preview.jpg", "progress.mp4")
+"""What comes along where there is one."""
 
 
 def download_files(model: "ModelHandle", folder: Path) -> list[Path]:
     """Write the model's files into `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     stored = {entry.name for entry in model.model.files}
-    wanted = [name for name in (*FILES, "preview.jpg") if name in stored or not stored]
+    wanted = [name for name in FILES if name in stored or not stored]
+    wanted += [name for name in SOMETIMES if name in stored]
     return [model.download(folder / name, file=name) for name in wanted]
 
 

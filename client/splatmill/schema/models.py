@@ -10,7 +10,7 @@ from splatmill.schema.events import CurveRow
 
 
 class ModelFile(Response):
-    """One file of a model: model.ply, report.json, report.png, report.html, cameras.json, preview.jpg."""
+    """One file of a model: model.ply, report.json, report.png, report.html, cameras.json, preview.jpg, progress.mp4."""
 
     name: str
     size: int = Field(ge=0, description="Bytes.")

@@ -66,6 +66,7 @@ PROBLEMS: dict[str, Kind] = {
     "no_images": Kind(422, "There are no images"),
     "too_few_images": Kind(422, "There are too few images"),
     "poses_invalid": Kind(422, "The camera poses that came with the images cannot be used"),
+    "start_unusable": Kind(422, "The model to start from cannot be used"),
     "holdout_empty": Kind(422, "Holding out these views leaves nothing to train on"),
     # Structure from motion.
     "sfm_no_features": Kind(422, "The photos show too little detail to match"),

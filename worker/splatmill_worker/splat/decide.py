@@ -35,8 +35,6 @@ EXPOSURES_DIFFER = 0.2
 
 TINTS_DIFFER = 0.1
 DISTANCES_DIFFER = 4.0
-CONTINUED_FROM = 0.5
-"""Share of the rates' fall that a model given has behind it: at full rates a trained scene is first shaken apart."""
 
 
 def loading_size(options: TrainOptions, kernels: Kernels) -> int:
@@ -230,7 +228,11 @@ def _resolution(steps: int, image_size: int, why: Reasons) -> tuple[tuple[int, i
 
 
 def _continued(schedule: Schedule, start: Start, why: Reasons) -> Schedule:
-    """The course of a scene that was trained before: what its beginning is for is done."""
+    """The course of a scene that was trained before: what its beginning is for is done.
+
+    The rates start as ever. On the fox, 300 steps on a model of 700 ended at 29.7 dB so, and at 29.5, 29.3 and 28.8 dB
+    with a quarter, a half and three quarters of their fall skipped.
+    """
     why.left_out["coarse_to_fine"] = "The model given is trained already; small photos would blur it."
     degree = schedule.degree
     if "sh_degree" not in why.forced and start.degree > degree:
@@ -241,7 +243,6 @@ def _continued(schedule: Schedule, start: Start, why: Reasons) -> Schedule:
         resolution=((0, 1),),
         degree=degree,
         first_degree=min(degree, start.degree),
-        annealing=replace(schedule.annealing, skipped=CONTINUED_FROM),
     )
 
 

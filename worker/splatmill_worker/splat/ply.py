@@ -16,6 +16,8 @@ MIN_OPACITY = 1.0 / 255.0
 """An opacity under this adds nothing to an 8-bit image, and every renderer skips it."""
 
 _DEGREE_OF_REST = {0: 0, 9: 1, 24: 2, 45: 3}
+_HEAD_BYTES = 65536
+_OPAQUE = 16.0  # logit: 1 - 1e-7, the last opacity under 1 in float32
 
 
 class PlyUnreadableError(ValueError):
@@ -87,6 +89,25 @@ def write(
     return n
 
 
+def offset(path: Path) -> tuple[float, float, float]:
+    """By how much `export` moved the scene to keep float32 exact (world = file + offset); zeros where it did not.
+
+    Raises PlyUnreadableError for a comment that says so and holds no three numbers.
+    """
+    head = path.open("rb").read(_HEAD_BYTES).partition(b"end_header")[0].decode("ascii", "replace")
+    for line in head.splitlines():
+        words = line.split()
+        if words[:2] == ["comment", "offset"]:
+            try:
+                x, y, z = (float(word) for word in words[2:])
+            except ValueError as error:
+                raise PlyUnreadableError(
+                    f"{path.name} has a broken offset in its header: {line!r}."
+                ) from error
+            return x, y, z
+    return 0.0, 0.0, 0.0
+
+
 def read(path: Path) -> Gaussians:
     """Read any tool's 3D Gaussian `.ply` (binary of either byte order, or text) as float32 tensors.
 
@@ -135,7 +156,8 @@ def read(path: Path) -> Gaussians:
         means=columns("x", "y", "z"),
         log_scales=columns("scale_0", "scale_1", "scale_2"),
         quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        logit_opacities=columns("opacity")[:, 0].contiguous(),
+        # Some tools write an opacity of exactly 1 or 0 as its infinite logit.
+        logit_opacities=columns("opacity")[:, 0].contiguous().clamp(-_OPAQUE, _OPAQUE),
         sh=torch.cat([columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest_columns.transpose(1, 2)], dim=1),
     )
     keep = gaussians.finite()

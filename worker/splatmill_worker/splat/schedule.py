@@ -16,6 +16,7 @@ class Schedule:
     resolution: (first step, reduction) pairs; photos are reduced by 4, then 2, then not at all, because early
     steps gain as much from a small photo as from a large one. degree_every: steps between SH degrees.
     degree_by: share of the budget in which a short one reaches its last degree; None: by steps alone.
+    first_degree: that of the first step.
     densify_from / densify_every in steps, densify_until as a share: after it, positions and colours settle.
     """
 
@@ -27,6 +28,7 @@ class Schedule:
     densify_every: int
     densify_until: float
     degree_by: float | None = 1.0 / 3.0
+    first_degree: int = 0
     annealing: Annealing = field(default_factory=Annealing)
 
     def reduction(self, step: int) -> int:
@@ -37,7 +39,7 @@ class Schedule:
         """SH degree in use."""
         by_steps = (step - 1) // self.degree_every
         by_share = 0 if self.degree_by is None else int(progress * self.degree / self.degree_by)
-        return min(self.degree, max(by_steps, by_share))
+        return min(self.degree, max(self.first_degree, by_steps, by_share))
 
     def densifies(self, step: int, progress: float) -> bool:
         """Whether the number of Gaussians may change after `step`."""

@@ -23,7 +23,11 @@ class Stages:
         try:
             yield
         finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - started
-            part = self._path.with_suffix(".part")
-            part.write_text(json.dumps(self.seconds))
-            part.replace(self._path)
+            self.add(stage, time.perf_counter() - started)
+
+    def add(self, stage: str, seconds: float) -> None:
+        """Adds `seconds` that were measured elsewhere to `stage`."""
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+        part = self._path.with_suffix(".part")
+        part.write_text(json.dumps(self.seconds))
+        part.replace(self._path)

@@ -1,0 +1,100 @@
+"""A finished model as the start of a training: read, brought into the training world, and judged before it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatmill_worker.scene import Normalization
+from splatmill_worker.splat import ply
+from splatmill_worker.splat.evaluate import compare
+from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.render import render
+from splatmill_worker.splat.views import TrainingView
+
+JUDGES = 8
+"""Training views that a model is judged on."""
+
+DOUBTFUL = 3.0
+"""dB over one colour per photo: a model in the right world shows its photos far better."""
+
+
+class StartUnusableError(ValueError):
+    """The model given cannot be started from; the message says what was seen."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """What is known of the model given: its size, SH degree, and how it shows training photos before any step.
+
+    psnr, one_color in dB: medians over some training views of the model's rendering, and of each photo's mean
+    colour, which asks for no model at all.
+    """
+
+    gaussians: int
+    degree: int
+    psnr: float
+    one_color: float
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the model says so little about these photos that its world may be another."""
+        return not self.psnr > self.one_color + DOUBTFUL
+
+
+def read(path: Path, frame: Normalization) -> Gaussians:
+    """The Gaussians of `path` in the training world. Raises StartUnusableError where there are none.
+
+    A model that this program wrote far from its origin says by how much it was moved; that is undone.
+    """
+    try:
+        offset = ply.offset(path)
+        gaussians = ply.read(path)
+    except (ply.PlyUnreadableError, FileNotFoundError) as error:
+        raise StartUnusableError(str(error)) from error
+    if gaussians.count == 0:
+        raise StartUnusableError(f"{path.name} holds no Gaussian with finite values.")
+    shift = frame.scale * np.array(offset) + frame.translation
+    return gaussians.moved(frame.scale, torch.from_numpy(shift))
+
+
+def judge(gaussians: Gaussians, views: Sequence[TrainingView]) -> Start:
+    """How `gaussians` show some of `views`. Raises StartUnusableError where one colour per photo is nearer to them."""
+    some = views[:: max(1, len(views) // JUDGES)]
+    # As training judges: white only behind what is transparent.
+    backdrop = torch.ones(3) if any(view.full.alpha is not None for view in views) else torch.zeros(3)
+    shown, plain = [], []
+    with torch.no_grad():
+        for view in some:
+            target = view.full
+            photo = target.over(backdrop)
+            color = render(gaussians, target.camera, background=backdrop).color
+            shown.append(compare(view.name, color, photo, target.mask).psnr)
+            plain.append(compare(view.name, _one_color(photo, target.mask), photo, target.mask).psnr)
+    start = Start(gaussians.count, gaussians.degree, float(np.median(shown)), float(np.median(plain)))
+    if not start.psnr > start.one_color:
+        raise StartUnusableError(
+            f"The model shows the training photos at {start.psnr:.1f} dB, no better than one colour per photo "
+            f"({start.one_color:.1f} dB): it is not in the world of these cameras."
+        )
+    return start
+
+
+def strongest(gaussians: Gaussians, most: int) -> Gaussians:
+    """At most `most` Gaussians, the most opaque ones, in their order."""
+    if gaussians.count <= most:
+        return gaussians
+    order = torch.argsort(gaussians.logit_opacities, descending=True, stable=True)
+    return gaussians.select(torch.sort(order[:most]).values)
+
+
+def _one_color(photo: Tensor, mask: Tensor | None) -> Tensor:
+    """The mean colour of a photo's pixels that count, everywhere [H, W, 3]; the photo is uint8."""
+    values = photo.float() / 255.0
+    counted = values.reshape(-1, 3) if mask is None else values[mask]
+    return counted.mean(dim=0).expand_as(values)
