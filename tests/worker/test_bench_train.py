@@ -52,7 +52,13 @@ def rows_of(folder: Path) -> list[Row]:
 def parts(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The benchmark's own modules, which find one another by name."""
     monkeypatch.syspath_prepend(str(BENCH))
-    names = ("_rows", *(f"_train.{name}" for name in ("configurations", "rows", "spread", "tables")))
+    names = (
+        "_rows",
+        *(
+            f"_train.{name}"
+            for name in ("ablation", "budgets", "configurations", "rows", "scenes", "spread", "tables")
+        ),
+    )
     return {name: importlib.import_module(name) for name in names}
 
 
@@ -82,7 +88,7 @@ def test_what_is_there_is_not_run_again_and_is_drawn_again(
     for drawn in ("rows.md", "rows.png"):
         (place / drawn).unlink()
     assert run(place, "--budgets", "30steps", "--configs", "sh-0", "--seeds", "3") == 0
-    assert "1 of 1 rows are there; 0 to measure." in capsys.readouterr().out
+    assert "1 rows are asked for; 0 are not there yet." in capsys.readouterr().out
     assert (place / "rows.jsonl").read_bytes() == before
     assert "![error against run time](rows.png)" in (place / "rows.md").read_text()
     with Image.open(place / "rows.png") as figure:
@@ -221,7 +227,7 @@ def test_budgets_are_judged_by_all_their_runs(parts: Any, place: Path) -> None:
 
 
 def test_switches_are_compared_seed_by_seed_on_the_same_code(parts: Any, place: Path) -> None:
-    ablation = parts["_train.tables"].ablation
+    ablation = parts["_train.ablation"].ablation
     row = next(row for row in rows_of(place) if row["kind"] == "run")
     default, changed = row | {"config": "default"}, {**row["plan"], "densify": "mcmc"}
     rows = [like(default, seed=seed, psnr=20.0 + 3 * seed, train=10.0) for seed in (0, 1, 2)]
@@ -244,4 +250,43 @@ def test_switches_are_compared_seed_by_seed_on_the_same_code(parts: Any, place: 
     alone = ablation([rows[0], like(row, config="mcmc", plan=changed, seed=0, psnr=21.0)])
     assert "one seed says nothing" in alone
     same = ablation([like(default, seed=0), like(row, config="antialias", seed=0)])
-    assert "the plan is the same" in same
+    assert "the default's plan is the same" in same
+    elsewhere = [like(default, scene="flat", seed=seed) for seed in (0, 1)]
+    elsewhere += [like(row, scene="flat", config="sh-3", plan=changed, seed=0)]
+    assert "Not measured, since the default's plan is that already: `mcmc` on flat" not in ablation(
+        [*rows, *elsewhere]
+    )
+    has_it = [like(default, scene="flat", seed=seed, plan=changed) for seed in (0, 1)]
+    has_it += [like(row, scene="flat", config="sh-3", seed=0)]
+    assert "the default's plan is that already: `mcmc` on flat at 30steps." in ablation([*rows, *has_it])
+
+
+def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: Path) -> None:
+    """tiny has no tracks, so that its plan leaves out antialiasing, and no densification at 30 steps."""
+    rows, configurations = parts["_train.rows"], parts["_train.configurations"]
+    default = next(row for row in rows_of(place) if row["kind"] == "run") | {"config": "default"}
+    scene = parts["_train.scenes"].Scene(default["scene"], place / "tiny")
+    budget = parts["_train.budgets"].parse(default["budget"])
+
+    def idle(config: str, plan: Row) -> bool:
+        measured = default | {"plan": plan, "code": rows.code_version()}
+        return bool(rows.idle(rows.Run(scene, config, budget, default["seed"]), [measured]))
+
+    assert "densify" not in default["plan"]
+    assert idle("no-densification", default["plan"])
+    assert not idle("mcmc", default["plan"])
+    assert idle("mcmc", default["plan"] | {"densify": "mcmc"})
+    assert idle("no-coarse-to-fine", default["plan"])
+    assert idle("no-antialias", default["plan"])
+    assert not idle("antialias", default["plan"])
+    assert idle("sh-0", default["plan"])
+    assert not idle("sh-3", default["plan"])
+    assert not idle("default", default["plan"])
+    wanted = rows.runs_of([scene], ["mcmc", "default", "no-random-background"], [budget], [1, 0])
+    assert [(run.seed, run.config) for run in wanted] == [
+        (1, "default"),
+        (1, "mcmc"),
+        (0, "default"),
+        (0, "mcmc"),
+    ]
+    assert configurations.named("no-random-background").alpha

@@ -24,7 +24,7 @@ from pathlib import Path
 
 from _rows import HERE, Row, append, lines
 from _train import budgets, child, configurations, estimate, figure, scenes, tables
-from _train.rows import Run, failed, missing, runs_of
+from _train.rows import Run, failed, idle, missing, runs_of
 from _train.scenes import Scene
 
 from splatmill.schema.quantities import format_duration
@@ -128,9 +128,9 @@ def _wanted(asked: argparse.Namespace) -> Wanted:
 def _measure(wanted: Wanted, path: Path, work: Path) -> bool:
     """Append the rows that are not there yet to the file at `path`; False where one could not be had."""
     found = lines(path)
-    todo = missing(wanted.runs, found)
+    todo = [run for run in missing(wanted.runs, found) if not idle(run, found)]
     if wanted.runs:
-        print(f"{len(wanted.runs) - len(todo)} of {len(wanted.runs)} rows are there; {len(todo)} to measure.")
+        print(f"{len(wanted.runs)} rows are asked for; {len(todo)} are not there yet.")
     involved = {run.scene.name: run.scene for run in todo}
     unusable = {name for name, scene in involved.items() if not _usable(scene, work)}
     todo = [run for run in todo if run.scene.name not in unusable]
@@ -139,6 +139,9 @@ def _measure(wanted: Wanted, path: Path, work: Path) -> bool:
         left = format_duration(estimate.seconds_left(todo, found))
         print(f"About {left}. Ctrl-C loses the row in work at most; the same command goes on.", flush=True)
     for number, run in enumerate(todo):
+        if idle(run, found):
+            print(f"[{number + 1}/{len(todo)}] {run}: the default's plan already, nothing to measure")
+            continue
         try:
             row = child.measured(run, work)
         except child.Fault as fault:

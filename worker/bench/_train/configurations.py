@@ -15,13 +15,26 @@ class Configuration:
     """One switch against what the plan decides by itself.
 
     what: the switch in words. options: fields of TrainOptions. plan: fields of the plan that was made, with dots
-    into its parts ("schedule.degree_every"). alpha: the switch means something on transparent photos only.
+    into its parts ("schedule.degree_every"). gives: fields of the plan that the options lead to; where a plan has them
+    anyway, the switch changes nothing. alpha: the switch means something on transparent photos only.
     """
 
     what: str
     options: dict[str, Any] = field(default_factory=dict)
+    gives: dict[str, Any] = field(default_factory=dict)
     plan: dict[str, Any] = field(default_factory=dict)
     alpha: bool = False
+
+    def changes(self, plan: dict[str, Any]) -> bool:
+        """Whether the switch makes another plan of a row's plan, in which what is off or None is absent."""
+        wanted = self.gives | self.plan
+        return not wanted or any(
+            (_at(plan, path) or None) != (value or None) for path, value in wanted.items()
+        )
+
+
+def _option(what: str, name: str, value: str, gives: bool) -> Configuration:
+    return Configuration(what, {name: value}, {name: gives})
 
 
 CONFIGURATIONS = {
@@ -29,17 +42,24 @@ CONFIGURATIONS = {
     "no-coarse-to-fine": Configuration(
         "photos at full size from the first step", plan={"schedule.resolution": [[0, 1]]}
     ),
-    "no-densification": Configuration("the Gaussians to start with stay as many", {"densify": "off"}),
-    "absolute": Configuration("densification by absolute gradients", {"densify": "absolute"}),
-    "mcmc": Configuration("MCMC relocation and noise", {"densify": "mcmc"}),
+    "no-densification": Configuration(
+        "the Gaussians to start with stay as many", {"densify": "off"}, {"densify": None}
+    ),
+    "classic": Configuration(
+        "densification by the paper's gradients", {"densify": "classic"}, {"densify": "classic"}
+    ),
+    "absolute": Configuration(
+        "densification by absolute gradients", {"densify": "absolute"}, {"densify": "absolute"}
+    ),
+    "mcmc": Configuration("MCMC relocation and noise", {"densify": "mcmc"}, {"densify": "mcmc"}),
     "sh-at-once": Configuration(
         "the last SH degree from the start", plan={"schedule.degree_every": 1, "schedule.degree_by": None}
     ),
     "sh-slow": Configuration(
         "1000 steps for each SH degree", plan={"schedule.degree_every": 1000, "schedule.degree_by": None}
     ),
-    "sh-0": Configuration("colour does not change with the view", {"sh_degree": 0}),
-    "sh-3": Configuration("SH degree 3 whatever the views' angles", {"sh_degree": 3}),
+    "sh-0": Configuration("colour does not change with the view", {"sh_degree": 0}, {"schedule.degree": 0}),
+    "sh-3": Configuration("SH degree 3 whatever the views' angles", {"sh_degree": 3}, {"schedule.degree": 3}),
     "no-annealing": Configuration(
         "rates stay as they start",
         plan={"schedule.annealing.position_fall": 1.0, "schedule.annealing.rest_fall": 1.0},
@@ -47,11 +67,21 @@ CONFIGURATIONS = {
     "position-annealing-only": Configuration(
         "only the position rate falls, as in the paper", plan={"schedule.annealing.rest_fall": 1.0}
     ),
-    "antialias": Configuration("opacities compensated for the 0.3 px dilation", {"antialias": "on"}),
-    "exposure": Configuration("an affine colour for each photo", {"exposure": "on"}),
+    "antialias": _option("opacities compensated for the 0.3 px dilation", "antialias", "on", True),
+    "no-antialias": _option("no such compensation", "antialias", "off", False),
+    "exposure": _option("an affine colour for each photo", "exposure", "on", True),
+    "no-exposure": _option("no such colour", "exposure", "off", False),
     "no-random-background": Configuration(
-        "white behind transparent photos", {"background": "white"}, alpha=True
+        "white behind transparent photos", {"background": "white"}, {"background": "white"}, alpha=True
     ),
+    "sky": _option("a far shell of Gaussians where photos show sky", "sky", "on", True),
+    "no-sky": _option("no such shell", "sky", "off", False),
+    "gaps": _option("Gaussians where photos show what no point describes", "gaps", "on", True),
+    "no-gaps": _option("no such Gaussians", "gaps", "off", False),
+    "depth-hints": _option("the points' depths pull on the rendered ones", "depth_hints", "on", True),
+    "no-depth-hints": _option("no such pull", "depth_hints", "off", False),
+    "pose-refinement": _option("training cameras are corrected", "pose_refinement", "on", True),
+    "no-pose-refinement": _option("cameras stay as they are", "pose_refinement", "off", False),
 }
 """Name to switch. A name keeps its meaning: rows already measured carry it."""
 
@@ -83,3 +113,10 @@ def _with(part: Any, names: list[str], value: Any, path: str) -> Any:
     elif isinstance(value, list):
         value = tuple(tuple(each) if isinstance(each, list) else each for each in value)
     return replace(part, **{names[0]: value})
+
+
+def _at(plan: dict[str, Any], path: str) -> Any:
+    part: Any = plan
+    for name in path.split("."):
+        part = part.get(name) if isinstance(part, dict) else None
+    return part

@@ -15,7 +15,7 @@ from _rows import Row
 import splatmill.schema
 import splatmill_worker
 from _train.budgets import Budget
-from _train.configurations import CONFIGURATIONS, DEFAULT, named
+from _train.configurations import DEFAULT, named
 from _train.scenes import Scene
 
 _WORKER = Path(splatmill_worker.__file__).parent
@@ -75,15 +75,16 @@ def key(row: Row) -> str:
 def runs_of(
     scenes: Iterable[Scene], configs: Iterable[str], budgets: Iterable[Budget], seeds: Iterable[int]
 ) -> list[Run]:
-    """Every combination that means something, seeds outermost: an interrupted run leaves whole seeds behind."""
-    scenes, configs, budgets = list(scenes), list(configs), list(budgets)
+    """Every combination that means something: the default first, and seeds outermost, so that those done are whole."""
+    scenes, budgets = list(scenes), list(budgets)
+    configs = sorted(configs, key=lambda name: name != DEFAULT)
     return [
         Run(scene, config, budget, seed)
         for seed in seeds
         for budget in budgets
         for scene in scenes
         for config in configs
-        if scene.transparent or not CONFIGURATIONS[config].alpha
+        if scene.transparent or not named(config).alpha
     ]
 
 
@@ -91,6 +92,13 @@ def missing(runs: list[Run], rows: list[Row]) -> list[Run]:
     """Those of `runs` that have no row of today's code."""
     there = {key(row) for row in rows}
     return [run for run in runs if key(run.identity() | {"code": code_version()}) not in there]
+
+
+def idle(run: Run, rows: list[Row]) -> bool:
+    """Whether the default of the same scene, budget, seed and code does already what the switch would do."""
+    defaults, _ = _sides(rows)
+    default = defaults.get((run.scene.name, run.budget.name, run.seed, code_version()))
+    return default is not None and not failed(default) and not named(run.config).changes(default["plan"])
 
 
 def failed(row: Row) -> bool:
@@ -112,18 +120,35 @@ def by_time(row: Row) -> bool:
     return not row["budget"].endswith("steps")
 
 
+def whole(rows: Iterable[Row]) -> list[Row]:
+    """Rows that have a figure."""
+    return [row for row in rows if not failed(row) and row["psnr"] is not None]
+
+
+def grouped(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
+    """Rows that agree in the fields `names`, in order of appearance."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in names), []).append(row)
+    return groups
+
+
 def once(rows: list[Row]) -> list[Row]:
     """The last row of every run."""
     return list({key(row): row for row in rows}.values())
 
 
-def compared(rows: list[Row]) -> dict[tuple[str, str, str], list[tuple[Row, Row]]]:
+Pair = tuple[Row, Row]
+"""The default's row and a switch's."""
+
+
+def compared(rows: list[Row]) -> dict[tuple[str, str, str], list[Pair]]:
     """(scene, budget, configuration) to pairs of rows: the default's and the configuration's, of one seed and code.
 
     Of several codes the last one counts that has both.
     """
     defaults, others = _sides(rows)
-    found: dict[tuple[str, str, str], list[tuple[Row, Row]]] = {}
+    found: dict[tuple[str, str, str], list[Pair]] = {}
     for row in others:
         if _place(row) in defaults:
             group = found.setdefault((row["scene"], row["budget"], row["config"]), [])

@@ -1,0 +1,132 @@
+"""One switch at a time against the default: what each decision of the plan is worth."""
+
+from __future__ import annotations
+
+from _rows import Row
+
+from _train.configurations import CONFIGURATIONS, DEFAULT
+from _train.markdown import table
+from _train.rows import Pair, compared, grouped, lonely, once, whole
+from _train.spread import Spread
+
+ONE_SWITCH = """Differences to the default with the same seed. "Better" or "worse" only where every seed agrees, of at
+least two. At budgets in steps the price is in the column of the time; at budgets in seconds it is in the quality."""
+
+SAME = "the default's plan is the same"
+
+Place = tuple[str, str, str]
+"""Scene, budget, configuration."""
+
+
+def ablation(rows: list[Row]) -> str:
+    """The section: switches over all scenes, then each on each scene, then what they are compared with."""
+    pairs = compared(rows)
+    if not pairs:
+        return ""
+    order = {name: number for number, name in enumerate(CONFIGURATIONS)}
+    places = sorted(pairs, key=lambda place: (order.get(place[2], len(order)), place))
+    quality = {place: found for place in places if (found := difference(pairs[place], "psnr")) is not None}
+    head = "switch|what|scene|budget|seeds|PSNR, dB|SSIM|training time, %|quality against the default"
+    parts = [
+        ONE_SWITCH,
+        *([summary(quality)] if quality else []),
+        table(head, [_line(place, pairs[place]) for place in places]),
+        *_idle(pairs),
+    ]
+    if alone := lonely(rows):
+        parts.append(f"{alone} rows of a switch have no default of the same code, and are not shown.")
+    return "\n\n".join([*parts, defaults(pairs)])
+
+
+def difference(pairs: list[Pair], name: str) -> Spread | None:
+    """The switch's value less the default's, over seeds; None where nothing can be compared or nothing was changed."""
+    known = _comparable(pairs)
+    if not known or all(_course(default) == _course(row) for default, row in known):
+        return None
+    return Spread.of(row[name] - default[name] for default, row in known)
+
+
+def verdict(difference: Spread) -> str:
+    """What the seeds say together."""
+    if difference.count < 2:
+        return "one seed says nothing"
+    if difference.least > 0:
+        return "better"
+    if difference.largest < 0:
+        return "worse"
+    return "no clear difference"
+
+
+def summary(quality: dict[Place, Spread]) -> str:
+    """Each switch over all scenes and budgets: where it was better or worse, and its median difference there."""
+    lines = []
+    for config in dict.fromkeys(config for _, _, config in quality):
+        mine = {f"{place[0]}, {place[1]}": found for place, found in quality.items() if place[2] == config}
+        where = [
+            "; ".join(place for place, found in mine.items() if verdict(found) == word) or "nowhere"
+            for word in ("better", "worse")
+        ]
+        over = Spread.of(found.median for found in mine.values())
+        lines.append([f"`{config}`", len(mine), *where, over.text(2, signed=True)])
+    return table("switch|places|better on|worse on|PSNR over the places: median of medians, dB", lines)
+
+
+def defaults(pairs: dict[Place, list[Pair]]) -> str:
+    """What the switches are compared with, and how far seeds alone move it."""
+    rows = whole(once([default for group in pairs.values() for default, _ in group]))
+    lines = [
+        [
+            scene,
+            budget,
+            len(group),
+            Spread.of(row["psnr"] for row in group).text(2),
+            Spread.of(row["ssim"] for row in group).text(4),
+            Spread.of(row["seconds"]["train"] for row in group).text(1),
+            f"{Spread.of(row['gaussians'] for row in group).median:.0f}",
+        ]
+        for (scene, budget), group in grouped(rows, "scene", "budget").items()
+    ]
+    return table(f"the {DEFAULT} on|budget|seeds|PSNR dB|SSIM|training s|Gaussians", lines)
+
+
+def _line(place: Place, pairs: list[Pair]) -> list[object]:
+    scene, budget, config = place
+    known, name = _comparable(pairs), f"`{config}`"
+    what = CONFIGURATIONS[config].what if config in CONFIGURATIONS else "no longer there"
+    lost = f"{len(pairs) - len(known)} failed"
+    quality, structure = difference(pairs, "psnr"), difference(pairs, "ssim")
+    if quality is None or structure is None:
+        return [name, what, scene, budget, len(known), "", "", "", SAME if known else lost]
+    time = Spread.of(
+        100 * (row["seconds"]["train"] / default["seconds"]["train"] - 1) for default, row in known
+    )
+    figures = [quality.text(2, signed=True), structure.text(4, signed=True), time.text(0, signed=True)]
+    said = verdict(quality) + (f"; {lost}" if len(known) < len(pairs) else "")
+    return [name, what, scene, budget, len(known), *figures, said]
+
+
+def _idle(pairs: dict[Place, list[Pair]]) -> list[str]:
+    """A sentence on switches that were not measured on a scene because its plan has them anyway."""
+    asked = {config for _, _, config in pairs} & CONFIGURATIONS.keys()
+    found: dict[str, list[str]] = {}
+    for (scene, budget), group in grouped(
+        (default for pair in pairs.values() for default, _ in pair), "scene", "budget"
+    ).items():
+        for config in sorted(asked):
+            plans = [row["plan"] for row in whole(group)]
+            there = (scene, budget, config) in pairs
+            if plans and not there and not any(CONFIGURATIONS[config].changes(plan) for plan in plans):
+                found.setdefault(config, []).append(f"{scene} at {budget}")
+    if not found:
+        return []
+    said = "; ".join(f"`{config}` on {', '.join(places)}" for config, places in found.items())
+    return [f"Not measured, since the default's plan is that already: {said}."]
+
+
+def _comparable(pairs: list[Pair]) -> list[Pair]:
+    return [pair for pair in pairs if len(whole(pair)) == 2]
+
+
+def _course(row: Row) -> Row:
+    """What the plan makes a run do, without what it says about it."""
+    return {name: value for name, value in row["plan"].items() if name not in ("left_out", "forced")}
