@@ -1,25 +1,29 @@
 """Cameras against time: scenes x settings, pose error, registered share, and what a short training makes of them.
 
-    python -m splatmill_worker bench sfm                          # all scenes, with training; about 15 minutes
-    python -m splatmill_worker bench sfm --scenes fox kermit --settings auto --no-train
+    python -m splatmill_worker bench sfm                          # all scenes, with training; about 12 minutes
+    python -m splatmill_worker bench sfm --scenes fox kermit --settings auto --again --no-train
     python -m splatmill_worker bench sfm --growth                 # 25 to 200 generated photos, and the fit
 
-Rows go to results/sfm.jsonl (results/sfm_growth.jsonl), the figures to figures/, the tables to results/*.md.
+Rows go to results/sfm.jsonl (results/sfm_growth.jsonl) one by one, the figures to figures/, the tables to sfm*.md.
+A row that is there is not measured again, unless by --again; without a training of --train seconds it is not whole.
 Rules: photos come from ../shared/data, and a scene that is not there gets no row; every run starts from an empty
-folder; a failed run gets no point in the figure and is named in the table. Pose errors are medians after the best
-similarity to the reference: for fox COLMAP's model of the full-size photos (itself no truth: its principal point
-was held), for generated photos the true cameras, for lund the GPS places (10 m accurate), positions only.
-Held-out PSNR is that of the default pipeline trained for --train seconds on the cameras, longest side 480.
+folder; a failed run gets no point in the figure and is named in the table. A row during which other programs took
+more than a tenth of the machine's time is marked "busy": its seconds are too high and its PSNR too low.
+Pose errors are medians after the best similarity to the reference: for fox COLMAP's model of the full-size photos
+(itself no truth: its principal point was held), for generated photos the true cameras, for lund the GPS places (10 m
+accurate), positions only. Held-out PSNR is that of the default pipeline trained for --train seconds on the cameras
+with the points of structure from motion, longest side 480; stereo adds to them where the pipeline would.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +32,7 @@ import _data
 import _rows
 import numpy as np
 import numpy.typing as npt
+import psutil
 from _plot import axes, save
 
 from splatmill.schema import TrainOptions
@@ -42,7 +47,9 @@ Float = npt.NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
 FOLDERS = {name: _data.FOLDERS[name] for name in ("fox", "lund", "kermit", "unrelated", "rotation")}
 GROWTH = (25, 50, 100, 200)
+GROWTH_WIDTH, GROWTH_HEIGHT = 480, 360
 TRAIN_SIDE = 480
+BUSY = 0.1  # of the machine's time, taken by other programs
 
 
 @dataclass(frozen=True)
@@ -180,7 +187,7 @@ def trained_psnr(scene: Scene, seconds: float, workdir: Path) -> dict[str, float
 
 
 def as_model(scene: Scene) -> pycolmap.Reconstruction:
-    """The scene as a COLMAP model under the photos' own names, with its points but without its tracks."""
+    """The scene as a COLMAP model under the photos' own names, with SfM's own points and their tracks."""
     model = pycolmap.Reconstruction()
     for number, view in enumerate(scene.views, 1):
         camera = view.camera
@@ -205,7 +212,7 @@ def as_model(scene: Scene) -> pycolmap.Reconstruction:
     offsets, seen = scene.point_views
     places: dict[int, list[Float]] = {number: [] for number in range(1, len(scene.views) + 1)}
     elements: list[list[tuple[int, int]]] = []
-    for index in range(len(scene.points)):
+    for index in range(scene.facts.get("sparse_points", len(scene.points))):
         row = []
         for view_index in seen[offsets[index] : offsets[index + 1]]:
             image_id = int(view_index) + 1
@@ -225,9 +232,10 @@ def measure(
 ) -> dict[str, Any]:
     """One row: a run of `setting` from an empty folder, its errors, and the training on top."""
     with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
-        wall, cpu = time.perf_counter(), time.process_time()
+        wall, cpu, machine = time.perf_counter(), time.process_time(), _worked()
         result = SETTINGS[setting](images, Path(folder) / "sfm")
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        others = max(0.0, _worked() - machine - cpu)
         row: dict[str, Any] = {
             "scene": name,
             "setting": setting,
@@ -236,8 +244,10 @@ def measure(
             "outcome": result.failure or "placed",
             "seconds": round(wall, 2),
             "cpu_seconds": round(cpu, 2),
+            "busy": others > BUSY * wall * (psutil.cpu_count() or 1),
             "stages": result.seconds,
             "points": result.facts.get("points", 0),
+            "stereo_points": result.facts.get("stereo_points", 0),
             "reprojection_pixels": result.facts.get("reprojection_pixels"),
             "effort": result.facts.get("effort"),
             "mapper": result.facts.get("mapper"),
@@ -245,8 +255,17 @@ def measure(
         if result.scene is not None:
             row |= pose_error(result.scene, truth) | gps_error(result.scene, images, Path(folder) / "look")
             if train is not None:
-                row |= trained_psnr(result.scene, train, Path(folder))
+                cpu, machine, wall = time.process_time(), _worked(), time.perf_counter()
+                row |= {"train": train} | trained_psnr(result.scene, train, Path(folder))
+                others = _worked() - machine - (time.process_time() - cpu)
+                row["busy"] |= others > BUSY * (time.perf_counter() - wall) * (psutil.cpu_count() or 1)
         return row
+
+
+def _worked() -> float:
+    """CPU seconds that the whole machine has worked so far."""
+    times = psutil.cpu_times()
+    return float(sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0))
 
 
 def reference(name: str) -> dict[str, Camera]:
@@ -255,28 +274,54 @@ def reference(name: str) -> dict[str, Camera]:
     return {view.name: view.camera for view in found.load().views} if found is not None else {}
 
 
-def scenes_bench(scenes: list[str], settings: list[str], train: float | None) -> list[dict[str, Any]]:
-    rows = []
+def scenes_bench(
+    scenes: list[str], settings: list[str], train: float | None, rows: dict[tuple[str, str], _rows.Row]
+) -> None:
+    """Measures what `rows` (by scene and setting) lacks; each row is stored once it is there."""
     for name in scenes:
         images = _data.SHARED / FOLDERS[name] / "images"
         if not images.is_dir():
             print(f"{name} is not here ({images}); no row for it.", file=sys.stderr)
             continue
         for setting in settings:
-            rows.append(measure(name, images, setting, reference(name), train))
-            print(rows[-1], flush=True)
-    return rows
+            if (name, setting) not in rows:
+                keep("sfm", rows, measure(name, images, setting, reference(name), train))
 
 
-def growth_bench(counts: tuple[int, ...], setting: str) -> list[dict[str, Any]]:
-    """Generated sets of growing size: evenly spread subsets would change the overlap, so each is its own orbit."""
-    rows = []
+def growth_bench(counts: Sequence[int], setting: str, rows: dict[tuple[str, str], _rows.Row]) -> None:
+    """Generated sets of growing size: evenly spread subsets would change the overlap, so each is its own orbit.
+
+    Taking the photos is not on the clock, and each set is taken once.
+    """
     for count in counts:
-        with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
-            truth = synthetic.capture(Path(folder) / "images", count, 480, 360)
-            rows.append(measure(f"still life {count}", Path(folder) / "images", setting, truth, None))
-            print(rows[-1], flush=True)
-    return rows
+        name = f"still life {count}"
+        if (name, setting) in rows:
+            continue
+        folder = Path(tempfile.gettempdir()) / "splatmill-bench-growth" / str(count)
+        poses = folder / "poses.json"
+        if not poses.is_file():
+            made = synthetic.capture(folder / "images", count, GROWTH_WIDTH, GROWTH_HEIGHT)
+            poses.write_text(json.dumps({n: [c.K.tolist(), c.viewmat.tolist()] for n, c in made.items()}))
+        truth = {
+            n: Camera(GROWTH_WIDTH, GROWTH_HEIGHT, K[0][0], K[1][1], K[0][2], K[1][2], np.array(viewmat))
+            for n, (K, viewmat) in json.loads(poses.read_text()).items()
+        }
+        keep("sfm_growth", rows, measure(name, folder / "images", setting, truth, None))
+
+
+def keep(name: str, rows: dict[tuple[str, str], _rows.Row], row: _rows.Row) -> None:
+    """Adds a row and stores all of them, so that an interrupted benchmark goes on where it stopped."""
+    rows[row["scene"], row["setting"]] = row | _rows.origin()
+    path = HERE / "results" / f"{name}.jsonl"
+    part = path.with_suffix(".part")
+    part.write_text("".join(json.dumps(row) + "\n" for row in rows.values()))
+    part.replace(path)
+    print(row, flush=True)
+
+
+def kept(name: str) -> dict[tuple[str, str], _rows.Row]:
+    """The rows of earlier runs by scene and setting."""
+    return {(row["scene"], row["setting"]): row for row in _rows.lines(HERE / "results" / f"{name}.jsonl")}
 
 
 def exponent(rows: list[dict[str, Any]], key: str = "cpu_seconds") -> float:
@@ -303,8 +348,9 @@ def table(rows: list[dict[str, Any]]) -> str:
     for row in rows:
         share = f"{row['registered']} of {row['photos']}"
         cells = [str(row[key]) if row.get(key) is not None else "" for key in columns]
+        cells[3] += " (busy)" if row["busy"] else ""
         lines.append("| " + " | ".join([share, *cells]) + " |")
-    return "\n".join(lines) + "\n\n" + _rows.footer([row | _rows.origin() for row in rows]) + "\n"
+    return "\n".join(lines) + "\n\n" + _rows.footer(rows) + "\n"
 
 
 def scenes_figure(rows: list[dict[str, Any]], path: Path) -> None:
@@ -328,7 +374,7 @@ def scenes_figure(rows: list[dict[str, Any]], path: Path) -> None:
         f"{row['scene']}, {row['setting']}: {row['outcome']}" for row in rows if row["outcome"] != "placed"
     ]
     note = f" · no point for: {'; '.join(failed)}" if failed else ""
-    save(figure, path, _rows.footer([row | _rows.origin() for row in rows]) + note)
+    save(figure, path, _rows.footer(rows) + note)
 
 
 def growth_figure(rows: list[dict[str, Any]], path: Path) -> None:
@@ -343,7 +389,7 @@ def growth_figure(rows: list[dict[str, Any]], path: Path) -> None:
         )
     axis.set(xscale="log", yscale="log", xlabel="photos", ylabel="seconds for the cameras")
     axis.legend()
-    save(figure, path, _rows.footer([row | _rows.origin() for row in rows]))
+    save(figure, path, _rows.footer(rows))
 
 
 def main(argv: list[str]) -> int:
@@ -358,16 +404,29 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--no-train", action="store_true")
     parser.add_argument("--growth", action="store_true", help="generated sets of growing size instead")
     parser.add_argument("--counts", nargs="+", type=int, default=GROWTH)
+    parser.add_argument("--again", action="store_true", help="measure the chosen rows again")
     chosen = parser.parse_args(argv)
     name = "sfm_growth" if chosen.growth else "sfm"
+    known = kept(name)
+    scenes = [f"still life {count}" for count in chosen.counts] if chosen.growth else chosen.scenes
+    settings = ["auto"] if chosen.growth else chosen.settings
+    train = None if chosen.growth or chosen.no_train else chosen.train
+    for key, row in list(known.items()):
+        whole = train is None or row["outcome"] != "placed" or row.get("train") == train
+        if key[0] in scenes and key[1] in settings and (chosen.again or not whole):
+            del known[key]
     if chosen.growth:
-        rows = growth_bench(tuple(chosen.counts), "auto")
+        growth_bench(chosen.counts, "auto", known)
     else:
-        rows = scenes_bench(chosen.scenes, chosen.settings, None if chosen.no_train else chosen.train)
-    if not rows:
+        scenes_bench(scenes, settings, train, known)
+    if not known:
         print("No scene was there to measure.", file=sys.stderr)
         return 1
-    _rows.write(name, rows)
+    if chosen.growth:
+        rows = sorted(known.values(), key=lambda row: row["photos"])
+    else:
+        order = [*FOLDERS, *SETTINGS]
+        rows = sorted(known.values(), key=lambda r: (order.index(r["scene"]), order.index(r["setting"])))
     text = table(rows)
     if chosen.growth:
         wall, cpu = exponent(rows, "seconds"), exponent(rows)
@@ -375,7 +434,7 @@ def main(argv: list[str]) -> int:
         growth_figure(rows, HERE / "figures" / "sfm_growth.png")
     else:
         scenes_figure(rows, HERE / "figures" / "sfm.png")
-    (HERE / "results" / f"{name}.md").write_text(text)
+    (HERE / f"{name}.md").write_text(text)
     print(text)
     return 0
 

@@ -10,6 +10,7 @@ from typing import Literal
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.cancellation import stop_if
+from splatmill_worker.sfm.merge import merged
 
 Mapper = Literal["incremental", "global"]
 LENS_PHOTOS = 8
@@ -18,10 +19,11 @@ LENS_OBSERVATIONS = 2000
 
 @dataclass(frozen=True)
 class Mapped:
-    """All models a mapper made, the one with the most photos first."""
+    """All models a mapper made, the one with the most photos first; `joined` others are part of it already."""
 
     mapper: Mapper
     models: tuple[pycolmap.Reconstruction, ...]
+    joined: int
     seconds: float
 
     @property
@@ -77,7 +79,11 @@ def run(
     stop_if(cancelled)
     models = [manager.get(index) for index in range(manager.size())]
     models.sort(key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-    return Mapped(mapper, tuple(models), time.perf_counter() - started)
+    joined: list[int] = []
+    if len(models) > 1:
+        whole, joined = merged(models)
+        models = [whole, *(model for index, model in enumerate(models) if index > 0 and index not in joined)]
+    return Mapped(mapper, tuple(models), len(joined), time.perf_counter() - started)
 
 
 def _incremental(threads: int, seed: int, relaxed: bool, fixed: bool) -> pycolmap.IncrementalPipelineOptions:
@@ -113,7 +119,9 @@ def _incremental(threads: int, seed: int, relaxed: bool, fixed: bool) -> pycolma
 def _global(threads: int, seed: int, fixed: bool) -> pycolmap.GlobalPipelineOptions:
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = threads
-    options.random_seed = seed
+    # Each step draws its own numbers: with one seed left at its default no two runs agree.
+    options.random_seed = options.mapper.random_seed = seed
+    options.mapper.global_positioning.random_seed = options.mapper.rotation_averaging.random_seed = seed
     options.mapper.global_positioning.use_gpu = False
     options.mapper.bundle_adjustment.ceres.use_gpu = False
     if fixed:

@@ -10,7 +10,8 @@ from typing import Literal
 class SfmOptions:
     """`side`, `features`: longest side in pixels and features per photo; None leaves them to the effort.
 
-    `frames`: how many frames are taken from a video. `camera_model`: COLMAP's name. `threads` None: all cores.
+    `frames`: how many frames are taken from a video. `camera_model`: COLMAP's name. `stereo`: look for more points
+    where there are few. `threads` None: all cores.
     """
 
     effort: Literal["auto", "lean", "standard", "high"] = "auto"
@@ -20,6 +21,7 @@ class SfmOptions:
     features: int | None = None
     camera_model: str = "auto"
     frames: int = 150
+    stereo: bool = True
     seed: int = 0
     threads: int | None = None
 

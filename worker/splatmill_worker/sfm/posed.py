@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from splatmill_worker.scene import Scene, Source
-from splatmill_worker.sfm import colmap_model, transforms
+from splatmill_worker.sfm import colmap_model, stereo, transforms
 from splatmill_worker.sfm.files import ImageFiles
 
 MODEL_FILES = ("cameras.bin", "cameras.txt")
@@ -39,6 +41,20 @@ class PosedInput:
         if self.model is not None:
             return colmap_model.load(self.model, files, self.notes)
         return transforms.load(self.transforms, self.source, files, self.notes)
+
+
+def completed(scene: Scene, workdir: Path, cancelled: Callable[[], bool] = lambda: False) -> Scene:
+    """The scene with points found over its cameras where it brings few or none; kept in `workdir`.
+
+    What stands on a transparent background is left as it is: its silhouettes say where it can be.
+    """
+    if scene.source == "blender":
+        return scene
+    digest = hashlib.sha256(repr(len(scene.points)).encode())
+    for view in scene.views:
+        digest.update(repr((view.name, view.lens)).encode())
+        digest.update(view.camera.viewmat.tobytes() + view.camera.K.tobytes())
+    return stereo.completed(scene, workdir / "sfm" / f"posed-{digest.hexdigest()[:24]}.npz", cancelled)
 
 
 def find(directory: Path) -> PosedInput | None:

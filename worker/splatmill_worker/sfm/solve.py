@@ -21,7 +21,7 @@ import torch
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.scene import Scene, View
-from splatmill_worker.sfm import cameras, checks, colors, features, geometry, mapping, pairs
+from splatmill_worker.sfm import cameras, checks, colors, features, geometry, mapping, pairs, stereo
 from splatmill_worker.sfm.cameras import Group
 from splatmill_worker.sfm.cancellation import stop_if
 from splatmill_worker.sfm.colmap_model import posed_view, scene_of
@@ -29,10 +29,11 @@ from splatmill_worker.sfm.failure import Cancelled, SfmFailed
 from splatmill_worker.sfm.features import Features, Workspace
 from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions, fitted
 
+STEREO = "stereo.npz"
 OnProgress = Callable[[str, int, int, str], None]
-VERSION = 3  # of what is cached; another one means the cache of an older program is not read
+VERSION = 4  # of what is cached; another one means the cache of an older program is not read
 REPAIR_ROUNDS = 2
-ENOUGH = 0.95  # of the photos surely placed: below, more effort is spent
+ENOUGH = 0.9  # of the photos surely placed: below, more effort is spent
 GLOBAL_FROM = 400  # photos: from here on the global mapper goes first where the view graph is dense
 
 
@@ -357,9 +358,7 @@ def _map(run: Run, progress: Progress) -> mapping.Mapped:
 
 def _unregistered(run: Run, progress: Progress) -> list[int]:
     largest = progress.mapped.largest if progress.mapped is not None else None
-    placed = (
-        {features.photo_index(largest.images[i].name) for i in largest.reg_image_ids()} if largest else set()
-    )
+    placed = _photos_of(largest) if largest is not None else set()
     return [index for index in range(run.count) if index not in placed]
 
 
@@ -395,7 +394,7 @@ def _store(run: Run, progress: Progress, target: Path) -> None:
         views = _views(run.prepared, model)
         colors.paint(model, views, run.pool)
     facts["features_per_photo"] = float(np.median([len(found.scales) for found in progress.features]))
-    facts["mapper"] = progress.mapped.mapper if progress.mapped is not None else None
+    facts |= _model_facts(run, progress, model)
     facts["seconds"] = {stage: round(seconds, 3) for stage, seconds in run.seconds.items()}
     partial = target.with_name(f"{target.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -404,8 +403,29 @@ def _store(run: Run, progress: Progress, target: Path) -> None:
     left_out = {run.prepared.photos[index].name: reason for index, reason in reasons.items()}
     document = {"facts": facts, "left_out": left_out, "notes": run.notes}
     (partial / "facts.json").write_text(json.dumps(document, indent=1), "utf-8")
+    if run.options.stereo:
+        run.on_progress("stereo", 0, len(views), "points between those found")
+        stereo.completed(_read(run.prepared, partial), partial / STEREO, run.cancelled)
     shutil.rmtree(target, ignore_errors=True)
     partial.rename(target)
+
+
+def _model_facts(run: Run, progress: Progress, model: pycolmap.Reconstruction) -> dict[str, Any]:
+    """Which mapper made the model, how many others were joined to it, and the photos of those that were not."""
+    mapped = progress.mapped
+    if mapped is None:
+        return {"mapper": None}
+    placed = _photos_of(model)
+    others = [sorted(_photos_of(other) - placed) for other in mapped.models[1:]]
+    return {
+        "mapper": mapped.mapper,
+        "merged_models": mapped.joined,
+        "other_models": [[run.prepared.photos[index].name for index in own] for own in others if own],
+    }
+
+
+def _photos_of(model: pycolmap.Reconstruction) -> set[int]:
+    return {features.photo_index(model.images[i].name) for i in model.reg_image_ids()}
 
 
 def _polished(run: Run, model: pycolmap.Reconstruction, fixed: bool) -> pycolmap.Reconstruction:
@@ -456,7 +476,7 @@ def _with_possible_intrinsics(
 
 def _reasons(run: Run, progress: Progress, model: pycolmap.Reconstruction) -> dict[int, str]:
     """Why each photo without a camera has none; photos that form a smaller model of their own are told apart."""
-    placed = {features.photo_index(model.images[i].name) for i in model.reg_image_ids()}
+    placed = _photos_of(model)
     partners: dict[int, int] = {}
     for pair in _edges(progress):
         for index in pair:
@@ -470,7 +490,7 @@ def _reasons(run: Run, progress: Progress, model: pycolmap.Reconstruction) -> di
         else:
             reasons[index] = f"it matches {partners[index]} other photos, but not well enough to be placed"
     for number, other in enumerate(progress.mapped.models[1:] if progress.mapped is not None else (), 2):
-        own = {features.photo_index(other.images[i].name) for i in other.reg_image_ids()} - placed
+        own = _photos_of(other) - placed
         for index in own & reasons.keys():
             reasons[index] = (
                 f"it belongs to a part of {len(own)} photos that shares too little with the others (model {number})"
@@ -501,7 +521,8 @@ def _read(prepared: Prepared, stored: Path) -> Scene:
         left_out=(*prepared.skipped, *document["left_out"].items()),
         notes=(*prepared.notes, *document["notes"]),
     )
-    return replace(scene, facts=document["facts"])
+    scene = replace(scene, facts=document["facts"])
+    return stereo.add(scene, stereo.Added.load(stored / STEREO)) if (stored / STEREO).is_file() else scene
 
 
 def _digest(*values: object) -> str:

@@ -1,0 +1,70 @@
+"""Models that share photos become one, in the world of the first; models that share too few stay apart.
+
+Proven on a model of generated photos taken apart and put together again. It does not prove that a mapper's own
+fragments, with their own errors, always agree well enough to be joined.
+"""
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatmill_worker import sfm, synthetic
+from splatmill_worker.colmap import pycolmap
+from splatmill_worker.sfm.merge import merged
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> pycolmap.Reconstruction:
+    folder = tmp_path_factory.mktemp("merge")
+    synthetic.capture(folder / "images", 14, 320, 240)
+    options = sfm.SfmOptions(effort="lean", stereo=False)
+    sfm.reconstruct(folder / "images", None, folder / "work", options, lambda *_: None, lambda: False)
+    stored = next((folder / "work").rglob("facts.json"))
+    return pycolmap.Reconstruction(stored.parent)
+
+
+def part(model: pycolmap.Reconstruction, first: int, last: int, folder: Path) -> pycolmap.Reconstruction:
+    """Photos `first` to `last` (by name) alone, as a mapper hands them over: without the others."""
+    result = copy.deepcopy(model)
+    ordered = sorted(result.reg_image_ids(), key=lambda image_id: result.images[image_id].name)
+    for image_id in ordered[:first] + ordered[last:]:
+        result.deregister_frame(result.images[image_id].frame_id)
+    folder.mkdir()
+    result.write_binary(folder)
+    return pycolmap.Reconstruction(folder)
+
+
+def moved(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    turn = pycolmap.Rotation3d(np.array([0.1, -0.4, 0.2, 0.8]) / np.linalg.norm([0.1, -0.4, 0.2, 0.8]))
+    model.transform(pycolmap.Sim3d(2.5, turn, np.array([3.0, -1.0, 7.0])))
+    return model
+
+
+def test_two_halves_that_share_photos_become_the_whole(
+    model: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    count = model.num_reg_images()
+    assert count >= 12
+    left, right = part(model, 0, 9, tmp_path / "left"), moved(part(model, 5, count, tmp_path / "right"))
+    assert (left.num_images(), right.num_images()) == (9, count - 5)
+    whole, joined = merged([left, right])
+    assert joined == [1]
+    assert left.num_reg_images() == 9  # the model given is left as it was
+    assert whole.num_reg_images() == count
+    for image_id in model.reg_image_ids():
+        there = whole.images[image_id].projection_center()
+        np.testing.assert_allclose(there, model.images[image_id].projection_center(), atol=1e-3)
+    assert whole.num_points3D() >= 0.9 * model.num_points3D()
+    assert whole.compute_mean_reprojection_error() < 1.5
+    for point in whole.points3D.values():
+        assert len({element.image_id for element in point.track.elements}) >= 2
+
+
+def test_parts_that_share_too_few_photos_stay_apart(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
+    count = model.num_reg_images()
+    left, right = part(model, 0, 8, tmp_path / "left"), moved(part(model, 6, count, tmp_path / "right"))
+    whole, joined = merged([left, right])
+    assert joined == []
+    assert whole is left
