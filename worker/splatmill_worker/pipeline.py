@@ -31,7 +31,6 @@ from splatmill_worker.refusal import Refusal
 from splatmill_worker.scene import Normalization, Scene, View
 from splatmill_worker.splat import checkpoint, initialise
 from splatmill_worker.splat.decide import decide, loading_size
-from splatmill_worker.splat.depths import DepthHints
 from splatmill_worker.splat.engine import Engine, open_engine
 from splatmill_worker.splat.export import Frame, export
 from splatmill_worker.splat.facts import ENOUGH_POINTS, Facts, measure
@@ -130,7 +129,6 @@ def run(
             held_out,
             plan,
             extent=EXTENT,
-            hints=DepthHints.of(world, views) if plan.depth_hints else None,
             hooks=Hooks(
                 tick=teller.tick,
                 measured=teller.measured,

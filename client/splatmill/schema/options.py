@@ -16,7 +16,6 @@ from splatmill.schema.base import Request, Response
 from splatmill.schema.captures import safe_name
 from splatmill.schema.quantities import ByteSize, Duration
 
-
 _MODEL_ID = re.compile(r"[a-z0-9]{8,40}", re.ASCII)
 
 
@@ -185,11 +184,6 @@ class TrainOptions(Request):
     gaps: Switch = Field(
         default=Switch.auto,
         description="Put Gaussians where photos show what no point of the reconstruction describes.",
-        json_schema_extra=_PHOTOS,
-    )
-    depth_hints: Switch = Field(
-        default=Switch.auto,
-        description="Pull depths to those of the reconstruction's points while the scene takes shape.",
         json_schema_extra=_PHOTOS,
     )
     mapper: Mapper = Field(

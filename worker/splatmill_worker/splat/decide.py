@@ -87,7 +87,6 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         seed=options.seed,
         sky=needs.sky,
         gaps=needs.gaps,
-        depth_hints=needs.depth_hints,
         pose_refinement=needs.pose_refinement,
         reasons=why.chosen,
         left_out=why.left_out,

@@ -1,4 +1,4 @@
-"""What a scene needs beside Gaussians on its points: the sky, the gaps between points, depth hints, better cameras."""
+"""What a scene needs beside Gaussians on its points: the sky, the gaps between points, better cameras."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ OUTDOORS = 6.0
 
 MANY_GAPS = 0.1
 
-FEW_VIEWS = 12
-
 POSES_OFF = 1.0
 """Pixels at the training size: below, cameras err by less than the photos resolve."""
 
@@ -28,7 +26,6 @@ class Needs(NamedTuple):
 
     sky: bool
     gaps: bool
-    depth_hints: bool
     pose_refinement: bool
     added: int
 
@@ -40,9 +37,8 @@ def needs_of(facts: Facts, options: TrainOptions, kernels: Kernels, why: Reasons
     """
     sky = why.switch("sky", options.sky, *_sky(facts))
     gaps = why.switch("gaps", options.gaps, *_gaps(facts))
-    hints = why.switch("depth_hints", options.depth_hints, *_hints(facts))
     poses = why.switch("pose_refinement", options.pose_refinement, *_poses(facts, kernels))
-    for name, asked in (("sky", options.sky), ("gaps", options.gaps), ("depth_hints", options.depth_hints)):
+    for name, asked in (("sky", options.sky), ("gaps", options.gaps)):
         if asked is Switch.on and facts.sightings is None:
             raise ValueError(
                 f"{name}=on needs points that the photos show, and there are none. Leave it at auto."
@@ -55,7 +51,7 @@ def needs_of(facts: Facts, options: TrainOptions, kernels: Kernels, why: Reasons
         raise ValueError(
             "pose_refinement=on needs at least two photos: one alone shows any error of its camera."
         )
-    return Needs(sky, gaps, hints, poses, sky * facts.sky_points + gaps * facts.gap_points)
+    return Needs(sky, gaps, poses, sky * facts.sky_points + gaps * facts.gap_points)
 
 
 def _sky(facts: Facts) -> tuple[bool, str]:
@@ -80,17 +76,6 @@ def _gaps(facts: Facts) -> tuple[bool, str]:
     if facts.gap_share < MANY_GAPS:
         return False, f"Only {seen}."
     return True, f"{seen}: {facts.gap_points} Gaussians are put there, as deep as the nearest points."
-
-
-def _hints(facts: Facts) -> tuple[bool, str]:
-    if facts.views >= FEW_VIEWS:
-        return False, f"{facts.views} photos tell depths by themselves."
-    if facts.sightings is None:
-        return False, "There are no points to take depths from."
-    return (
-        True,
-        f"{facts.views} photos leave depths open; each shows {facts.sightings:.0f} points that tell some.",
-    )
 
 
 def _poses(facts: Facts, kernels: Kernels) -> tuple[bool, str]:

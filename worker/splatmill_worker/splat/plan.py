@@ -22,9 +22,8 @@ class Plan:
 
     image_size: longest side in pixels. background: what is put behind transparent photos while training.
     sky: a far shell of Gaussians stands for it. gaps: Gaussians are put where photos show what no point describes.
-    depth_hints: the reconstruction's points pull rendered depths to theirs. pose_refinement: training cameras are
-    corrected. `reasons` has one sentence per field; `left_out` one per thing that this scene does not need; `forced`
-    names the fields that an option fixed.
+    pose_refinement: training cameras are corrected. `reasons` has one sentence per field;
+    `left_out` one per thing that this scene does not need; `forced` names the fields that an option fixed.
     """
 
     schedule: Schedule
@@ -42,7 +41,6 @@ class Plan:
     seed: int
     sky: bool = False
     gaps: bool = False
-    depth_hints: bool = False
     pose_refinement: bool = False
     reasons: dict[str, str] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)

@@ -11,10 +11,13 @@ from torch import Tensor
 
 from splatmill_worker.splat.views import Target, TrainingView
 
-RATE, LAST_RATE = 0.3, 0.01
-"""Of a step at the beginning and at the end of a run, in pixels of the full training size."""
+REACH = 6.0
+"""Pixels of the full training size that a camera could go if it went on at its first rate."""
 
-FROM = 0.1
+FALL = 0.1
+"""Of the rate, from the beginning to the end of a run."""
+
+FROM = 0.2
 """Share of the budget before anything moves: a scene that shows nothing yet says nothing about cameras."""
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
@@ -31,16 +34,17 @@ class Poses:
 
     def __init__(self, views: Sequence[TrainingView], depth: float) -> None:
         """depth: a typical distance to what is seen, by which a step of rho is as many pixels as one of phi."""
-        self._given = torch.stack([torch.from_numpy(view.full.camera.viewmat) for view in views])
+        self.given = torch.stack([torch.from_numpy(view.full.camera.viewmat) for view in views])
         focal = torch.tensor([view.full.camera.fx for view in views], dtype=torch.float64)
         self.depth = depth
         self._unit = torch.cat([torch.full((3,), depth), torch.ones(3)]).double() / focal.median()
-        self._gauge = gauge(self._given)
+        self._gauge = gauge(self.given)
         self._onto_gauge = torch.linalg.pinv(self._gauge / self._unit.repeat(len(views))[:, None])
         self.twists = torch.zeros(len(views), 6, dtype=torch.float64)
         self._average = torch.zeros_like(self.twists)
         self._square = torch.zeros_like(self.twists)
         self._visits = torch.zeros(len(views), dtype=torch.int64)
+        self._seen = torch.zeros(len(views), dtype=torch.int64)
 
     def viewmat(self, number: int) -> Tensor:
         """The corrected matrix of camera `number`, float32 [4, 4]."""
@@ -48,11 +52,15 @@ class Poses:
 
     def matrix(self, number: int) -> Tensor:
         """The same in float64."""
-        return motion(self.twists[number]) @ self._given[number]
+        return motion(self.twists[number]) @ self.given[number]
 
     def update(self, number: int, gradient: Tensor, progress: float, scale: float) -> None:
-        """One Adam step of camera `number` down `gradient` [6]; one that is not finite is not followed."""
+        """One Adam step of camera `number` down `gradient` [6], with the rate times `scale`, at `progress` in 0..1.
+
+        A gradient that is not finite is not followed.
+        """
         slope = gradient.double().cpu() * self._unit
+        self._seen[number] += 1
         if progress < FROM or not bool(torch.isfinite(slope).all()):
             return
         self._visits[number] += 1
@@ -60,7 +68,8 @@ class Poses:
         self._average[number].lerp_(slope, 1.0 - BETA1)
         self._square[number].lerp_(slope.square(), 1.0 - BETA2)
         correction = math.sqrt(1.0 - BETA2**visits) / (1.0 - BETA1**visits)
-        rate = scale * RATE * (LAST_RATE / RATE) ** progress
+        # However often the budget lets a photo come, its camera gets as far.
+        rate = scale * REACH * progress / float(self._seen[number]) * FALL**progress
         move = correction * self._average[number] / (self._square[number].sqrt() + EPSILON)
         self.twists[number] -= rate * self._unit * move
         weighed = (self.twists / self._unit).reshape(-1)
@@ -77,6 +86,7 @@ class Poses:
             "average": self._average.clone(),
             "square": self._square.clone(),
             "visits": self._visits.clone(),
+            "seen": self._seen.clone(),
         }
 
     def restore(self, state: dict[str, Tensor]) -> None:
@@ -85,6 +95,7 @@ class Poses:
         self._average.copy_(state["average"])
         self._square.copy_(state["square"])
         self._visits.copy_(state["visits"])
+        self._seen.copy_(state["seen"])
 
 
 def motion(twist: Tensor) -> Tensor:

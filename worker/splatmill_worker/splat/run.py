@@ -14,7 +14,6 @@ from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu.step import Rates
 from splatmill_worker.splat.budget import Budget, Clock
 from splatmill_worker.splat.density.interface import Densifier, Moment
-from splatmill_worker.splat.depths import DepthHints
 from splatmill_worker.splat.engine import Engine, StepResult
 from splatmill_worker.splat.exposure import Exposure
 from splatmill_worker.splat.failure import FailureName, TrainingFailed
@@ -57,7 +56,6 @@ class Run:
     exposure: Exposure | None
     warn: Callable[[str], None]
     poses: Poses | None = None
-    hints: DepthHints | None = None
     clock: Clock = field(default_factory=Clock)
     step: int = 0
     loss: float = math.nan
@@ -74,6 +72,7 @@ class Run:
         self.budget: Budget = self.plan.schedule.budget
         self.random = torch.Generator().manual_seed(self.plan.seed)
         self._good: tuple[dict[str, Tensor], Tensor, Tensor] | None = None
+        self._good_poses: dict[str, Tensor] | None = None
         self._good_progress = -math.inf
         self._good_level = math.inf
         self._most = self.plan.max_gaussians
@@ -102,10 +101,10 @@ class Run:
         try:
             if self.poses is not None:
                 target = target._replace(viewmat=self.poses.viewmat(number))
-            if self.exposure is None and self.hints is None:
+            if self.exposure is None:
                 result = self._plain_step(number, target, degree, rates)
             else:
-                result = self._composed_step(number, target, degree, rates)
+                result = self._exposed_step(self.exposure, number, target, degree, rates)
         except MemoryError as short:
             raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
         self.loss = result.loss
@@ -129,7 +128,7 @@ class Run:
             self._shrink(failure)
             return
         self.rate_scale *= 0.5
-        self.engine.replace(*self._good)
+        self._go_back(self._good)
         self.health = Health(lowest=self._good_level, calm_from=self.step + len(self.views))
         self.warn(f"{failure} Went back to the last good state, with steps half as long.")
 
@@ -158,8 +157,13 @@ class Run:
         """Back to the last good state without going on; False when there is none."""
         if self._good is None:
             return False
-        self.engine.replace(*self._good)
+        self._go_back(self._good)
         return True
+
+    def _go_back(self, good: tuple[dict[str, Tensor], Tensor, Tensor]) -> None:
+        self.engine.replace(*good)
+        if self.poses is not None and self._good_poses is not None:
+            self.poses.restore(self._good_poses)
 
     def background(self, target: Target) -> Tensor:
         """RGB [3] behind this step's photo: random where the photo is transparent and the plan says so."""
@@ -221,10 +225,11 @@ class Run:
             key=(number, self.reduction) if target.alpha is None else None,
         )
 
-    def _composed_step(self, number: int, target: Target, degree: int, rates: Rates) -> StepResult:
-        """A step whose loss is more than that of the photo: exposures are fitted, or depths are hinted at."""
+    def _exposed_step(
+        self, exposure: Exposure, number: int, target: Target, degree: int, rates: Rates
+    ) -> StepResult:
         background = self.background(target)
-        color, alpha, depth = self.engine.forward(
+        color, alpha, _ = self.engine.forward(
             target.viewmat,
             target.K,
             target.camera.width,
@@ -233,24 +238,16 @@ class Run:
             background=background,
             antialias=self.plan.antialias,
         )
-        visible = int(bool((alpha > 0).any()))
-        pulls: tuple[Tensor | None, Tensor | None] = (None, None)
-        if self.hints is not None:
-            pulls = self.hints.gradient(number, target, alpha, depth, self.progress)
         color = color.detach().clone().requires_grad_()
-        seen = color if self.exposure is None else self.exposure.applied(number, color)
+        seen = exposure.applied(number, color)
         photo = target.over(background).to(seen.device)
         mask = None if target.mask is None else target.mask.to(seen.device)
         loss = ops.loss(seen, photo, mask=mask, backend=self.plan.kernels)
-        total = loss
-        if self.exposure is not None:
-            total = loss + self.exposure.penalty(number).to(loss.device)
-        total.backward()  # type: ignore[no-untyped-call]  # torch's own gap
-        if self.exposure is not None:
-            self.exposure.update(self.rate_scale)
+        (loss + exposure.penalty(number).to(loss.device)).backward()  # type: ignore[no-untyped-call]  # torch's own gap
+        exposure.update(self.rate_scale)
         assert color.grad is not None
-        self.engine.backward_update(color.grad, *pulls, rates=rates, step=self.step)
-        return StepResult(float(loss.detach()), visible, 0)
+        self.engine.backward_update(color.grad, rates=rates, step=self.step)
+        return StepResult(float(loss.detach()), int(bool((alpha > 0).any())), 0)
 
     def _next_view(self) -> int:
         """Every photo once in random order, then again."""
@@ -278,5 +275,6 @@ class Run:
                 FailureName.non_finite, f"{spoilt} parameters are not finite.", step=self.step
             )
         self._good = (parameters, *self.engine.moments())
+        self._good_poses = None if self.poses is None else self.poses.state()
         self._good_progress = progress
         self._good_level = self.health.lowest

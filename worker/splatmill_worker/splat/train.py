@@ -10,7 +10,6 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from splatmill_worker.splat.depths import DepthHints
 from splatmill_worker.splat.engine import Engine, gaussians_of
 from splatmill_worker.splat.evaluate import Score, evaluate
 from splatmill_worker.splat.exposure import Exposure
@@ -110,14 +109,12 @@ def train(
     plan: Plan,
     *,
     extent: float,
-    hints: DepthHints | None = None,
     hooks: Hooks | None = None,
     resume_from: dict[str, Any] | None = None,
 ) -> Trained:
     """Optimise what `engine` holds until it shows `views`, as `plan` says.
 
-    extent: radius of the cameras in the training world, the unit of the position rate. hints: depths of points, where
-    the plan asks for them. resume_from: a state that
+    extent: radius of the cameras in the training world, the unit of the position rate. resume_from: a state that
     `hooks.checkpoint` was given by an earlier attempt with the same plan. Evaluation and checkpoints are not on
     the training clock. Raises TrainingFailed when nothing usable was reached, Cancelled on request.
     """
@@ -128,7 +125,7 @@ def train(
     if plan.pose_refinement:
         poses = Poses(views, _depth_seen(engine, views, plan))
         engine.keep_pose_gradient = True
-    run = Run(engine, plan, views, extent, densifier_of(plan), exposure, hooks.warn, poses, hints)
+    run = Run(engine, plan, views, extent, densifier_of(plan), exposure, hooks.warn, poses)
     if resume_from is not None:
         run.resume(resume_from)
     measuring = _Measuring(done=sum(share <= run.progress for share in MEASURED_AT))
