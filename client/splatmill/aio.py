@@ -12,7 +12,7 @@ from splatmill.connection import RETRIES, TIMEOUT, Connection, read_answer
 from splatmill.downloads import AnyPath
 from splatmill.errors import invalid
 from splatmill.job import AsyncJobHandle
-from splatmill.layout import find_files
+from splatmill.layout import find_files, start_file
 from splatmill.model import AsyncModelHandle, find_model
 from splatmill.schema import (
     IDEMPOTENCY_HEADER,
@@ -66,11 +66,13 @@ class AsyncClient:
     ) -> AsyncJobHandle:
         """Upload what lies at `path` (photos, a zip, a video or a posed data set) and start a job on it.
 
-        `options` are those of `TrainOptions`; they and the path are checked before anything is sent. The job goes
-        on whatever becomes of this connection. `handle.refused` names photos the server would not take.
+        `options` are those of `TrainOptions`; they and the path are checked before anything is sent. `start` may
+        also be the path of a .ply file here, which is uploaded beside the poses. The job goes on whatever becomes
+        of this connection. `handle.refused` names photos the server would not take.
         """
+        options, model = with_start_file(options)
         checked = train_options(options)
-        capture, uploaded = await self.upload(path, name=name, on_progress=on_progress)
+        capture, uploaded = await self.upload(path, name=name, on_progress=on_progress, model=model)
         handle = await self.submit(capture.id, checked, name=name)
         handle.refused = uploaded.refused
         return handle
@@ -82,16 +84,20 @@ class AsyncClient:
         name: str | None = None,
         capture: str | None = None,
         on_progress: OnProgress | None = None,
+        model: Path | None = None,
     ) -> tuple[Capture, Uploaded]:
-        """Send what lies at `path` into a new capture, or into `capture` (files that are there are not sent twice)."""
-        found = find_files(path)
+        """Send what lies at `path` into a new capture, or into `capture` (files that are there are not sent twice).
+
+        `model`: a .ply to start from, to be sent along.
+        """
+        files = [*find_files(path).files, *([start_file(model)] if model is not None else [])]
         if capture is None:
             body = {"name": name or Path(path).expanduser().resolve().name}
             response = await self.connection.request("POST", "/v1/captures", json=body)
             target = read_answer(Capture, response)
         else:
             target = await self.capture(capture)
-        return target, await upload(self.connection, target.id, found.files, on_progress)
+        return target, await upload(self.connection, target.id, files, on_progress)
 
     async def submit(
         self, capture: str, options: TrainOptions | None = None, *, name: str | None = None
@@ -168,6 +174,18 @@ class AsyncClient:
         except httpx.TransportError as error:
             raise self.connection.lost(error) from error
         return read_answer(Ready, response)
+
+
+def with_start_file(options: Mapping[str, Any]) -> tuple[dict[str, Any], Path | None]:
+    """The options with a local .ply in `start` replaced by its name in the capture, and its path, if it is one.
+
+    Raises NothingToUpload for a .ply that is not there.
+    """
+    start = options.get("start")
+    if start is None or not str(start).lower().endswith(".ply"):
+        return dict(options), None
+    path = Path(start).expanduser()
+    return {**options, "start": start_file(path).name}, path
 
 
 def train_options(options: Mapping[str, Any]) -> TrainOptions:

@@ -86,10 +86,13 @@ class Client:
         name: str | None = None,
         capture: str | None = None,
         on_progress: OnProgress | None = None,
+        model: Path | None = None,
     ) -> tuple[Capture, Uploaded]:
-        """Send what lies at `path` into a new capture, or into `capture`."""
+        """Send what lies at `path` into a new capture, or into `capture`, and `model`, a .ply to start from."""
         return self._loop.run_reporting(
-            lambda report: self._async.upload(path, name=name, capture=capture, on_progress=report),
+            lambda report: self._async.upload(
+                path, name=name, capture=capture, on_progress=report, model=model
+            ),
             on_progress,
         )
 

@@ -95,6 +95,18 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     return Found(tuple(files), tuple(ignored))
 
 
+def start_file(path: Path) -> LocalFile:
+    """A model to start from as a file of the capture: it lies beside the poses whose world it is in.
+
+    Raises NothingToUpload where it is no file, or its name is not accepted.
+    """
+    if not path.is_file():
+        raise NothingToUpload(
+            f"The model {path} to start from does not exist.", "Give a .ply file, or a model's id."
+        )
+    return _local(Role.poses, path.name, path)
+
+
 def _single(path: Path) -> Found:
     if _suffix(path.name) not in IMAGE_SUFFIXES | VIDEO_SUFFIXES | ARCHIVE_SUFFIXES:
         raise NothingToUpload(

@@ -78,7 +78,9 @@ async def upload(
 
 async def _send(connection: Connection, capture_id: str, file: LocalFile) -> CaptureFile:
     digest, size = await asyncio.to_thread(_digest, file.path)
-    media_type = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
+    # What a machine calls a .ply or .bin differs; of poses the service reads the bytes alone.
+    known = mimetypes.guess_type(file.name)[0] if file.role is not Role.poses else None
+    media_type = known or "application/octet-stream"
     response = await connection.request(
         "PUT",
         f"/v1/captures/{capture_id}/{file.role.value}/{quote(file.name)}",

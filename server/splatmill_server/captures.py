@@ -116,13 +116,23 @@ class Captures:
                 advice="Upload photos, a video or a zip with PUT /v1/captures/{id}/images/{name} first.",
             )
         photos = all(entry.path.lower().endswith(_PHOTO_SUFFIXES) for entry in images)
-        posed = any(True for _ in self.storage.entries(layout.capture_files(capture_id, Role.poses)))
+        poses = self.storage.entries(layout.capture_files(capture_id, Role.poses))
+        posed = any(not entry.path.lower().endswith(".ply") for entry in poses)  # a model to start from
         if len(images) == 1 and photos and not posed:
             raise ProblemError(
                 "too_few_images",
                 "The capture holds one photo; depth cannot be recovered from a single view.",
                 advice="Take 20 or more photos from different places, each overlapping the next by two thirds.",
                 facts={"images": 1},
+            )
+
+    def check_start(self, capture_id: str, name: str) -> None:
+        """Refuse a model to start from that is not among the capture's poses, with a 404 problem."""
+        if not self.storage.exists(layout.capture_file(capture_id, Role.poses, name)):
+            raise ProblemError(
+                "file_not_found",
+                f"The capture has no file {name[:80]!r} among its poses to start from.",
+                advice="Upload it with PUT /v1/captures/{id}/poses/{name} first, or name a stored model.",
             )
 
     async def store(

@@ -28,6 +28,7 @@ async def create_from_form(service: Service, request: Request, key: str | None) 
         files, fields = await _receive(service, request, capture.id)
         create = _request(capture.id, fields)
         await run_in_threadpool(service.captures.check_trainable, capture.id)
+        await run_in_threadpool(check_start, service, create)
         described = create.model_dump_json(exclude={"capture"}) + "\n".join(names(files))
         job, new = await run_in_threadpool(lambda: service.jobs.create(create, key=key, body=described))
         kept = job.capture == capture.id
@@ -35,6 +36,15 @@ async def create_from_form(service: Service, request: Request, key: str | None) 
     finally:
         if not kept:
             await run_in_threadpool(service.captures.delete, capture.id)
+
+
+def check_start(service: Service, create: CreateJob) -> None:
+    """Raise the problem that says why a job cannot start from the model it names, if it names one."""
+    options = create.options
+    if options.start_file is not None:
+        service.captures.check_start(create.capture, options.start_file)
+    elif options.start_model is not None:
+        service.models.check(options.start_model)
 
 
 async def _receive(

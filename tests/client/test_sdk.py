@@ -15,7 +15,7 @@ import pytest
 from pydantic import SecretStr
 
 from splatmill import AsyncClient, Client, JobCancelled, JobFailed
-from splatmill.errors import Conflict, InvalidRequest, NotFound, Unauthorized
+from splatmill.errors import Conflict, InvalidRequest, NothingToUpload, NotFound, Unauthorized
 from splatmill.schema import (
     JobState,
     LogEvent,
@@ -195,3 +195,19 @@ def test_several_jobs_on_one_loop(service, photos):
             return await asyncio.gather(*(follow(client) for _ in range(3)))
 
     assert asyncio.run(main()) == [JobState.succeeded] * 3
+
+
+def test_a_model_to_start_from_is_sent_beside_the_poses(service, photos, tmp_path):
+    (tmp_path / "before.ply").write_bytes(PLY)
+    with Client(service.url) as client:
+        job = client.train(photos, start=tmp_path / "before.ply", steps=10)
+        assert job.job.options.start == "before.ply"
+        sent = [file for file in client.capture(job.job.capture).files if file.role == "poses"]
+        assert [(file.name, file.sha256) for file in sent] == [
+            ("before.ply", hashlib.sha256(PLY).hexdigest())
+        ]
+        with pytest.raises(NothingToUpload, match="does not exist"):
+            client.train(photos, start=tmp_path / "gone.ply")
+        service.begin(job.id)
+        service.finish(job.id, PLY)
+        assert client.train(photos, start=job.id).job.options.start_model == job.id

@@ -247,3 +247,31 @@ def test_a_form_that_is_refused_leaves_nothing(app: Running) -> None:
     assert (status, b"malformed_body" in body) == (400, True)
     assert stored(app) == []
     assert app.http.get("/v1/jobs").json()["jobs"] == []
+
+
+def test_a_job_starts_only_from_a_model_that_is_there(app: Running) -> None:
+    capture_id = app.capture()
+    body: dict[str, Any] = {"capture": capture_id, "options": {"start": "before.ply"}}
+    refused = problem(app.http.post("/v1/jobs", json=body), 404, "file_not_found")
+    assert "before.ply" in refused["detail"]
+    app.http.put(f"/v1/captures/{capture_id}/poses/before.ply", content=b"ply").raise_for_status()
+    assert app.http.post("/v1/jobs", json=body).json()["options"]["start"] == "before.ply"
+
+    body["options"]["start"] = "0123456789abcdef"
+    problem(app.http.post("/v1/jobs", json=body), 404, "model_not_found")
+    unfinished = app.job(capture_id)
+    body["options"]["start"] = unfinished
+    problem(app.http.post("/v1/jobs", json=body), 409, "model_not_ready")
+    app.begin(unfinished)
+    app.finish(unfinished)
+    assert app.http.post("/v1/jobs", json=body).status_code == 202
+    for nonsense in ("../model.ply", "model.obj", ""):
+        body["options"]["start"] = nonsense
+        assert app.http.post("/v1/jobs", json=body).status_code == 422
+
+
+def test_a_model_among_the_poses_gives_a_single_photo_no_camera(app: Running) -> None:
+    capture_id = app.capture("only.jpg")
+    app.http.put(f"/v1/captures/{capture_id}/poses/m.ply", content=b"ply").raise_for_status()
+    answer = app.http.post("/v1/jobs", json={"capture": capture_id, "options": {"start": "m.ply"}})
+    problem(answer, 422, "too_few_images")

@@ -25,7 +25,7 @@ def test_a_model_says_what_it_is(app: Running, model_id: str) -> None:
     ply = app.http.get(f"/v1/models/{model_id}/files/model.ply")
     assert (model["id"], model["gaussians"], model["sh_degree"], model["psnr"]) == (model_id, 2, 1, 27.5)
     assert model["bytes"] == len(ply.content)
-    assert {f["name"] for f in model["files"]} == set(layout.MODEL_FILES) - {"report.png"}
+    assert {f["name"] for f in model["files"]} == set(layout.MODEL_FILES) - {"report.png", "progress.mp4"}
     assert ply.headers["content-disposition"].startswith("attachment")
     assert [m["id"] for m in app.http.get("/v1/models").json()["models"]] == [model_id]
     assert app.http.get(f"/v1/models/{model_id}/cameras").json() == {"cameras": []}

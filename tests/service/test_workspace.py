@@ -16,7 +16,7 @@ from splatmill.backplane.storage import Storage, StorageError, StorageFullError
 from splatmill.schema import Role
 from splatmill_worker import reconstruction, sweep, workspace
 from splatmill_worker.mishap import Transient, problem_of
-from splatmill_worker.workspace import FolderInUseError, Mirror, Workspace, in_use
+from splatmill_worker.workspace import FolderInUseError, Mirror, StartGoneError, Workspace, in_use
 
 JOB, CAPTURE = "job00001", "capture1"
 
@@ -199,3 +199,20 @@ def test_what_is_only_away_is_tried_again(error: Exception, code: str) -> None:
     with pytest.raises(Transient) as caught:
         problem_of(error)
     assert caught.value.problem.code == code
+
+
+@pytest.mark.parametrize("where", ["local", "remote"])
+def test_a_stored_model_is_brought_along_to_start_from(where: str, request: pytest.FixtureRequest) -> None:
+    storage: Storage = request.getfixturevalue(where)
+    storage.put(layout.model_file("model001", "model.ply"), b"splats")
+    space = Workspace(storage, JOB, CAPTURE)
+    space.stage_start("model001")
+    storage.delete(layout.model_file("model001", "model.ply"))
+    space.stage_start("model001")  # a later attempt; the model may be gone by now
+    assert (space.run / "start.ply").read_bytes() == b"splats"
+    space.start_over()
+    for gone in ("model001", "../../etc"):
+        with pytest.raises(StartGoneError) as missing:
+            space.stage_start(gone)
+        assert problem_of(missing.value).code == "model_not_found"
+    space.close()

@@ -57,11 +57,11 @@ def train(
     **options: Any,
 ) -> None:
     """Train Gaussian splats from photos; leaves model.ply and its report in DIR."""
-    from splatmill.aio import train_options
+    from splatmill.aio import train_options, with_start_file
 
-    checked = train_options(
-        {key: value for key, value in options.items() if value is not None and value != []}
-    )
+    given = {key: value for key, value in options.items() if value is not None and value != []}
+    given, start = with_start_file(given)
+    checked = train_options(given)
     found = find_files(path)
     if detach and server is None:
         raise typer.BadParameter("Without --server the job ends with this call.", param_hint="--detach")
@@ -69,7 +69,7 @@ def train(
     _announce(found)
     with _sigterm_as_interrupt(), _client(server, out) as client:
         title = name or path.expanduser().resolve().name
-        capture = _upload(client, path, title)
+        capture = _upload(client, path, title, start)
         if detach:
             typer.echo(client.submit(capture.id, checked, name=title).id)
             return
@@ -104,9 +104,9 @@ def _client(server: str | None, out: Path) -> Iterator[Client]:
         yield client
 
 
-def _upload(client: Client, path: Path, name: str) -> Capture:
+def _upload(client: Client, path: Path, name: str, start: Path | None) -> Capture:
     with make_display() as display:
-        capture, uploaded = client.upload(path, name=name, on_progress=display.progress)
+        capture, uploaded = client.upload(path, name=name, on_progress=display.progress, model=start)
     for photo, problem in uploaded.refused:
         typer.echo(f"left out: {photo}: {problem.detail}", err=True)
     return capture

@@ -9,7 +9,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import IDEMPOTENCY_HEADER, CreateJob, Job, JobPage, JobState
-from splatmill_server.oneshot import create_from_form
+from splatmill_server.oneshot import check_start, create_from_form
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.problems import ProblemError
 from splatmill_server.routes.documented import JOB_REQUESTS, answer, problems
@@ -45,6 +45,9 @@ _FORM = {
         "capture_not_found",
         "no_images",
         "too_few_images",
+        "model_not_found",
+        "model_not_ready",
+        "file_not_found",
         "unknown_option",
         "option_out_of_range",
         "idempotency_conflict",
@@ -104,6 +107,7 @@ async def _create_from_json(service: Service, body: bytes, key: str | None) -> t
         # A repeated request is answered with its job even if its capture is gone by now.
         if key is None or service.jobs.known(key) is None:
             service.captures.check_trainable(create.capture)
+            check_start(service, create)
         return service.jobs.create(create, key=key, body=create.model_dump_json())
 
     return await run_in_threadpool(make)

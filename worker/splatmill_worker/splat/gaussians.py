@@ -78,7 +78,7 @@ class Gaussians:
         """bool [N]: rows whose every parameter is finite and whose quaternion has a direction."""
         keep: Tensor = torch.linalg.vector_norm(self.quats, dim=1) > 0
         for value in self:
-            keep &= torch.isfinite(value.reshape(self.count, -1)).all(dim=1)
+            keep &= torch.isfinite(value.unsqueeze(-1).flatten(1)).all(dim=1)  # also of no rows
         return keep
 
     def padded(self, degree: int) -> Gaussians:

@@ -59,9 +59,7 @@ def write(
             gaussians.means,
             torch.zeros(n, 3),
             gaussians.sh[:, 0],
-            gaussians.sh[:, 1:]
-            .transpose(1, 2)
-            .reshape(n, -1),  # channel-major: all R, then all G, then all B
+            gaussians.sh[:, 1:].transpose(1, 2).flatten(1),  # channel-major: all R, then all G, then all B
             gaussians.logit_opacities[:, None],
             gaussians.log_scales,
             quats,
@@ -94,8 +92,9 @@ def offset(path: Path) -> tuple[float, float, float]:
 
     Raises PlyUnreadableError for a comment that says so and holds no three numbers.
     """
-    head = path.open("rb").read(_HEAD_BYTES).partition(b"end_header")[0].decode("ascii", "replace")
-    for line in head.splitlines():
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES).partition(b"end_header")[0]
+    for line in head.decode("ascii", "replace").splitlines():
         words = line.split()
         if words[:2] == ["comment", "offset"]:
             try:

@@ -21,7 +21,11 @@ JUDGES = 8
 """Training views that a model is judged on."""
 
 DOUBTFUL = 3.0
-"""dB over one colour per photo: a model in the right world shows its photos far better."""
+"""dB over one colour per photo: a model in the right world shows its photos far better, unless it is hardly trained."""
+
+TELLS_APART = 1.0
+"""dB by which a view of a doubtful model must be nearer to its own photo than to another one. On the still life bare points
+of the right world are by 1.3 to 2.9, and the same points moved, turned or scaled by 1.0 at most."""
 
 
 class StartUnusableError(ValueError):
@@ -32,19 +36,25 @@ class StartUnusableError(ValueError):
 class Start:
     """What is known of the model given: its size, SH degree, and how it shows training photos before any step.
 
-    psnr, one_color in dB: medians over some training views of the model's rendering, and of each photo's mean
-    colour, which asks for no model at all.
+    psnr, one_color, another in dB: medians over some training views of the model's rendering, of each photo's mean
+    colour, which asks for no model at all, and of the rendering against another view's photo.
     """
 
     gaussians: int
     degree: int
     psnr: float
     one_color: float
+    another: float | None
 
     @property
     def doubtful(self) -> bool:
         """Whether the model says so little about these photos that its world may be another."""
         return not self.psnr > self.one_color + DOUBTFUL
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether what the model shows has nothing to do with where the cameras stand."""
+        return self.doubtful and self.another is not None and not self.psnr > self.another + TELLS_APART
 
 
 def read(path: Path, frame: Normalization) -> Gaussians:
@@ -64,23 +74,35 @@ def read(path: Path, frame: Normalization) -> Gaussians:
 
 
 def judge(gaussians: Gaussians, views: Sequence[TrainingView]) -> Start:
-    """How `gaussians` show some of `views`. Raises StartUnusableError where one colour per photo is nearer to them."""
+    """How `gaussians` show some of `views`. Raises StartUnusableError where they show something else."""
     some = views[:: max(1, len(views) // JUDGES)]
     # As training judges: white only behind what is transparent.
     backdrop = torch.ones(3) if any(view.full.alpha is not None for view in views) else torch.zeros(3)
-    shown, plain = [], []
+    shown: list[float] = []
+    plain: list[float] = []
+    other: list[float] = []
     with torch.no_grad():
-        for view in some:
-            target = view.full
+        half = len(some) // 2
+        for view, far in zip(some, [*some[half:], *some[:half]], strict=True):
+            target, beyond = view.full, far.full
             photo = target.over(backdrop)
             color = render(gaussians, target.camera, background=backdrop).color
             shown.append(compare(view.name, color, photo, target.mask).psnr)
             plain.append(compare(view.name, _one_color(photo, target.mask), photo, target.mask).psnr)
-    start = Start(gaussians.count, gaussians.degree, float(np.median(shown)), float(np.median(plain)))
-    if not start.psnr > start.one_color:
+            if beyond.rgb.shape == target.rgb.shape and len(some) > 1:
+                other.append(compare(view.name, color, beyond.over(backdrop), beyond.mask).psnr)
+    start = Start(
+        gaussians.count,
+        gaussians.degree,
+        float(np.median(shown)),
+        float(np.median(plain)),
+        float(np.median(other)) if other else None,
+    )
+    if start.elsewhere:
         raise StartUnusableError(
-            f"The model shows the training photos at {start.psnr:.1f} dB, no better than one colour per photo "
-            f"({start.one_color:.1f} dB): it is not in the world of these cameras."
+            f"The model's views are as near to other photos ({start.another:.1f} dB) as to their own "
+            f"({start.psnr:.1f} dB; one colour per photo: {start.one_color:.1f} dB): it is not in the world of these "
+            "cameras."
         )
     return start
 
