@@ -69,10 +69,16 @@ def residuals(model: pycolmap.Reconstruction) -> dict[int, tuple[int, float]]:
 
 
 def trusted(model: pycolmap.Reconstruction | None) -> int:
-    """Photos of a model that hang on enough points to believe in it; 0 where its cameras are none."""
+    """How many photos of a model hang on enough points to believe in it; 0 where its cameras are none."""
+    return len(trusted_images(model))
+
+
+def trusted_images(model: pycolmap.Reconstruction | None) -> set[int]:
+    """The ids of those photos."""
     if model is None or absurd_intrinsics(model) is not None:
-        return 0
-    return sum(count >= SURE_SEEN and error <= SURE_PIXELS for count, error in residuals(model).values())
+        return set()
+    measured = residuals(model).items()
+    return {image_id for image_id, (count, error) in measured if count >= SURE_SEEN and error <= SURE_PIXELS}
 
 
 def drop_misplaced(model: pycolmap.Reconstruction) -> dict[int, str]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sqlite3
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from splatmill_worker.sfm.cameras import Group
 from splatmill_worker.sfm.cancellation import native_token, stop_if
 from splatmill_worker.sfm.options import Effort
 
+PAIR_IDS = 2147483647  # COLMAP's largest number of images
 BATCH = 8  # photos per native call: progress is told between two of them
 
 
@@ -112,6 +115,32 @@ def extract(
                 told += len(batch)
                 on_progress("features", told, len(photos), photos[batch[-1]].name)
     _set_cameras(groups, names, place.database)
+
+
+def carry_over(source: Workspace, target: Workspace, again: set[int]) -> None:
+    """Starts `target` with all that `source` has, but for the photos whose features are to be found `again`.
+
+    Both look at the photos at one size. Pairs with such a photo are forgotten with it; what other pairs gave stays.
+    Photos keep their ids. A target that is there already is left as it is.
+    """
+    if target.database.is_file():
+        return
+    target.folder.mkdir(parents=True, exist_ok=True)
+    part = target.database.with_suffix(".part")
+    part.unlink(missing_ok=True)
+    with closing(sqlite3.connect(source.database)) as old, closing(sqlite3.connect(part)) as new:
+        old.backup(new)
+        ids = {photo_index(name): number for number, name in new.execute("SELECT image_id, name FROM images")}
+        gone = {ids[photo] for photo in again if photo in ids}
+        # COLMAP numbers a pair of images a < b by PAIR_IDS * a + b.
+        for table in ("matches", "two_view_geometries"):
+            pairs = [number for (number,) in new.execute(f"SELECT pair_id FROM {table}")]
+            lost = [(number,) for number in pairs if gone & {number // PAIR_IDS, number % PAIR_IDS}]
+            new.executemany(f"DELETE FROM {table} WHERE pair_id = ?", lost)
+        for table in ("keypoints", "descriptors"):
+            new.executemany(f"DELETE FROM {table} WHERE image_id = ?", [(number,) for number in gone])
+        new.commit()
+    part.replace(target.database)
 
 
 def _camera_of(group: Group, names: dict[int, str], path: Path) -> int:

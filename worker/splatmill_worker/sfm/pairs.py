@@ -135,6 +135,12 @@ def best_partners(scores: dict[Pair, int], count: int, partners: int) -> set[Pai
     return chosen
 
 
+def likeliest(scores: dict[Pair, int], photo: int, partners: int) -> list[Pair]:
+    """The `partners` best pairs of one photo by score."""
+    own = [(-score, pair) for pair, score in scores.items() if photo in pair]
+    return [pair for _, pair in sorted(own)[:partners]]
+
+
 def components(count: int, edges: Iterable[Pair]) -> list[list[int]]:
     """The connected parts of the view graph, the largest first."""
     parent = list(range(count))

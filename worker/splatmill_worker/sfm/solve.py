@@ -34,6 +34,8 @@ OnProgress = Callable[[str, int, int, str], None]
 VERSION = 4  # of what is cached; another one means the cache of an older program is not read
 REPAIR_ROUNDS = 2
 ENOUGH = 0.9  # of the photos surely placed: below, more effort is spent
+PARTNERS_AGAIN = 4  # of a photo without a sure place, that are looked at harder together with it
+NEARLY_ALL = 0.8  # of the photos: then all are
 GLOBAL_FROM = 400  # photos: from here on the global mapper goes first where the view graph is dense
 
 
@@ -178,7 +180,7 @@ def _solve(run: Run) -> Progress:
             run.notes.append(
                 f"With {best.effort.name} effort {_placed(best)[0]} of {run.count} photos surely found their place."
             )
-        progress = _attempt(run, effort)
+        progress = _attempt(run, effort, best)
         if best is None or _placed(progress) > _placed(best):
             best = progress
         if _placed(best)[0] >= ENOUGH * run.count:
@@ -196,11 +198,17 @@ def _placed(progress: Progress) -> tuple[int, int]:
     return checks.trusted(progress.mapped.largest), progress.mapped.registered
 
 
-def _attempt(run: Run, effort: Effort) -> Progress:
-    """Features, pairs, matches and mapping at one effort; photos left over get matched with more partners."""
-    key = _digest(VERSION, effort, run.model, [group.focal for group in run.groups])
+def _attempt(run: Run, effort: Effort, earlier: Progress | None) -> Progress:
+    """Features, pairs, matches and mapping at one effort; photos left over get matched with more partners.
+
+    What is sure from `earlier` is kept where the photos are looked at in the same size.
+    """
+    doubtful = _in_doubt(run, earlier) if earlier is not None and earlier.effort.side == effort.side else None
+    key = _digest(VERSION, effort, run.model, [group.focal for group in run.groups], sorted(doubtful or ()))
     progress = Progress(effort, Workspace(run.folder / f"{effort.name}-{key}"))
     with run.clock("features"):
+        if earlier is not None and doubtful is not None:
+            features.carry_over(earlier.place, progress.place, doubtful)
         features.extract(
             run.prepared.photos,
             run.groups,
@@ -247,6 +255,25 @@ def _attempt(run: Run, effort: Effort) -> Progress:
     finally:
         database.close()
     return progress
+
+
+def _in_doubt(run: Run, progress: Progress) -> set[int] | None:
+    """Photos without a sure place, and the likeliest partners of each; None where that is nearly all of them."""
+    model = progress.mapped.largest if progress.mapped is not None else None
+    sure = (
+        set()
+        if model is None
+        else {features.photo_index(model.images[i].name) for i in checks.trusted_images(model)}
+    )
+    doubtful = set(range(run.count)) - sure
+    partners = {
+        index
+        for photo in doubtful
+        for pair in pairs.likeliest(run.scores, photo, PARTNERS_AGAIN)
+        for index in pair
+    }
+    both = doubtful | partners
+    return None if not run.scores or len(both) > NEARLY_ALL * run.count else both
 
 
 def _require_features(run: Run, progress: Progress) -> None:

@@ -81,7 +81,7 @@ def wanted(scene: Scene) -> bool:
 
 
 def find(scene: Scene, cancelled: Callable[[], bool] = lambda: False) -> Added:
-    """Points between those of the scene; ends after a few photos where hardly any patch is found again.
+    """Points between those of the scene; none where a few photos show that hardly any patch is found again.
 
     That is so where cameras move along their own axis, and for thin or moving things. Raises OSError where a
     photo does not decode any more, Cancelled where the caller asks to stop.
@@ -98,7 +98,8 @@ def find(scene: Scene, cancelled: Callable[[], bool] = lambda: False) -> Added:
     for done, index in enumerate(order):
         stop_if(cancelled)
         if done == len(trial) and _yield(batches) < MIN_YIELD:
-            given_up = True
+            # Of so few the most are matches by chance.
+            given_up, points, batches = True, scene.points, []
             break
         inside, _, _, z = placed(shots[index].camera, points)
         if inside.sum() >= KNOWN:
