@@ -72,6 +72,24 @@ def test_a_posed_capture_becomes_a_model_with_its_reports(tmp_path: Path) -> Non
         assert drawn.size[0] > 500
 
 
+def test_corrected_cameras_are_exported_and_held_out_ones_are_not_touched(tmp_path: Path) -> None:
+    capture = stillife.posed_capture(tmp_path / "capture")
+    out = run(capture, tmp_path / "work", options(pose_refinement="on"))[0].out
+    report = json.loads((out / "report.json").read_text())
+    assert 0.0 < report["result"]["cameras_moved_pixels"] < 5.0
+    assert "Held-out cameras stay as they came" in report["plan"]["reasons"]["pose_refinement"]
+    cameras = ModelCameras.model_validate_json((out / "cameras.json").read_text()).cameras
+    given = {view.name: view.camera.center for view in stillife.scene().views}
+    moves = {
+        camera.name: float(
+            np.linalg.norm(np.array(camera.camera.camera_to_world)[:3, 3] - given[camera.name])
+        )
+        for camera in cameras
+    }
+    assert all(moves[camera.name] < 1e-9 for camera in cameras if camera.split == "test")
+    assert all(1e-6 < moves[camera.name] < 0.2 for camera in cameras if camera.split == "train")
+
+
 def test_the_model_shows_the_photos_at_the_reported_error_in_the_captures_own_world(tmp_path: Path) -> None:
     capture = stillife.posed_capture(tmp_path / "capture")
     out = run(capture, tmp_path / "work", options(steps=120))[0].out

@@ -71,6 +71,13 @@ def test_every_field_has_its_reason_and_absent_ones_say_why() -> None:
     [
         ({"exposure_spread": 0.3}, "exposure", True),
         ({"exposure_spread": None}, "exposure", False),
+        ({"tint_spread": 0.2}, "exposure", True),
+        ({"sky_share": 0.2, "depth_ratio": 15.0, "sky_points": 800}, "sky", True),
+        ({"sky_share": 0.2, "depth_ratio": 2.0, "sky_points": 800}, "sky", False),
+        ({"sky_share": 0.01, "depth_ratio": 15.0}, "sky", False),
+        ({"gap_share": 0.3, "gap_points": 5000}, "gaps", True),
+        ({"gap_share": 0.02, "gap_points": 50}, "gaps", False),
+        ({"reprojection": 2.5}, "pose_refinement", True),
         ({"transparent": 43}, "background", "random"),
         ({"points": 3}, "initial", "random"),
         ({"distance_ratio": 9.0}, "antialias", True),
@@ -93,6 +100,8 @@ def test_the_degree_follows_from_the_angles_between_views(angle: float | None, d
     [
         ({"exposure": "on"}, "exposure", True),
         ({"antialias": "on"}, "antialias", True),
+        ({"pose_refinement": "on"}, "pose_refinement", True),
+        ({"gaps": "off"}, "gaps", False),
         ({"densify": "mcmc"}, "densify", "mcmc"),
         ({"densify": "off"}, "densify", None),
         ({"background": "white"}, "background", "white"),
@@ -105,6 +114,14 @@ def test_options_force(asked: dict[str, object], field: str, value: object) -> N
     assert getattr(plan, field) == value
     if field != "seed":
         assert field in plan.forced
+
+
+def test_what_is_added_to_start_with_counts_among_the_gaussians() -> None:
+    sparse = replace(FACTS, points=900, gap_share=0.5, gap_points=30_000, sightings=90.0)
+    plan = planned(sparse, steps=100)
+    assert plan.max_gaussians == 30_900
+    assert "30000 Gaussians are put there" in plan.reasons["gaps"]
+    assert planned(sparse, steps=100, gaps="off").max_gaussians < 30_000
 
 
 def test_what_cannot_be_followed_is_refused() -> None:

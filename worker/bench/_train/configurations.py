@@ -78,8 +78,6 @@ CONFIGURATIONS = {
     "no-sky": _option("no such shell", "sky", "off", False),
     "gaps": _option("Gaussians where photos show what no point describes", "gaps", "on", True),
     "no-gaps": _option("no such Gaussians", "gaps", "off", False),
-    "depth-hints": _option("the points' depths pull on the rendered ones", "depth_hints", "on", True),
-    "no-depth-hints": _option("no such pull", "depth_hints", "off", False),
     "pose-refinement": _option("training cameras are corrected", "pose_refinement", "on", True),
     "no-pose-refinement": _option("cameras stay as they are", "pose_refinement", "off", False),
 }

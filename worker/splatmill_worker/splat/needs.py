@@ -38,6 +38,10 @@ def needs_of(facts: Facts, options: TrainOptions, kernels: Kernels, why: Reasons
     sky = why.switch("sky", options.sky, *_sky(facts))
     gaps = why.switch("gaps", options.gaps, *_gaps(facts))
     poses = why.switch("pose_refinement", options.pose_refinement, *_poses(facts, kernels))
+    if poses:
+        why.chosen["pose_refinement"] += (
+            " Held-out cameras stay as they came, so that their score is not flattered."
+        )
     for name, asked in (("sky", options.sky), ("gaps", options.gaps)):
         if asked is Switch.on and facts.sightings is None:
             raise ValueError(
@@ -90,4 +94,4 @@ def _poses(facts: Facts, kernels: Kernels) -> tuple[bool, str]:
             False,
             f"{seen}, which would call for correcting them; the gpu kernels give no gradient to cameras.",
         )
-    return True, f"{seen}: those of training photos are corrected, held-out ones are judged as they came."
+    return True, f"{seen}: those of training photos are corrected."

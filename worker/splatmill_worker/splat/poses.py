@@ -75,6 +75,11 @@ class Poses:
         weighed = (self.twists / self._unit).reshape(-1)
         self.twists -= (self._gauge @ (self._onto_gauge @ weighed)).reshape_as(self.twists)
 
+    def pixels_moved(self) -> float:
+        """How far the corrections move what the cameras see: median over cameras, in pixels of the training size."""
+        weighed = (self.twists / self._unit).reshape(-1, 2, 3)
+        return float(torch.linalg.vector_norm(weighed, dim=2).amax(dim=1).median())
+
     def corrected(self, views: Sequence[TrainingView]) -> list[TrainingView]:
         """The views as their cameras are now."""
         return [moved(view, self.matrix(i)) for i, view in enumerate(views)]

@@ -27,6 +27,8 @@ MISFIT = 6.0
 
 WORST = 4
 
+NO_LPIPS = "It needs the weights of an image network, which nothing that is installed brings; PSNR and SSIM are reported."
+
 
 def write_report(
     out: Path,
@@ -57,8 +59,9 @@ def write_report(
         "left_out": [
             *({"what": name, "why": reason} for name, reason in plan.left_out.items()),
             *({"photo": name, "why": reason} for name, reason in scene.left_out),
+            {"what": "lpips", "why": NO_LPIPS},
         ],
-        "warnings": [*warnings, *_misfits(trained)],
+        "warnings": [*warnings, *_unplaced(scene), *_misfits(trained)],
         "facts": facts.as_dict(),
         "sfm": scene.facts,
         "offset": frame.offset.tolist() if frame.offset.any() else None,
@@ -102,6 +105,7 @@ def _result(trained: Trained, written: int) -> dict[str, Any]:
         "steps": trained.steps,
         "stopped": trained.stopped,
         "recoveries": trained.recoveries,
+        "cameras_moved_pixels": trained.cameras_moved,
         "failure": None if trained.failure is None else trained.failure.name.value,
         "psnr": None if held is None else held.psnr,
         "ssim": None if held is None else held.ssim,
@@ -119,6 +123,15 @@ def _view_rows(trained: Trained) -> list[dict[str, Any]]:
         if score is not None
         for view in score.views
     ]
+
+
+def _unplaced(scene: Scene) -> list[str]:
+    """One sentence for the photos that have no camera; each with its reason is among what was left out."""
+    if not scene.left_out:
+        return []
+    names = [name for name, _ in scene.left_out]
+    shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    return [f"{len(names)} of {len(names) + len(scene.views)} photos are not used: {shown}."]
 
 
 def _misfits(trained: Trained) -> list[str]:

@@ -15,6 +15,7 @@ from splatmill_worker.splat.evaluate import Score, evaluate
 from splatmill_worker.splat.exposure import Exposure
 from splatmill_worker.splat.failure import FailureName, TrainingFailed
 from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.machine import resident_memory
 from splatmill_worker.splat.plan import Plan
 from splatmill_worker.splat.poses import Poses, typical_depth
 from splatmill_worker.splat.run import Row, Run
@@ -77,7 +78,8 @@ class Hooks:
 class Trained:
     """What came out. `gaussians` are in the training world; `stopped` says why the run ended.
 
-    `views` are the training views with their cameras as the run left them.
+    `views` are the training views with their cameras as the run left them, `cameras_moved` by how many pixels (the
+    median); None where the plan leaves cameras as they come.
     """
 
     gaussians: Gaussians
@@ -91,6 +93,7 @@ class Trained:
     failure: TrainingFailed | None
     recoveries: int
     views: Sequence[TrainingView]
+    cameras_moved: float | None
 
 
 @dataclass
@@ -183,6 +186,7 @@ def train(
         failure,
         run.recoveries,
         seen_from,
+        None if poses is None else poses.pixels_moved(),
     )
 
 
@@ -246,6 +250,7 @@ def _measure(run: Run, held_out: Sequence[TrainingView], measuring: _Measuring) 
         None if score is None else score.psnr,
         None if score is None else score.ssim,
         run.engine.count,
+        resident_memory(),
     )
     run.rows.append(row)
     measuring.seconds += time.perf_counter() - started
