@@ -24,7 +24,7 @@ from pathlib import Path
 
 from _rows import HERE, Row, append, lines
 from _train import budgets, child, configurations, estimate, figure, scenes, tables
-from _train.rows import Run, failed, idle, missing, runs_of
+from _train.rows import Run, code_version, failed, idle, missing, runs_of
 from _train.scenes import Scene
 
 from splatmill.schema.quantities import format_duration
@@ -150,6 +150,8 @@ def _measure(wanted: Wanted, path: Path, work: Path) -> bool:
             continue
         append(path, row)
         found.append(row)
+        if row["code"] != code_version():
+            print("The code was changed meanwhile: this row compares with later ones only.", file=sys.stderr)
         left = format_duration(estimate.seconds_left(todo[number + 1 :], found))
         print(f"[{number + 1}/{len(todo)}] {run}: {_said(row)}; about {left} left", flush=True)
     for peer in wanted.peers:

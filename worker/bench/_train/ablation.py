@@ -21,8 +21,10 @@ Place = tuple[str, str, str]
 def ablation(rows: list[Row]) -> str:
     """The section: switches over all scenes, then each on each scene, then what they are compared with."""
     pairs = compared(rows)
+    alone = lonely(rows)
+    left = [f"{alone} rows of a switch have no default of the same code, and are not shown."] if alone else []
     if not pairs:
-        return ""
+        return "".join(left)
     order = {name: number for number, name in enumerate(CONFIGURATIONS)}
     places = sorted(pairs, key=lambda place: (order.get(place[2], len(order)), place))
     quality = {place: found for place in places if (found := difference(pairs[place], "psnr")) is not None}
@@ -32,10 +34,10 @@ def ablation(rows: list[Row]) -> str:
         *([summary(quality)] if quality else []),
         table(head, [_line(place, pairs[place]) for place in places]),
         *_idle(pairs),
+        *left,
+        defaults(pairs),
     ]
-    if alone := lonely(rows):
-        parts.append(f"{alone} rows of a switch have no default of the same code, and are not shown.")
-    return "\n\n".join([*parts, defaults(pairs)])
+    return "\n\n".join(parts)
 
 
 def difference(pairs: list[Pair], name: str) -> Spread | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Iterable
 
 from _rows import Row
@@ -23,15 +24,13 @@ def seconds_left(runs: Iterable[Run], rows: list[Row]) -> float:
 
 
 def expected(run: Run, rows: list[Row]) -> float:
-    """Wall seconds of one run: as long as its like took last time, else a guess from its budget."""
-    for row in reversed(rows):
-        if row["kind"] == "run" and not failed(row) and (row["scene"], row["budget"]) == _like(run):
-            return START + float(row["wall_seconds"])
+    """Wall seconds of one run: what its like took, by the median, else a guess from its budget."""
+    like = (run.scene.name, run.budget.name)
+    known = [row for row in rows if row["kind"] == "run" and not failed(row)]
+    took = [row["wall_seconds"] for row in known if (row["scene"], row["budget"]) == like]
+    if took:
+        return START + float(statistics.median(took))
     if run.budget.steps is not None:
         return START + AROUND + PER_STEP * run.budget.steps
     assert run.budget.seconds is not None
     return START + AROUND + run.budget.seconds
-
-
-def _like(run: Run) -> tuple[str, str]:
-    return run.scene.name, run.budget.name
