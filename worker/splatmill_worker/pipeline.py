@@ -286,6 +286,7 @@ class _Teller:
                 psnr=row.psnr,
                 ssim=row.ssim,
                 gaussians=row.gaussians,
+                memory=row.memory,
             )
         )
         self.preview(engine, row.step)

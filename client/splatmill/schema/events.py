@@ -60,6 +60,7 @@ class CurveRow(Response):
     psnr: Measured = None
     ssim: Measured = None
     gaussians: int = Field(ge=0)
+    memory: int | None = Field(default=None, ge=0, description="Bytes that the attempt's process holds.")
 
 
 class StateEvent(Response):

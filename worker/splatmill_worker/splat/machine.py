@@ -47,6 +47,11 @@ def peak_memory() -> int:
     return peak if platform.system() == "Darwin" else 1024 * peak
 
 
+def resident_memory() -> int:
+    """Resident size of this process now, in bytes."""
+    return int(psutil.Process().memory_info().rss)
+
+
 def _processor() -> str:
     """The model name as the kernel tells it, or what Python knows."""
     try:

@@ -11,6 +11,7 @@ from typing import Any
 
 from torch import Tensor
 
+from splatmill.schema import format_bytes
 from splatmill_worker.splat.evaluate import ViewScore
 from splatmill_worker.splat.picture import data_uri
 
@@ -19,8 +20,9 @@ body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto
 h1 { font-size: 1.5rem; } h2 { font-size: 1.1rem; margin-top: 2rem; }
 table { border-collapse: collapse; } td, th { padding: .2rem .8rem .2rem 0; text-align: left; vertical-align: top; }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
-img { max-width: 100%; height: auto; } .pair { display: flex; gap: .5rem; margin: .5rem 0; }
-.pair figure { margin: 0; flex: 1; } figcaption, .dim { color: #666; font-size: .85rem; }
+img { max-width: 100%; height: auto; } .pairs { display: flex; flex-wrap: wrap; gap: 1rem 2rem; }
+.pair { display: flex; gap: .5rem; } .pair figure { margin: 0; } .pair img { max-height: 20rem; display: block; }
+figcaption, .dim { color: #666; font-size: .85rem; }
 .warn { background: #fff4e0; padding: .5rem .8rem; border-left: 3px solid #d08a20; margin: .3rem 0; }
 """
 
@@ -45,14 +47,22 @@ def render(report: dict[str, Any], figure: Path, pairs: Sequence[Pair]) -> str:
         f"<img alt='held-out error against training seconds' src='data:image/png;base64,{curve}'>",
         "<h2>Where the time went</h2>",
         _table(["stage", "seconds"], [[name, f"{value:.1f}"] for name, value in report["seconds"].items()]),
+        f"<p class=dim>At most {format_bytes(report['peak_memory'])} of memory were in use.</p>",
         "<h2>What was decided, and why</h2>",
         _plan(report["plan"]),
         "<h2>What was left out, and why</h2>",
         _table(
-            ["", ""], [[row.get("what") or row.get("photo"), row["why"]] for row in report["left_out"]], 2
+            ["", ""],
+            [
+                [row["what"].replace("_", " ") if "what" in row else row["photo"], row["why"]]
+                for row in report["left_out"]
+            ],
+            2,
         ),
         "<h2>Worst views: rendered, and the photo</h2>",
+        "<div class=pairs>",
         *(_pair(pair) for pair in pairs),
+        "</div>",
         "<h2>Every measured view</h2>",
         _table(
             ["photo", "split", "PSNR (dB)", "SSIM"],
@@ -78,8 +88,9 @@ def _plan(plan: dict[str, Any]) -> str:
     reasons = plan.get("reasons", {})
     rows = []
     for name, reason in reasons.items():
-        value = plan.get(name, "")
-        rows.append([name.replace("_", " "), "" if isinstance(value, dict) else str(value), reason])
+        value = plan["schedule"]["degree"] if name == "sh_degree" else plan.get(name, "")
+        shown = "" if isinstance(value, dict) else "yes" if value is True else str(value)
+        rows.append([name.replace("_", " "), shown, reason])
     return _table(["", "", ""], rows, 3)
 
 

@@ -27,7 +27,7 @@ MISFIT = 6.0
 
 WORST = 4
 
-NO_LPIPS = "It needs the weights of an image network, which nothing that is installed brings; PSNR and SSIM are reported."
+NO_LPIPS = "It needs the weights of an image network, which nothing installed brings; PSNR and SSIM are reported."
 
 
 def write_report(

@@ -34,7 +34,7 @@ GREY = 0.5
 
 @dataclass(frozen=True)
 class Row:
-    """One point of error against run time, on the held-out views; None where there are none."""
+    """One point of error against run time, on the held-out views; None where there are none. memory: resident bytes."""
 
     seconds: float
     step: int
@@ -42,6 +42,7 @@ class Row:
     psnr: float | None
     ssim: float | None
     gaussians: int
+    memory: int | None = None
 
 
 @dataclass
@@ -113,7 +114,8 @@ class Run:
         self.ever_saw |= result.visible > 0
         self.health.watch(self.step, result.loss, result.visible)
         # What nobody will read is not summed.
-        self.engine.keep_scores = self.densifier is not None and progress < schedule.densify_until
+        reads = self.densifier is not None and progress < schedule.densify_until
+        self.engine.keep_scores = self.densifier.scores if self.densifier is not None and reads else None
         if self.densifier is not None:
             self.densifier.after_step(self.engine, rates.means, self.random)
             if schedule.densifies(self.step, progress):

@@ -24,8 +24,8 @@ DOUBTFUL = 3.0
 """dB over one colour per photo: a model in the right world shows its photos far better, unless it is hardly trained."""
 
 TELLS_APART = 1.0
-"""dB by which a view of a doubtful model must be nearer to its own photo than to another one. On the still life bare points
-of the right world are by 1.3 to 2.9, and the same points moved, turned or scaled by 1.0 at most."""
+"""dB by which a view of a doubtful model must be nearer to its own photo than to another one. On the still
+life bare points of the right world are by 1.3 to 2.9, and the same points moved, turned or scaled by 1.0 at most."""
 
 
 class StartUnusableError(ValueError):
