@@ -149,7 +149,7 @@ def goals(timed: list[Row], references: list[Row]) -> str:
         psnr, ssim = Spread.of(row["psnr"] for row in group), Spread.of(row["ssim"] for row in group)
         least = f"{goal['psnr']:.1f} dB" + (f", SSIM {goal['ssim']:.3f}" if "ssim" in goal else "")
         met = psnr.median >= goal["psnr"] and ssim.median >= goal.get("ssim", 0.0)
-        verdict = "NOT met" if not met else "the aim is met" if psnr.median >= goal["aim"] else "met"
+        verdict = "NO" if not met else "yes, and the aim" if psnr.median >= goal["aim"] else "yes"
         lines.append(
             [
                 goal["scene"],
@@ -160,7 +160,7 @@ def goals(timed: list[Row], references: list[Row]) -> str:
                 verdict,
             ]
         )
-    return table("scene|budget|goal|PSNR dB|SSIM|", lines) if lines else ""
+    return table("scene|budget|goal|PSNR dB|SSIM|met", lines) if lines else ""
 
 
 def peers(rows: list[Row]) -> str:
