@@ -81,6 +81,8 @@ def test_what_points_leave_open_is_measured() -> None:
     assert seen.gap_share is not None
     assert seen.sky_share is not None
     assert seen.sightings > 50
+    assert seen.extent is not None
+    assert 0.2 < seen.extent < 3.0
     assert 0.05 < seen.gap_share < 0.95
     assert seen.gap_points > 100
     assert 0.0 <= seen.sky_share < 0.4

@@ -54,6 +54,7 @@ class Facts:
     distortion moves a pixel of this size. tint_spread: as exposure_spread, of the log ratios of red and blue to
     green. sightings: median number of points that a photo shows. sky_share, gap_share: shares of the photos that look
     like sky, and that (sky apart) have no point near; sky_points, gap_points: what would stand for them.
+    extent: distance of the farthest tenth of the points over the radius of the cameras.
     start: the model to start from, if one was given.
     """
 
@@ -83,6 +84,7 @@ class Facts:
     gap_share: float | None = None
     sky_points: int = 0
     gap_points: int = 0
+    extent: float | None = None
 
     @property
     def pixels(self) -> int:
@@ -146,7 +148,15 @@ def _coverage(scene: Scene, views: Sequence[TrainingView]) -> dict[str, Any]:
         "gap_share": gap_share(cells),
         "sky_points": len(shell(cells, scene.points)[0]),
         "gap_points": len(filled(cells)[0]),
+        "extent": _extent(scene, views),
     }
+
+
+def _extent(scene: Scene, views: Sequence[TrainingView]) -> float:
+    centers = np.array([view.full.camera.center for view in views])
+    middle = centers.mean(axis=0)
+    radius = float(np.linalg.norm(centers - middle, axis=1).max())
+    return float(np.percentile(np.linalg.norm(scene.points - middle, axis=1), 90)) / max(radius, 1e-12)
 
 
 def _reprojection(scene: Scene, longest: int) -> float | None:

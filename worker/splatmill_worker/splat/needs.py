@@ -77,6 +77,8 @@ def _gaps(facts: Facts) -> tuple[bool, str]:
     if facts.gap_share is None:
         return False, "Where points are missing cannot be told without points in the photos."
     seen = f"{100 * facts.gap_share:.0f} % of what the photos show has no point near it"
+    if facts.sightings is not None:
+        seen += f" ({facts.sightings:.0f} points a photo)"
     if facts.gap_share < MANY_GAPS:
         return False, f"Only {seen}."
     return True, f"{seen}: {facts.gap_points} Gaussians are put there, as deep as the nearest points."
