@@ -44,6 +44,11 @@ def test_only_masked_pixels_are_judged() -> None:
     color = photo.float() / 255
     color[~mask] = 0.0
     assert compare("x", color, photo, mask).psnr == 100.0
+    assert compare("x", color, photo, mask).ssim == pytest.approx(1.0, abs=1e-5)
+    dimmed = 0.8 * color
+    score = compare("x", dimmed, photo, mask)
+    photo[~mask] = torch.randint(0, 256, photo[~mask].shape).to(torch.uint8)
+    assert compare("x", torch.where(mask[..., None], dimmed, 1.0), photo, mask) == score
 
 
 def test_ssim_is_that_of_the_training_loss() -> None:

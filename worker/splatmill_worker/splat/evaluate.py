@@ -59,17 +59,18 @@ def evaluate(draw: Draw, views: Sequence[TrainingView], background: Tensor) -> S
 
 
 def compare(name: str, color: Tensor, photo: Tensor, mask: Tensor | None = None) -> ViewScore:
-    """Score of a rendered image [H, W, 3] against a photo uint8 [H, W, 3]; only `mask` [H, W] pixels count."""
+    """Score of a rendered image [H, W, 3] against a photo uint8 [H, W, 3]; only `mask` [H, W] pixels count.
+
+    What is masked reaches no window of SSIM either: the edge of a mask is one of the image, as in the loss.
+    """
     image = color.detach().float().clamp(0.0, 1.0)
     truth = photo.to(image.device).float() / 255.0
     squares = (image - truth).square().mean(dim=2)
-    if mask is not None and bool(mask.any()):
-        mask = mask.to(image.device)
-        squares = squares[mask]
-        similarity = float(ssim_map(image, truth).mean(dim=2)[mask].double().mean())
-    else:
-        # The kernel's value of the same definition, many times as fast: curves are measured every few seconds.
-        similarity = 1.0 - float(ops.loss(image, photo.to(image.device).contiguous(), dssim_weight=1.0))
+    counted = mask.to(image.device) if mask is not None and bool(mask.any()) else None
+    if counted is not None:
+        squares = squares[counted]
+    # The kernel's value of `ssim_map`, many times as fast: curves are measured every few seconds.
+    similarity = 1.0 - float(ops.loss(image, photo.to(image.device).contiguous(), mask=counted, dssim_weight=1.0))
     mse = float(squares.double().mean())
     return ViewScore(name, mse, psnr(mse), similarity)
 
