@@ -22,7 +22,7 @@ table { border-collapse: collapse; } td, th { padding: .2rem .8rem .2rem 0; text
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
 img { max-width: 100%; height: auto; } .pairs { display: flex; flex-wrap: wrap; gap: 1rem 2rem; }
 .pair { display: flex; gap: .5rem; } .pair figure { margin: 0; } .pair img { max-height: 20rem; display: block; }
-figcaption, .dim { color: #666; font-size: .85rem; }
+.pair figcaption { width: 0; min-width: 100%; } figcaption, .dim { color: #666; font-size: .85rem; }
 .warn { background: #fff4e0; padding: .5rem .8rem; border-left: 3px solid #d08a20; margin: .3rem 0; }
 """
 
@@ -121,4 +121,5 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[Any]], text_columns: in
 def _footer(report: dict[str, Any]) -> str:
     machine, versions = report["machine"], report["versions"]
     named = ", ".join(f"{name} {value}" for name, value in versions.items() if value)
-    return f"{machine['processor']}, {machine['cores']} cores. {named}. Stopped because {report['result']['stopped']}."
+    where = f"{machine['processor']}, {machine['cores']} cores, {format_bytes(machine['memory'])}"
+    return f"{where}. {named}. Stopped because {report['result']['stopped']}."

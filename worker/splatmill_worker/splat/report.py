@@ -9,6 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from splatmill_worker.scene import Scene
 from splatmill_worker.splat import page
 from splatmill_worker.splat.engine import Engine
@@ -20,14 +23,16 @@ from splatmill_worker.splat.machine import machine, peak_memory, versions
 from splatmill_worker.splat.plan import Plan
 from splatmill_worker.splat.stages import Stages
 from splatmill_worker.splat.train import Trained, drawer, evaluation_background
-from splatmill_worker.splat.views import TrainingView
+from splatmill_worker.splat.views import Target, TrainingView
 
 MISFIT = 6.0
 """dB under the median training view: such a photo does not fit the others."""
 
 WORST = 4
 
-NO_LPIPS = "It needs the weights of an image network, which nothing installed brings; PSNR and SSIM are reported."
+NO_LPIPS = (
+    "It needs the weights of an image network, which nothing installed brings; PSNR and SSIM are reported."
+)
 
 
 def write_report(
@@ -80,9 +85,15 @@ def write_report(
     for view_score in sorted(score.views, key=lambda row: row.psnr)[:WORST]:
         view = next(view for view in judged if view.name == view_score.name)
         rendered = draw(view.full, backdrop).clone()
-        pictures.append(page.Pair(view_score, rendered, view.full.over(backdrop)))
+        pictures.append(page.Pair(view_score, rendered, _counted(view.full, backdrop)))
     (out / "report.html").write_text(page.render(report, out / "report.png", pictures))
     return report
+
+
+def _counted(target: Target, backdrop: Tensor) -> Tensor:
+    """The photo uint8 [H, W, 3], grey where a mask keeps pixels out."""
+    photo = target.over(backdrop)
+    return photo if target.mask is None else torch.where(target.mask[..., None], photo, photo.new_tensor(128))
 
 
 def plain(value: Any) -> Any:
