@@ -15,6 +15,7 @@ from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu import engine
 from splatmill_worker.kernels.cpu.loss import photo_stats
 from splatmill_worker.kernels.cpu.step import Rates, Step
+from splatmill_worker.kernels.records import Scores
 from splatmill_worker.kernels.reference import adam_ as reference_adam_
 
 from .cases import GROUPS, Case, scene
@@ -169,7 +170,7 @@ def test_same_bytes_on_any_number_of_threads(gaussians: int) -> None:
     for step in runs[1:]:
         assert torch.equal(step.blocks, runs[0].blocks)
         assert torch.equal(step.exp_avg_sq, runs[0].exp_avg_sq)
-        for score in ("plain_sum", "abs_sum", "visible_count", "max_extent", "error_sum"):
+        for score in ("plain_sum", "abs_sum", "visible_count", "max_extent"):
             assert torch.equal(getattr(step, score), getattr(runs[0], score)), score
 
 
@@ -218,32 +219,21 @@ def test_scores_are_what_they_say() -> None:
     torch.testing.assert_close(step.max_extent.double(), torch.where(seen, extent, 0.0), rtol=1e-5, atol=0)
 
 
-def test_error_score_is_weight_times_error() -> None:
-    """The weights w_i come from the reference as the gradient of the image to a colour."""
-    case = scene("error", 20, width=18, height=17, degree=0)
-    photo, step = photo_of(case), make_step(case)
-    step.train(*case.camera(), photo, degree=0, rates=RATES, step=1, background=case.background)
-    projected = ops.project(
-        *case.groups(torch.float64),
-        *case.camera(torch.float64),
-        case.width,
-        case.height,
-        degree=0,
-        backend="reference",
-    )
-    bins = ops.bin(projected, case.width, case.height, backend="reference")
-    colors = projected.colors.detach().requires_grad_()
-    color, _, _ = ops.composite(
-        projected._replace(colors=colors),
-        bins,
-        case.width,
-        case.height,
-        background=case.background.double(),
-        backend="reference",
-    )
-    error = (color.detach() - photo / 255).abs().sum(2)
-    (weighted,) = torch.autograd.grad((color[..., 0] * error).sum(), colors)
-    torch.testing.assert_close(step.error_sum.double(), weighted[:, 0], rtol=2e-4, atol=2e-4)
+@pytest.mark.parametrize("kept", ["plain", None])
+def test_a_score_that_is_not_asked_for_is_not_kept_and_changes_nothing(kept: Scores | None) -> None:
+    case = scene("kept", 60)
+    photo = photo_of(case)
+    all_of_them, fewer = make_step(case), make_step(case)
+    fewer.keep_scores = kept
+    for number in (1, 2):
+        for step in (all_of_them, fewer):
+            step.train(*case.camera(), photo, degree=3, rates=RATES, step=number)
+    assert torch.equal(all_of_them.blocks, fewer.blocks)
+    assert all_of_them.abs_sum.max() > 0
+    assert torch.count_nonzero(fewer.abs_sum) == 0
+    for score in ("plain_sum", "visible_count", "max_extent"):
+        want = getattr(all_of_them, score)
+        assert torch.equal(getattr(fewer, score), want if kept == "plain" else torch.zeros_like(want)), score
 
 
 def test_state_goes_in_and_comes_out_unchanged() -> None:

@@ -158,7 +158,6 @@ def test_threads_do_not_show(build: str) -> None:
                     step.exp_avg_sq,
                     step.plain_sum,
                     step.abs_sum,
-                    step.error_sum,
                     torch.tensor(result.loss),
                 ]
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from torch import Tensor
 
@@ -13,6 +13,9 @@ ALPHA_MAX = 0.999  # keeps 1 - alpha away from 0, so that what lies behind still
 TRANSMITTANCE_MIN = 1e-4  # a splat that would bring the transmittance to this or below ends the pixel
 BLUR = 0.3  # added to both variances of a projected splat, pixels^2
 COMPENSATION_MIN = 2.5e-5  # floor of det / det' under antialiasing
+
+Scores = Literal["plain", "absolute"]
+"""Which densification scores a step adds up: "absolute" all of them, "plain" all but the sum of absolute gradients."""
 
 
 class Projected(NamedTuple):

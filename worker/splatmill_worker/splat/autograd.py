@@ -9,6 +9,7 @@ from torch import Tensor
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu.step import Rates
+from splatmill_worker.kernels.records import Scores
 from splatmill_worker.splat.engine import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.poses import motion
@@ -27,7 +28,7 @@ class AutogradStep:
 
     def __init__(self, gaussians: Gaussians, *, backend: ops.Backend) -> None:
         self._backend = backend
-        self.keep_scores = True  # autograd has them anyway
+        self.keep_scores: Scores | None = "absolute"  # autograd has them anyway
         self.keep_pose_gradient = False
         self.pose_gradient: Tensor | None = None
         self.replace(gaussians.padded(3).parameters(), None, None)

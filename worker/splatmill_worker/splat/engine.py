@@ -9,6 +9,7 @@ from torch import Tensor
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu.step import Rates
+from splatmill_worker.kernels.records import Scores
 from splatmill_worker.splat.gaussians import Gaussians
 
 
@@ -26,13 +27,13 @@ class Engine(Protocol):
     Scores are sums since the last `replace`, one value per Gaussian: `plain_sum` and `abs_sum` of the norm of
     the gradient of the projected mean in NDC units (the absolute one adds magnitudes over pixels; None where a
     backend has none), `visible_count` of steps that saw it, `max_extent` its largest half size over
-    half the photo's longer side. `keep_scores` False says that nobody will read them.
+    half the photo's longer side. `keep_scores` says which will be read: `Scores`, or None of them.
 
     With `keep_pose_gradient`, every step leaves in `pose_gradient` [6] the loss's gradient to a twist (rho, phi) of the
     camera exp(twist^) viewmat, as `kernels.cpu.step` defines it.
     """
 
-    keep_scores: bool
+    keep_scores: Scores | None
     keep_pose_gradient: bool
     pose_gradient: Tensor | None
 

@@ -15,7 +15,11 @@ WIDTH = {"means": 3, "log_scales": 3, "quats": 4, "logit_opacities": 1, "sh": 48
 
 def empty(count: int) -> Tensor:
     """Zeroed blocks for `count` Gaussians."""
-    return torch.zeros(-(-count // LANES), ROWS, LANES)
+    blocks = torch.zeros(-(-count // LANES), ROWS, LANES)
+    engine.wish_huge_pages(
+        blocks
+    )  # before the first touch: zeros of this size come untouched from the system
+    return blocks
 
 
 def pack(groups: dict[str, Tensor], count: int, threads: int) -> Tensor:

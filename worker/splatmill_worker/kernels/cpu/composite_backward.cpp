@@ -11,35 +11,17 @@
 namespace splatmill {
 namespace {
 
-template <bool kDepth, bool kScores>
+template <bool kDepth>
 struct Block {
   alignas(64) float T[kLanes], final_T[kLanes];
   alignas(64) float behind[kLanes];  // gradient . (final image - blended so far): what a splat here would hide
   alignas(64) float d_red[kLanes], d_green[kLanes], d_blue[kLanes];
   alignas(64) float d_depth[kDepth ? kLanes : 1];
-  alignas(64) float error[kScores ? kLanes : 1];
 };
 
-// Sum over the channels of |colour - photo|; 0 outside the image and where a pixel does not count.
-Float load_block_error(const ImageGradient& g, int tile_x, int tile_y, int b) {
-  const int x = tile_x * kTile + b % 4 * kBlockSide, y = tile_y * kTile + b / 4 * kBlockSide;
-  const int64_t stride = g.image.stride, plane = stride * g.image.height;
-  const int rows = std::min(kBlockSide, g.image.height - y);
-  const auto bytes = [&](const uint8_t* p) {
-    alignas(64) float lanes[kLanes] = {};
-    for (int i = 0; i < rows; ++i)
-      for (int j = 0; j < kBlockSide; ++j) lanes[4 * i + j] = p[(y + i) * stride + x + j];
-    return load(lanes);
-  };
-  Float error = splat(0.0f);
-  for (int c = 0; c < 3; ++c)
-    error += abs(load_block(block_origin(g.image, c, tile_x, tile_y, b), stride) - bytes(g.photo + c * plane) * (1.0f / 255.0f));
-  return keep(bytes(g.used) > 0.0f, error);
-}
-
-template <bool kDepth, bool kScores>
+template <bool kDepth>
 SPLATMILL_INLINE void load_block_gradient(const Frame& frame, const ImageGradient& g, int tile, int tile_x, int tile_y, int b,
-                                          Block<kDepth, kScores>& block) {
+                                          Block<kDepth>& block) {
   const Float final_T = load(frame.final_T.get() + (static_cast<int64_t>(tile) * kTileBlocks + b) * kLanes);
   Float behind = splat(0.0f);
   float* d_color[3] = {block.d_red, block.d_green, block.d_blue};
@@ -56,19 +38,18 @@ SPLATMILL_INLINE void load_block_gradient(const Frame& frame, const ImageGradien
     const Float d_alpha = load_block(block_origin(g.gradient, kAlphaPlane, tile_x, tile_y, b), g.gradient.stride);
     behind = fnma(d_alpha, final_T, behind);
   }
-  if constexpr (kScores) store(block.error, g.photo ? load_block_error(g, tile_x, tile_y, b) : splat(0.0f));
   store(block.behind, behind);
   store(block.T, splat(1.0f));
   store(block.final_T, final_T);
 }
 
-template <bool kDepth, bool kScores>
+template <bool kDepth, bool kAbsolute>
 void differentiate_tile(Frame& frame, const ImageGradient& g, int tile) {
-  constexpr int kCount = kScores ? kSums : kDepth ? kSumDepth + 1 : kSumBlue + 1;
+  constexpr int kCount = kAbsolute ? kSums : kDepth ? kSumDepth + 1 : kSumBlue + 1;
   const int columns = frame.camera.columns(), tile_x = tile % columns, tile_y = tile / columns;
   const float x0 = tile_x * kTile + 0.5f, y0 = tile_y * kTile + 0.5f;
   const TileLanes lanes = tile_lanes();
-  Block<kDepth, kScores> blocks[kTileBlocks];
+  Block<kDepth> blocks[kTileBlocks];
   for (int b = 0; b < kTileBlocks; ++b) load_block_gradient(frame, g, tile, tile_x, tile_y, b, blocks[b]);
 
   int64_t k = frame.offsets[tile];
@@ -93,7 +74,7 @@ void differentiate_tile(Frame& frame, const ImageGradient& g, int tile) {
       constexpr bool kMayClamp = decltype(may_clamp)::value;
       for (uint32_t left = entry.blocks; left; left &= left - 1) {
         const int b = __builtin_ctz(left);
-        Block<kDepth, kScores>& block = blocks[b];
+        Block<kDepth>& block = blocks[b];
         const Float u = form.u_at(b), v = form.v_at(b);
         const Float e = log2_alpha(level, u, v);
         const Float raw = exp2_of_alpha(e), alpha = min(raw, kAlphaMax);
@@ -120,10 +101,9 @@ void differentiate_tile(Frame& frame, const ImageGradient& g, int tile) {
         s[kSumGreen] = fma(w, d_green, s[kSumGreen]);
         s[kSumBlue] = fma(w, d_blue, s[kSumBlue]);
         if constexpr (kDepth) s[kSumDepth] = fma(w, load(block.d_depth), s[kSumDepth]);
-        if constexpr (kScores) {
+        if constexpr (kAbsolute) {
           s[kSumAbsX] += abs(qu);
           s[kSumAbsY] += abs(fma(splat(r.uy), qu, splat(r.vy) * qv));
-          s[kSumError] = fma(w, load(block.error), s[kSumError]);
         }
       }
     };
@@ -147,11 +127,11 @@ void composite_backward(Frame& frame, const ImageGradient& g, int threads) {
     const FlushDenormals flush;
 #pragma omp for schedule(dynamic, 2)
     for (int tile = 0; tile < tiles; ++tile) {
-      if (g.with_alpha_and_depth && g.scores)
+      if (g.with_alpha_and_depth && g.absolute)
         differentiate_tile<true, true>(frame, g, tile);
       else if (g.with_alpha_and_depth)
         differentiate_tile<true, false>(frame, g, tile);
-      else if (g.scores)
+      else if (g.absolute)
         differentiate_tile<false, true>(frame, g, tile);
       else
         differentiate_tile<false, false>(frame, g, tile);

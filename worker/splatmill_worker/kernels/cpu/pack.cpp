@@ -1,5 +1,6 @@
 // Between the plain form of a scene, one row per Gaussian, and its blocks of sixteen.
 #include "arguments.hpp"
+#include "buffer.hpp"
 #include "shuffles.hpp"
 #include "threads.hpp"
 
@@ -72,6 +73,9 @@ void bind_pack(nb::module_& m) {
         move_groups<false>(groups_of(groups, first), blocks.data(), count, threads);
       },
       "groups"_a, "first"_a, "blocks"_a.noconvert(), "count"_a, "threads"_a, "The reverse of `pack`.");
+  m.def(
+      "wish_huge_pages", [](Blocks blocks) { wish_huge_pages(blocks.data(), blocks.size() * sizeof(float)); },
+      "blocks"_a.noconvert(), "Asks for huge pages behind blocks that were just allocated.");
 }
 
 }  // namespace splatmill

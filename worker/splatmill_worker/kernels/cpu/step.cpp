@@ -15,7 +15,7 @@ namespace splatmill {
 namespace {
 
 // Rows of the densification scores [kScoreRows][Gaussians]; lengths in NDC units.
-enum Score { kPlain, kAbsolute, kSeen, kExtent, kError, kScoreRows };
+enum Score { kPlain, kAbsolute, kSeen, kExtent, kScoreRows };
 
 struct Scene {
   const float* params;
@@ -28,7 +28,7 @@ struct Update {
   float rates[kRows] = {};  // with the bias correction of the first moment
   float root = 0;           // bias correction of the second
   float* gradients = nullptr;
-  float* scores = nullptr;  // [kScoreRows][stride]
+  float* scores = nullptr;  // [kScoreRows][stride], null: none are kept
   int64_t score_stride = 0;
 };
 
@@ -65,28 +65,29 @@ SPLATMILL_INLINE ProjectedGradient gradient_from_sums(const Float* s, const Proj
 }
 
 SPLATMILL_INLINE void add_scores(const Update& update, const Camera& cam, int64_t b, const Float* s, const Projection& o,
-                                 const ProjectedGradient& d, Mask visible) {
+                                 const ProjectedGradient& d, Mask visible, bool absolute) {
   const float half_w = 0.5f * cam.width, half_h = 0.5f * cam.height;
   const auto length = [&](Float x, Float y) {
     x = x * half_w, y = y * half_h;
     return sqrt(fma(x, x, y * y));
   };
-  const Factor f = conic_factor(o.b, o.c, o.det);
-  constexpr float k1 = 2.0f * kLn2;
   float* score = update.scores + b * kLanes;
   const auto at = [&](Score k) { return score + k * update.score_stride; };
   store(at(kPlain), visible, load(at(kPlain)) + length(d.x2d, d.y2d));
-  store(at(kAbsolute), visible, load(at(kAbsolute)) + length(f.ux * s[kSumAbsX] * k1, s[kSumAbsY] * k1));
+  if (absolute) {
+    constexpr float k1 = 2.0f * kLn2;
+    const Float ux = conic_factor(o.b, o.c, o.det).ux;
+    store(at(kAbsolute), visible, load(at(kAbsolute)) + length(ux * s[kSumAbsX] * k1, s[kSumAbsY] * k1));
+  }
   store(at(kSeen), visible, load(at(kSeen)) + 1.0f);
   const float per_image = 2.0f / static_cast<float>(std::max(cam.width, cam.height));
   store(at(kExtent), visible, max(max(o.extent_x, o.extent_y) * per_image, load(at(kExtent))));
-  store(at(kError), visible, load(at(kError)) + s[kSumError]);
 }
 
 // Sums that a pass did not take hold garbage in memory.
 SPLATMILL_INLINE void clear_unused(Float* sums, const ImageGradient& g) {
-  if (!g.scores)
-    for (int k : {kSumAbsX, kSumAbsY, kSumError}) sums[k] = splat(0.0f);
+  if (!g.absolute)
+    for (int k : {kSumAbsX, kSumAbsY}) sums[k] = splat(0.0f);
   if (!g.with_alpha_and_depth) sums[kSumDepth] = splat(0.0f);
 }
 
@@ -106,7 +107,7 @@ int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& sc
     Projection o;
     project_geometry(p, frame.camera, o);
     const ProjectedGradient d = gradient_from_sums(sums, o);
-    if (g.scores) add_scores(update, frame.camera, b, sums, o, d, visible);
+    if (update.scores) add_scores(update, frame.camera, b, sums, o, d, visible, g.absolute);
     CameraGradient camera;
     project_backward<kPose>(p, frame.camera, scene.degree, o, d, gradient, &camera);
     if constexpr (kPose) add_camera_gradient(camera, visible, pose);
@@ -156,8 +157,6 @@ int64_t update_scene(Frame& frame, const ImageGradient& g, const Scene& scene, c
   return refused;
 }
 
-using Bytes3 = Tensor<const uint8_t, nb::shape<3, -1, -1>>;
-using Bytes2 = Tensor<const uint8_t, nb::shape<-1, -1>>;
 using ScoreRows = Tensor<float, nb::shape<kScoreRows, -1>>;
 using Twist = Tensor<float, nb::shape<6>>;
 
@@ -200,17 +199,15 @@ void bind_step(nb::module_& m) {
   m.def(
       "update",
       [](Frame& frame, Blocks params, Blocks exp_avg, Blocks exp_avg_sq, int degree, Image image, Image gradient,
-         std::optional<Bytes3> photo, std::optional<Bytes2> used, const std::vector<float>& rates, int64_t step,
-         std::optional<ScoreRows> scores, int threads, std::optional<Twist> pose) {
+         const std::vector<float>& rates, int64_t step, std::optional<ScoreRows> scores, bool absolute, int threads, std::optional<Twist> pose) {
         Update update;
         update.params = params.data(), update.exp_avg = exp_avg.data(), update.exp_avg_sq = exp_avg_sq.data();
         const AdamStep scale(step);
         for (int r = 0; r < kRows; ++r) update.rates[r] = rates.at(r) * scale.size;
         update.root = scale.root;
         ImageGradient g{planes_of(image, frame.camera), planes_of(gradient, frame.camera), gradient.shape(0) == 5};
-        g.scores = scores.has_value();
+        g.absolute = scores && absolute;
         if (scores) update.scores = scores->data(), update.score_stride = static_cast<int64_t>(scores->shape(1));
-        if (photo && used) g.photo = photo->data(), g.used = used->data();
         nb::gil_scoped_release release;
         Stopwatch watch;
         composite_backward(frame, g, threads);
@@ -228,8 +225,8 @@ void bind_step(nb::module_& m) {
         return refused;
       },
       "frame"_a, "params"_a.noconvert(), "exp_avg"_a.noconvert(), "exp_avg_sq"_a.noconvert(), "degree"_a,
-      "image"_a.noconvert(), "gradient"_a.noconvert(), "photo"_a.noconvert().none(), "used"_a.noconvert().none(), "rates"_a,
-      "step"_a, "scores"_a.noconvert().none(), "threads"_a, "pose"_a.noconvert().none() = nb::none(),
+      "image"_a.noconvert(), "gradient"_a.noconvert(), "rates"_a, "step"_a,
+      "scores"_a.noconvert().none(), "absolute"_a, "threads"_a, "pose"_a.noconvert().none() = nb::none(),
       "Backward pass of the last render and one Adam step; returns how many gradient values were refused as not finite. Fills "
       "`pose` [6], where given, with the gradient to a motion of the camera (pose.hpp).");
   m.def(

@@ -15,6 +15,8 @@ import triton.language as tl
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
+from splatmill_worker.kernels.records import Scores
+
 from . import adam, device
 from .bin import Lists, Room, lists
 from .composite import Blended, blend
@@ -143,7 +145,9 @@ class Step:
         where: torch.device | str | None = None,
         together: Together | None = None,
     ) -> None:
-        self.keep_scores = True  # a pass of its own here, which costs next to nothing beside the others
+        self.keep_scores: Scores | None = (
+            "absolute"  # a pass of its own here, which costs next to nothing beside the others
+        )
         if where is None:
             where = "cpu" if device.interpreting() else "cuda"
         self.device = torch.device(where)

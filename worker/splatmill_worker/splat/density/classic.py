@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
+from splatmill_worker.kernels.records import Scores
 from splatmill_worker.splat.density import prune
 from splatmill_worker.splat.density.interface import Change, Moment
 from splatmill_worker.splat.density.rows import Rows, offsets
@@ -31,9 +31,14 @@ class Classic:
     units. Of those above it, no more are taken than `Moment.allowed` leaves room for, the largest scores first.
     """
 
-    score: Literal["plain", "absolute"]
+    score: Scores
     threshold: float
     opacity_decay: float = 1.0
+
+    @property
+    def scores(self) -> Scores:
+        """The score decides, and visibility and extent come with either."""
+        return self.score
 
     def densify(self, engine: Engine, moment: Moment, random: torch.Generator) -> Change:
         before = engine.count

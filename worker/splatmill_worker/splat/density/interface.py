@@ -7,6 +7,7 @@ from typing import Protocol
 
 import torch
 
+from splatmill_worker.kernels.records import Scores
 from splatmill_worker.splat.engine import Engine
 
 
@@ -30,6 +31,10 @@ class Change:
 
 class Densifier(Protocol):
     """One strategy."""
+
+    @property
+    def scores(self) -> Scores | None:
+        """Which of the engine's scores it reads."""
 
     def densify(self, engine: Engine, moment: Moment, random: torch.Generator) -> Change:
         """Add, move and remove Gaussians; called between steps, at the times that the schedule sets."""

@@ -32,6 +32,11 @@ class Mcmc:
     min_opacity: float = prune.MIN_OPACITY
     steps_since_noise: int = 0
 
+    @property
+    def scores(self) -> None:
+        """None: opacities decide."""
+        return None
+
     def densify(self, engine: Engine, moment: Moment, random: torch.Generator) -> Change:
         rows = Rows.of(engine)
         alive = prune.keep(rows.gaussians, None, min_opacity=self.min_opacity)
