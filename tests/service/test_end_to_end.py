@@ -94,6 +94,20 @@ def test_posed_photos_become_a_model_whose_views_match_them(
     assert video.headers["content-type"] == "video/mp4"
     assert video.content[4:8] == b"ftyp"
 
+    # From that model, filmed.
+    further = {"steps": 40, "start": job_id, "progress_video": True}
+    answer = up.http.post("/v1/jobs", json={"capture": capture, "options": further})
+    later_id = answer.json()["id"]
+    later = up.ended(later_id, 200)
+    assert later["state"] == "succeeded", later["problem"]
+    assert later["plan"]["initial"] == "model"
+    curve = up.http.get(f"/v1/jobs/{later_id}/report").json()["curve"]
+    assert curve[0]["psnr"] > report["curve"][-1]["psnr"] - 1.5
+    assert curve[0]["memory"] > 10**8
+    film = up.http.get(f"/v1/models/{later_id}/files/progress.mp4")
+    assert film.headers["content-type"] == "video/mp4"
+    assert film.content[4:8] == b"ftyp"
+
 
 def test_cancel_during_reconstruction_takes_under_two_seconds(
     true_service: Up, photos: tuple[Path, dict[str, Camera]]
