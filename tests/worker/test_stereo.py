@@ -24,7 +24,7 @@ WIDTH, HEIGHT = 320, 240
 def bare(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     """Photos with their true cameras and no points."""
     folder = tmp_path_factory.mktemp("stereo")
-    truth = synthetic.capture(folder, 12, WIDTH, HEIGHT, samples=1)
+    truth = synthetic.capture(folder, 18, WIDTH, HEIGHT, samples=1)
     views = tuple(View(name, camera, folder / name) for name, camera in sorted(truth.items()))
     return Scene(views, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "transforms")
 
