@@ -49,7 +49,8 @@ def test_shaken_cameras_come_back_and_held_out_views_gain() -> None:
     views = shaken(truth, TURN, SHIFT)
     left, refined = run(views, held_out, False), run(views, held_out, True)
     assert turned(list(left.views), truth) == pytest.approx(TURN, rel=1e-6)
-    assert turned(list(refined.views), truth) < 0.8 * TURN  # a third of a pixel, 0.25 degrees, is not resolved here
+    # A third of a pixel, a quarter of a degree, is not resolved here.
+    assert turned(list(refined.views), truth) < 0.8 * TURN
     assert left.held_out is not None
     assert refined.held_out is not None
     assert refined.held_out.psnr > left.held_out.psnr + 0.2
