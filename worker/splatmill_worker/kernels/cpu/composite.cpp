@@ -104,6 +104,22 @@ void gradients_of_rows(const Frame& frame, const ProjectedRows& out, int threads
   }
 }
 
+struct BlockCounts {
+  int64_t reached = 0, changed = 0;
+};
+
+// 4x4-pixel blocks that the pairs of the last render reached before their tiles were done, and those that they changed: the work of
+// the two passes. To be asked between them, because the backward pass clears what it skips.
+BlockCounts count_blocks(const Frame& frame) {
+  BlockCounts found;
+  for (int tile = 0; tile < frame.tiles(); ++tile)
+    for (int64_t k = frame.offsets[tile]; k < frame.offsets[tile] + frame.walked[tile]; ++k) {
+      found.reached += __builtin_popcount(frame.touches[frame.entries[k].slot].blocks);
+      found.changed += __builtin_popcount(frame.entries[k].blocks);
+    }
+  return found;
+}
+
 }  // namespace
 
 void bind_composite(nb::module_& m) {
@@ -139,6 +155,13 @@ void bind_composite(nb::module_& m) {
       "frame"_a, "image"_a.noconvert(), "gradient"_a.noconvert(), "d_means2d"_a.noconvert(), "d_conics"_a.noconvert(),
       "d_opacities"_a.noconvert(), "d_colors"_a.noconvert(), "d_depths"_a.noconvert(), "threads"_a,
       "Adds nothing: writes the gradients of the Gaussians that were blended, and leaves the other rows alone (give zeros).");
+  m.def(
+      "count_blocks",
+      [](const Frame& frame) {
+        const BlockCounts found = count_blocks(frame);
+        return std::make_tuple(found.reached, found.changed);
+      },
+      "frame"_a, "Blocks of 4x4 pixels that the last `render` of the frame worked on, and those that it changed (for benchmarks).");
 }
 
 }  // namespace splatmill
