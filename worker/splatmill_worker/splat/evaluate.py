@@ -10,11 +10,8 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
+from splatmill_worker.kernels.reference.loss import C1, C2, SIGMA, WINDOW
 from splatmill_worker.splat.views import Target, TrainingView
-
-WINDOW = 11
-SIGMA = 1.5
-C1, C2 = 0.01**2, 0.03**2
 
 Draw = Callable[[Target, Tensor], Tensor]
 """Colour [H, W, 3] of a camera over a background [3]."""
