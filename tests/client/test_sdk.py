@@ -15,7 +15,7 @@ import pytest
 from pydantic import SecretStr
 
 from splatmill import AsyncClient, Client, JobCancelled, JobFailed
-from splatmill.errors import Conflict, InvalidRequest, NothingToUpload, NotFound, Unauthorized
+from splatmill.errors import Conflict, InvalidRequest, NotFound, NothingToUpload, Unauthorized
 from splatmill.schema import (
     JobState,
     LogEvent,

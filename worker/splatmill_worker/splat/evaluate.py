@@ -67,7 +67,9 @@ def compare(name: str, color: Tensor, photo: Tensor, mask: Tensor | None = None)
     if counted is not None:
         squares = squares[counted]
     # The kernel's value of `ssim_map`, many times as fast: curves are measured every few seconds.
-    similarity = 1.0 - float(ops.loss(image, photo.to(image.device).contiguous(), mask=counted, dssim_weight=1.0))
+    similarity = 1.0 - float(
+        ops.loss(image, photo.to(image.device).contiguous(), mask=counted, dssim_weight=1.0)
+    )
     mse = float(squares.double().mean())
     return ViewScore(name, mse, psnr(mse), similarity)
 
