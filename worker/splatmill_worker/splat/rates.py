@@ -18,8 +18,12 @@ class Annealing:
     The position rate falls exponentially from `POSITION_START * extent` by `position_fall`; the others keep the
     paper's values until `hold` of the budget is spent, then fall by a half cosine to `rest_fall` of them: with
     Adam, what is left of the step size at the end is noise in the parameters.
+
+    boost: all of them are this many times the paper's (opacities its root, since they saturate). With Adam a
+    parameter travels at most rate times steps, so a run shorter than the paper's needs longer steps to arrive.
     """
 
+    boost: float = 1.0
     position_fall: float = 0.01
     hold: float = 0.6
     rest_fall: float = 0.1
@@ -39,14 +43,15 @@ class RateSchedule:
     def at(self, progress: float) -> Rates:
         """Rates at `progress` in 0..1."""
         fall = self.annealing
+        long = self.scale * fall.boost
         position = POSITION_START * self.extent * math.exp(math.log(fall.position_fall) * progress)
         late = min(1.0, max(0.0, (progress - fall.hold) / (1.0 - fall.hold)))
-        rest = self.scale * (fall.rest_fall + (1.0 - fall.rest_fall) * 0.5 * (1.0 + math.cos(math.pi * late)))
+        rest = long * (fall.rest_fall + (1.0 - fall.rest_fall) * 0.5 * (1.0 + math.cos(math.pi * late)))
         return Rates(
-            means=self.scale * position,
+            means=long * position,
             log_scales=rest * 5e-3,
             quats=rest * 1e-3,
-            logit_opacities=rest * 5e-2,
+            logit_opacities=rest / math.sqrt(fall.boost) * 5e-2,
             sh_dc=rest * 2.5e-3,
             sh_rest=rest * 2.5e-3 / 20.0,
         )
