@@ -34,6 +34,7 @@ import numpy as np
 import numpy.typing as npt
 import psutil
 from _plot import axes, save
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline, sfm, synthetic
@@ -361,7 +362,9 @@ def scenes_figure(rows: list[dict[str, Any]], path: Path) -> None:
     for row in rows:
         if row["outcome"] != "placed":
             continue
-        style = {"color": colors[row["scene"]], "marker": markers[row["setting"]], "s": 48}
+        color = colors[row["scene"]]
+        face = "none" if row["busy"] else color
+        style = {"edgecolors": color, "facecolors": face, "marker": markers[row["setting"]], "s": 48}
         label = f"{row['scene']}, {row['setting']}"
         if "psnr" in row:
             left.scatter(row["seconds"], row["psnr"], label=label, **style)
@@ -369,11 +372,16 @@ def scenes_figure(rows: list[dict[str, Any]], path: Path) -> None:
             right.scatter(row["seconds"], row["rotation_deg"], label=label, **style)
     left.set(xscale="log", xlabel="seconds for the cameras", ylabel="held-out PSNR, dB")
     right.set(xscale="log", xlabel="seconds for the cameras", ylabel="median rotation error, degrees")
+    for axis in (left, right):
+        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axis.xaxis.set_minor_formatter(NullFormatter())
     (left if left.has_data() else right).legend(fontsize=7)
     failed = [
         f"{row['scene']}, {row['setting']}: {row['outcome']}" for row in rows if row["outcome"] != "placed"
     ]
-    note = f" · no point for: {'; '.join(failed)}" if failed else ""
+    hollow = " · hollow: on a busy machine" if any(row["busy"] for row in rows) else ""
+    note = f"{hollow} · no point for: {'; '.join(failed)}" if failed else hollow
     save(figure, path, _rows.footer(rows) + note)
 
 
