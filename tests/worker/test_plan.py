@@ -1,6 +1,6 @@
 """Proves that the plan follows from facts and options alone, that it says why, and what schedules and budgets mean.
 
-Does not prove that the thresholds are the best ones: `bench train --ablate` measures what each choice is worth.
+Does not prove that the thresholds are the best ones: `bench train --configs all` measures what each choice is worth.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from splatmill_worker.splat.budget import Budget
 from splatmill_worker.splat.decide import decide
 from splatmill_worker.splat.facts import Facts, Speed
 from splatmill_worker.splat.plan import Plan
-from splatmill_worker.splat.rates import RateSchedule
+from splatmill_worker.splat.rates import Annealing, RateSchedule
 from splatmill_worker.splat.schedule import Schedule
 
 FACTS = Facts(
@@ -167,6 +167,32 @@ def test_the_schedule_goes_from_coarse_to_fine() -> None:
     assert schedule.degree_at(1000, 0.01) == 3
     events = [step for step in range(1, 1001) if schedule.densifies(step, step / 1000)]
     assert events == [300, 400, 500, 600]
+
+
+def test_short_runs_take_longer_steps_and_fewer_gaussians() -> None:
+    boosts = [planned(steps=steps).schedule.annealing.boost for steps in (300, 600, 3000, 30_000, 100_000)]
+    assert boosts == pytest.approx([8.0, math.sqrt(50), math.sqrt(10), 1.0, 1.0])
+    short, long = planned(steps=600), planned(steps=2400)
+    assert long.max_gaussians == pytest.approx(2 * short.max_gaussians, rel=1e-3)
+    plain, boosted = RateSchedule(2.0).at(0.2), RateSchedule(2.0, Annealing(boost=4.0)).at(0.2)
+    assert boosted.means == pytest.approx(4 * plain.means)
+    assert boosted.logit_opacities == pytest.approx(2 * plain.logit_opacities)
+    assert boosted.sh_rest == pytest.approx(4 * plain.sh_rest)
+
+
+def test_a_time_budget_is_laid_out_for_the_gaussians_it_pays_for() -> None:
+    plans = [planned(time_budget=seconds) for seconds in (10, 20, 40)]
+    counts = [plan.max_gaussians for plan in plans]
+    assert counts == sorted(counts)
+    assert counts[0] < counts[-1]
+
+
+def test_gaps_are_left_when_few_photos_could_correct_a_guess() -> None:
+    bare = replace(FACTS, gap_share=0.4, gap_points=500, sightings=80.0)
+    assert planned(bare).gaps
+    few = planned(replace(bare, views=11))
+    assert not few.gaps
+    assert "11 photos are too few" in few.left_out["gaps"]
 
 
 def test_rates_fall_to_their_ends() -> None:

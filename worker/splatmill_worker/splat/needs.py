@@ -17,6 +17,9 @@ OUTDOORS = 6.0
 
 MANY_GAPS = 0.1
 
+FEW_VIEWS = 12
+"""With fewer photos, hardly any other photo corrects a depth that was guessed: kermit (11) ends 1.3 dB lower."""
+
 POSES_OFF = 1.0
 """Pixels at the training size: below, cameras err by less than the photos resolve."""
 
@@ -81,6 +84,8 @@ def _gaps(facts: Facts) -> tuple[bool, str]:
         seen += f" ({facts.sightings:.0f} points a photo)"
     if facts.gap_share < MANY_GAPS:
         return False, f"Only {seen}."
+    if facts.views < FEW_VIEWS:
+        return False, f"{seen}, but {facts.views} photos are too few to correct depths that are guessed."
     return True, f"{seen}: {facts.gap_points} Gaussians are put there, as deep as the nearest points."
 
 
