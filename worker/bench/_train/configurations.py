@@ -51,6 +51,9 @@ CONFIGURATIONS = {
     "absolute": Configuration(
         "densification by absolute gradients", {"densify": "absolute"}, {"densify": "absolute"}
     ),
+    "no-opacity-decay": Configuration(
+        "opacities stay as they are when Gaussians are added", plan={"schedule.opacity_decay": 1.0}
+    ),
     "mcmc": Configuration("MCMC relocation and noise", {"densify": "mcmc"}, {"densify": "mcmc"}),
     "sh-at-once": Configuration(
         "the last SH degree from the start", plan={"schedule.degree_every": 1, "schedule.degree_by": None}
@@ -63,6 +66,9 @@ CONFIGURATIONS = {
     "no-annealing": Configuration(
         "rates stay as they start",
         plan={"schedule.annealing.position_fall": 1.0, "schedule.annealing.rest_fall": 1.0},
+    ),
+    "paper-rates": Configuration(
+        "steps as long as in the paper's 30,000", plan={"schedule.annealing.boost": 1.0}
     ),
     "position-annealing-only": Configuration(
         "only the position rate falls, as in the paper", plan={"schedule.annealing.rest_fall": 1.0}

@@ -28,6 +28,8 @@ SETTLED = 1550.0
 """Gaussians per root of a step. More cost their time without showing more: on fox and lego, 600 steps gain 0.5 and
 1.2 dB from 48,000 in place of 24,000, and 1500 steps nothing from 100,000 in place of 60,000."""
 
+OPACITY_DECAY = 0.9
+
 PIXELS_PER_GAUSSIAN = 20
 """Over all training photos: with fewer, Gaussians describe noise."""
 
@@ -75,6 +77,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         densify_from=max(50, min(300, steps // 8)),
         densify_every=max(40, min(100, steps // 20)),
         densify_until=0.7,
+        opacity_decay=OPACITY_DECAY if densify in ("classic", "absolute") else 1.0,
         annealing=Annealing(boost=_boost(steps, why)),
     )
     if facts.start is not None:

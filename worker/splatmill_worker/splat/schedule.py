@@ -17,7 +17,8 @@ class Schedule:
     steps gain as much from a small photo as from a large one. degree_every: steps between SH degrees.
     degree_by: share of the budget in which a short one reaches its last degree; None: by steps alone.
     first_degree: that of the first step.
-    densify_from / densify_every in steps, densify_until as a share: after it, positions and colours settle.
+    opacity_decay: factor on all opacities at each densification: what the photos need grows back, what they do not
+    is pruned. densify_from / densify_every in steps, densify_until as a share: after it, positions and colours settle.
     """
 
     budget: Budget
@@ -27,6 +28,7 @@ class Schedule:
     densify_from: int
     densify_every: int
     densify_until: float
+    opacity_decay: float = 1.0
     degree_by: float | None = 1.0 / 3.0
     first_degree: int = 0
     annealing: Annealing = field(default_factory=Annealing)

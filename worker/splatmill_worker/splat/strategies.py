@@ -15,8 +15,9 @@ def densifier_of(plan: Plan) -> Densifier | None:
     """None when the plan leaves densification out."""
     if plan.densify is None:
         return None
+    decay = plan.schedule.opacity_decay
     if plan.densify == "classic":
-        return Classic("plain", PLAIN_THRESHOLD)
+        return Classic("plain", PLAIN_THRESHOLD, decay)
     if plan.densify == "absolute":
-        return Classic("absolute", ABSOLUTE_THRESHOLD)
+        return Classic("absolute", ABSOLUTE_THRESHOLD, decay)
     return Mcmc()
