@@ -37,15 +37,15 @@ def test_a_film_is_there_when_it_is_whole(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("pictures", [0, 3])
 def test_what_breaks_a_film_is_what_is_told(tmp_path: Path, pictures: int) -> None:
+    def break_off() -> None:
+        with whole(tmp_path / "a.mp4") as part, Film(part, 32, 16, 24) as film:
+            for _ in range(pictures):
+                film.add(GREY)
+            raise ZeroDivisionError
+
     (tmp_path / "a.mp4").write_text("an earlier one")
-    with (
-        pytest.raises(ZeroDivisionError),
-        whole(tmp_path / "a.mp4") as part,
-        Film(part, 32, 16, 24) as film,
-    ):
-        for _ in range(pictures):
-            film.add(GREY)
-        raise ZeroDivisionError
+    with pytest.raises(ZeroDivisionError):
+        break_off()
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
     assert (tmp_path / "a.mp4").read_text() == "an earlier one"
 
