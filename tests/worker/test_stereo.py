@@ -9,9 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import stillife
 from PIL import Image
 
+from splatmill.schema import TrainOptions
 from splatmill_worker import synthetic
+from splatmill_worker.capture import cameras_of
 from splatmill_worker.images import load_views
 from splatmill_worker.scene import Lens, Scene, View
 from splatmill_worker.sfm import Cancelled, posed, stereo
@@ -138,6 +141,18 @@ def test_other_points_and_masks_are_searched_anew(bare: Scene, tmp_path: Path) -
         posed.completed(scene, tmp_path / "work", lambda stage, *_: stages.append(stage))
         assert len(list((tmp_path / "work" / "sfm").iterdir())) == min(done + 1, 3)
     assert stages == ["stereo"] * 9  # three photos, three times; the fourth time all is there
+
+
+def test_a_photo_that_does_not_decode_is_no_fault_of_the_poses(tmp_path: Path) -> None:
+    capture = stillife.posed_capture(tmp_path / "capture")
+    photo = capture / "images" / "03.png"
+    photo.write_bytes(photo.read_bytes()[:2000])  # its size can still be read
+    stages: list[str] = []
+    with pytest.raises(OSError, match=r"truncated|broken"):
+        cameras_of(
+            capture, tmp_path / "work", TrainOptions(), lambda stage, *_: stages.append(stage), lambda: False
+        )
+    assert stages == []
 
 
 def test_scenes_with_enough_points_or_transparent_surroundings_are_left_as_they_are(
