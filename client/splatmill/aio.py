@@ -67,10 +67,10 @@ class AsyncClient:
         """Upload what lies at `path` (photos, a zip, a video or a posed data set) and start a job on it.
 
         `options` are those of `TrainOptions`; they and the path are checked before anything is sent. `start` may
-        also be the path of a .ply file here, which is uploaded beside the poses. The job goes on whatever becomes
-        of this connection. `handle.refused` names photos the server would not take.
+        also be the path of a .ply file here, or its name in the folder at `path`; it is uploaded beside the poses.
+        The job goes on whatever becomes of this connection. `handle.refused` names photos the server would not take.
         """
-        options, model = with_start_file(options)
+        options, model = with_start_file(options, path)
         checked = train_options(options)
         capture, uploaded = await self.upload(path, name=name, on_progress=on_progress, model=model)
         handle = await self.submit(capture.id, checked, name=name)
@@ -176,15 +176,18 @@ class AsyncClient:
         return read_answer(Ready, response)
 
 
-def with_start_file(options: Mapping[str, Any]) -> tuple[dict[str, Any], Path | None]:
+def with_start_file(options: Mapping[str, Any], folder: AnyPath) -> tuple[dict[str, Any], Path | None]:
     """The options with a local .ply in `start` replaced by its name in the capture, and its path, if it is one.
 
-    Raises NothingToUpload for a .ply that is not there.
+    A .ply that is not there is looked for in `folder`, the data set. Raises NothingToUpload for one that is in neither.
     """
     start = options.get("start")
     if start is None or not str(start).lower().endswith(".ply"):
         return dict(options), None
     path = Path(start).expanduser()
+    inside = Path(folder).expanduser() / path
+    if not path.is_file() and inside.is_file():
+        path = inside
     return {**options, "start": start_file(path).name}, path
 
 

@@ -208,6 +208,10 @@ def test_a_model_to_start_from_is_sent_beside_the_poses(service, photos, tmp_pat
         ]
         with pytest.raises(NothingToUpload, match="does not exist"):
             client.train(photos, start=tmp_path / "gone.ply")
+        (photos / "inside.ply").write_bytes(PLY)
+        inside = client.train(photos, start="inside.ply", steps=10).job
+        assert inside.options.start == "inside.ply"
+        assert "inside.ply" in {file.name for file in client.capture(inside.capture).files}
         service.begin(job.id)
         service.finish(job.id, PLY)
         assert client.train(photos, start=job.id).job.options.start_model == job.id

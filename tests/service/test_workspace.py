@@ -71,7 +71,9 @@ def test_checkpoints_reach_an_attempt_on_another_machine(
     remote: Storage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     space = Workspace(remote, JOB, CAPTURE)
-    for name in ("checkpoints/checkpoint.pt", "plan.json", "out/model.ply"):
+    for name in (
+        "checkpoints/checkpoint.pt", "plan.json", "out/model.ply", "start.ply", "film/000.jpg", "film/.001.jpg.part",
+    ):  # fmt: skip
         (space.run / name).parent.mkdir(parents=True, exist_ok=True)
         (space.run / name).write_text(name)
     warnings: list[str] = []
@@ -80,12 +82,29 @@ def test_checkpoints_reach_an_attempt_on_another_machine(
 
     monkeypatch.setenv("SPLATMILL_DATA", str(tmp_path / "another machine"))
     there = Workspace(remote, JOB, CAPTURE)
-    assert sorted(there.restore()) == ["checkpoints/checkpoint.pt", "plan.json"]
+    assert sorted(there.restore()) == ["checkpoints/checkpoint.pt", "film/000.jpg", "plan.json", "start.ply"]
     assert (there.run / "checkpoints/checkpoint.pt").read_text() == "checkpoints/checkpoint.pt"
     assert there.restore() == [], "what this machine has is newer"
     there.remove()
     assert not there.folder.exists()
     assert list(remote.entries(layout.job(JOB))) == []
+
+
+@pytest.mark.parametrize("elsewhere", [True, False])
+def test_a_run_begun_anew_gets_no_film_of_the_one_before(
+    remote: Storage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, elsewhere: bool
+) -> None:
+    space = Workspace(remote, JOB, CAPTURE)
+    for name in ("film/000.jpg", "plan.json"):
+        (space.run / name).parent.mkdir(parents=True, exist_ok=True)
+        (space.run / name).write_text(name)
+    Mirror(space, lambda _: None).close(copy=True)
+    if elsewhere:
+        monkeypatch.setenv("SPLATMILL_DATA", str(tmp_path / "another machine"))
+        space = Workspace(remote, JOB, CAPTURE)
+    assert space.restore() == (["plan.json"] if elsewhere else [])
+    stored = [entry.path for entry in remote.entries(layout.job_work(JOB))]
+    assert stored == [f"{layout.job_work(JOB)}/plan.json"]
 
 
 def test_recovered_cameras_serve_the_next_job_on_the_capture(remote: Storage, tmp_path: Path) -> None:
@@ -210,9 +229,25 @@ def test_a_stored_model_is_brought_along_to_start_from(where: str, request: pyte
     storage.delete(layout.model_file("model001", "model.ply"))
     space.stage_start("model001")  # a later attempt; the model may be gone by now
     assert (space.run / "start.ply").read_bytes() == b"splats"
+    assert not (space.run / "start.ply").is_symlink()
     space.start_over()
     for gone in ("model001", "../../etc"):
         with pytest.raises(StartGoneError) as missing:
             space.stage_start(gone)
         assert problem_of(missing.value).code == "model_not_found"
     space.close()
+
+
+def test_a_model_to_start_from_is_copied_where_links_cannot_be_made(
+    local: Storage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(source: Path, target: Path) -> None:
+        raise OSError(errno.EXDEV, "Invalid cross-device link")
+
+    monkeypatch.setattr(workspace.os, "link", refuse)  # storage on another file system than the work folder
+    local.put(layout.model_file("model001", "model.ply"), b"splats")
+    space = Workspace(local, JOB, CAPTURE)
+    space.stage_start("model001")
+    local.delete(layout.model_file("model001", "model.ply"))
+    assert [path.name for path in space.run.iterdir()] == ["start.ply"]
+    assert (space.run / "start.ply").read_bytes() == b"splats"

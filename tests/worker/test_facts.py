@@ -13,7 +13,7 @@ import stillife
 import torch
 from test_gaps import scene
 
-from splatmill_worker.scene import Lens, Scene
+from splatmill_worker.scene import Lens, PointViews, Scene
 from splatmill_worker.splat.facts import Facts, measure
 from splatmill_worker.splat.views import TrainingView
 
@@ -72,6 +72,37 @@ def test_errors_and_lenses_are_in_pixels_of_the_training_size() -> None:
     assert seen.lens_residual == pytest.approx(0.1 * corner**3 * 300.0 / 4, rel=1e-6)
     assert seen.distorted == len(views)
     assert facts(world, views).lens_residual is None
+
+
+def test_points_of_stereo_say_nothing_about_errors_and_angles() -> None:
+    world, views = scene()
+    own = len(world.points)
+    assert world.point_views is not None
+    first_view = np.zeros(own, np.int32)
+    more = replace(
+        world,
+        points=np.concatenate([world.points, world.points]),
+        colors=np.concatenate([world.colors, world.colors]),
+        point_errors=np.concatenate([np.full(own, 2.0), np.full(own, 0.01)]),
+        point_views=PointViews(
+            np.concatenate([world.point_views.offsets, world.point_views.offsets[-1] + 1 + np.arange(own)]),
+            np.concatenate([world.point_views.views, first_view]),
+        ),
+    )
+    told = facts(replace(more, facts={"sparse_points": own}), views)
+    assert told.reprojection == pytest.approx(2.0)
+    assert told.view_angle == pytest.approx(facts(world, views).view_angle, rel=0.1)
+    only = facts(replace(more, facts={"sparse_points": 0}), views)
+    assert (only.reprojection, only.view_angle) == (None, None)
+    assert only.exposure_spread is not None
+
+
+def test_errors_that_are_not_known_do_not_count() -> None:
+    world, views = scene()
+    errors = np.full(len(world.points), np.nan)
+    assert facts(replace(world, point_errors=errors), views).reprojection is None
+    errors[3:6] = 1.5
+    assert facts(replace(world, point_errors=errors), views).reprojection == pytest.approx(1.5)
 
 
 def test_what_points_leave_open_is_measured() -> None:

@@ -16,11 +16,14 @@ import pytest
 import torch
 from PIL import Image
 
-from splatmill.schema import FitImageOptions, ModelCameras
+from splatmill.cli.exits import Exit
+from splatmill.schema import FitImageOptions, ModelCameras, describe_options
+from splatmill_worker import fit_image as program
 from splatmill_worker.fit_image import fit_image, load
 from splatmill_worker.refusal import Refusal
 from splatmill_worker.splat import plane, ply
 from splatmill_worker.splat.budget import Budget
+from splatmill_worker.splat.failure import FailureName, TrainingFailed
 
 WIDTH, HEIGHT = 80, 56
 
@@ -138,6 +141,64 @@ def test_more_gaussians_than_pixels_are_not_used(tmp_path: Path) -> None:
     result = fit_image(saved(tmp_path / "p.png"), tmp_path, options(steps=2, gaussians=10_000), said.append)
     assert result.gaussians <= WIDTH * HEIGHT
     assert any("would describe nothing" in line for line in said)
+
+
+def test_what_nobody_asked_for_is_not_spoken_of(tmp_path: Path) -> None:
+    Image.fromarray(pixels()).resize((160, 16)).save(tmp_path / "p.png")
+    said: list[str] = []
+    result = fit_image(tmp_path / "p.png", tmp_path, FitImageOptions(steps=2, image_size=32), said.append)
+    assert result.gaussians <= 32 * 3
+    assert not any("asked for" in line for line in said)
+
+
+def test_the_help_text_says_the_numbers_that_are_used() -> None:
+    help_of = {option.name: option.help for option in describe_options(FitImageOptions)}
+    assert f"one for every {program.PIXELS_PER_GAUSSIAN} pixels" in help_of["gaussians"]
+    assert help_of["time_budget"].endswith(f"{program.DEFAULT_SECONDS:.0f}s.")
+
+
+def test_the_exit_statuses_are_those_of_the_command_line() -> None:
+    own = (program.REFUSED, program.FAILED, program.UNWRITABLE, program.STOPPED)
+    assert own == (Exit.refused, Exit.job_failed, Exit.error, Exit.cancelled)
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("in the way")
+    assert program.main(saved(tmp_path / "p.png"), tmp_path / "file" / "out", '{"steps": 2}') == Exit.error
+    assert str(tmp_path / "file" / "out") in capsys.readouterr().err
+
+
+def test_a_numerical_failure_advises_on_a_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise TrainingFailed(FailureName.non_finite, "the loss became nan.", step=3)
+
+    monkeypatch.setattr(plane, "fit", fail)  # no picture is known that does this
+    out = tmp_path / "out"
+    assert program.main(saved(tmp_path / "p.png"), out, '{"video": true}') == Exit.job_failed
+    told = capsys.readouterr().err
+    assert "the loss became nan" in told
+    assert "seed" in told
+    assert "camera" not in told
+    assert list(out.iterdir()) == [], "a film that was begun stays as a fragment"
+
+
+@pytest.mark.parametrize(
+    ("where", "told"), [("plane.fit", "nothing was written"), ("draw_curve", "is not whole")]
+)
+def test_ctrl_c_says_what_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], where: str, told: str
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"splatmill_worker.fit_image.{where}", stop)
+    out = tmp_path / "out"
+    options = '{"steps": 2, "video": true}'
+    assert program.main(saved(tmp_path / "p.png"), out, options) == Exit.cancelled
+    assert told in capsys.readouterr().err
+    assert ((out / "model.ply").exists(), (out / "fit.mp4").exists()) == (where == "draw_curve", False)
 
 
 def write_bad(path: Path, kind: str) -> Path:

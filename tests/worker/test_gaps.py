@@ -1,7 +1,7 @@
 """Proves where Gaussians are put for what the points leave open: gaps as deep as their neighbours, the sky far away.
 
-Does not prove that this pays on real photos: `bench train --ablate` measures that. Which colours are sky is a rule, and
-is proven here on plain cases only.
+Does not prove that this pays on real photos: `bench train --configs` measures that. Which colours are sky is a
+rule, and is proven here on plain cases only.
 """
 
 from __future__ import annotations
@@ -94,7 +94,10 @@ def test_masked_cells_are_no_gaps() -> None:
 def test_the_sky_is_blue_or_grey_and_has_nothing_above_it(
     rows: list[tuple[int, int, int]], expected: list[bool]
 ) -> None:
-    assert sky.sky_of(np.array(rows, np.uint8)[:, None]).ravel().tolist() == expected
+    assert (
+        sky.sky_of(np.array(rows, np.uint8)[:, None], np.ones((len(rows), 1), bool)).ravel().tolist()
+        == expected
+    )
 
 
 def test_the_shell_is_far_and_where_the_photos_show_it() -> None:

@@ -187,6 +187,19 @@ def test_a_time_budget_is_laid_out_for_the_gaussians_it_pays_for() -> None:
     assert counts[0] < counts[-1]
 
 
+def test_fewer_gaussians_than_a_budget_pays_for_leave_time_for_more_steps() -> None:
+    def laid_out(**values: object) -> float:
+        return planned(time_budget=60, **values).schedule.annealing.boost
+
+    assert laid_out(max_gaussians=12_000) < laid_out()
+
+
+def test_more_gaussians_asked_for_never_cut_those_at_the_start() -> None:
+    sparse = replace(FACTS, views=3, width=60, height=40)
+    assert planned(sparse, max_gaussians=50_000).max_gaussians == sparse.points
+    assert planned(sparse, max_gaussians=5000).max_gaussians == 5000
+
+
 def test_gaps_are_left_when_few_photos_could_correct_a_guess() -> None:
     bare = replace(FACTS, gap_share=0.4, gap_points=500, sightings=80.0)
     assert planned(bare).gaps

@@ -103,6 +103,40 @@ def test_names_are_found_by_suffix_and_without_extension(tmp_path: Path) -> None
     assert scene.views[0].camera.fx == pytest.approx(0.5 * 64 / math.tan(0.5))
 
 
+PLY = """ply
+format ascii 1.0
+element vertex 1
+property float x
+property float y
+property float z
+end_header
+1 2 3
+"""
+
+
+def test_points_are_read_from_within_the_capture_alone(tmp_path: Path) -> None:
+    capture = tmp_path / "capture"
+    write_photos(capture / "images", ["a.png"])
+    frame = {"file_path": "a.png", "transform_matrix": opengl([0.0, 0.0, 0.0])}
+    for place in (tmp_path / "outside.ply", capture / "inside.ply"):
+        place.write_text(PLY)
+    (capture / "poses").mkdir()
+    (capture / "poses" / "link.ply").symlink_to(tmp_path / "outside.ply")
+
+    def points_named(name: str) -> tuple[int, tuple[str, ...]]:
+        write_transforms(capture / "poses/transforms.json", [frame], camera_angle_x=1.0, ply_file_path=name)
+        found = posed.find(capture)
+        assert found is not None
+        scene = found.load()
+        return len(scene.points), scene.notes
+
+    assert points_named("../inside.ply") == (1, ())
+    for name in ("../../outside.ply", str(tmp_path / "outside.ply"), "link.ply"):
+        count, notes = points_named(name)
+        assert count == 0
+        assert "leads out of the capture" in notes[0]
+
+
 def test_a_blender_set_keeps_its_own_split(tmp_path: Path) -> None:
     write_photos(tmp_path, ["train/r_0.png", "train/r_1.png", "test/r_0.png", "val/r_0.png"])
     for part, count in (("train", 2), ("test", 1), ("val", 1)):

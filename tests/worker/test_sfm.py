@@ -80,6 +80,8 @@ def test_cameras_of_generated_photos_match_the_truth(
     assert scene.colors.std() > 10  # painted from the photos, not left black
     assert scene.point_views is not None
     assert scene.point_views.views.max() < 16
+    assert scene.facts["stereo_points"] > 0
+    assert scene.facts["seconds"]["stereo"] >= 0.9 * scene.facts["stereo_seconds"]
 
 
 def test_a_restart_reads_the_cameras_back(

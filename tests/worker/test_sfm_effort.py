@@ -60,4 +60,17 @@ def test_what_is_there_is_not_started_again(place: Workspace, tmp_path: Path) ->
 
 def test_the_likeliest_partners_come_first() -> None:
     scores = {(0, 1): 5, (0, 2): 9, (1, 2): 30, (0, 3): 7}
-    assert pairs.likeliest(scores, 0, 2) == [(0, 2), (0, 3)]
+    assert pairs.likeliest(scores, 4, [0], 2) == {(0, 2), (0, 3)}
+    assert pairs.likeliest(scores, 4, [0, 1], 1) == {(0, 2), (1, 2)}
+    assert pairs.likeliest(scores, 4, [], 2) == set()
+
+
+def test_another_seed_and_another_matcher_do_not_read_what_was_matched_before(tmp_path: Path) -> None:
+    synthetic.capture(tmp_path / "images", 4, 120, 90, samples=1)
+    for changed in ({}, {"seed": 1}, {"matcher": "sequential"}, {}):
+        options = sfm.SfmOptions(effort="lean", stereo=False, **changed)  # type: ignore[arg-type]
+        with suppress(sfm.SfmFailed):
+            sfm.reconstruct(
+                tmp_path / "images", None, tmp_path / "work", options, lambda *_: None, lambda: False
+            )
+    assert len(list((tmp_path / "work").rglob("database.db"))) == 3

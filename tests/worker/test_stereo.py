@@ -9,9 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import stillife
 from PIL import Image
 
+from splatmill.schema import TrainOptions
 from splatmill_worker import synthetic
+from splatmill_worker.capture import cameras_of
 from splatmill_worker.images import load_views
 from splatmill_worker.scene import Lens, Scene, View
 from splatmill_worker.sfm import Cancelled, posed, stereo
@@ -128,6 +131,30 @@ def test_posed_captures_without_points_get_them_once(bare: Scene, tmp_path: Path
     assert len(list((tmp_path / "sfm").iterdir())) == 2
 
 
+def test_other_points_and_masks_are_searched_anew(bare: Scene, tmp_path: Path) -> None:
+    few = replace(bare, views=bare.views[:3], points=np.full((5, 3), 0.1), colors=np.zeros((5, 3), np.uint8))
+    Image.fromarray(np.full((HEIGHT, WIDTH), 255, np.uint8)).save(tmp_path / "white.png")
+    masked = tuple(replace(view, mask=tmp_path / "white.png") for view in few.views)
+    stages: list[str] = []
+    scenes = [few, replace(few, points=np.full((5, 3), 0.2)), replace(few, views=masked), few]
+    for done, scene in enumerate(scenes):
+        posed.completed(scene, tmp_path / "work", lambda stage, *_: stages.append(stage))
+        assert len(list((tmp_path / "work" / "sfm").iterdir())) == min(done + 1, 3)
+    assert stages == ["stereo"] * 9  # three photos, three times; the fourth time all is there
+
+
+def test_a_photo_that_does_not_decode_is_no_fault_of_the_poses(tmp_path: Path) -> None:
+    capture = stillife.posed_capture(tmp_path / "capture")
+    photo = capture / "images" / "03.png"
+    photo.write_bytes(photo.read_bytes()[:2000])  # its size can still be read
+    stages: list[str] = []
+    with pytest.raises(OSError, match=r"truncated|broken"):
+        cameras_of(
+            capture, tmp_path / "work", TrainOptions(), lambda stage, *_: stages.append(stage), lambda: False
+        )
+    assert stages == []
+
+
 def test_scenes_with_enough_points_or_transparent_surroundings_are_left_as_they_are(
     bare: Scene, tmp_path: Path
 ) -> None:
@@ -141,4 +168,53 @@ def test_scenes_with_enough_points_or_transparent_surroundings_are_left_as_they_
 
 def test_cancelling_ends_the_search(bare: Scene) -> None:
     with pytest.raises(Cancelled):
-        stereo.find(bare, lambda: True)
+        stereo.find(bare, cancelled=lambda: True)
+
+
+def test_cancelling_reaches_the_loading_of_photos(bare: Scene, tmp_path: Path) -> None:
+    asked = iter([False, False, True])
+    gone = [replace(view, image=tmp_path / "gone.png") for view in bare.views[6:]]
+    with pytest.raises(Cancelled):  # and not OSError: the photos that are gone are not waited for
+        stereo.find(replace(bare, views=(*bare.views[:6], *gone)), cancelled=lambda: next(asked))
+
+
+def test_three_photos_are_judged_as_well(bare: Scene, tmp_path: Path) -> None:
+    random, views = np.random.default_rng(0), []
+    for view in bare.views[:3]:
+        noise = random.integers(0, 255, (HEIGHT // 4, WIDTH // 4, 3), np.uint8)
+        Image.fromarray(noise).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC).save(tmp_path / view.name)
+        views.append(replace(view, image=tmp_path / view.name))
+    found = stereo.find(replace(bare, views=tuple(views)))
+    assert found.given_up
+    assert len(found.points) == 0
+
+
+def test_photos_held_out_by_the_data_set_take_no_part(bare: Scene, tmp_path: Path) -> None:
+    tests = (0, 9)
+    views = tuple(
+        replace(view, split="test", image=tmp_path / "gone.png")
+        if i in tests
+        else replace(view, split="train")
+        for i, view in enumerate(bare.views)
+    )
+    found = stereo.find(replace(bare, views=views))
+    assert len(found.points) > 300
+    assert found.seen.shape == (len(found.points), len(views))
+    assert not found.seen[:, tests].any()
+    assert found.seen[:, 1].any()
+    assert np.median(depth_errors(bare, found.points, found.seen)) < 0.01
+
+
+def test_points_without_tracks_are_not_said_to_be_seen_by_no_photo(bare: Scene, added: stereo.Added) -> None:
+    own = np.random.default_rng(0).normal(0.0, 0.2, (30, 3))
+    both = stereo.add(replace(bare, points=own, colors=np.zeros((30, 3), np.uint8)), added)
+    assert len(both.points) == 30 + len(added.points)
+    assert both.point_views is None
+    assert both.track_lengths is None
+    assert both.point_errors is not None
+    assert np.isnan(both.point_errors[:30]).all()
+    np.testing.assert_array_equal(both.point_errors[30:], added.errors)
+
+
+def test_without_any_points_the_sentence_says_so(bare: Scene, added: stereo.Added) -> None:
+    assert "no points" in stereo.add(bare, added).notes[-1]

@@ -7,12 +7,13 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 
 from splatmill_worker.kernels.cpu import isa
@@ -48,10 +49,21 @@ def origin() -> Row:
 
 
 def footer(rows: list[Row]) -> str:
-    """One line under a figure or table: what the rows were measured on."""
-    first = rows[0]
-    versions = ", ".join(f"{k} {v}" for k, v in first["versions"].items())
-    return f"{first['machine']} · {versions} · commit {first['commit']}"
+    """One line under a figure or table: all that the rows were measured on."""
+
+    def distinct(found: Iterable[str], between: str) -> str:
+        return between.join(dict.fromkeys(found))
+
+    machines = distinct((row["machine"] for row in rows), "; ")
+    versions = distinct((", ".join(f"{k} {v}" for k, v in row["versions"].items()) for row in rows), "; ")
+    commits = distinct((row["commit"] for row in rows), ", ")
+    return f"{machines} · {versions} · commit {commits}"
+
+
+def worked() -> float:
+    """CPU seconds that the whole machine has worked: what others took is seen in the row, not guessed."""
+    times = psutil.cpu_times()
+    return float(sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0))
 
 
 def write(name: str, rows: list[Row]) -> Path:

@@ -18,6 +18,7 @@ with the points of structure from motion, longest side 480; stereo adds to them 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import math
 import sys
@@ -37,7 +38,7 @@ from _plot import axes, save
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from splatmill.schema import TrainOptions
-from splatmill_worker import pipeline, sfm, synthetic
+from splatmill_worker import pipeline, sfm, synthetic, textures
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images import prepare
 from splatmill_worker.scene import Camera, Scene
@@ -45,7 +46,6 @@ from splatmill_worker.sfm import colmap_model, pairs, posed
 from splatmill_worker.sfm.files import ImageFiles
 
 Float = npt.NDArray[np.float64]
-HERE = Path(__file__).resolve().parent
 FOLDERS = {name: _data.FOLDERS[name] for name in ("fox", "lund", "kermit", "unrelated", "rotation")}
 GROWTH = (25, 50, 100, 200)
 GROWTH_WIDTH, GROWTH_HEIGHT = 480, 360
@@ -233,10 +233,10 @@ def measure(
 ) -> dict[str, Any]:
     """One row: a run of `setting` from an empty folder, its errors, and the training on top."""
     with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
-        wall, cpu, machine = time.perf_counter(), time.process_time(), _worked()
+        wall, cpu, machine = time.perf_counter(), time.process_time(), _rows.worked()
         result = SETTINGS[setting](images, Path(folder) / "sfm")
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        others = max(0.0, _worked() - machine - cpu)
+        others = max(0.0, _rows.worked() - machine - cpu)
         row: dict[str, Any] = {
             "scene": name,
             "setting": setting,
@@ -256,17 +256,11 @@ def measure(
         if result.scene is not None:
             row |= pose_error(result.scene, truth) | gps_error(result.scene, images, Path(folder) / "look")
             if train is not None:
-                cpu, machine, wall = time.process_time(), _worked(), time.perf_counter()
+                cpu, machine, wall = time.process_time(), _rows.worked(), time.perf_counter()
                 row |= {"train": train} | trained_psnr(result.scene, train, Path(folder))
-                others = _worked() - machine - (time.process_time() - cpu)
+                others = _rows.worked() - machine - (time.process_time() - cpu)
                 row["busy"] |= others > BUSY * (time.perf_counter() - wall) * (psutil.cpu_count() or 1)
         return row
-
-
-def _worked() -> float:
-    """CPU seconds that the whole machine has worked so far."""
-    times = psutil.cpu_times()
-    return float(sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0))
 
 
 def reference(name: str) -> dict[str, Camera]:
@@ -292,13 +286,16 @@ def scenes_bench(
 def growth_bench(counts: Sequence[int], setting: str, rows: dict[tuple[str, str], _rows.Row]) -> None:
     """Generated sets of growing size: evenly spread subsets would change the overlap, so each is its own orbit.
 
-    Taking the photos is not on the clock, and each set is taken once.
+    Taking the photos is not on the clock, and each set is taken once in each size by each version of the generator.
     """
+    sources = [Path(str(module.__file__)).read_bytes() for module in (synthetic, textures)]
+    place = Path(tempfile.gettempdir()) / "splatmill-bench-growth"
+    version = hashlib.sha256(b"".join(sources)).hexdigest()[:12]
     for count in counts:
         name = f"still life {count}"
         if (name, setting) in rows:
             continue
-        folder = Path(tempfile.gettempdir()) / "splatmill-bench-growth" / str(count)
+        folder = place / f"{count}-{GROWTH_WIDTH}x{GROWTH_HEIGHT}-{version}"
         poses = folder / "poses.json"
         if not poses.is_file():
             made = synthetic.capture(folder / "images", count, GROWTH_WIDTH, GROWTH_HEIGHT)
@@ -313,7 +310,7 @@ def growth_bench(counts: Sequence[int], setting: str, rows: dict[tuple[str, str]
 def keep(name: str, rows: dict[tuple[str, str], _rows.Row], row: _rows.Row) -> None:
     """Adds a row and stores all of them, so that an interrupted benchmark goes on where it stopped."""
     rows[row["scene"], row["setting"]] = row | _rows.origin()
-    path = HERE / "results" / f"{name}.jsonl"
+    path = _rows.HERE / "results" / f"{name}.jsonl"
     part = path.with_suffix(".part")
     part.write_text("".join(json.dumps(row) + "\n" for row in rows.values()))
     part.replace(path)
@@ -322,7 +319,9 @@ def keep(name: str, rows: dict[tuple[str, str], _rows.Row], row: _rows.Row) -> N
 
 def kept(name: str) -> dict[tuple[str, str], _rows.Row]:
     """The rows of earlier runs by scene and setting."""
-    return {(row["scene"], row["setting"]): row for row in _rows.lines(HERE / "results" / f"{name}.jsonl")}
+    return {
+        (row["scene"], row["setting"]): row for row in _rows.lines(_rows.HERE / "results" / f"{name}.jsonl")
+    }
 
 
 def exponent(rows: list[dict[str, Any]], key: str = "cpu_seconds") -> float:
@@ -439,10 +438,10 @@ def main(argv: list[str]) -> int:
     if chosen.growth:
         wall, cpu = exponent(rows, "seconds"), exponent(rows)
         text += f"\nFit: wall seconds grow as n^{wall:.2f}, CPU seconds as n^{cpu:.2f}.\n"
-        growth_figure(rows, HERE / "figures" / "sfm_growth.png")
+        growth_figure(rows, _rows.HERE / "figures" / "sfm_growth.png")
     else:
-        scenes_figure(rows, HERE / "figures" / "sfm.png")
-    (HERE / f"{name}.md").write_text(text)
+        scenes_figure(rows, _rows.HERE / "figures" / "sfm.png")
+    (_rows.HERE / f"{name}.md").write_text(text)
     print(text)
     return 0
 

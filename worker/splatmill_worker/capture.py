@@ -26,20 +26,19 @@ def cameras_of(
     """The posed scene: the cameras that came with the photos, or those recovered from them.
 
     `capture` holds images/, and masks/ and poses/ where given (or is a data set's own folder). Raises Refusal
-    for poses that cannot be used, and what `sfm.reconstruct` raises.
+    for poses that cannot be used, and what `posed.completed` and `sfm.reconstruct` raise.
     """
     given = posed.find(capture)
     if given is not None:
         try:
             scene = given.load()
-            on_progress("stereo", 0, len(scene.views), "points between those given")
-            return posed.completed(scene, workdir, cancelled)
         except (ValueError, OSError) as error:
             raise Refusal(
                 "poses_invalid",
                 str(error),
                 advice="Correct the poses, or leave them out to have the cameras recovered from the photos.",
             ) from error
+        return posed.completed(scene, workdir, on_progress, cancelled)
     images = capture / "images"
     masks = capture / "masks"
     wanted = sfm.SfmOptions(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -29,7 +31,12 @@ class Film:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        if error is None:
+            self.close()
+            return
+        # What lies there is not whole in any case, and the error under way is the one to tell.
+        with suppress(av.FFmpegError, OSError, ValueError):
+            self._container.close()
 
     def add(self, pixels: npt.NDArray[np.uint8]) -> None:
         """Append a picture, RGB [H, W, 3]."""
@@ -39,9 +46,22 @@ class Film:
 
     def close(self) -> None:
         """Write what the encoder still holds, and the index."""
-        for packet in self._stream.encode():
-            self._container.mux(packet)
-        self._container.close()
+        try:
+            for packet in self._stream.encode():
+                self._container.mux(packet)
+        finally:
+            self._container.close()
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """Where to write the file `path`: it takes its name when the block ends, and vanishes when the block fails."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def even(pixels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:

@@ -5,19 +5,20 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import torch
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from splatmill.schema import FitImageOptions, ModelCamera, ModelCameras
-from splatmill_worker.film import Film, even
+from splatmill_worker.film import Film, even, whole
 from splatmill_worker.images import load_view
 from splatmill_worker.images.decode import upright_size
 from splatmill_worker.images.prepare import MAX_PIXELS, MIN_SIDE
@@ -29,6 +30,7 @@ from splatmill_worker.splat.evaluate import ViewScore, compare
 from splatmill_worker.splat.export import spec_of
 from splatmill_worker.splat.failure import TrainingFailed
 from splatmill_worker.splat.figure import draw_curve
+from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.machine import machine, peak_memory, versions
 from splatmill_worker.splat.picture import as_image
 from splatmill_worker.splat.render import render
@@ -41,8 +43,12 @@ FRAMES, FPS, LAST_FRAMES = 120, 24, 24
 DEGREE = 3
 """Coefficients above degree 0 are zero and still written: the first viewers read files with all of them only."""
 
-REFUSED, FAILED = 5, 1
-"""Exit statuses, as in the command line: the picture cannot be used; the optimisation failed."""
+REFUSED, FAILED, UNWRITABLE, STOPPED = 5, 3, 1, 130
+"""Exit statuses, those of the command line: the picture cannot be used; the optimisation failed; the results could
+not be written; Ctrl-C."""
+
+FAILED_ADVICE = "Try another seed, or fewer Gaussians."
+"""For a numerical failure; what `failure` advises is about the photos and cameras of a scene."""
 
 Say = Callable[[str], None]
 
@@ -56,6 +62,10 @@ class Result:
     files: tuple[Path, ...]
 
 
+class NotWhole(KeyboardInterrupt):
+    """Ctrl-C while the results were being written: those in the folder are not whole, or not of one fit."""
+
+
 def main(photo: Path, out: Path, options: str) -> int:
     """Run from the command line; returns the exit status."""
     wanted = FitImageOptions.model_validate_json(options)
@@ -65,14 +75,19 @@ def main(photo: Path, out: Path, options: str) -> int:
         print(f"Error: {refusal.message}\n{refusal.advice}", file=sys.stderr)
         return REFUSED
     except TrainingFailed as failure:
-        print(f"Error: {failure}", file=sys.stderr)
+        print(
+            f"Error: Fitting stopped at step {failure.step}: {failure.seen} {FAILED_ADVICE}", file=sys.stderr
+        )
         return FAILED
-    except OSError as error:
+    except (OSError, av.FFmpegError) as error:
         print(f"Error: {error.filename or out}: {error.strerror or error}.", file=sys.stderr)
-        return FAILED
+        return UNWRITABLE
+    except NotWhole:
+        print(f"Stopped before the end; what is in {out} is not whole.", file=sys.stderr)
+        return STOPPED
     except KeyboardInterrupt:
         print("Stopped; nothing was written.", file=sys.stderr)
-        return 130
+        return STOPPED
     score = result.score
     print(f"{result.gaussians:,} Gaussians, PSNR {score.psnr:.2f} dB, SSIM {score.ssim:.4f}")
     for path in result.files:
@@ -84,12 +99,13 @@ def fit_image(photo: Path, out: Path, options: FitImageOptions, say: Say = lambd
     """Fit `photo` and leave model.ply, picture.png, cameras.json, fit.json, fit.png (and fit.mp4) in `out`.
 
     The result is judged by what the written file shows. Raises Refusal for what is no usable picture,
-    TrainingFailed for a numerical failure and OSError where `out` cannot be written.
+    TrainingFailed for a numerical failure, OSError or av.FFmpegError where `out` cannot be written, and NotWhole where
+    Ctrl-C comes while it is.
     """
     view = load(photo, options.image_size, say)
-    camera, transparent = view.full.camera, view.full.alpha is not None
+    camera = view.full.camera
     pixels = camera.width * camera.height
-    most = options.gaussians or max(64, pixels // PIXELS_PER_GAUSSIAN)
+    most = options.gaussians or min(pixels, max(64, pixels // PIXELS_PER_GAUSSIAN))
     if most > pixels:
         say(
             f"{most} Gaussians were asked for; the picture has {pixels} pixels, and more would describe nothing."
@@ -107,19 +123,40 @@ def fit_image(photo: Path, out: Path, options: FitImageOptions, say: Say = lambd
             f"PSNR {row.score.psnr:.2f} dB  SSIM {row.score.ssim:.4f}"
         )
 
-    with ExitStack() as stack:
-        film = _Emerging(out / "fit.mp4", view, stack) if options.video else None
-        fitted, rows = plane.fit(
-            view,
-            most,
-            Budget(options.steps, seconds),
-            seed=options.seed,
-            measured=tell,
-            moments=() if film is None else tuple((i / FRAMES) ** 2 for i in range(FRAMES)),
-            frame=lambda color, _: None if film is None else film.add(color),
-        )
-        if film is not None:
-            film.hold()
+    writing = False
+    try:
+        with ExitStack() as stack:
+            film = stack.enter_context(_emerging(out / "fit.mp4", view)) if options.video else None
+            fitted, rows = plane.fit(
+                view,
+                most,
+                Budget(options.steps, seconds),
+                seed=options.seed,
+                measured=tell,
+                moments=() if film is None else tuple((i / FRAMES) ** 2 for i in range(FRAMES)),
+                frame=lambda color, _: None if film is None else film.add(color),
+            )
+            if film is not None:
+                film.hold()
+            writing = True
+            result = _written(photo, out, options, view, fitted, rows)
+    except KeyboardInterrupt as stop:
+        if writing:
+            raise NotWhole from stop
+        raise
+    return result
+
+
+def _written(
+    photo: Path,
+    out: Path,
+    options: FitImageOptions,
+    view: TrainingView,
+    fitted: Gaussians,
+    rows: list[plane.Row],
+) -> Result:
+    """All results but the video."""
+    camera, transparent = view.full.camera, view.full.alpha is not None
     files = [out / name for name in ("model.ply", "picture.png", "cameras.json", "fit.json", "fit.png")]
     comments = (
         "Made by Splatmill",
@@ -192,12 +229,19 @@ def _size(photo: Path, say: Say) -> tuple[int, int]:
     return width, height
 
 
+@contextmanager
+def _emerging(path: Path, view: TrainingView) -> Iterator[_Emerging]:
+    """The video at `path`, which is there when it is whole."""
+    height, width = even(view.full.rgb.numpy()).shape[:2]
+    with whole(path) as part, Film(part, width, height, FPS) as film:
+        yield _Emerging(film, width, height)
+
+
 class _Emerging:
     """The video of the picture as it emerges, over white."""
 
-    def __init__(self, path: Path, view: TrainingView, stack: ExitStack) -> None:
-        height, width = even(view.full.rgb.numpy()).shape[:2]
-        self._film = stack.enter_context(Film(path, width, height, FPS))
+    def __init__(self, film: Film, width: int, height: int) -> None:
+        self._film = film
         self._last = np.full((height, width, 3), 255, np.uint8)
 
     def add(self, color: Tensor) -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import av
 import torch
 
 from splatmill.schema import (
@@ -149,7 +152,11 @@ def run(
         written = export(out, trained, plan, home, views, held_out)
         teller.preview(engine, trained.steps)
     if film is not None:
-        film.develop(out / "progress.mp4")
+        try:
+            film.develop(out / "progress.mp4")
+        except (av.FFmpegError, OSError, ValueError) as error:
+            # The model is worth more than its film.
+            teller.warn(f"The film of the training could not be written: {error}.")
         stages.add("film", film.seconds)
     write_report(
         out, trained, plan, facts, scene, stages, written, home, engine, views, held_out, teller.warnings
@@ -224,13 +231,17 @@ def _plan(
     if stored.is_file():
         kept = json.loads(stored.read_text())
         if kept["options"] == options.model_dump(mode="json"):
-            return Plan.from_dict(kept["plan"]), facts
+            # A plan of another version has other fields; then one is made anew.
+            with suppress(KeyError, TypeError):
+                return Plan.from_dict(kept["plan"]), facts
     try:
         plan = revise(decide(facts, options, kernels))
     except ValueError as error:
         raise Refusal(
             "option_out_of_range", str(error), advice="Change the option and start again."
         ) from error
+    # What an attempt with another plan left cannot be gone on from.
+    shutil.rmtree(workdir / "checkpoints", ignore_errors=True)
     part = stored.with_suffix(".part")
     part.write_text(
         json.dumps({"options": options.model_dump(mode="json"), "plan": plan.as_dict(whole=True)})

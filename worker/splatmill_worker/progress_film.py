@@ -11,7 +11,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from splatmill.schema import format_duration
-from splatmill_worker.film import Film, even
+from splatmill_worker.film import Film, even, whole
 from splatmill_worker.splat.engine import Engine
 from splatmill_worker.splat.plan import Plan
 from splatmill_worker.splat.train import drawer, evaluation_background
@@ -29,7 +29,8 @@ CAPTIONED = 160  # pixels of width under which a line of text covers too much of
 class ProgressFilm:
     """Shots kept in `folder` as they are taken, so that a later attempt goes on with the film of this one.
 
-    A shot is one forward pass and one JPEG, taken while the training clock stands still; `seconds` is their cost.
+    A shot is one forward pass and one JPEG, taken while the training clock stands still. `seconds` is what shots and
+    video cost this attempt; what earlier ones spent is in no account.
     """
 
     def __init__(self, folder: Path, view: TrainingView, plan: Plan, *, anew: bool) -> None:
@@ -56,27 +57,31 @@ class ProgressFilm:
         while self.due(progress):
             self._next += 1
         path = self._folder / f"{self._next - 1:03d}.jpg"
-        part = path.with_suffix(".part")
+        part = path.with_name(f".{path.name}.part")  # a dotted name is not copied to storage
         picture.save(part, "JPEG", quality=QUALITY, subsampling=0)
         part.replace(path)
         self.seconds += time.perf_counter() - started
 
-    def develop(self, path: Path) -> None:
-        """Write the shots so far as a video, the last one held for a second."""
+    def develop(self, path: Path) -> bool:
+        """Write the shots so far as a video, the last one held for a second; False, and no file, without shots.
+
+        Raises av.FFmpegError, OSError or ValueError, and leaves no file, where the video cannot be written.
+        """
         started = time.perf_counter()
         shots = sorted(self._folder.glob("*.jpg"))
+        if not shots:
+            return False
         with Image.open(shots[0]) as first:
             width, height = first.size
-        part = path.with_suffix(".part")
-        with Film(part, width, height, FPS) as film:
+        with whole(path) as part, Film(part, width, height, FPS) as film:
             for shot in shots:
                 with Image.open(shot) as picture:
                     pixels = np.asarray(picture.convert("RGB"))
                 film.add(pixels)
             for _ in range(HELD):
                 film.add(pixels)
-        part.replace(path)
         self.seconds += time.perf_counter() - started
+        return True
 
 
 def _caption(picture: Image.Image, text: str) -> None:

@@ -11,7 +11,8 @@ from splatmill.backplane.storage import Storage
 
 _FOLDER = "sfm"
 _WHOLE = "facts.json"
-"""Written last by `sfm`, and copied last here: a model without it is not one yet."""
+"""`sfm` gives a model's folder its name once all is in it. Here it is copied file by file, this one last: a model
+without it is not one yet."""
 
 
 def fetch(storage: Storage, capture_id: str, run: Path) -> int:

@@ -26,7 +26,9 @@ MIRROR_SECONDS = 15.0
 LOCK_SECONDS = 10.0
 """How long to wait for a process that is being killed to let go of the folder."""
 
-MIRRORED = ("checkpoints", "plan.json", "stages.json", "film")
+START, FILM, CHECKPOINTS = "start.ply", "film", "checkpoints"
+
+MIRRORED = (START, CHECKPOINTS, "plan.json", "stages.json", FILM)
 """Cameras are not among them: `reconstruction` shares those with every job on the capture."""
 
 _RECONSTRUCTION = "sfm"
@@ -80,7 +82,7 @@ class Workspace:
 
     def stage_start(self, model_id: str) -> None:
         """Bring a finished model's .ply here to start from, as run/start.ply. Raises StartGoneError without one."""
-        target = self.run / "start.ply"
+        target = self.run / START
         if target.is_file():
             return
         path = layout.model_file(model_id, "model.ply") if layout.is_id(model_id) else None
@@ -90,13 +92,24 @@ class Workspace:
         if source is None:
             self.storage.download(path, target)
         else:
-            _link(source, target)
+            _kept(source, target)
 
     def restore(self) -> list[str]:
-        """Fetch what an attempt on another machine left, if this one has nothing of its own. Returns the names."""
-        if self.storage.root is not None or self.run.is_dir():
+        """Fetch what an attempt on another machine left, if this one has nothing of its own. Returns the names.
+
+        A run without a checkpoint begins anew: the film of the one before is dropped, here from storage.
+        """
+        if self.storage.root is not None:
             return []
-        return self.storage.download_prefix(layout.job_work(self.job_id), self.run)
+        stored = layout.job_work(self.job_id)
+        own = self.run.is_dir()
+        if own:
+            resumes = (self.run / CHECKPOINTS).is_dir()
+        else:
+            resumes = any(True for _ in self.storage.entries(f"{stored}/{CHECKPOINTS}"))
+        if not resumes:
+            self.storage.delete_prefix(f"{stored}/{FILM}")
+        return [] if own else self.storage.download_prefix(stored, self.run)
 
     def close(self) -> None:
         """Let go of the folder and leave it as it is."""
@@ -210,3 +223,14 @@ def _link(source: Path, target: Path) -> None:
         os.link(source, target)
     except OSError:
         target.symlink_to(source)
+
+
+def _kept(source: Path, target: Path) -> None:
+    """A link to `source`, or a copy where none can be made: later attempts read it when the source is gone."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        part = target.with_name(f".{target.name}.part")
+        shutil.copy2(source, part)
+        part.replace(target)

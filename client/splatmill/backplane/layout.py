@@ -12,9 +12,8 @@ models/{id}/job.json                        the job as it ended; its presence is
 A model's id is the id of the job that made it.
 """
 
-import re
-
 from splatmill.schema import Role
+from splatmill.schema.ids import ID
 
 MODEL_FILES = {
     "model.ply": "application/octet-stream",
@@ -28,12 +27,10 @@ MODEL_FILES = {
 }
 """Names a model may hold, with the media type each is served under."""
 
-_ID = re.compile(r"[a-z0-9]{8,40}")
-
 
 def is_id(text: str) -> bool:
     """Whether `text` has the shape of a capture or job id; anything else must never reach a path."""
-    return _ID.fullmatch(text) is not None
+    return ID.fullmatch(text) is not None
 
 
 def captures() -> str:

@@ -60,7 +60,7 @@ def train(
     from splatmill.aio import train_options, with_start_file
 
     given = {key: value for key, value in options.items() if value is not None and value != []}
-    given, start = with_start_file(given)
+    given, start = with_start_file(given, path)
     checked = train_options(given)
     found = find_files(path)
     if detach and server is None:

@@ -3,7 +3,6 @@
 `/v1/options`, the OpenAPI document and the command line's help are generated from this model.
 """
 
-import re
 from enum import StrEnum
 from types import NoneType
 from typing import Any, Literal, get_args
@@ -14,9 +13,8 @@ from pydantic.fields import FieldInfo
 
 from splatmill.schema.base import Request, Response
 from splatmill.schema.captures import safe_name
+from splatmill.schema.ids import ID
 from splatmill.schema.quantities import ByteSize, Duration
-
-_MODEL_ID = re.compile(r"[a-z0-9]{8,40}", re.ASCII)
 
 
 class Preset(StrEnum):
@@ -157,8 +155,8 @@ class TrainOptions(Request):
     start: str | None = Field(
         default=None,
         max_length=512,
-        description="Start from a trained model instead of points: the id of a model on the server, or the name of "
-        "a .ply file among the capture's poses. It must be in the world of the capture's cameras.",
+        description="Start from a trained model instead of points: the id of a model on the server, or a .ply file, "
+        "by its path here or its name among the capture's poses. It must be in the world of the capture's cameras.",
         json_schema_extra=_PHOTOS,
     )
     progress_video: bool = Field(
@@ -239,7 +237,7 @@ class TrainOptions(Request):
     @field_validator("start")
     @classmethod
     def _model_or_file(cls, start: str | None) -> str | None:
-        if start is None or _MODEL_ID.fullmatch(start):
+        if start is None or ID.fullmatch(start):
             return start
         if not start.lower().endswith(".ply"):
             raise ValueError(f"{start[:80]!r} is neither a model's id nor the name of a .ply file")

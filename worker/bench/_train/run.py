@@ -12,9 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import psutil
 import torch
-from _rows import Row, origin
+from _rows import Row, origin, worked
 from torch import Tensor
 
 from _train.configurations import revised
@@ -74,14 +73,14 @@ def measure(job: Row) -> Row:
     row = {**job["identity"], "bench": "train", "code": code_version(), **origin()}
     with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
         workdir = _with_cameras(Path(folder), job)
-        wall, cpu, machine = time.perf_counter(), time.process_time(), _busy()
+        wall, cpu, machine = time.perf_counter(), time.process_time(), worked()
         try:
             outcome = pipeline.run(capture, workdir, options, _quiet, lambda: False, revise=revise)
         except NAMED as failure:
             spent = {"wall_seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
             return row | {"outcome": f"failed: {failure}", "curve": []} | spent
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        others = max(0.0, _busy() - machine - cpu)
+        others = max(0.0, worked() - machine - cpu)
         report = json.loads((outcome.out / "report.json").read_text())
     result, seconds = report["result"], report["seconds"]
     recovered = report["sfm"].get("seconds", {}) if report["facts"]["source"] == "sfm" else {}
@@ -177,12 +176,6 @@ def _with_cameras(workdir: Path, job: Row) -> Path:
     kept.mkdir(parents=True, exist_ok=True)
     (workdir / "sfm").symlink_to(kept)
     return workdir
-
-
-def _busy() -> float:
-    """CPU seconds that the whole machine has worked: what others took is seen in the row, not guessed."""
-    times = psutil.cpu_times()
-    return float(sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0))
 
 
 def rounded(value: Any) -> Any:

@@ -15,7 +15,8 @@ BLUR = 0.3  # added to both variances of a projected splat, pixels^2
 COMPENSATION_MIN = 2.5e-5  # floor of det / det' under antialiasing
 
 Scores = Literal["plain", "absolute"]
-"""Which densification scores a step adds up: "absolute" all of them, "plain" all but the sum of absolute gradients."""
+"""Which densification scores a step adds up: "absolute" all of them, "plain" all but the sum of absolute gradients. The
+GPU's adds up all of them whenever one is asked for: beside its other passes that costs next to nothing."""
 
 
 class Projected(NamedTuple):

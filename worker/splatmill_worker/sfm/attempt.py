@@ -24,7 +24,15 @@ def attempt(run: Run, effort: Effort, earlier: Progress | None) -> Progress:
     What is sure from `earlier` is kept where the photos are looked at in the same size.
     """
     doubtful = _in_doubt(run, earlier) if earlier is not None and earlier.effort.side == effort.side else None
-    key = digest(VERSION, effort, run.model, [group.focal for group in run.groups], sorted(doubtful or ()))
+    key = digest(
+        VERSION,
+        effort,
+        run.options.matcher,
+        run.options.seed,
+        run.model,
+        [group.focal for group in run.groups],
+        sorted(doubtful or ()),
+    )
     progress = Progress(effort, Workspace(run.folder / f"{effort.name}-{key}"))
     with run.clock("features"):
         if earlier is not None and doubtful is not None:
@@ -86,14 +94,11 @@ def _in_doubt(run: Run, progress: Progress) -> set[int] | None:
         else {features.photo_index(model.images[i].name) for i in checks.trusted_images(model)}
     )
     doubtful = set(range(run.count)) - sure
-    partners = {
-        index
-        for photo in doubtful
-        for pair in pairs.likeliest(run.scores, photo, PARTNERS_AGAIN)
-        for index in pair
-    }
-    both = doubtful | partners
-    return None if not run.scores or len(both) > NEARLY_ALL * run.count else both
+    if not run.scores or len(doubtful) > NEARLY_ALL * run.count:
+        return None
+    chosen = pairs.likeliest(run.scores, run.count, doubtful, PARTNERS_AGAIN)
+    both = doubtful.union(*chosen)
+    return None if len(both) > NEARLY_ALL * run.count else both
 
 
 def _require_features(run: Run, progress: Progress) -> None:

@@ -18,7 +18,7 @@ from splatmill_worker.sfm import checks, colors, features, mapping, stereo
 from splatmill_worker.sfm.attempt import edges, photos_of
 from splatmill_worker.sfm.colmap_model import posed_view, scene_of
 from splatmill_worker.sfm.failure import SfmFailed
-from splatmill_worker.sfm.run import Progress, Run
+from splatmill_worker.sfm.run import Progress, Run, torch_threads
 
 STEREO = "stereo.npz"
 
@@ -45,17 +45,20 @@ def store(run: Run, progress: Progress, target: Path) -> None:
         colors.paint(model, views, run.pool)
     facts["features_per_photo"] = float(np.median([len(found.scales) for found in progress.features]))
     facts |= _model_facts(run, progress, model)
-    facts["seconds"] = {stage: round(seconds, 3) for stage, seconds in run.seconds.items()}
     partial = target.with_name(f"{target.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     model.write_binary(partial)
+    scene = scene_of(model, views, source="sfm")
+    if run.options.stereo and stereo.wanted(scene):
+        # The photos are swept one after another: each has all threads.
+        with run.clock("stereo"), torch_threads(run.threads):
+            stereo.completed(scene, partial / STEREO, run.on_progress, run.cancelled)
+    facts["seconds"] = {stage: round(seconds, 3) for stage, seconds in run.seconds.items()}
+    notes = [*run.notes, *(progress.mapped.notes if progress.mapped is not None else ())]
     left_out = {run.prepared.photos[index].name: reason for index, reason in reasons.items()}
-    document = {"facts": facts, "left_out": left_out, "notes": run.notes}
+    document = {"facts": facts, "left_out": left_out, "notes": notes}
     (partial / "facts.json").write_text(json.dumps(document, indent=1), "utf-8")
-    if run.options.stereo:
-        run.on_progress("stereo", 0, len(views), "points between those found")
-        stereo.completed(read(run.prepared, partial), partial / STEREO, run.cancelled)
     shutil.rmtree(target, ignore_errors=True)
     partial.rename(target)
 

@@ -19,12 +19,16 @@ LENS_OBSERVATIONS = 2000
 
 @dataclass(frozen=True)
 class Mapped:
-    """All models a mapper made, the one with the most photos first; `joined` others are part of it already."""
+    """All models a mapper made, the one with the most photos first; `joined` others are part of it already.
+
+    `notes` are sentences for a person.
+    """
 
     mapper: Mapper
     models: tuple[pycolmap.Reconstruction, ...]
     joined: int
     seconds: float
+    notes: tuple[str, ...] = ()
 
     @property
     def largest(self) -> pycolmap.Reconstruction | None:
@@ -79,11 +83,30 @@ def run(
     stop_if(cancelled)
     models = [manager.get(index) for index in range(manager.size())]
     models.sort(key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-    joined: list[int] = []
-    if len(models) > 1:
+    models, count_joined, notes = together(models)
+    return Mapped(mapper, tuple(models), count_joined, time.perf_counter() - started, notes)
+
+
+def together(
+    models: list[pycolmap.Reconstruction],
+) -> tuple[list[pycolmap.Reconstruction], int, tuple[str, ...]]:
+    """The models after those that share photos with the first were joined to it, how many, and notes.
+
+    Where COLMAP refuses to join them they stay as they are: the first may be good without the others.
+    """
+    if len(models) < 2:
+        return models, 0, ()
+    try:
         whole, joined = merged(models)
-        models = [whole, *(model for index, model in enumerate(models) if index > 0 and index not in joined)]
-    return Mapped(mapper, tuple(models), len(joined), time.perf_counter() - started)
+    except (RuntimeError, ValueError, LookupError) as error:
+        said = (str(error).strip().splitlines() or ["no message"])[0][:200]
+        note = (
+            f"The photos form {len(models)} models that could not be joined; the largest is used. "
+            f"Joining them ended with {type(error).__name__}: {said}"
+        )
+        return models, 0, (note,)
+    apart = [model for index, model in enumerate(models) if index > 0 and index not in joined]
+    return [whole, *apart], len(joined), ()
 
 
 def _incremental(threads: int, seed: int, relaxed: bool, fixed: bool) -> pycolmap.IncrementalPipelineOptions:

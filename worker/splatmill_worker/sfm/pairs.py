@@ -123,22 +123,18 @@ def quick_look(
 
 def best_partners(scores: dict[Pair, int], count: int, partners: int) -> set[Pair]:
     """For each photo its `partners` best pairs by score; the first few of them however low they score."""
-    by_photo: list[list[tuple[int, Pair]]] = [[] for _ in range(count)]
-    for pair, score in scores.items():
-        for index in pair:
-            by_photo[index].append((-score, pair))
     chosen: set[Pair] = set()
-    for ranked in by_photo:
-        for rank, (score, pair) in enumerate(sorted(ranked)[:partners]):
-            if rank < SURE_PARTNERS or -score >= MIN_LOOK:
+    for ranked in _ranked(scores, count):
+        for rank, pair in enumerate(ranked[:partners]):
+            if rank < SURE_PARTNERS or scores[pair] >= MIN_LOOK:
                 chosen.add(pair)
     return chosen
 
 
-def likeliest(scores: dict[Pair, int], photo: int, partners: int) -> list[Pair]:
-    """The `partners` best pairs of one photo by score."""
-    own = [(-score, pair) for pair, score in scores.items() if photo in pair]
-    return [pair for _, pair in sorted(own)[:partners]]
+def likeliest(scores: dict[Pair, int], count: int, photos: Iterable[int], partners: int) -> set[Pair]:
+    """The `partners` best pairs by score of each of `photos` (of `count`)."""
+    ranked = _ranked(scores, count)
+    return {pair for photo in photos for pair in ranked[photo][:partners]}
 
 
 def components(count: int, edges: Iterable[Pair]) -> list[list[int]]:
@@ -170,6 +166,15 @@ def bridges(parts: list[list[int]], scores: dict[Pair, int], tried: set[Pair], p
             fresh.sort(key=lambda pair: (-scores.get(pair, 0), pair))
             chosen.update(fresh[:per_photo])
     return chosen
+
+
+def _ranked(scores: dict[Pair, int], count: int) -> list[list[Pair]]:
+    """The pairs of each photo, the best by score first."""
+    by_photo: list[list[Pair]] = [[] for _ in range(count)]
+    for pair in sorted(scores, key=lambda pair: (-scores[pair], pair)):
+        for index in pair:
+            by_photo[index].append(pair)
+    return by_photo
 
 
 def _alike(features: Sequence[Features], partners: int) -> set[Pair]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from splatmill_worker.scene import Scene, Source
 from splatmill_worker.sfm import colmap_model, stereo, transforms
 from splatmill_worker.sfm.files import ImageFiles
+from splatmill_worker.sfm.run import OnProgress
 
 MODEL_FILES = ("cameras.bin", "cameras.txt")
 # Where tools put things; the first folder that has a model wins.
@@ -40,21 +41,37 @@ class PosedInput:
         files = ImageFiles.under(self.directory)
         if self.model is not None:
             return colmap_model.load(self.model, files, self.notes)
-        return transforms.load(self.transforms, self.source, files, self.notes)
+        return transforms.load(self.transforms, self.source, files, self.directory, self.notes)
 
 
-def completed(scene: Scene, workdir: Path, cancelled: Callable[[], bool] = lambda: False) -> Scene:
+def completed(
+    scene: Scene,
+    workdir: Path,
+    on_progress: OnProgress = lambda stage, done, total, note: None,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> Scene:
     """The scene with points found over its cameras where it brings few or none; kept in `workdir`.
 
-    What stands on a transparent background is left as it is: its silhouettes say where it can be.
+    What stands on a transparent background is left as it is: its silhouettes say where it can be. Raises what
+    `stereo.find` raises.
     """
-    if scene.source == "blender":
+    if scene.source == "blender" or not stereo.wanted(scene):
         return scene
-    digest = hashlib.sha256(repr(len(scene.points)).encode())
+    stored = workdir / "sfm" / f"posed-{_digest(scene)}.npz"
+    return stereo.completed(scene, stored, on_progress, cancelled)
+
+
+def _digest(scene: Scene) -> str:
+    """A name for what the points are found from: the method, the cameras, the known points, and the masks."""
+    digest = hashlib.sha256(repr((stereo.VERSION, scene.points.shape)).encode())
+    digest.update(scene.points.tobytes())
     for view in scene.views:
-        digest.update(repr((view.name, view.lens)).encode())
-        digest.update(view.camera.viewmat.tobytes() + view.camera.K.tobytes())
-    return stereo.completed(scene, workdir / "sfm" / f"posed-{digest.hexdigest()[:24]}.npz", cancelled)
+        camera = view.camera
+        digest.update(repr((view.name, view.lens, view.split, camera.width, camera.height)).encode())
+        digest.update(camera.viewmat.tobytes() + camera.K.tobytes())
+        if view.mask is not None:
+            digest.update(hashlib.sha256(view.mask.read_bytes()).digest())
+    return digest.hexdigest()[:24]
 
 
 def find(directory: Path) -> PosedInput | None:

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.scene import Scene
-from splatmill_worker.sfm import cameras, checks
+from splatmill_worker.sfm import cameras, checks, stereo
 from splatmill_worker.sfm.attempt import ENOUGH, attempt, edges
 from splatmill_worker.sfm.cancellation import stop_if
 from splatmill_worker.sfm.failure import Cancelled, SfmFailed
 from splatmill_worker.sfm.finish import read, store
 from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions, fitted
-from splatmill_worker.sfm.run import VERSION, OnProgress, Progress, Run, digest
+from splatmill_worker.sfm.run import VERSION, OnProgress, Progress, Run, digest, torch_threads
 
 
 def reconstruct(
@@ -34,8 +32,9 @@ def reconstruct(
 ) -> Scene:
     """Recovers the cameras of the photos under `images` (and in videos and zips there).
 
-    `on_progress(stage, done, total, note)` is told of images, features, pairs, matching and mapping. The same
-    photos with the same options are read back from `workdir`; a restart goes on where the last one stopped.
+    `on_progress(stage, done, total, note)` is told of images, features, pairs, matching, mapping and, where
+    points are few, stereo. The same photos with the same options are read back from `workdir`; a restart goes on
+    where the last one stopped.
 
     Raises SfmFailed with facts and advice, and Cancelled within a fraction of a second of `cancelled()` turning
     true (the global mapper and a single bundle adjustment finish first).
@@ -60,12 +59,13 @@ def reconstruct_photos(
     _require_photos(prepared)
     stop_if(cancelled)
     folder = workdir / "sfm" / prepared.key[:24]
-    stored = folder / f"model-{digest(VERSION, pycolmap.__version__, options)}"
+    stored = folder / f"model-{digest(VERSION, stereo.VERSION, pycolmap.__version__, options)}"
     if not (stored / "facts.json").is_file():
         threads = options.threads or os.cpu_count() or 1
         groups = cameras.group(prepared.photos)
         model = options.camera_model if options.camera_model != "auto" else "SIMPLE_RADIAL"
-        with ThreadPoolExecutor(threads) as pool, _one_thread_each():
+        # One thread for each torch call: the pairs themselves run side by side.
+        with ThreadPoolExecutor(threads) as pool, torch_threads(1):
             run = Run(prepared, groups, model, options, folder, threads, pool, on_progress, cancelled)
             store(run, _solve(run), stored)
     return read(prepared, stored)
@@ -88,17 +88,6 @@ def _require_photos(prepared: Prepared) -> None:
             facts,
             "Take at least 3 from different places, better 20 or more.",
         )
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """One thread for each torch call: the pairs themselves run side by side."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _efforts(options: SfmOptions, longest_side: int) -> list[Effort]:

@@ -25,9 +25,12 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 MAX_SHEAR = 1e-2  # of R^T R from the identity, once its scale is taken out
 
 
-def load(paths: tuple[Path, ...], source: Source, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
+def load(
+    paths: tuple[Path, ...], source: Source, files: ImageFiles, capture: Path, notes: tuple[str, ...] = ()
+) -> Scene:
     """Reads the cameras of all `paths`; Blender's own split is kept, its validation set left out.
 
+    Points and masks that a file names are read from within the folder `capture` alone: the files are uploads.
     Raises ValueError, naming the file and the frame, for what cannot be a camera, and where no photo is there.
     """
     views: dict[str, View] = {}
@@ -42,14 +45,14 @@ def load(paths: tuple[Path, ...], source: Source, files: ImageFiles, notes: tupl
             continue
         tests = set(document.get("test_filenames", ()))
         for index, frame in enumerate(document["frames"]):
-            name, view = _view(path, index, document, frame, files)
+            name, view = _view(path, index, document, frame, files, capture)
             if view is None:
                 left_out.append((name, f"{path.name} has a camera for it, but the photo is not here"))
                 continue
             own = split or (("test" if frame["file_path"] in tests else "train") if tests else None)
             views[view.name] = replace(view, split=own)
         if document.get("ply_file_path"):
-            points, note = _sparse_points(path.parent / str(document["ply_file_path"]))
+            points, note = _sparse_points(path.parent / str(document["ply_file_path"]), capture)
             said += [note] if note else []
     if not views:
         first = f" (such as {left_out[0][0]!r})" if left_out else ""
@@ -89,7 +92,7 @@ def _split_of(path: Path) -> Literal["train", "test", "val"] | None:
 
 
 def _view(
-    path: Path, index: int, document: dict[str, Any], frame: Any, files: ImageFiles
+    path: Path, index: int, document: dict[str, Any], frame: Any, files: ImageFiles, capture: Path
 ) -> tuple[str, View | None]:
     """The name a frame gives and its view; None where the photo is not there."""
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
@@ -109,8 +112,7 @@ def _view(
     mask = files.mask(relative)
     if mask is None and isinstance(frame.get("mask_path"), str):
         beside = path.parent / frame["mask_path"]
-        inside = beside.resolve().is_relative_to(files.root.resolve())
-        mask = beside if inside and beside.is_file() else None
+        mask = beside if _within(beside, capture) and beside.is_file() else None
     return name, fit_to_file(camera_and_lens(camera, viewmat), relative, photo, mask)
 
 
@@ -178,9 +180,18 @@ def _colmap_camera(values: dict[str, Any], photo: Path) -> pycolmap.Camera:
     return pycolmap.Camera(model=model, width=width, height=height, params=[fx, fy, cx, cy, *extra])
 
 
-def _sparse_points(path: Path) -> tuple[tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]], str | None]:
+def _within(path: Path, capture: Path) -> bool:
+    """Whether a path, with its links followed, lies in the capture's folder."""
+    return path.resolve().is_relative_to(capture.resolve())
+
+
+def _sparse_points(
+    path: Path, capture: Path
+) -> tuple[tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]], str | None]:
     """Points of nerfstudio's sparse .ply (in the world of the transforms), and a note where it is not usable."""
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    if not _within(path, capture):
+        return nothing, f"The points in {path.name} are not used: ply_file_path leads out of the capture."
     try:
         vertex = PlyData.read(path)["vertex"]  # plyfile has no types
         points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)

@@ -49,10 +49,17 @@ class Cells:
             array: npt.NDArray[np.float32] = small.numpy()
             return array
 
-        color = (area(target.rgb.permute(2, 0, 1).float()) + 0.5).astype(np.uint8).transpose(1, 2, 0)
+        rgb = target.rgb.permute(2, 0, 1).float()
         used = np.ones((height, width), bool)
-        if target.mask is not None:
-            used = area(target.mask[None].float())[0] > 0.5
+        if target.mask is None:
+            mean = area(rgb)
+        else:
+            # Masked pixels are no part of the colour of what is beside them.
+            counted = target.mask[None].float()
+            share = area(counted)
+            mean = area(rgb * counted) / np.maximum(share, 1e-6)
+            used = share[0] > 0.5
+        color = (mean + 0.5).astype(np.uint8).transpose(1, 2, 0)
         seen = projected(camera, points)
         return Cells(camera, color, marked(seen, (height, width), spread=1), used, seen)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -38,12 +41,13 @@ class Exposure:
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
 
-    def state(self) -> dict[str, object]:
+    def state(self) -> dict[str, Any]:
         """For a checkpoint."""
-        return {"affine": self.affine.detach().clone(), "adam": self._adam.state_dict()}
+        # A copy: Adam's own dictionary goes on changing.
+        return {"affine": self.affine.detach().clone(), "adam": copy.deepcopy(self._adam.state_dict())}
 
-    def restore(self, state: dict[str, object]) -> None:
+    def restore(self, state: dict[str, Any]) -> None:
         """From a checkpoint."""
         with torch.no_grad():
-            self.affine.copy_(state["affine"])  # type: ignore[arg-type]  # a checkpoint holds plain objects
-        self._adam.load_state_dict(state["adam"])  # type: ignore[arg-type]
+            self.affine.copy_(state["affine"])
+        self._adam.load_state_dict(copy.deepcopy(state["adam"]))

@@ -50,7 +50,8 @@ class Facts:
     halving_loss: median RMS difference, in grey levels of 255, between a photo and its half-size copy enlarged.
     view_angle: median over points of the largest angle between two views of it, in degrees. distance_ratio:
     90th percentile over points of largest over smallest pixel footprint. depth_ratio: 95th over 5th percentile
-    of depths. reprojection: median error of the points in pixels of this size. lens_residual: the farthest that
+    of depths. reprojection: median error of the points in pixels of this size. Neither it nor view_angle counts what
+    stereo added: that is looked for under few angles and in steps of its own. lens_residual: the farthest that
     distortion moves a pixel of this size. tint_spread: as exposure_spread, of the log ratios of red and blue to
     green. sightings: median number of points that a photo shows. sky_share, gap_share: shares of the photos that look
     like sky, and that (sky apart) have no point near; sky_points, gap_points: what would stand for them.
@@ -115,7 +116,7 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
         halving_loss=float(np.median([halving_loss(view.full.rgb) for view in views])),
         exposure_spread=None if seen is None else exposure_spread(seen),
         tint_spread=None if seen is None else tint_spread(seen),
-        view_angle=None if seen is None else seen.view_angle(),
+        view_angle=None if seen is None else seen.view_angle(_own_points(scene)),
         distance_ratio=None if seen is None else seen.distance_ratio(),
         depth_ratio=None if seen is None else seen.depth_ratio(),
         reprojection=_reprojection(scene, max(width, height)),
@@ -161,11 +162,18 @@ def _extent(scene: Scene, views: Sequence[TrainingView]) -> float:
 
 def _reprojection(scene: Scene, longest: int) -> float | None:
     """Median error of the points, from pixels of the photos that the cameras were recovered from to `longest`."""
-    if scene.point_errors is None or not len(scene.point_errors):
+    errors = np.zeros(0) if scene.point_errors is None else scene.point_errors[: _own_points(scene)]
+    known = errors[np.isfinite(errors)]
+    if not len(known):
         return None
     sizes = [view.camera if view.lens is None else view.lens for view in scene.views]
     own = float(np.median([max(size.width, size.height) for size in sizes]))
-    return float(np.median(scene.point_errors)) * longest / own
+    return float(np.median(known)) * longest / own
+
+
+def _own_points(scene: Scene) -> int:
+    """How many of the points, the first ones, came with the cameras and not from stereo over them."""
+    return int(scene.facts.get("sparse_points", len(scene.points)))
 
 
 def _lens_residual(scene: Scene, longest: int) -> float | None:
@@ -252,24 +260,30 @@ class _Sightings:
             return None
         return _Sightings(len(scene.points), len(views), *joined)
 
-    def view_angle(self) -> float:
-        """Median over points of the largest angle between two of its views, in degrees."""
-        return float(np.median([_widest(rows) for rows in self._by_point(self.direction)]))
+    def view_angle(self, first: int) -> float | None:
+        """Median over the `first` points of the largest angle between two of its views, in degrees; None without."""
+        own = self.point < first
+        if not own.any():
+            return None
+        return float(np.median([_widest(rows) for rows in _by_point(self.point[own], self.direction[own])]))
 
     def distance_ratio(self) -> float:
         """90th percentile over points of the largest over the smallest footprint of a pixel on it."""
-        return float(np.percentile([rows.max() / rows.min() for rows in self._by_point(self.footprint)], 90))
+        ratios = [rows.max() / rows.min() for rows in _by_point(self.point, self.footprint)]
+        return float(np.percentile(ratios, 90))
 
     def depth_ratio(self) -> float:
         """95th over 5th percentile of all depths."""
         low, high = np.percentile(self.depth, [5, 95])
         return float(high / max(low, 1e-12))
 
-    def _by_point(self, values: Float) -> list[Float]:
-        order = np.argsort(self.point, kind="stable")
-        starts = np.flatnonzero(np.diff(self.point[order], prepend=-1))
-        groups = np.split(values[order], starts[1:])
-        return [group for group in groups if len(group) >= 2] or groups
+
+def _by_point(point: npt.NDArray[np.int64], values: Float) -> list[Float]:
+    """The values of each point's sightings, of points with at least two where there are any such."""
+    order = np.argsort(point, kind="stable")
+    starts = np.flatnonzero(np.diff(point[order], prepend=-1))
+    groups = np.split(values[order], starts[1:])
+    return [group for group in groups if len(group) >= 2] or groups
 
 
 def _widest(directions: Float) -> float:

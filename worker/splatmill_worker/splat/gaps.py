@@ -18,7 +18,7 @@ AGREES = 1.5
 
 def gap_share(cells: Sequence[Cells]) -> float:
     """Share of what the photos show, sky apart, with no point of the reconstruction in the cell or beside it."""
-    ground = sum(int((grid.used & ~sky_of(grid.color)).sum()) for grid in cells)
+    ground = sum(int((grid.used & ~sky_of(grid.color, grid.used)).sum()) for grid in cells)
     return sum(int(_gaps(grid).sum()) for grid in cells) / max(1, ground)
 
 
@@ -48,7 +48,7 @@ def filled(cells: Sequence[Cells]) -> tuple[Float, Pixels]:
 
 
 def _gaps(grid: Cells) -> Flags:
-    return grid.used & ~grid.covered & ~sky_of(grid.color)
+    return grid.used & ~grid.covered & ~sky_of(grid.color, grid.used)
 
 
 def _one_per_cell(points: Float) -> Float:

@@ -33,14 +33,23 @@ class Needs(NamedTuple):
     added: int
 
 
-def needs_of(facts: Facts, options: TrainOptions, kernels: Kernels, why: Reasons) -> Needs:
+def needs_of(
+    facts: Facts, options: TrainOptions, kernels: Kernels, why: Reasons, *, error_scale: float = 1.0
+) -> Needs:
     """The needs that the facts show or the options force, each with its sentence in `why`.
+
+    error_scale: pixels at the training size for one of the photos as they were loaded.
 
     Raises ValueError, as a sentence, for an option that this scene cannot follow.
     """
+    for name, asked in (("sky", options.sky), ("gaps", options.gaps)):
+        if asked is Switch.on and facts.start is not None:
+            raise ValueError(
+                f"{name}=on adds to points; this training starts from a model. Leave it at auto."
+            )
     sky = why.switch("sky", options.sky, *_sky(facts))
     gaps = why.switch("gaps", options.gaps, *_gaps(facts))
-    poses = why.switch("pose_refinement", options.pose_refinement, *_poses(facts, kernels))
+    poses = why.switch("pose_refinement", options.pose_refinement, *_poses(facts, kernels, error_scale))
     if poses:
         why.chosen["pose_refinement"] += (
             " Held-out cameras stay as they came, so that their score is not flattered."
@@ -63,8 +72,12 @@ def needs_of(facts: Facts, options: TrainOptions, kernels: Kernels, why: Reasons
 
 def _sky(facts: Facts) -> tuple[bool, str]:
     share, ratio = facts.sky_share, facts.depth_ratio
-    if share is None or ratio is None:
+    if facts.start is not None:
+        return False, "The model given stands for it."
+    if share is None:
         return False, "Whether the photos show sky cannot be told without points in them."
+    if ratio is None:
+        return False, "How far the points are from the cameras that saw them is not known."
     seen = f"{100 * share:.0f} % of the photos look like sky"
     if share < MUCH_SKY:
         return False, f"{seen}."
@@ -77,6 +90,8 @@ def _sky(facts: Facts) -> tuple[bool, str]:
 
 
 def _gaps(facts: Facts) -> tuple[bool, str]:
+    if facts.start is not None:
+        return False, "The model given stands for it."
     if facts.gap_share is None:
         return False, "Where points are missing cannot be told without points in the photos."
     seen = f"{100 * facts.gap_share:.0f} % of what the photos show has no point near it"
@@ -89,10 +104,12 @@ def _gaps(facts: Facts) -> tuple[bool, str]:
     return True, f"{seen}: {facts.gap_points} Gaussians are put there, as deep as the nearest points."
 
 
-def _poses(facts: Facts, kernels: Kernels) -> tuple[bool, str]:
-    error = facts.reprojection
-    if error is None:
+def _poses(facts: Facts, kernels: Kernels, error_scale: float) -> tuple[bool, str]:
+    if facts.reprojection is None:
         return False, "The cameras are taken as given: there are no points to test them on."
+    error = error_scale * facts.reprojection
+    if facts.views < 2:
+        return False, "One photo alone shows any error of its camera."
     seen = f"The cameras fit their points to {error:.2f} pixels"
     if error < POSES_OFF:
         return False, f"{seen}."

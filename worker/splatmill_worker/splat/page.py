@@ -118,8 +118,13 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[Any]], text_columns: in
     return f"<table><tr>{head}</tr>{body}</table>"
 
 
+def _ended(stopped: str) -> str:
+    """Why training ended, as a sentence; a failure is one already."""
+    return stopped if stopped.endswith(".") else f"Training ended because {stopped}."
+
+
 def _footer(report: dict[str, Any]) -> str:
     machine, versions = report["machine"], report["versions"]
     named = ", ".join(f"{name} {value}" for name, value in versions.items() if value)
     where = f"{machine['processor']}, {machine['cores']} cores, {format_bytes(machine['memory'])}"
-    return f"{where}. {named}. Stopped because {report['result']['stopped']}."
+    return f"{where}. {named}. {_ended(report['result']['stopped'])}"

@@ -202,14 +202,21 @@ class _Fit:
             weight = weight * (target.alpha > 0)
         weight = weight + max(1e-12, 1e-3 * float(weight.mean()))
         chance = (weight / weight.sum()).reshape(-1)
-        drawn = torch.multinomial(
-            chance, count, replacement=count > chance.numel() // 2, generator=self.random
-        )
+        if count > chance.numel() // 2:
+            # By the inverse of the sum, in double precision: a large photo has more pixels than float32 has steps.
+            ends = chance.double().cumsum(0)
+            places = torch.rand(count, dtype=torch.float64, generator=self.random) * ends[-1]
+            drawn = torch.searchsorted(ends, places).clamp_max(chance.numel() - 1)
+        else:
+            # The largest of chance / Exp(1) are a sample without replacement (Efraimidis and Spirakis 2006);
+            # torch.multinomial refuses more than 2^24 places.
+            waits = torch.empty_like(chance).exponential_(generator=self.random).clamp_min(1e-30)
+            drawn = (chance / waits).topk(count).indices
         rows, columns = drawn // width, drawn % width
         jitter = torch.rand(count, 2, generator=self.random)
         camera = target.camera
         x = (columns + jitter[:, 0] - camera.cx) * self.pixel
-        y = (rows + jitter[:, 1] - camera.cy) * self.pixel
+        y = (rows + jitter[:, 1] - camera.cy) / camera.fy
         share = 1.0 / (chance[drawn] * count)  # pixels for each
         sigma = (WIDTH * (share / math.pi).sqrt()).clamp(NARROWEST, max(height, width) / 8) * self.pixel
         log_scales = sigma.log()[:, None].repeat(1, 3)

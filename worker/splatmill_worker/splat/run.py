@@ -74,6 +74,7 @@ class Run:
         self.random = torch.Generator().manual_seed(self.plan.seed)
         self._good: tuple[dict[str, Tensor], Tensor, Tensor] | None = None
         self._good_poses: dict[str, Tensor] | None = None
+        self._good_exposure: dict[str, Any] | None = None
         self._good_progress = -math.inf
         self._good_level = math.inf
         self._most = self.plan.max_gaussians
@@ -146,7 +147,7 @@ class Run:
             exp_avg[kept],
             exp_avg_sq[kept],
         )
-        self.engine.replace(*self._good)
+        self._go_back(self._good)
         self.health = Health(lowest=self._good_level, calm_from=self.step + len(self.views))
         self.warn(f"{failure} Went back to the last good state, and on with at most {self._most} Gaussians.")
 
@@ -166,6 +167,8 @@ class Run:
         self.engine.replace(*good)
         if self.poses is not None and self._good_poses is not None:
             self.poses.restore(self._good_poses)
+        if self.exposure is not None and self._good_exposure is not None:
+            self.exposure.restore(self._good_exposure)
 
     def background(self, target: Target) -> Tensor:
         """RGB [3] behind this step's photo: random where the photo is transparent and the plan says so."""
@@ -192,10 +195,12 @@ class Run:
             "poses": None if self.poses is None else self.poses.state(),
             "budget": asdict(self.budget),
             "shortened": self.shortened,
+            "most": self._most,
+            "ever_saw": self.ever_saw,
         }
 
     def resume(self, state: dict[str, Any]) -> None:
-        """Go on from `state`; densification scores start again, which is all that is lost."""
+        """Go on from `state`; densification scores and what the health watch remembers start again."""
         self.engine.replace(state["parameters"], state["exp_avg"], state["exp_avg_sq"])
         self.step = state["step"]
         self.clock = Clock(state["seconds"])
@@ -206,6 +211,8 @@ class Run:
         self.random.set_state(state["random"])
         self.budget = Budget(**state["budget"])
         self.shortened = state["shortened"]
+        self._most = state["most"]
+        self.ever_saw = state["ever_saw"]
         self.health.disturbed(self.step)
         if self.exposure is not None:
             self.exposure.restore(state["exposure"])
@@ -246,7 +253,8 @@ class Run:
         mask = None if target.mask is None else target.mask.to(seen.device)
         loss = ops.loss(seen, photo, mask=mask, backend=self.plan.kernels)
         (loss + exposure.penalty(number).to(loss.device)).backward()  # type: ignore[no-untyped-call]  # torch's own gap
-        exposure.update(self.rate_scale)
+        if bool(torch.isfinite(loss)):  # else the step is about to be undone
+            exposure.update(self.rate_scale)
         assert color.grad is not None
         self.engine.backward_update(color.grad, rates=rates, step=self.step)
         return StepResult(float(loss.detach()), int(bool((alpha > 0).any())), 0)
@@ -278,5 +286,6 @@ class Run:
             )
         self._good = (parameters, *self.engine.moments())
         self._good_poses = None if self.poses is None else self.poses.state()
+        self._good_exposure = None if self.exposure is None else self.exposure.state()
         self._good_progress = progress
         self._good_level = self.health.lowest

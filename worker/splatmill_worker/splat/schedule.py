@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
 
 from splatmill_worker.splat.budget import Budget
 from splatmill_worker.splat.rates import Annealing
@@ -17,8 +16,9 @@ class Schedule:
     steps gain as much from a small photo as from a large one. degree_every: steps between SH degrees.
     degree_by: share of the budget in which a short one reaches its last degree; None: by steps alone.
     first_degree: that of the first step.
-    opacity_decay: factor on all opacities at each densification: what the photos need grows back, what they do not
-    is pruned. densify_from / densify_every in steps, densify_until as a share: after it, positions and colours settle.
+    opacity_decay: factor on the opacities of those Gaussians that stay when others are added: what the photos need
+    grows back, what they do not is pruned.
+    densify_from / densify_every in steps, densify_until as a share: after it, positions and colours settle.
     """
 
     budget: Budget
@@ -50,7 +50,3 @@ class Schedule:
             and progress < self.densify_until
             and (step - self.densify_from) % self.densify_every == 0
         )
-
-    def as_dict(self) -> dict[str, Any]:
-        """For the report."""
-        return asdict(self)

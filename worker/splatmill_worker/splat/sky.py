@@ -21,10 +21,11 @@ OPACITY = 0.7
 """Of the shell when training begins: nothing stands behind it."""
 
 
-def sky_of(color: Pixels) -> Flags:
+def sky_of(color: Pixels, used: Flags) -> Flags:
     """bool [h, w] of a coarse photo uint8 [h, w, 3]: bright blue, white or grey, with nothing else above it.
 
-    Photos are upright by their EXIF orientation; in one that is not, little is found and nothing is lost.
+    Cells that are not `used` [h, w] hide nothing below them, and are no sky. Photos are upright by their EXIF
+    orientation; in one that is not, little is found and nothing is lost.
     """
     channels = color.astype(np.float64)
     red, green, blue = (channels[..., i] for i in range(3))
@@ -33,13 +34,13 @@ def sky_of(color: Pixels) -> Flags:
     cloud = (
         (channels.max(axis=2) - channels.min(axis=2) <= GREY) & (mean >= GREY_BRIGHT) & (blue >= red - 4.0)
     )
-    upper: Flags = np.logical_and.accumulate(clear | cloud, axis=0)
+    upper: Flags = np.logical_and.accumulate(clear | cloud | ~used, axis=0) & used
     return upper
 
 
 def sky_share(cells: Sequence[Cells]) -> float:
     """Share of all photos that shows sky without a point of the reconstruction on it."""
-    sky = sum(int((sky_of(grid.color) & grid.used & ~grid.covered).sum()) for grid in cells)
+    sky = sum(int((sky_of(grid.color, grid.used) & ~grid.covered).sum()) for grid in cells)
     return sky / max(1, sum(grid.used.size for grid in cells))
 
 
@@ -56,7 +57,7 @@ def shell(cells: Sequence[Cells], points: Float) -> tuple[Float, Pixels]:
     radius = DISTANCE * max(reach, spread, 1e-6)
     places, colors = [], []
     for grid in cells:
-        rows = np.argwhere(sky_of(grid.color) & grid.used & ~grid.covered)
+        rows = np.argwhere(sky_of(grid.color, grid.used) & ~grid.covered)
         away = grid.at(rows, np.ones(len(rows))) - grid.camera.center
         away /= np.linalg.norm(away, axis=1, keepdims=True)
         # Where the ray of a camera that is not in the middle meets the sphere.

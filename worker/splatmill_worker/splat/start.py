@@ -65,8 +65,10 @@ def read(path: Path, frame: Normalization) -> Gaussians:
     try:
         offset = ply.offset(path)
         gaussians = ply.read(path)
-    except (ply.PlyUnreadableError, FileNotFoundError) as error:
+    except ply.PlyUnreadableError as error:
         raise StartUnusableError(str(error)) from error
+    except OSError as error:
+        raise StartUnusableError(f"{path.name} cannot be opened: {error.strerror or error}.") from error
     if gaussians.count == 0:
         raise StartUnusableError(f"{path.name} holds no Gaussian with finite values.")
     shift = frame.scale * np.array(offset) + frame.translation
@@ -118,5 +120,5 @@ def strongest(gaussians: Gaussians, most: int) -> Gaussians:
 def _one_color(photo: Tensor, mask: Tensor | None) -> Tensor:
     """The mean colour of a photo's pixels that count, everywhere [H, W, 3]; the photo is uint8."""
     values = photo.float() / 255.0
-    counted = values.reshape(-1, 3) if mask is None else values[mask]
+    counted = values.reshape(-1, 3) if mask is None or not bool(mask.any()) else values[mask]
     return counted.mean(dim=0).expand_as(values)

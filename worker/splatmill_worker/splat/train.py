@@ -131,7 +131,9 @@ def train(
     run = Run(engine, plan, views, extent, densifier_of(plan), exposure, hooks.warn, poses)
     if resume_from is not None:
         run.resume(resume_from)
-    measuring = _Measuring(done=sum(share <= run.progress for share in MEASURED_AT))
+    # The last point is always measured: an attempt may end after its last step and before its model is written.
+    done = min(sum(share <= run.progress for share in MEASURED_AT), len(MEASURED_AT) - 1)
+    measuring = _Measuring(done=done)
     stopped, failure = "", None
     last_tick = last_checkpoint = time.monotonic()
     while not stopped:
@@ -146,7 +148,7 @@ def train(
             if run.recoveries >= MAX_RECOVERIES or named.name is FailureName.empty_scene:
                 if not run.ever_saw or not run.rows or not run.restore_good():
                     raise
-                stopped, failure = f"failed: {named}", named
+                stopped, failure = f"{named}", named
                 break
             run.recover(named)
         if run.progress >= MEASURED_AT[measuring.done]:
@@ -161,7 +163,7 @@ def train(
         if now - last_tick >= TICK_SECONDS:
             last_tick = now
             hooks.tick(_tick(run))
-        if hooks.checkpoint is not None and now - last_checkpoint >= hooks.checkpoint_seconds:
+        if hooks.checkpoint is not None and not stopped and now - last_checkpoint >= hooks.checkpoint_seconds:
             with run.clock.stopped():
                 hooks.checkpoint(run.state())
             last_checkpoint = time.monotonic()

@@ -98,7 +98,7 @@ def variants() -> Iterator[Variant]:
     )
     yield Variant(
         composite_backward.composite_backward_kernel,
-        {**back, "ALPHA": True, "DEPTH": True, "SCORES": False, "errors": None},
+        {**back, "ALPHA": True, "DEPTH": True, "SCORES": False},
     )
     bare, photo = {"MASK": False, "mask": None}, {"mean": None, "variance": None}
     yield Variant(loss.across_kernel, {**bare, "STATS": True})

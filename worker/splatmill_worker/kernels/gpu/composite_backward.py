@@ -29,7 +29,7 @@ def pick(k, which: tl.constexpr, value, others):
 @triton.jit
 def composite_backward_kernel(
     records, offsets, ids, color, transmittance, depth, checkpoints, first_segment, segment_tile,
-    d_color, d_alpha, d_depth, errors, gradient, width, height, columns,
+    d_color, d_alpha, d_depth, gradient, width, height, columns,
     ALPHA: tl.constexpr, DEPTH: tl.constexpr, SCORES: tl.constexpr, SEGMENT: tl.constexpr, BATCH: tl.constexpr,
 ):  # fmt: skip
     segment = tl.program_id(0)
@@ -59,9 +59,6 @@ def composite_backward_kernel(
     if DEPTH:
         g_depth = tl.load(d_depth + out, mask=inside, other=0.0)
         behind += tl.load(depth + out, mask=inside, other=0.0) * g_depth
-    error = tl.zeros([PIXELS], tl.float32)
-    if SCORES:
-        error = tl.load(errors + out, mask=inside, other=0.0)
 
     place = checkpoints + segment.to(tl.int64) * (5 * PIXELS) + pixel
     through = tl.load(place + 3 * PIXELS)
@@ -114,9 +111,8 @@ def composite_backward_kernel(
             if SCORES:
                 sums = pick(k, 10, tl.sum(tl.abs(a * pull_x + b * pull_y), axis=0), sums)
                 sums = pick(k, 11, tl.sum(tl.abs(b * pull_x + c * pull_y), axis=0), sums)
-                sums = pick(k, 12, tl.sum(weight * error, axis=0), sums)
             target = gradient + splat.to(tl.int64) * GRADIENT_STRIDE + k
-            tl.atomic_add(target, sums, mask=listed & (k < 13), sem="relaxed")
+            tl.atomic_add(target, sums, mask=listed & (k < 12), sem="relaxed")
         most = tl.max(through, 0)
         done += BATCH
 
@@ -131,11 +127,9 @@ def blend_backward(
     *,
     d_alpha: Tensor | None = None,
     d_depth: Tensor | None = None,
-    errors: Tensor | None = None,
+    scores: bool = False,
 ) -> Tensor:
-    """Gradient records [N, 16] (see `record`) of one view; with errors [H, W] the densification sums are
-    filled too.
-    """
+    """Gradient records [N, 16] (see `record`) of one view; with `scores` the densification sums are filled too."""
     if made.checkpoints is None or made.segment_tile is None:
         raise ValueError(
             "the view was composited without checkpoints; composite it again with them to differentiate it"
@@ -145,9 +139,9 @@ def blend_backward(
         records, bins.offsets, bins.ids, made.color, made.transmittance, made.depth, made.checkpoints,
         made.first_segment, made.segment_tile, d_color.contiguous(),
         None if d_alpha is None else d_alpha.contiguous(),
-        None if d_depth is None else d_depth.contiguous(), errors, gradient,
+        None if d_depth is None else d_depth.contiguous(), gradient,
         width, height, -(-width // TILE),
         ALPHA=d_alpha is not None, DEPTH=d_depth is not None,
-        SCORES=errors is not None, SEGMENT=SEGMENT,
+        SCORES=scores, SEGMENT=SEGMENT,
     )  # fmt: skip
     return gradient

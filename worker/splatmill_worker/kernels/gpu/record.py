@@ -13,10 +13,8 @@ from ..records import Projected
 # gathers by index and pays by the 32-byte sector: one record is two sectors, six separate arrays would be at
 # least six.
 WIDTH = 12
-# The gradient of the first ten, then sum |d mean x|, sum |d mean y|, sum weight * |colour error|, and padding
-# to 64 bytes.
+# The gradient of the first ten, then sum |d mean x|, sum |d mean y|, and padding to 64 bytes.
 GRADIENT_WIDTH = 16
-ABS_X, ABS_Y, ERROR = 10, 11, 12
 
 
 def fields(record: Tensor) -> Projected:

@@ -77,9 +77,7 @@ class StepResult(NamedTuple):
 
 @triton.jit
 def scores_kernel(gradient, records, scores, count, half_width, half_height, per_image, BLOCK: tl.constexpr):
-    """Add one view to scores [5, N]: plain and absolute gradient of the mean in NDC units, visits, largest
-    extent, error.
-    """
+    """Add one view to scores [4, N]: plain and absolute gradient of the mean in NDC units, visits, largest extent."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     source = records + i.to(tl.int64) * 12
@@ -91,7 +89,6 @@ def scores_kernel(gradient, records, scores, count, half_width, half_height, per
     y = tl.load(row + 1, mask=seen, other=0.0) * half_height
     ax = tl.load(row + 10, mask=seen, other=0.0) * half_width
     ay = tl.load(row + 11, mask=seen, other=0.0) * half_height
-    error = tl.load(row + 12, mask=seen, other=0.0)
     place = scores + i
     tl.store(place, tl.load(place, mask=seen) + tl.sqrt_rn(x * x + y * y), mask=seen)
     place += count
@@ -101,8 +98,6 @@ def scores_kernel(gradient, records, scores, count, half_width, half_height, per
     place += count
     largest = tl.maximum(extent_x, extent_y) * per_image
     tl.store(place, tl.maximum(tl.load(place, mask=seen), largest), mask=seen)
-    place += count
-    tl.store(place, tl.load(place, mask=seen) + error, mask=seen)
 
 
 @dataclass
@@ -145,9 +140,7 @@ class Step:
         where: torch.device | str | None = None,
         together: Together | None = None,
     ) -> None:
-        self.keep_scores: Scores | None = (
-            "absolute"  # a pass of its own here, which costs next to nothing beside the others
-        )
+        self.keep_scores: Scores | None = "absolute"
         if where is None:
             where = "cpu" if device.interpreting() else "cuda"
         self.device = torch.device(where)
@@ -202,11 +195,6 @@ class Step:
     def max_extent(self) -> Tensor:
         return self._scores[3]
 
-    @property
-    def error_sum(self) -> Tensor:
-        """Sum over pixels of blending weight times |colour error|."""
-        return self._scores[4]
-
     def clear_scores(self) -> None:
         """Start the scores anew."""
         self._scores.zero_()
@@ -245,7 +233,7 @@ class Step:
                 else given.to(self.device, torch.float32).t().contiguous()
                 for given in (exp_avg, exp_avg_sq)
             ]
-            scores = torch.zeros(5, count, device=self.device)
+            scores = torch.zeros(4, count, device=self.device)
             gradient = torch.empty_like(params)
             last = torch.full((count,), self._steps, dtype=torch.int32, device=self.device)
         grown = count / max(1, self.count) if hasattr(self, "_params") else 1.0
@@ -297,7 +285,7 @@ class Step:
         with self._sparing():
             given = [None if d is None else d.to(self.device) for d in (d_color, d_alpha, d_depth)]
             assert given[0] is not None
-            seen = self._differentiate(view, given[0], given[1], given[2], None)
+            seen = self._differentiate(view, given[0], given[1], given[2])
             refused = torch.zeros(1, dtype=torch.int32, device=self.device)
             self._move(seen, view.degree, rates, step, refused)
         self._listen(view.key, torch.zeros(3, device=self.device), view.lists.used, refused)
@@ -328,10 +316,7 @@ class Step:
                 color, seen_photo, dssim_weight=dssim_weight, mask=used_pixels, stats=None
             )
             assert d_color is not None
-            errors = (color - seen_photo.to(torch.float32) / 255).abs_().sum(2)
-            if used_pixels is not None:
-                errors *= used_pixels != 0
-            seen = self._differentiate(view, d_color, None, None, errors)
+            seen = self._differentiate(view, d_color, None, None)
             refused = torch.zeros(1, dtype=torch.int32, device=self.device)
             self._move(seen, degree, rates, step, refused)
         losses = torch.stack([value, l1, ssim])
@@ -366,22 +351,24 @@ class Step:
         d_color: Tensor,
         d_alpha: Tensor | None,
         d_depth: Tensor | None,
-        errors: Tensor | None,
     ) -> Tensor:
         """Fill the gradient planes and add to the scores; which Gaussians have a gradient, uint8 [N]."""
         size = (view.width, view.height)
-        if errors is None:
-            errors = torch.zeros(view.height, view.width, device=self.device)
         image = view.image
         gradient = blend_backward(
             view.records, view.lists.bins, image, *size, d_color,
-            d_alpha=d_alpha, d_depth=d_depth, errors=errors,
+            d_alpha=d_alpha, d_depth=d_depth, scores=self.keep_scores is not None,
         )  # fmt: skip
         project_backward(
             self._groups(self._params), view.viewmat, view.K, *size, view.records, gradient,
             degree=view.degree, antialias=view.antialias, planar=self.count, into=self._groups(self._gradient),
         )  # fmt: skip
-        seen = (view.records[:, 10] > 0).to(torch.uint8)
+        if self.keep_scores is not None:
+            self._score(view, gradient)
+        return (view.records[:, 10] > 0).to(torch.uint8)
+
+    def _score(self, view: _View, gradient: Tensor) -> None:
+        """Add a view's gradient records [N, 16] to the scores, of all processes where there are several."""
         scores = self._scores if self._together is None else torch.zeros_like(self._scores)
         if self.count:
             scores_kernel[(triton.cdiv(self.count, 256),)](
@@ -395,7 +382,6 @@ class Step:
             self._together.add_(scores)
             self._scores += scores
             torch.maximum(self._scores[3], extent, out=self._scores[3])
-        return seen
 
     def _move(self, seen: Tensor, degree: int, rates: Rates, step: int, refused: Tensor) -> None:
         channels = 11 + 3 * (degree + 1) ** 2
