@@ -51,13 +51,12 @@ class Cells:
 
         rgb = target.rgb.permute(2, 0, 1).float()
         used = np.ones((height, width), bool)
-        if target.mask is None:
-            mean = area(rgb)
-        else:
+        mean: npt.NDArray[np.floating] = area(rgb)
+        if target.mask is not None:
             # Masked pixels are no part of the colour of what is beside them.
             counted = target.mask[None].float()
             share = area(counted)
-            mean = area(rgb * counted) / np.maximum(share, 1e-6)
+            mean = area(rgb * counted) / np.maximum(share, np.float32(1e-6))
             used = share[0] > 0.5
         color = (mean + 0.5).astype(np.uint8).transpose(1, 2, 0)
         seen = projected(camera, points)
