@@ -53,8 +53,8 @@ def _named(error: Any) -> tuple[str, str, str | None] | None:
 
 
 def _pixels(camera: dict[Any, Any]) -> float:
-    sides = [camera.get("width"), camera.get("height")]
-    return sides[0] * sides[1] if all(isinstance(side, int) for side in sides) else 0  # type: ignore[operator]
+    width, height = camera.get("width"), camera.get("height")
+    return width * height if isinstance(width, int) and isinstance(height, int) else 0
 
 
 def _path(error: Any) -> str:

@@ -105,14 +105,18 @@ def test_masked_places_get_no_points(bare: Scene, tmp_path: Path) -> None:
     assert x.min() >= WIDTH // 2
 
 
-def test_photos_without_a_common_scene_are_given_up(bare: Scene, tmp_path: Path) -> None:
-    random = np.random.default_rng(0)
-    views = []
-    for view in bare.views:
+def of_noise(scene: Scene, count: int, folder: Path) -> Scene:
+    """The first `count` cameras of the scene, each with a photo of blobs that no other photo shows."""
+    random, views = np.random.default_rng(0), []
+    for view in scene.views[:count]:
         noise = random.integers(0, 255, (HEIGHT // 4, WIDTH // 4, 3), np.uint8)
-        Image.fromarray(noise).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC).save(tmp_path / view.name)
-        views.append(replace(view, image=tmp_path / view.name))
-    found = stereo.find(replace(bare, views=tuple(views)))
+        Image.fromarray(noise).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC).save(folder / view.name)
+        views.append(replace(view, image=folder / view.name))
+    return replace(scene, views=tuple(views))
+
+
+def test_photos_without_a_common_scene_are_given_up(bare: Scene, tmp_path: Path) -> None:
+    found = stereo.find(of_noise(bare, len(bare.views), tmp_path))
     assert found.given_up
     assert len(found.points) == 0
     assert stereo.add(bare, found).facts["stereo_points"] == 0
@@ -179,12 +183,7 @@ def test_cancelling_reaches_the_loading_of_photos(bare: Scene, tmp_path: Path) -
 
 
 def test_three_photos_are_judged_as_well(bare: Scene, tmp_path: Path) -> None:
-    random, views = np.random.default_rng(0), []
-    for view in bare.views[:3]:
-        noise = random.integers(0, 255, (HEIGHT // 4, WIDTH // 4, 3), np.uint8)
-        Image.fromarray(noise).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC).save(tmp_path / view.name)
-        views.append(replace(view, image=tmp_path / view.name))
-    found = stereo.find(replace(bare, views=tuple(views)))
+    found = stereo.find(of_noise(bare, 3, tmp_path))
     assert found.given_up
     assert len(found.points) == 0
 
