@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 import matplotlib as mpl
@@ -21,6 +22,8 @@ COLORS = {
 }
 LOSER = "#c0392b"
 WINNER = "#2d2d2d"
+LETTERS_PER_INCH = 18.0
+"""Of the footer's size: 7 points, sans serif."""
 
 plt.rcParams.update(
     {
@@ -43,7 +46,8 @@ def axes(columns: int, *, height: float = 4.0, width: float = 5.4) -> tuple[Figu
 
 def save(figure: Figure, path: Path, footer: str) -> None:
     path.parent.mkdir(exist_ok=True)
-    figure.tight_layout(rect=(0, 0.04, 1, 1))
-    figure.text(0.01, 0.01, footer, fontsize=7, color="#777777")
+    lines = textwrap.wrap(footer, round(LETTERS_PER_INCH * figure.get_figwidth()))
+    figure.tight_layout(rect=(0, 0.01 + 0.03 * len(lines), 1, 1))
+    figure.text(0.01, 0.01, "\n".join(lines), fontsize=7, color="#777777")
     figure.savefig(path)
     plt.close(figure)

@@ -48,7 +48,7 @@ def draw(rows: list[Row], references: list[Row], path: Path) -> None:
             [handles[i] for i in scenes_first],
             [labels[i] for i in scenes_first],
             fontsize=7,
-            loc="lower right",
+            loc="upper left",  # where nothing is: a good picture in no time
         )
     quality.set_title(
         "points: separate runs, median and range over seeds; thin: the course of the longest", fontsize=8
