@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -263,7 +264,7 @@ def test_switches_are_compared_seed_by_seed_on_the_same_code(parts: Any, place: 
 
 def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: Path) -> None:
     """tiny has no tracks, so that its plan leaves out antialiasing, and no densification at 30 steps."""
-    rows, configurations = parts["_train.rows"], parts["_train.configurations"]
+    rows = parts["_train.rows"]
     default = next(row for row in rows_of(place) if row["kind"] == "run") | {"config": "default"}
     scene = parts["_train.scenes"].Scene(default["scene"], place / "tiny")
     budget = parts["_train.budgets"].parse(default["budget"])
@@ -282,11 +283,19 @@ def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: P
     assert idle("sh-0", default["plan"])
     assert not idle("sh-3", default["plan"])
     assert not idle("default", default["plan"])
-    wanted = rows.runs_of([scene], ["mcmc", "default", "no-random-background"], [budget], [1, 0])
+    wanted = rows.runs_of(
+        [scene], ["mcmc", "default", "no-random-background", "black-background"], [budget], [1, 0]
+    )
     assert [(run.seed, run.config) for run in wanted] == [
         (1, "default"),
         (1, "mcmc"),
+        (1, "black-background"),
         (0, "default"),
         (0, "mcmc"),
+        (0, "black-background"),
     ]
-    assert configurations.named("no-random-background").alpha
+    clear = replace(scene, transparent=True)
+    assert [
+        run.config
+        for run in rows.runs_of([clear], ["no-random-background", "black-background"], [budget], [0])
+    ] == ["no-random-background"]

@@ -23,7 +23,8 @@ from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan import Plan
 from splatmill_worker.splat.run import Run
 from splatmill_worker.splat.schedule import Schedule
-from splatmill_worker.splat.train import Cancelled, Hooks, Tick, train
+from splatmill_worker.splat.train import Cancelled, Hooks, Tick, evaluation_background, train
+from splatmill_worker.splat.views import TrainingView
 
 
 def plan(steps: int | None = 300, seconds: float | None = None, **changes: Any) -> Plan:
@@ -91,6 +92,38 @@ def test_every_strategy_learns_and_keeps_to_its_limit(strategy: str) -> None:
     assert trained.held_out is not None
     assert trained.held_out.psnr > 17.0
     assert trained.gaussians.count <= 2200
+
+
+def test_dark_surfaces_are_no_holes_over_random_colours() -> None:
+    """Over black, what is not there looks like a dark wall, and training has no reason to put one."""
+    views = [
+        TrainingView(view.name, {1: view.full._replace(rgb=torch.full_like(view.full.rgb, 4))})
+        for view in split()[0]
+    ]
+    through: dict[str, float] = {}
+    for background in ("black", "random"):
+        engine = first_engine()
+        train(engine, views, [], plan(400, background=background), extent=1.1)
+        target = views[0].full
+        _, alpha, _ = engine.forward(
+            target.viewmat, target.K, target.camera.width, target.camera.height, degree=1
+        )
+        through[background] = float((alpha < 0.9).float().mean())
+    assert through["black"] > 0.5
+    assert through["random"] < 0.2
+
+
+def test_opaque_photos_are_judged_over_black_and_transparent_ones_over_white() -> None:
+    views, _ = split()
+    opaque = views[0]
+    clear = TrainingView("clear", {1: opaque.full._replace(alpha=opaque.full.rgb[..., 0])})
+    for background, judged, colour in (
+        ("random", [opaque], 0.0),
+        ("random", [opaque, clear], 1.0),
+        ("white", [opaque], 1.0),
+        ("black", [clear], 0.0),
+    ):
+        assert evaluation_background(plan(background=background), judged).tolist() == [colour] * 3
 
 
 def test_the_same_seed_gives_the_same_bytes() -> None:

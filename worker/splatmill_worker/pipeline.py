@@ -307,6 +307,6 @@ class _Teller:
         self._emit(LogEvent(level="warning", message=message))
 
     def preview(self, engine: Engine, step: int) -> None:
-        color = drawer(engine, self._plan)(self._view.full, evaluation_background(self._plan))
+        color = drawer(engine, self._plan)(self._view.full, evaluation_background(self._plan, [self._view]))
         save_jpeg(self._workdir / "out" / "preview.jpg", color)
         self._emit(PreviewEvent(path="out/preview.jpg", step=step))

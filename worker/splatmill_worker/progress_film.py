@@ -49,7 +49,7 @@ class ProgressFilm:
     def take(self, engine: Engine, progress: float, seconds: float) -> None:
         """Take the shot that is due, `seconds` into the training."""
         started = time.perf_counter()
-        color = drawer(engine, self._plan)(self._view.full, evaluation_background(self._plan))
+        color = drawer(engine, self._plan)(self._view.full, evaluation_background(self._plan, [self._view]))
         picture = Image.fromarray(
             even((color.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy())
         )

@@ -166,7 +166,8 @@ class TrainOptions(Request):
     )
     background: Background = Field(
         default=Background.auto,
-        description="What lies behind the scene; random keeps transparent photos transparent.",
+        description="What lies behind the scene while training; over random colours no hole passes for a surface, and "
+        "transparent photos stay transparent.",
         json_schema_extra=_PHOTOS,
     )
     exposure: Switch = Field(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 from splatmill_worker.splat.plan import Plan
 
@@ -16,14 +16,14 @@ class Configuration:
 
     what: the switch in words. options: fields of TrainOptions. plan: fields of the plan that was made, with dots
     into its parts ("schedule.degree_every"). gives: fields of the plan that the options lead to; where a plan has them
-    anyway, the switch changes nothing. alpha: the switch means something on transparent photos only.
+    anyway, the switch changes nothing. photos: the switch means something on such photos only.
     """
 
     what: str
     options: dict[str, Any] = field(default_factory=dict)
     gives: dict[str, Any] = field(default_factory=dict)
     plan: dict[str, Any] = field(default_factory=dict)
-    alpha: bool = False
+    photos: Literal["any", "opaque", "transparent"] = "any"
 
     def changes(self, plan: dict[str, Any]) -> bool:
         """Whether the switch makes another plan of a row's plan, in which what is off or None is absent."""
@@ -78,7 +78,13 @@ CONFIGURATIONS = {
     "exposure": _option("an affine colour for each photo", "exposure", "on", True),
     "no-exposure": _option("no such colour", "exposure", "off", False),
     "no-random-background": Configuration(
-        "white behind transparent photos", {"background": "white"}, {"background": "white"}, alpha=True
+        "white behind transparent photos",
+        {"background": "white"},
+        {"background": "white"},
+        photos="transparent",
+    ),
+    "black-background": Configuration(
+        "black behind the Gaussians", {"background": "black"}, {"background": "black"}, photos="opaque"
     ),
     "sky": _option("a far shell of Gaussians where photos show sky", "sky", "on", True),
     "no-sky": _option("no such shell", "sky", "off", False),

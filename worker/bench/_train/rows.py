@@ -84,7 +84,7 @@ def runs_of(
         for budget in budgets
         for scene in scenes
         for config in configs
-        if scene.transparent or not named(config).alpha
+        if named(config).photos in ("any", "transparent" if scene.transparent else "opaque")
     ]
 
 

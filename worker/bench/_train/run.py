@@ -27,7 +27,7 @@ from splatmill_worker.refusal import Refusal
 from splatmill_worker.scene import Normalization, Scene
 from splatmill_worker.sfm import posed
 from splatmill_worker.splat import ply
-from splatmill_worker.splat.evaluate import evaluate
+from splatmill_worker.splat.evaluate import evaluate, judged_over
 from splatmill_worker.splat.failure import TrainingFailed
 from splatmill_worker.splat.plan import Plan
 from splatmill_worker.splat.render import render
@@ -123,10 +123,8 @@ def judge(job: Row) -> Row:
         return render(moved, target.camera, background=background, backend=backend).color
 
     views = [TrainingView.of(photo, frame) for photo in load_views(test, options.image_size)]
-    # As runs are judged: white behind transparent photos; opaque ones are trained over black, by everybody.
-    backdrop = torch.full((3,), float(any(view.full.alpha is not None for view in views)))
     with torch.no_grad():
-        score = evaluate(draw, views, backdrop)
+        score = evaluate(draw, views, judged_over(views))
     return rounded(
         {
             "kind": "peer",

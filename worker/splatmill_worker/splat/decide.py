@@ -11,7 +11,7 @@ from splatmill_worker.kernels.gpu.device import largest_budget
 from splatmill_worker.splat.budget import Budget
 from splatmill_worker.splat.facts import ENOUGH_POINTS, Facts, Speed
 from splatmill_worker.splat.initialise import RANDOM_GAUSSIANS
-from splatmill_worker.splat.needs import needs_of
+from splatmill_worker.splat.needs import FEW_VIEWS, needs_of
 from splatmill_worker.splat.plan import Kernels, Plan, Strategy
 from splatmill_worker.splat.rates import Annealing
 from splatmill_worker.splat.reasons import Reasons
@@ -311,6 +311,11 @@ def _degree(facts: Facts, options: TrainOptions, why: Reasons) -> int:
 
 
 def _background(facts: Facts, options: TrainOptions, why: Reasons) -> Literal["black", "white", "random"]:
+    """Over black, dark surfaces stay transparent: on the fox, 1.8 % of the held-out pixels by more than a tenth.
+
+    8000 steps end at 32.7 dB so, and at 33.0 dB with 0.02 % of them over random colours; lund gains 0.3 dB in 800,
+    kermit (9 training views) loses 0.7.
+    """
     if options.background is not Background.auto:
         why.option("background")
         named: dict[Background, Literal["black", "white", "random"]] = {
@@ -324,9 +329,16 @@ def _background(facts: Facts, options: TrainOptions, why: Reasons) -> Literal["b
             f"{facts.transparent} photos are transparent, and must stay so over any colour."
         )
         return "random"
-    why.chosen["background"] = "No photo is transparent."
     why.left_out["alpha"] = "No photo is transparent."
-    return "black"
+    if facts.views < FEW_VIEWS:
+        why.chosen["background"] = (
+            f"No photo is transparent, and {facts.views} are too few to say how deep an opaque surface has to be."
+        )
+        return "black"
+    why.chosen["background"] = (
+        "No photo is transparent: over colours that change, no hole passes for a surface."
+    )
+    return "random"
 
 
 def _exposure(facts: Facts, options: TrainOptions, why: Reasons) -> bool:

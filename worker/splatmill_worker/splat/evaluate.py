@@ -55,6 +55,11 @@ def evaluate(draw: Draw, views: Sequence[TrainingView], background: Tensor) -> S
     return Score(tuple(scores))
 
 
+def judged_over(views: Sequence[TrainingView]) -> Tensor:
+    """Background [3] of an evaluation: white where any photo is transparent, else black."""
+    return torch.full((3,), float(any(view.full.alpha is not None for view in views)))
+
+
 def compare(name: str, color: Tensor, photo: Tensor, mask: Tensor | None = None) -> ViewScore:
     """Score of a rendered image [H, W, 3] against a photo uint8 [H, W, 3]; only `mask` [H, W] pixels count.
 

@@ -20,7 +20,7 @@ BYTES_PER_GAUSSIAN = 59 * 4 * 8
 class Plan:
     """The whole course of a run. What is not needed is None or absent.
 
-    image_size: longest side in pixels. background: what is put behind transparent photos while training.
+    image_size: longest side in pixels. background: what is behind Gaussians and transparent photos while training.
     sky: a far shell of Gaussians stands for it. gaps: Gaussians are put where photos show what no point describes.
     pose_refinement: training cameras are corrected. `reasons` has one sentence per field;
     `left_out` one per thing that this scene does not need; `forced` names the fields that an option fixed.

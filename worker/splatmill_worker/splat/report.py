@@ -80,7 +80,7 @@ def write_report(
     judged = held_out or views
     score = trained.held_out or trained.on_training
     draw = drawer(engine, plan)
-    backdrop = evaluation_background(plan)
+    backdrop = evaluation_background(plan, views)
     pictures = []
     for view_score in sorted(score.views, key=lambda row: row.psnr)[:WORST]:
         view = next(view for view in judged if view.name == view_score.name)

@@ -29,8 +29,6 @@ SNAPSHOT_SHARE = 0.04
 MEMORY_SHRINK = 0.8
 """Of the Gaussians there were when memory ran out."""
 
-GREY = 0.5
-
 
 @dataclass(frozen=True)
 class Row:
@@ -78,7 +76,7 @@ class Run:
         self._good_progress = -math.inf
         self._good_level = math.inf
         self._most = self.plan.max_gaussians
-        self._fixed = torch.full((3,), {"black": 0.0, "white": 1.0, "random": GREY}[self.plan.background])
+        self._fixed = torch.full((3,), 1.0 if self.plan.background == "white" else 0.0)
 
     @property
     def progress(self) -> float:
@@ -170,11 +168,9 @@ class Run:
         if self.exposure is not None and self._good_exposure is not None:
             self.exposure.restore(self._good_exposure)
 
-    def background(self, target: Target) -> Tensor:
-        """RGB [3] behind this step's photo: random where the photo is transparent and the plan says so."""
-        if target.alpha is not None and self.plan.background == "random":
-            return torch.rand(3, generator=self.random)
-        return self._fixed if target.alpha is not None or self.plan.background == "white" else torch.zeros(3)
+    def background(self) -> Tensor:
+        """RGB [3] behind this step's photo."""
+        return torch.rand(3, generator=self.random) if self.plan.background == "random" else self._fixed
 
     def state(self) -> dict[str, Any]:
         """Everything a later attempt needs to go on, as plain values and tensors."""
@@ -220,7 +216,7 @@ class Run:
             self.poses.restore(state["poses"])
 
     def _plain_step(self, number: int, target: Target, degree: int, rates: Rates) -> StepResult:
-        background = self.background(target)
+        background = self.background()
         return self.engine.train_photo(
             target.viewmat,
             target.K,
@@ -237,7 +233,7 @@ class Run:
     def _exposed_step(
         self, exposure: Exposure, number: int, target: Target, degree: int, rates: Rates
     ) -> StepResult:
-        background = self.background(target)
+        background = self.background()
         color, alpha, _ = self.engine.forward(
             target.viewmat,
             target.K,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from splatmill_worker.scene import Normalization
 from splatmill_worker.splat import ply
-from splatmill_worker.splat.evaluate import compare
+from splatmill_worker.splat.evaluate import compare, judged_over
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.render import render
 from splatmill_worker.splat.views import TrainingView
@@ -78,8 +78,7 @@ def read(path: Path, frame: Normalization) -> Gaussians:
 def judge(gaussians: Gaussians, views: Sequence[TrainingView]) -> Start:
     """How `gaussians` show some of `views`. Raises StartUnusableError where they show something else."""
     some = views[:: max(1, len(views) // JUDGES)]
-    # As training judges: white only behind what is transparent.
-    backdrop = torch.ones(3) if any(view.full.alpha is not None for view in views) else torch.zeros(3)
+    backdrop = judged_over(views)
     shown: list[float] = []
     plain: list[float] = []
     other: list[float] = []

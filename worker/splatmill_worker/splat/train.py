@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.splat.engine import Engine, gaussians_of
-from splatmill_worker.splat.evaluate import Score, evaluate
+from splatmill_worker.splat.evaluate import Score, evaluate, judged_over
 from splatmill_worker.splat.exposure import Exposure
 from splatmill_worker.splat.failure import FailureName, TrainingFailed
 from splatmill_worker.splat.gaussians import Gaussians
@@ -170,7 +170,7 @@ def train(
     seconds = run.clock.seconds
     started = time.perf_counter()
     draw = drawer(engine, plan)
-    backdrop = evaluation_background(plan)
+    backdrop = evaluation_background(plan, views)
     final = evaluate(draw, held_out, backdrop) if held_out else None
     engine.keep_pose_gradient = False
     seen_from = list(views) if poses is None else poses.corrected(views)
@@ -211,9 +211,14 @@ def drawer(engine: Engine, plan: Plan) -> Callable[[Target, Tensor], Tensor]:
     return draw
 
 
-def evaluation_background(plan: Plan) -> Tensor:
-    """White behind transparent photos unless the plan says black: what published results are judged on."""
-    return torch.zeros(3) if plan.background == "black" else torch.ones(3)
+def evaluation_background(plan: Plan, views: Sequence[TrainingView]) -> Tensor:
+    """What published results are judged on: white behind transparent photos, black behind opaque ones.
+
+    A colour that the plan fixes is kept: the Gaussians know no other.
+    """
+    if plan.background == "random":
+        return judged_over(views)
+    return torch.full((3,), 1.0 if plan.background == "white" else 0.0)
 
 
 def _depth_seen(engine: Engine, views: Sequence[TrainingView], plan: Plan) -> float:
@@ -235,7 +240,7 @@ def _depth_seen(engine: Engine, views: Sequence[TrainingView], plan: Plan) -> fl
 
 def warm_up(engine: Engine, view: TrainingView, plan: Plan) -> None:
     """Touch code and memory once before the clock starts; changes nothing."""
-    drawer(engine, plan)(view.full, evaluation_background(plan))
+    drawer(engine, plan)(view.full, evaluation_background(plan, [view]))
 
 
 def _measure(run: Run, held_out: Sequence[TrainingView], measuring: _Measuring) -> Row:
@@ -244,7 +249,7 @@ def _measure(run: Run, held_out: Sequence[TrainingView], measuring: _Measuring) 
         measuring.done += 1
     score = None
     if held_out:
-        score = evaluate(drawer(run.engine, run.plan), held_out, evaluation_background(run.plan))
+        score = evaluate(drawer(run.engine, run.plan), held_out, evaluation_background(run.plan, run.views))
     row = Row(
         run.clock.seconds,
         run.step,
