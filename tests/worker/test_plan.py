@@ -105,7 +105,7 @@ def test_the_degree_follows_from_the_angles_between_views(angle: float | None, d
         ({"antialias": "on"}, "antialias", True),
         ({"pose_refinement": "on"}, "pose_refinement", True),
         ({"gaps": "off"}, "gaps", False),
-        ({"densify": "mcmc"}, "densify", "mcmc"),
+        ({"densify": "absolute"}, "densify", "absolute"),
         ({"densify": "off"}, "densify", None),
         ({"background": "white"}, "background", "white"),
         ({"max_gaussians": 7000}, "max_gaussians", 7000),

@@ -34,7 +34,6 @@ class Densify(StrEnum):
     off = "off"
     classic = "classic"
     absolute = "absolute"
-    mcmc = "mcmc"
 
 
 class Background(StrEnum):
@@ -214,7 +213,7 @@ class TrainOptions(Request):
     )
     densify: Densify = Field(
         default=Densify.auto,
-        description="How Gaussians are added: the paper's gradients, absolute gradients, or MCMC relocation.",
+        description="How Gaussians are added: by the paper's gradients, or by absolute ones.",
         json_schema_extra=_ENGINE,
     )
     antialias: Switch = Field(

@@ -80,7 +80,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         densify_from=max(50, min(300, steps // 8)),
         densify_every=max(40, min(100, steps // 20)),
         densify_until=0.7,
-        opacity_decay=OPACITY_DECAY if densify in ("classic", "absolute") else 1.0,
+        opacity_decay=1.0 if densify is None else OPACITY_DECAY,
         annealing=Annealing(boost=_boost(steps, why)),
     )
     if facts.start is not None:
@@ -245,7 +245,6 @@ def _densify(options: TrainOptions, most: int, start: int, why: Reasons) -> Stra
         chosen: dict[Densify, Strategy] = {
             Densify.classic: "classic",
             Densify.absolute: "absolute",
-            Densify.mcmc: "mcmc",
         }
         return chosen[options.densify]
     if start >= most:

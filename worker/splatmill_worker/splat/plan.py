@@ -9,7 +9,7 @@ from splatmill_worker.splat.budget import Budget
 from splatmill_worker.splat.rates import Annealing
 from splatmill_worker.splat.schedule import Schedule
 
-Strategy = Literal["classic", "absolute", "mcmc"]
+Strategy = Literal["classic", "absolute"]
 Kernels = Literal["reference", "cpu", "gpu"]
 
 BYTES_PER_GAUSSIAN = 59 * 4 * 8

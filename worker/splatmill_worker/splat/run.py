@@ -13,7 +13,8 @@ from torch import Tensor
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu.step import Rates
 from splatmill_worker.splat.budget import Budget, Clock
-from splatmill_worker.splat.density.interface import Densifier, Moment
+from splatmill_worker.splat.density.classic import Classic
+from splatmill_worker.splat.density.event import Moment
 from splatmill_worker.splat.engine import Engine, StepResult
 from splatmill_worker.splat.exposure import Exposure
 from splatmill_worker.splat.failure import FailureName, TrainingFailed
@@ -51,7 +52,7 @@ class Run:
     plan: Plan
     views: Sequence[TrainingView]
     extent: float
-    densifier: Densifier | None
+    densifier: Classic | None
     exposure: Exposure | None
     warn: Callable[[str], None]
     poses: Poses | None = None
@@ -115,10 +116,8 @@ class Run:
         # What nobody will read is not summed.
         reads = self.densifier is not None and progress < schedule.densify_until
         self.engine.keep_scores = self.densifier.scores if self.densifier is not None and reads else None
-        if self.densifier is not None:
-            self.densifier.after_step(self.engine, rates.means, self.random)
-            if schedule.densifies(self.step, progress):
-                self._densify(self.densifier, progress)
+        if self.densifier is not None and schedule.densifies(self.step, progress):
+            self._densify(self.densifier, progress)
 
     def recover(self, failure: TrainingFailed) -> None:
         """Back to the last good state, with steps half as long."""
@@ -261,7 +260,7 @@ class Run:
             self.order = torch.randperm(len(self.views), generator=self.random).tolist()
         return self.order.pop()
 
-    def _densify(self, densifier: Densifier, progress: float) -> None:
+    def _densify(self, densifier: Classic, progress: float) -> None:
         allowed = min(self.plan.max_gaussians, self._most)
         if self.plan.max_memory is not None:
             allowed = min(allowed, self.plan.gaussians_within(self.plan.max_memory))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from splatmill_worker.kernels.records import Scores
 from splatmill_worker.splat.density import prune
-from splatmill_worker.splat.density.interface import Change, Moment
+from splatmill_worker.splat.density.event import Change, Moment
 from splatmill_worker.splat.density.rows import Rows, offsets
 from splatmill_worker.splat.engine import Engine
 from splatmill_worker.splat.gaussians import Gaussians, concatenate
@@ -61,13 +61,10 @@ class Classic:
         added = int(hot.sum())
         return Change(added=added, removed=before + added - engine.count)
 
-    def after_step(self, engine: Engine, position_rate: float, random: torch.Generator) -> None:
-        """Nothing moves between events."""
-
     def _score(self, engine: Engine) -> Tensor:
         total = engine.plain_sum if self.score == "plain" else engine.abs_sum
         if total is None:
-            raise ValueError("This backend has no absolute gradients; choose densify=classic or mcmc.")
+            raise ValueError("This backend has no absolute gradients; choose densify=classic.")
         return total / engine.visible_count.clamp_min(1)
 
 
