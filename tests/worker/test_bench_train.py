@@ -240,11 +240,11 @@ def test_budgets_are_judged_by_all_their_runs(parts: Any, place: Path) -> None:
 def test_switches_are_compared_seed_by_seed_on_the_same_code(parts: Any, place: Path) -> None:
     ablation = parts["_train.ablation"].ablation
     row = next(row for row in rows_of(place) if row["kind"] == "run")
-    default, changed = row | {"config": "default"}, {**row["plan"], "densify": "absolute"}
+    default, changed = row | {"config": "default"}, {**row["plan"], "antialias": True, "exposure": True}
     rows = [like(default, seed=seed, psnr=20.0 + 3 * seed, train=10.0) for seed in (0, 1, 2)]
     for seed, gain in enumerate((0.1, 0.3, 0.2)):
         rows.append(
-            like(row, config="absolute", plan=changed, seed=seed, psnr=20.0 + 3 * seed + gain, train=11.0)
+            like(row, config="exposure", plan=changed, seed=seed, psnr=20.0 + 3 * seed + gain, train=11.0)
         )
         rows.append(
             like(row, config="antialias", plan=changed, seed=seed, psnr=20.0 + 3 * seed - gain, train=9.0)
@@ -253,7 +253,7 @@ def test_switches_are_compared_seed_by_seed_on_the_same_code(parts: Any, place: 
     text = ablation(rows)
     assert "| 3 | +0.20 (+0.10 to +0.30) | +0.0000 (+0.0000 to +0.0000) | +10 (+10 to +10) | better |" in text
     assert "| 3 | -0.20 (-0.30 to -0.10) | +0.0000 (+0.0000 to +0.0000) | -10 (-10 to -10) | worse |" in text
-    assert "| `absolute` | 1 | tiny, 30steps | nowhere | +0.20 |" in text
+    assert "| `exposure` | 1 | tiny, 30steps | nowhere | +0.20 |" in text
     assert "1 rows of a switch have no default of the same code" in text
     assert "`older`" not in text
     busy = [each | {"others_cpu_seconds": 1e3} for each in rows if each["seed"] == 2]
@@ -262,20 +262,20 @@ def test_switches_are_compared_seed_by_seed_on_the_same_code(parts: Any, place: 
     assert "| +0.0000 (+0.0000 to +0.0000) | busy machine | better |" in ablation(
         [each | {"others_cpu_seconds": 1e3} for each in rows]
     )
-    unclear = like(row, config="absolute", plan=changed, seed=2, psnr=25.9, train=11.0)
+    unclear = like(row, config="exposure", plan=changed, seed=2, psnr=25.9, train=11.0)
     assert "| no clear difference |" in ablation([*rows, unclear])
-    alone = ablation([rows[0], like(row, config="absolute", plan=changed, seed=0, psnr=21.0)])
+    alone = ablation([rows[0], like(row, config="exposure", plan=changed, seed=0, psnr=21.0)])
     assert "one seed says nothing" in alone
     same = ablation([like(default, seed=0), like(row, config="antialias", seed=0)])
     assert "the default's plan is the same" in same
     elsewhere = [like(default, scene="flat", seed=seed) for seed in (0, 1)]
     elsewhere += [like(row, scene="flat", config="sh-3", plan=changed, seed=0)]
-    assert "Not measured, since the default's plan is that already: `absolute` on flat" not in ablation(
+    assert "Not measured, since the default's plan is that already: `exposure` on flat" not in ablation(
         [*rows, *elsewhere]
     )
     has_it = [like(default, scene="flat", seed=seed, plan=changed) for seed in (0, 1)]
     has_it += [like(row, scene="flat", config="sh-3", seed=0)]
-    assert "the default's plan is that already: `absolute` on flat at 30steps." in ablation([*rows, *has_it])
+    assert "the default's plan is that already: `exposure` on flat at 30steps." in ablation([*rows, *has_it])
 
 
 def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: Path) -> None:
@@ -291,8 +291,8 @@ def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: P
 
     assert "densify" not in default["plan"]
     assert idle("no-densification", default["plan"])
-    assert not idle("absolute", default["plan"])
-    assert idle("absolute", default["plan"] | {"densify": "absolute"})
+    assert not idle("exposure", default["plan"])
+    assert idle("exposure", default["plan"] | {"exposure": True})
     assert idle("no-coarse-to-fine", default["plan"])
     assert idle("no-antialias", default["plan"])
     assert not idle("antialias", default["plan"])
@@ -300,14 +300,14 @@ def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: P
     assert not idle("sh-3", default["plan"])
     assert not idle("default", default["plan"])
     wanted = rows.runs_of(
-        [scene], ["absolute", "default", "no-random-background", "black-background"], [budget], [1, 0]
+        [scene], ["exposure", "default", "no-random-background", "black-background"], [budget], [1, 0]
     )
     assert [(run.seed, run.config) for run in wanted] == [
         (1, "default"),
-        (1, "absolute"),
+        (1, "exposure"),
         (1, "black-background"),
         (0, "default"),
-        (0, "absolute"),
+        (0, "exposure"),
         (0, "black-background"),
     ]
     bare = replace(scene, points=False)

@@ -8,13 +8,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-import pytest
 import torch
 from torch import Tensor
 
 from splatmill_worker.splat.density import prune
-from splatmill_worker.splat.density.classic import Classic, decayed
-from splatmill_worker.splat.density.event import Moment
+from splatmill_worker.splat.density.clone_split import Change, decayed, densify
 from splatmill_worker.splat.density.rows import rotations
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -43,7 +41,6 @@ class Held:
         n = self.held.count
         self.exp_avg = torch.arange(n)[:, None].expand(n, 59).float().clone()
         self.exp_avg_sq = self.exp_avg.clone()
-        self.abs_sum: Tensor | None = 4.0 * self.plain
         self.visible_count = torch.ones(n)
         self.max_extent = torch.zeros(n)
 
@@ -70,17 +67,17 @@ class Held:
         self.exp_avg, self.exp_avg_sq = exp_avg, exp_avg_sq
 
 
-def moment(allowed: int = 1000) -> Moment:
-    return Moment(step=100, progress=0.2, extent=1.0, allowed=allowed)
-
-
 def random() -> torch.Generator:
     return torch.Generator().manual_seed(3)
 
 
+def doubled(engine: Held, allowed: int = 1000) -> Change:
+    return densify(engine, random(), extent=1.0, allowed=allowed)  # type: ignore[arg-type]
+
+
 def test_small_ones_are_cloned_and_keep_their_moments() -> None:
     engine = Held(gaussians(6, scale=0.005), torch.tensor([0.0, 1e-3, 0.0, 0.0, 3e-4, 1e-4]))
-    change = Classic("plain", 2e-4).densify(engine, moment(), random())
+    change = doubled(engine)
     assert (change.added, change.removed) == (2, 0)
     assert engine.count == 8
     assert torch.equal(engine.held.means[6:], engine.held.means[[1, 4]])
@@ -91,7 +88,7 @@ def test_small_ones_are_cloned_and_keep_their_moments() -> None:
 def test_large_ones_are_split_in_two_smaller_ones() -> None:
     before = gaussians(4, scale=0.05)
     engine = Held(before, torch.tensor([0.0, 1e-3, 0.0, 0.0]))
-    Classic("plain", 2e-4).densify(engine, moment(), random())
+    doubled(engine)
     assert engine.count == 5
     assert torch.equal(engine.held.means[:3], before.means[[0, 2, 3]])
     assert torch.allclose(engine.held.log_scales[3:].exp(), torch.tensor(0.05 / 1.6))
@@ -102,18 +99,9 @@ def test_large_ones_are_split_in_two_smaller_ones() -> None:
 
 def test_the_budget_takes_the_largest_scores() -> None:
     engine = Held(gaussians(8, scale=0.005), torch.arange(8) * 1e-3)
-    Classic("plain", 2e-4).densify(engine, moment(allowed=10), random())
+    doubled(engine, allowed=10)
     assert engine.count == 10
     assert torch.equal(engine.held.means[8:], engine.held.means[[6, 7]])
-
-
-def test_absolute_scores_are_their_own() -> None:
-    engine = Held(gaussians(3, scale=0.005), torch.tensor([0.0, 1.9e-4, 2.1e-4]))
-    Classic("absolute", 8e-4).densify(engine, moment(), random())
-    assert engine.count == 4
-    engine.abs_sum = None
-    with pytest.raises(ValueError, match="no absolute gradients"):
-        Classic("absolute", 8e-4).densify(engine, moment(), random())
 
 
 def test_what_cannot_be_seen_goes() -> None:

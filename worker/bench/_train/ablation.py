@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from _rows import Row
 
-from _train.configurations import CONFIGURATIONS, DEFAULT
+from _train.configurations import CONFIGURATIONS, DEFAULT, TAKEN_OUT
 from _train.markdown import table
 from _train.rows import Pair, compared, disturbed, grouped, lonely, once, whole
 from _train.spread import Spread
@@ -97,7 +97,7 @@ def defaults(pairs: dict[Place, list[Pair]]) -> str:
 def _line(place: Place, pairs: list[Pair]) -> list[object]:
     scene, budget, config = place
     known, name = _comparable(pairs), f"`{config}`"
-    what = CONFIGURATIONS[config].what if config in CONFIGURATIONS else "no longer there"
+    what = CONFIGURATIONS[config].what if config in CONFIGURATIONS else TAKEN_OUT.get(config, "")
     lost = f"{len(pairs) - len(known)} failed"
     quality, structure = difference(pairs, "psnr"), difference(pairs, "ssim")
     if quality is None or structure is None:

@@ -16,7 +16,7 @@ class Configuration:
     """One switch against what the plan decides by itself.
 
     what: the switch in words. options: fields of TrainOptions. plan: fields of the plan that was made, with dots
-    into its parts ("schedule.degree_every"). gives: fields of the plan that the options lead to; where a plan has them
+    into its parts ("schedule.opacity_decay"). gives: fields of the plan that the options lead to; where a plan has them
     anyway, the switch changes nothing. photos: the switch means something on such photos only.
     points: it asks for points of the scene.
     """
@@ -53,20 +53,8 @@ CONFIGURATIONS = {
     "no-densification": Configuration(
         "the Gaussians to start with stay as many", {"densify": "off"}, {"densify": None}
     ),
-    "classic": Configuration(
-        "densification by the paper's gradients", {"densify": "classic"}, {"densify": "classic"}
-    ),
-    "absolute": Configuration(
-        "densification by absolute gradients", {"densify": "absolute"}, {"densify": "absolute"}
-    ),
     "no-opacity-decay": Configuration(
         "opacities stay as they are when Gaussians are added", plan={"schedule.opacity_decay": 1.0}
-    ),
-    "sh-at-once": Configuration(
-        "the last SH degree from the start", plan={"schedule.degree_every": 1, "schedule.degree_by": None}
-    ),
-    "sh-slow": Configuration(
-        "1000 steps for each SH degree", plan={"schedule.degree_every": 1000, "schedule.degree_by": None}
     ),
     "sh-0": Configuration("colour does not change with the view", {"sh_degree": 0}, {"schedule.degree": 0}),
     "sh-3": Configuration("SH degree 3 whatever the views' angles", {"sh_degree": 3}, {"schedule.degree": 3}),
@@ -101,6 +89,13 @@ CONFIGURATIONS = {
     "no-pose-refinement": _option("cameras stay as they are", "pose_refinement", "off", False),
 }
 """Name to switch. A name keeps its meaning: rows already measured carry it."""
+
+TAKEN_OUT = {
+    "absolute": "densification by absolute gradients (Ye et al. 2024)",
+    "mcmc": "MCMC relocation and noise (Kheradmand et al. 2024)",
+    "sh-at-once": "the last SH degree from the start: the default since",
+}
+"""Switches of rows measured before what they switch was taken out, because it did not pay."""
 
 
 def named(name: str) -> Configuration:
