@@ -43,11 +43,11 @@ def views() -> list[TrainingView]:
 
 def run(kernels: Kernels) -> Trained:
     schedule = Schedule(
-        budget=Budget(STEPS, None), resolution=((0, 1),), degree=1, degree_every=2, densify_from=2, densify_every=2,
+        budget=Budget(STEPS, None), resolution=((0, 1),), degree=1, densify_from=2, densify_every=2,
         densify_until=0.9,
     )  # fmt: skip
     plan = Plan(
-        schedule=schedule, image_size=replica.WIDTH, max_gaussians=14, densify="absolute", initial="points",
+        schedule=schedule, image_size=replica.WIDTH, max_gaussians=14, densify=True, initial="points",
         kernels=kernels, background="black", exposure=False, antialias=False, target_psnr=None, max_memory=None,
         stops_when_flat=False, seed=0,
     )  # fmt: skip

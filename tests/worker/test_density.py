@@ -1,4 +1,4 @@
-"""Proves what each densification strategy does to Gaussians and moments, one event at a time.
+"""Proves what densification does to Gaussians and moments, one event at a time.
 
 Does not prove that it helps: the ablation table of `bench train` measures that.
 """
@@ -8,15 +8,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-import pytest
 import torch
 from torch import Tensor
 
-from splatmill_worker.kernels import ops
 from splatmill_worker.splat.density import prune
-from splatmill_worker.splat.density.classic import Classic, decayed
-from splatmill_worker.splat.density.interface import Moment
-from splatmill_worker.splat.density.mcmc import Mcmc, shared, walk
+from splatmill_worker.splat.density.clone_split import Change, decayed, densify
 from splatmill_worker.splat.density.rows import rotations
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -45,7 +41,6 @@ class Held:
         n = self.held.count
         self.exp_avg = torch.arange(n)[:, None].expand(n, 59).float().clone()
         self.exp_avg_sq = self.exp_avg.clone()
-        self.abs_sum: Tensor | None = 4.0 * self.plain
         self.visible_count = torch.ones(n)
         self.max_extent = torch.zeros(n)
 
@@ -72,17 +67,17 @@ class Held:
         self.exp_avg, self.exp_avg_sq = exp_avg, exp_avg_sq
 
 
-def moment(allowed: int = 1000) -> Moment:
-    return Moment(step=100, progress=0.2, extent=1.0, allowed=allowed)
-
-
 def random() -> torch.Generator:
     return torch.Generator().manual_seed(3)
 
 
+def doubled(engine: Held, allowed: int = 1000) -> Change:
+    return densify(engine, random(), extent=1.0, allowed=allowed)  # type: ignore[arg-type]
+
+
 def test_small_ones_are_cloned_and_keep_their_moments() -> None:
     engine = Held(gaussians(6, scale=0.005), torch.tensor([0.0, 1e-3, 0.0, 0.0, 3e-4, 1e-4]))
-    change = Classic("plain", 2e-4).densify(engine, moment(), random())
+    change = doubled(engine)
     assert (change.added, change.removed) == (2, 0)
     assert engine.count == 8
     assert torch.equal(engine.held.means[6:], engine.held.means[[1, 4]])
@@ -93,7 +88,7 @@ def test_small_ones_are_cloned_and_keep_their_moments() -> None:
 def test_large_ones_are_split_in_two_smaller_ones() -> None:
     before = gaussians(4, scale=0.05)
     engine = Held(before, torch.tensor([0.0, 1e-3, 0.0, 0.0]))
-    Classic("plain", 2e-4).densify(engine, moment(), random())
+    doubled(engine)
     assert engine.count == 5
     assert torch.equal(engine.held.means[:3], before.means[[0, 2, 3]])
     assert torch.allclose(engine.held.log_scales[3:].exp(), torch.tensor(0.05 / 1.6))
@@ -104,18 +99,9 @@ def test_large_ones_are_split_in_two_smaller_ones() -> None:
 
 def test_the_budget_takes_the_largest_scores() -> None:
     engine = Held(gaussians(8, scale=0.005), torch.arange(8) * 1e-3)
-    Classic("plain", 2e-4).densify(engine, moment(allowed=10), random())
+    doubled(engine, allowed=10)
     assert engine.count == 10
     assert torch.equal(engine.held.means[8:], engine.held.means[[6, 7]])
-
-
-def test_absolute_scores_are_their_own() -> None:
-    engine = Held(gaussians(3, scale=0.005), torch.tensor([0.0, 1.9e-4, 2.1e-4]))
-    Classic("absolute", 8e-4).densify(engine, moment(), random())
-    assert engine.count == 4
-    engine.abs_sum = None
-    with pytest.raises(ValueError, match="no absolute gradients"):
-        Classic("absolute", 8e-4).densify(engine, moment(), random())
 
 
 def test_what_cannot_be_seen_goes() -> None:
@@ -131,51 +117,6 @@ def test_what_cannot_be_seen_goes() -> None:
 def test_decayed_opacities_are_multiplied() -> None:
     logits = torch.tensor([-2.0, 0.0, 3.0])
     assert torch.allclose(torch.sigmoid(decayed(logits, 0.9)), 0.9 * torch.sigmoid(logits), atol=1e-6)
-
-
-def test_dead_ones_move_to_live_ones_and_the_number_grows_by_a_twentieth() -> None:
-    scene = gaussians(100)
-    scene.logit_opacities[:20] = -9.0
-    engine = Held(scene, torch.zeros(100))
-    change = Mcmc().densify(engine, moment(), random())
-    assert change.removed == 20
-    assert engine.count == 105
-    assert bool((torch.sigmoid(engine.held.logit_opacities) >= prune.MIN_OPACITY).all())
-    engine = Held(scene, torch.zeros(100))
-    Mcmc().densify(engine, moment(allowed=90), random())
-    assert engine.count == 90
-
-
-@pytest.mark.parametrize("copies", [2, 3, 5])
-def test_copies_on_one_spot_look_like_the_one_they_came_from(copies: int) -> None:
-    """Equation 9 of the paper preserves the integral of the projected alpha, so the rendered light hardly changes."""
-    one = gaussians(1, scale=0.1, opacity=0.8)
-    one.means.zero_()
-    one.sh.zero_()
-    one.sh[:, 0] = 1.0
-    several = one.map(torch.clone)
-    shared(several, torch.tensor([copies]))
-    several = several.map(lambda value: value.repeat(copies, *[1] * (value.ndim - 1)))
-    viewmat = torch.eye(4)
-    viewmat[2, 3] = 2.0
-    lens = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]])
-
-    def light(scene: Gaussians) -> Tensor:
-        rows = ops.project(*scene, viewmat, lens, 64, 64, degree=0, backend="reference")
-        return ops.composite(
-            rows, ops.bin(rows, 64, 64, backend="reference"), 64, 64, background=None, backend="reference"
-        )[1]
-
-    before, after = light(one), light(several)
-    assert float(after.sum()) == pytest.approx(float(before.sum()), rel=0.08)
-    assert float((after - before).abs().max()) < 0.12
-
-
-def test_the_walk_moves_the_transparent_and_leaves_the_opaque() -> None:
-    scene = gaussians(400, scale=0.3, opacity=0.9)
-    scene.logit_opacities[:200] = math.log(0.004 / 0.996)
-    moves = walk(scene, random()).norm(dim=1)
-    assert float(moves[:200].mean()) > 1e3 * float(moves[200:].mean())
 
 
 def test_rotations_are_rotations() -> None:

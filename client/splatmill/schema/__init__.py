@@ -80,7 +80,6 @@ from splatmill.schema.models import (
 from splatmill.schema.options import (
     Backend,
     Background,
-    Densify,
     Effort,
     Mapper,
     Matcher,
@@ -135,7 +134,6 @@ __all__ = [
     "CreateCapture",
     "CreateJob",
     "CurveRow",
-    "Densify",
     "Duration",
     "Effort",
     "Event",

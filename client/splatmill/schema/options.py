@@ -29,14 +29,6 @@ class Switch(StrEnum):
     off = "off"
 
 
-class Densify(StrEnum):
-    auto = "auto"
-    off = "off"
-    classic = "classic"
-    absolute = "absolute"
-    mcmc = "mcmc"
-
-
 class Background(StrEnum):
     auto = "auto"
     black = "black"
@@ -212,9 +204,9 @@ class TrainOptions(Request):
         description="Degree of the spherical harmonics that let colour change with the viewing direction.",
         json_schema_extra=_ENGINE,
     )
-    densify: Densify = Field(
-        default=Densify.auto,
-        description="How Gaussians are added: the paper's gradients, absolute gradients, or MCMC relocation.",
+    densify: Switch = Field(
+        default=Switch.auto,
+        description="Add Gaussians where the photos ask for more, by cloning and splitting.",
         json_schema_extra=_ENGINE,
     )
     antialias: Switch = Field(

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from _rows import Row
 
-from _train.configurations import CONFIGURATIONS, DEFAULT
+from _train.configurations import CONFIGURATIONS, DEFAULT, TAKEN_OUT
 from _train.markdown import table
-from _train.rows import Pair, compared, grouped, lonely, once, whole
+from _train.rows import Pair, compared, disturbed, grouped, lonely, once, whole
 from _train.spread import Spread
 
 ONE_SWITCH = """Differences to the default with the same seed. "Better" or "worse" only where every seed agrees, of at
-least two. At budgets in steps the price is in the column of the time; at budgets in seconds it is in the quality."""
+least two. At budgets in steps the price is in the column of the time, from the runs that had the machine to
+themselves; at budgets in seconds it is in the quality."""
+
+BUSY = "busy machine"
 
 SAME = "the default's plan is the same"
 
@@ -83,7 +86,7 @@ def defaults(pairs: dict[Place, list[Pair]]) -> str:
             len(group),
             Spread.of(row["psnr"] for row in group).text(2),
             Spread.of(row["ssim"] for row in group).text(4),
-            Spread.of(row["seconds"]["train"] for row in group).text(1),
+            _seconds([row["seconds"]["train"] for row in group if not disturbed(row)], 1),
             f"{Spread.of(row['gaussians'] for row in group).median:.0f}",
         ]
         for (scene, budget), group in grouped(rows, "scene", "budget").items()
@@ -94,15 +97,21 @@ def defaults(pairs: dict[Place, list[Pair]]) -> str:
 def _line(place: Place, pairs: list[Pair]) -> list[object]:
     scene, budget, config = place
     known, name = _comparable(pairs), f"`{config}`"
-    what = CONFIGURATIONS[config].what if config in CONFIGURATIONS else "no longer there"
+    what = CONFIGURATIONS[config].what if config in CONFIGURATIONS else TAKEN_OUT.get(config, "")
     lost = f"{len(pairs) - len(known)} failed"
     quality, structure = difference(pairs, "psnr"), difference(pairs, "ssim")
     if quality is None or structure is None:
         return [name, what, scene, budget, len(known), "", "", "", SAME if known else lost]
-    time = Spread.of(
-        100 * (row["seconds"]["train"] / default["seconds"]["train"] - 1) for default, row in known
-    )
-    figures = [quality.text(2, signed=True), structure.text(4, signed=True), time.text(0, signed=True)]
+    times = [
+        100 * (row["seconds"]["train"] / default["seconds"]["train"] - 1)
+        for default, row in known
+        if not disturbed(default) and not disturbed(row)
+    ]
+    figures = [
+        quality.text(2, signed=True),
+        structure.text(4, signed=True),
+        _seconds(times, 0, signed=True),
+    ]
     said = verdict(quality) + (f"; {lost}" if len(known) < len(pairs) else "")
     return [name, what, scene, budget, len(known), *figures, said]
 
@@ -123,6 +132,10 @@ def _idle(pairs: dict[Place, list[Pair]]) -> list[str]:
         return []
     said = "; ".join(f"`{config}` on {', '.join(places)}" for config, places in found.items())
     return [f"Not measured, since the default's plan is that already: {said}."]
+
+
+def _seconds(quiet: list[float], digits: int, *, signed: bool = False) -> str:
+    return Spread.of(quiet).text(digits, signed=signed) if quiet else BUSY
 
 
 def _comparable(pairs: list[Pair]) -> list[Pair]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal
 
+from _train.scenes import Scene
 from splatmill_worker.splat.plan import Plan
 
 DEFAULT = "default"
@@ -15,8 +16,9 @@ class Configuration:
     """One switch against what the plan decides by itself.
 
     what: the switch in words. options: fields of TrainOptions. plan: fields of the plan that was made, with dots
-    into its parts ("schedule.degree_every"). gives: fields of the plan that the options lead to; where a plan has them
+    into its parts ("schedule.opacity_decay"). gives: fields of the plan that the options lead to; where a plan has them
     anyway, the switch changes nothing. photos: the switch means something on such photos only.
+    points: it asks for points of the scene.
     """
 
     what: str
@@ -24,6 +26,12 @@ class Configuration:
     gives: dict[str, Any] = field(default_factory=dict)
     plan: dict[str, Any] = field(default_factory=dict)
     photos: Literal["any", "opaque", "transparent"] = "any"
+    points: bool = False
+
+    def concerns(self, scene: Scene) -> bool:
+        """Whether the switch means something there."""
+        photos = "transparent" if scene.transparent else "opaque"
+        return self.photos in ("any", photos) and (scene.points or not self.points)
 
     def changes(self, plan: dict[str, Any]) -> bool:
         """Whether the switch makes another plan of a row's plan, in which what is off or None is absent."""
@@ -33,8 +41,8 @@ class Configuration:
         )
 
 
-def _option(what: str, name: str, value: str, gives: bool) -> Configuration:
-    return Configuration(what, {name: value}, {name: gives})
+def _option(what: str, name: str, value: str, gives: bool, *, points: bool = False) -> Configuration:
+    return Configuration(what, {name: value}, {name: gives}, points=points)
 
 
 CONFIGURATIONS = {
@@ -45,21 +53,8 @@ CONFIGURATIONS = {
     "no-densification": Configuration(
         "the Gaussians to start with stay as many", {"densify": "off"}, {"densify": None}
     ),
-    "classic": Configuration(
-        "densification by the paper's gradients", {"densify": "classic"}, {"densify": "classic"}
-    ),
-    "absolute": Configuration(
-        "densification by absolute gradients", {"densify": "absolute"}, {"densify": "absolute"}
-    ),
     "no-opacity-decay": Configuration(
         "opacities stay as they are when Gaussians are added", plan={"schedule.opacity_decay": 1.0}
-    ),
-    "mcmc": Configuration("MCMC relocation and noise", {"densify": "mcmc"}, {"densify": "mcmc"}),
-    "sh-at-once": Configuration(
-        "the last SH degree from the start", plan={"schedule.degree_every": 1, "schedule.degree_by": None}
-    ),
-    "sh-slow": Configuration(
-        "1000 steps for each SH degree", plan={"schedule.degree_every": 1000, "schedule.degree_by": None}
     ),
     "sh-0": Configuration("colour does not change with the view", {"sh_degree": 0}, {"schedule.degree": 0}),
     "sh-3": Configuration("SH degree 3 whatever the views' angles", {"sh_degree": 3}, {"schedule.degree": 3}),
@@ -86,14 +81,21 @@ CONFIGURATIONS = {
     "black-background": Configuration(
         "black behind the Gaussians", {"background": "black"}, {"background": "black"}, photos="opaque"
     ),
-    "sky": _option("a far shell of Gaussians where photos show sky", "sky", "on", True),
+    "sky": _option("a far shell of Gaussians where photos show sky", "sky", "on", True, points=True),
     "no-sky": _option("no such shell", "sky", "off", False),
-    "gaps": _option("Gaussians where photos show what no point describes", "gaps", "on", True),
+    "gaps": _option("Gaussians where photos show what no point describes", "gaps", "on", True, points=True),
     "no-gaps": _option("no such Gaussians", "gaps", "off", False),
     "pose-refinement": _option("training cameras are corrected", "pose_refinement", "on", True),
     "no-pose-refinement": _option("cameras stay as they are", "pose_refinement", "off", False),
 }
 """Name to switch. A name keeps its meaning: rows already measured carry it."""
+
+TAKEN_OUT = {
+    "absolute": "densification by absolute gradients (Ye et al. 2024)",
+    "mcmc": "MCMC relocation and noise (Kheradmand et al. 2024)",
+    "sh-at-once": "the last SH degree from the start: the default since",
+}
+"""Switches of rows measured before what they switch was taken out, because it did not pay."""
 
 
 def named(name: str) -> Configuration:

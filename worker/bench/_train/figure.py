@@ -13,11 +13,11 @@ from matplotlib.axis import Axis
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from _train.rows import failed, latest_default
-from _train.scenes import KNOWN
+from _train.scenes import ALL
 from _train.spread import Spread
 
 PEERS = "DP*Xhv<>"
-COLORS = {name: f"C{number}" for number, name in enumerate(KNOWN)}
+COLORS = {name: f"C{number}" for number, name in enumerate(ALL)}
 
 
 def draw(rows: list[Row], references: list[Row], path: Path) -> None:

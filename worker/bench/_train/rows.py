@@ -18,6 +18,9 @@ from _train.budgets import Budget
 from _train.configurations import DEFAULT, named
 from _train.scenes import Scene
 
+QUIET = 0.1
+"""Of a run's own CPU seconds, which other programs may take beside it before its seconds say too little."""
+
 _WORKER = Path(splatmill_worker.__file__).parent
 _COMPUTES = [
     *(_WORKER / name for name in ("images", "kernels", "sfm", "splat")),
@@ -84,7 +87,7 @@ def runs_of(
         for budget in budgets
         for scene in scenes
         for config in configs
-        if named(config).photos in ("any", "transparent" if scene.transparent else "opaque")
+        if named(config).concerns(scene)
     ]
 
 
@@ -118,6 +121,11 @@ def latest_default(rows: list[Row]) -> list[Row]:
 def by_time(row: Row) -> bool:
     """Whether the budget was seconds, not steps."""
     return not row["budget"].endswith("steps")
+
+
+def disturbed(row: Row) -> bool:
+    """Whether other programs took so much of the machine that the row's seconds say too little."""
+    return bool(row["others_cpu_seconds"] > QUIET * row["cpu_seconds"])
 
 
 def whole(rows: Iterable[Row]) -> list[Row]:

@@ -16,8 +16,10 @@ import torch
 from _rows import Row, origin, worked
 from torch import Tensor
 
+from _train import unequal
 from _train.configurations import revised
 from _train.rows import code_version
+from _train.scenes import UNEQUAL
 from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline, sfm, synthetic
 from splatmill_worker.__main__ import give_memory_back
@@ -163,6 +165,8 @@ def _posed(job: Row, options: TrainOptions) -> Scene:
     if job["made"] and not (capture / "images").is_dir():
         part = capture / "images.part"
         synthetic.capture(part, PHOTOS)
+        if job["made"] == UNEQUAL:
+            unequal.expose(part)
         part.rename(capture / "images")
     with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
         return cameras_of(capture, _with_cameras(Path(folder), job), options, _quiet, lambda: False)

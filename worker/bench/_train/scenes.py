@@ -14,17 +14,25 @@ SIDE = 480
 
 @dataclass(frozen=True)
 class Scene:
-    """A capture and the options that every run of it shares. `made`: photographed by ourselves on first use."""
+    """A capture and the options that every run of it shares. `made`: as what we photograph it on first use."""
 
     name: str
     folder: Path
     options: dict[str, Any] = field(default_factory=lambda: {"image_size": SIDE, "holdout": 8})
     transparent: bool = False
-    made: bool = False
+    points: bool = True
+    made: str | None = None
 
 
 KNOWN = ("fox", "lego", "lund", "kermit", "synthetic")
-"""fox and lego bring their cameras; those of lund, kermit and the still life are recovered once, then kept."""
+"""Trained by default. fox and lego bring their cameras; those of lund, kermit and the still life are recovered once,
+then kept."""
+
+UNEQUAL = "unequal"
+MADE = ("synthetic", UNEQUAL)
+"""The still life that we photograph ourselves, and the same with an exposure of its own for each photo."""
+
+ALL = (*KNOWN, UNEQUAL)
 
 
 def named(text: str, work: Path) -> Scene:
@@ -32,8 +40,8 @@ def named(text: str, work: Path) -> Scene:
 
     Raises, with a sentence, ValueError for what is neither, and FileNotFoundError for shared data that is not there.
     """
-    if text == "synthetic":
-        return Scene(text, work / "synthetic" / "capture", made=True)
+    if text in MADE:
+        return Scene(text, work / text / "capture", made=text)
     if text in KNOWN:
         folder = SHARED / FOLDERS[text]
         if not folder.is_dir():
@@ -41,10 +49,10 @@ def named(text: str, work: Path) -> Scene:
                 f"{text} is left out: {FOLDERS[text]} is not in ../shared/data, and no part of the project."
             )
         if text == "lego":
-            return Scene(text, folder, {"image_size": 400, "holdout": 8}, transparent=True)
+            return Scene(text, folder, {"image_size": 400, "holdout": 8}, transparent=True, points=False)
         return Scene(text, folder)
     folder = Path(text)
     if not folder.is_dir():
-        raise ValueError(f"{text!r} is neither a scene ({', '.join(KNOWN)}) nor a folder with a capture.")
+        raise ValueError(f"{text!r} is neither a scene ({', '.join(ALL)}) nor a folder with a capture.")
     folder = folder.resolve()
-    return Scene(f"{folder.name} (folder)" if folder.name in KNOWN else folder.name, folder)
+    return Scene(f"{folder.name} (folder)" if folder.name in ALL else folder.name, folder)

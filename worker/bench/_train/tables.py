@@ -10,14 +10,11 @@ from _rows import Row, footer
 from _train.ablation import ablation
 from _train.configurations import DEFAULT
 from _train.markdown import beside, section, table
-from _train.rows import by_time, failed, grouped, latest_default, once, whole
+from _train.rows import QUIET, by_time, failed, grouped, latest_default, once, whole
 from _train.spread import Spread, seconds_to
 
 TOLERANCE = 0.05
 """Of a time budget, by which a run may end early or late."""
-
-QUIET = 0.1
-"""Of a run's own CPU seconds, which other programs may take beside it before its seconds say too little."""
 
 COMMAND = "splatmill bench train"
 
@@ -62,7 +59,7 @@ def budgets(timed: list[Row]) -> str:
         early = any("held-out" in row["stopped"] for row in group)
         if off > TOLERANCE and not early:
             late.append(f"{scene} at {budget} is {100 * off:.1f} % off")
-        disturbed += [f"{scene} at {budget}, seed {row['seed']}" for row in group if _disturbed(row)]
+        disturbed += [f"{scene} at {budget}, seed {row['seed']}" for row in group if disturbed(row)]
         course.setdefault(scene, []).append((seconds, quality.median, budget))
         lines.append(
             [
@@ -214,10 +211,6 @@ def sources(references: list[Row]) -> str:
     """Where the hollow points come from."""
     known = {row["who"]: row["source"] for row in references if row["kind"] == "reference"}
     return "\n".join(f"- {who}: {source}." for who, source in known.items())
-
-
-def _disturbed(row: Row) -> bool:
-    return bool(row["others_cpu_seconds"] > QUIET * row["cpu_seconds"])
 
 
 def _of_scene(rows: list[Row], scene: str) -> list[Row]:

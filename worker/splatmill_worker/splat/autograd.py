@@ -20,15 +20,12 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 class AutogradStep:
     """An Engine over `kernels.ops`: slow on a CPU, and the same optimisation as the fused step does.
 
-    Adam runs over all Gaussians, those that a photo does not show with a zero gradient. Magnitudes of gradients
-    per pixel never exist here, so there is no absolute score.
+    Adam runs over all Gaussians, those that a photo does not show with a zero gradient.
     """
-
-    abs_sum: Tensor | None = None
 
     def __init__(self, gaussians: Gaussians, *, backend: ops.Backend) -> None:
         self._backend = backend
-        self.keep_scores: Scores | None = "absolute"  # autograd has them anyway
+        self.keep_scores: Scores | None = "plain"  # autograd has them anyway
         self.keep_pose_gradient = False
         self.pose_gradient: Tensor | None = None
         self.replace(gaussians.padded(3).parameters(), None, None)

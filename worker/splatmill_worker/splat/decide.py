@@ -6,13 +6,13 @@ import math
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
-from splatmill.schema import Background, Densify, Preset, Switch, TrainOptions
+from splatmill.schema import Background, Preset, Switch, TrainOptions
 from splatmill_worker.kernels.gpu.device import largest_budget
 from splatmill_worker.splat.budget import Budget
 from splatmill_worker.splat.facts import ENOUGH_POINTS, Facts, Speed
 from splatmill_worker.splat.initialise import RANDOM_GAUSSIANS
 from splatmill_worker.splat.needs import FEW_VIEWS, needs_of
-from splatmill_worker.splat.plan import Kernels, Plan, Strategy
+from splatmill_worker.splat.plan import Kernels, Plan
 from splatmill_worker.splat.rates import Annealing
 from splatmill_worker.splat.reasons import Reasons
 from splatmill_worker.splat.schedule import Schedule
@@ -76,11 +76,10 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         budget=budget,
         resolution=_resolution(steps, image_size, why),
         degree=_degree(facts, options, why),
-        degree_every=max(50, min(300, steps // 8)),
         densify_from=max(50, min(300, steps // 8)),
         densify_every=max(40, min(100, steps // 20)),
         densify_until=0.7,
-        opacity_decay=OPACITY_DECAY if densify in ("classic", "absolute") else 1.0,
+        opacity_decay=OPACITY_DECAY if densify else 1.0,
         annealing=Annealing(boost=_boost(steps, why)),
     )
     if facts.start is not None:
@@ -235,24 +234,12 @@ def _max_gaussians(
     return most
 
 
-def _densify(options: TrainOptions, most: int, start: int, why: Reasons) -> Strategy | None:
-    if options.densify is Densify.off:
-        why.forced.append("densify")
-        why.left_out["densify"] = "Left out by option."
-        return None
-    if options.densify is not Densify.auto:
-        why.option("densify")
-        chosen: dict[Densify, Strategy] = {
-            Densify.classic: "classic",
-            Densify.absolute: "absolute",
-            Densify.mcmc: "mcmc",
-        }
-        return chosen[options.densify]
+def _densify(options: TrainOptions, most: int, start: int, why: Reasons) -> bool:
     if start >= most:
-        why.left_out["densify"] = f"The {start} Gaussians to start with are all that the budget allows."
-        return None
-    why.chosen["densify"] = f"{start} Gaussians to start with do not resolve the photos; {most} may."
-    return "classic"
+        reason = f"The {start} Gaussians to start with are all that the budget allows."
+    else:
+        reason = f"{start} Gaussians to start with do not resolve the photos; {most} may."
+    return why.switch("densify", options.densify, start < most, reason)
 
 
 def _resolution(steps: int, image_size: int, why: Reasons) -> tuple[tuple[int, int], ...]:
@@ -285,7 +272,6 @@ def _continued(schedule: Schedule, start: Start, why: Reasons) -> Schedule:
         # Longer steps would first undo what the model has learnt.
         annealing=replace(schedule.annealing, boost=1.0),
         degree=degree,
-        first_degree=min(degree, start.degree),
     )
 
 

@@ -24,10 +24,9 @@ class StepResult(NamedTuple):
 class Engine(Protocol):
     """One scene under optimisation. The fused CPU step and the autograd step both are one.
 
-    Scores are sums since the last `replace`, one value per Gaussian: `plain_sum` and `abs_sum` of the norm of
-    the gradient of the projected mean in NDC units (the absolute one adds magnitudes over pixels; None where a
-    backend has none), `visible_count` of steps that saw it, `max_extent` its largest half size over
-    half the photo's longer side. `keep_scores` says which will be read: `Scores`, or None of them.
+    Scores are sums since the last `replace`, one value per Gaussian: `plain_sum` of the norm of the gradient of the
+    projected mean in NDC units, `visible_count` of steps that saw it, `max_extent` its largest half size over half the
+    photo's longer side. `keep_scores` says whether they will be read.
 
     With `keep_pose_gradient`, every step leaves in `pose_gradient` [6] the loss's gradient to a twist (rho, phi) of the
     camera exp(twist^) viewmat, as `kernels.cpu.step` defines it.
@@ -41,8 +40,6 @@ class Engine(Protocol):
     def count(self) -> int: ...
     @property
     def plain_sum(self) -> Tensor: ...
-    @property
-    def abs_sum(self) -> Tensor | None: ...
     @property
     def visible_count(self) -> Tensor: ...
     @property

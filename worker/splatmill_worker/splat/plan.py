@@ -9,7 +9,6 @@ from splatmill_worker.splat.budget import Budget
 from splatmill_worker.splat.rates import Annealing
 from splatmill_worker.splat.schedule import Schedule
 
-Strategy = Literal["classic", "absolute", "mcmc"]
 Kernels = Literal["reference", "cpu", "gpu"]
 
 BYTES_PER_GAUSSIAN = 59 * 4 * 8
@@ -29,7 +28,7 @@ class Plan:
     schedule: Schedule
     image_size: int
     max_gaussians: int
-    densify: Strategy | None
+    densify: bool
     initial: Literal["points", "random", "model"]
     kernels: Kernels
     background: Literal["black", "white", "random"]

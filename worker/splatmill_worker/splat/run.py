@@ -13,7 +13,7 @@ from torch import Tensor
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu.step import Rates
 from splatmill_worker.splat.budget import Budget, Clock
-from splatmill_worker.splat.density.interface import Densifier, Moment
+from splatmill_worker.splat.density import clone_split
 from splatmill_worker.splat.engine import Engine, StepResult
 from splatmill_worker.splat.exposure import Exposure
 from splatmill_worker.splat.failure import FailureName, TrainingFailed
@@ -51,7 +51,6 @@ class Run:
     plan: Plan
     views: Sequence[TrainingView]
     extent: float
-    densifier: Densifier | None
     exposure: Exposure | None
     warn: Callable[[str], None]
     poses: Poses | None = None
@@ -97,7 +96,7 @@ class Run:
         number = self._next_view()
         target = self.views[number].reduced(reduction)
         rates = RateSchedule(self.extent, schedule.annealing, self.rate_scale).at(progress)
-        degree = schedule.degree_at(self.step, progress)
+        degree = schedule.degree
         try:
             if self.poses is not None:
                 target = target._replace(viewmat=self.poses.viewmat(number))
@@ -113,12 +112,10 @@ class Run:
         self.ever_saw |= result.visible > 0
         self.health.watch(self.step, result.loss, result.visible)
         # What nobody will read is not summed.
-        reads = self.densifier is not None and progress < schedule.densify_until
-        self.engine.keep_scores = self.densifier.scores if self.densifier is not None and reads else None
-        if self.densifier is not None:
-            self.densifier.after_step(self.engine, rates.means, self.random)
-            if schedule.densifies(self.step, progress):
-                self._densify(self.densifier, progress)
+        read = self.plan.densify and progress < schedule.densify_until
+        self.engine.keep_scores = "plain" if read else None
+        if self.plan.densify and schedule.densifies(self.step, progress):
+            self._densify()
 
     def recover(self, failure: TrainingFailed) -> None:
         """Back to the last good state, with steps half as long."""
@@ -261,12 +258,18 @@ class Run:
             self.order = torch.randperm(len(self.views), generator=self.random).tolist()
         return self.order.pop()
 
-    def _densify(self, densifier: Densifier, progress: float) -> None:
+    def _densify(self) -> None:
         allowed = min(self.plan.max_gaussians, self._most)
         if self.plan.max_memory is not None:
             allowed = min(allowed, self.plan.gaussians_within(self.plan.max_memory))
         try:
-            densifier.densify(self.engine, Moment(self.step, progress, self.extent, allowed), self.random)
+            clone_split.densify(
+                self.engine,
+                self.random,
+                extent=self.extent,
+                allowed=allowed,
+                opacity_decay=self.plan.schedule.opacity_decay,
+            )
         except MemoryError as short:
             raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
         if self.engine.count == 0:

@@ -19,7 +19,6 @@ from splatmill_worker.splat.machine import resident_memory
 from splatmill_worker.splat.plan import Plan
 from splatmill_worker.splat.poses import Poses, typical_depth
 from splatmill_worker.splat.run import Row, Run
-from splatmill_worker.splat.strategies import densifier_of
 from splatmill_worker.splat.views import Target, TrainingView
 
 MAX_RECOVERIES = 3
@@ -128,7 +127,7 @@ def train(
     if plan.pose_refinement:
         poses = Poses(views, _depth_seen(engine, views, plan))
         engine.keep_pose_gradient = True
-    run = Run(engine, plan, views, extent, densifier_of(plan), exposure, hooks.warn, poses)
+    run = Run(engine, plan, views, extent, exposure, hooks.warn, poses)
     if resume_from is not None:
         run.resume(resume_from)
     # The last point is always measured: an attempt may end after its last step and before its model is written.

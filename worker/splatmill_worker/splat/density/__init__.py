@@ -1,1 +1,1 @@
-"""Strategies that change how many Gaussians there are, behind one small interface."""
+"""How the number of Gaussians follows the photos: by cloning, splitting and pruning."""

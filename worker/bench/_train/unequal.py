@@ -1,0 +1,28 @@
+"""Photos of one scene as a camera takes them that sets its exposure for each: what fitting exposures is for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+SPREAD = 0.3
+"""Standard deviation of the log brightness: 0.4 stops to either side, and twice that for one photo in twenty."""
+
+EVERY = 8
+"""One photo of so many, by name, keeps its exposure: those that are held out have to be judged as they should be."""
+
+
+def expose(folder: Path, seed: int = 0) -> None:
+    """Multiply the values of every JPEG in `folder` but the held-out ones by a factor of its own, around 1."""
+    random = np.random.default_rng(seed)
+    for number, path in enumerate(sorted(folder.glob("*.jpg"))):
+        gain = float(np.exp(SPREAD * random.standard_normal()))
+        if number % EVERY == 0:
+            continue
+        with Image.open(path) as photo:
+            values, exif = np.asarray(photo, dtype=np.float32), photo.getexif()
+        Image.fromarray((values * gain).clip(0, 255).round().astype(np.uint8)).save(
+            path, quality=95, exif=exif
+        )
