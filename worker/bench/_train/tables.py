@@ -49,7 +49,7 @@ def budgets(timed: list[Row]) -> str:
     """What each time budget gave, whether runs ended in time, and whether more time was ever worse."""
     groups = grouped((row for row in whole(timed) if by_time(row)), "scene", "budget")
     head = "scene|budget|seeds|training s|PSNR dB|SSIM|Gaussians|steps|all wall s|all CPU s|peak MB|cameras s"
-    lines, late, worse, disturbed = [], [], [], []
+    lines, late, worse, busy = [], [], [], []
     course: dict[str, list[tuple[float, float, str]]] = {}
     for (scene, budget), group in groups.items():
         seconds = float(budget.removesuffix("s"))
@@ -59,7 +59,7 @@ def budgets(timed: list[Row]) -> str:
         early = any("held-out" in row["stopped"] for row in group)
         if off > TOLERANCE and not early:
             late.append(f"{scene} at {budget} is {100 * off:.1f} % off")
-        disturbed += [f"{scene} at {budget}, seed {row['seed']}" for row in group if disturbed(row)]
+        busy += [f"{scene} at {budget}, seed {row['seed']}" for row in group if disturbed(row)]
         course.setdefault(scene, []).append((seconds, quality.median, budget))
         lines.append(
             [
@@ -93,7 +93,7 @@ def budgets(timed: list[Row]) -> str:
         + ("yes." if not late else f"NO: {'; '.join(late)}."),
         "- More time never gives a worse median: " + ("yes." if not worse else f"NO: {'; '.join(worse)}."),
         f"- No other work on the machine beyond {100 * QUIET:.0f} % of the run's own: "
-        + ("none." if not disturbed else f"NO: {'; '.join(disturbed)}."),
+        + ("none." if not busy else f"NO: {'; '.join(busy)}."),
     ]
     return table(head, lines) + "\n\n" + "\n".join(verdicts)
 
