@@ -10,7 +10,7 @@ from _rows import Row, footer
 from _train.ablation import ablation
 from _train.configurations import DEFAULT
 from _train.markdown import beside, section, table
-from _train.rows import QUIET, by_time, failed, grouped, latest_default, once, whole
+from _train.rows import QUIET, by_time, disturbed, failed, grouped, latest_default, once, whole
 from _train.spread import Spread, seconds_to
 
 TOLERANCE = 0.05
