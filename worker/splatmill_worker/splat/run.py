@@ -96,7 +96,7 @@ class Run:
         number = self._next_view()
         target = self.views[number].reduced(reduction)
         rates = RateSchedule(self.extent, schedule.annealing, self.rate_scale).at(progress)
-        degree = schedule.degree
+        degree = schedule.degree_at(self.step, progress)
         try:
             if self.poses is not None:
                 target = target._replace(viewmat=self.poses.viewmat(number))
