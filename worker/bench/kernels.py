@@ -81,7 +81,7 @@ def step_row(
 ) -> Row:
     """One whole training step over every view: project, bin, forward, loss, backward, sums + projection backward + Adam.
 
-    `scores` are the densification scores that it adds up: the default strategy reads the plain ones.
+    `scores` are the densification scores that it adds up: training reads the plain ones.
     """
     with build(build_name):
         step = Step(*scene.groups, threads=threads)
