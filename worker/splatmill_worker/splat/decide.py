@@ -302,8 +302,8 @@ def _background(facts: Facts, options: TrainOptions, why: Reasons) -> Literal["b
     """Over black, dark surfaces stay transparent: on the fox, 1.8 % of the held-out pixels by more than a tenth.
 
     The ablation has black 0.35 dB worse on lund and not clearly different on fox and the still life (600 steps, three
-    seeds). In trials, 8000 steps on fox gained 0.3 dB over random colours (one seed), and 800 on kermit, with 9 photos to
-    train on, lost 0.6 and 0.9 dB (two seeds): FEW_VIEWS keeps black there.
+    seeds). In trials, random colours gained 0.3 dB in 8000 steps on fox (one seed), and lost 0.6 and 0.9 dB in 800 on
+    kermit, with 9 photos to train on (two seeds): FEW_VIEWS keeps black there.
     """
     if options.background is not Background.auto:
         why.option("background")
