@@ -319,6 +319,16 @@ def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: P
     ] == ["no-random-background"]
 
 
+def test_a_reworded_comment_leaves_measured_rows_as_they_are(parts: Any) -> None:
+    computing = parts["_train.rows"].computing
+    said = computing(
+        '"""A."""\n\n\ndef f(x):\n    """B."""\n    return x + 1  # C\n\n\nY = "text"\n"""D."""\n'
+    )
+    assert said == computing('def f(x):\n    return x + 1\n\n\nY = "text"\n')
+    assert said != computing('def f(x):\n    return x + 2\n\n\nY = "text"\n')
+    assert said != computing('def f(x):\n    return x + 1\n\n\nY = "other"\n')
+
+
 def test_exposures_differ_but_for_the_photos_that_are_held_out(parts: Any, tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0110] = "Ray caster"

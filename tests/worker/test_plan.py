@@ -217,7 +217,7 @@ def test_rates_fall_to_their_ends() -> None:
     assert start.means == pytest.approx(3.2e-4)
     assert end.means == pytest.approx(0.01 * start.means)
     assert end.sh_dc == pytest.approx(0.1 * start.sh_dc)
-    assert start.sh_rest == pytest.approx(start.sh_dc / 20)
+    assert start.sh_rest == pytest.approx(start.sh_dc / 10)
     halved = RateSchedule(extent=2.0, scale=0.5).at(0.3)
     assert halved.log_scales == pytest.approx(0.5 * rates.at(0.3).log_scales)
     assert all(math.isfinite(value) for value in end.rows())

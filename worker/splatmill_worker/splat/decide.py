@@ -244,6 +244,9 @@ def _densify(options: TrainOptions, most: int, start: int, why: Reasons) -> bool
 
 
 def _resolution(steps: int, image_size: int, why: Reasons) -> tuple[tuple[int, int], ...]:
+    """Pays in 10 s on fox and the still life, costs on lego. That starts at random, which is not why: fox without its
+    points loses 0.7 to 0.9 dB at the same time when photos are never reduced (a trial of three seeds).
+    """
     first, second = max(20, min(200, steps // 8)), max(50, min(500, steps // 3))
     if image_size < 100:
         why.left_out["coarse_to_fine"] = f"Photos of {image_size} pixels are coarse already."
