@@ -43,7 +43,7 @@ def views() -> list[TrainingView]:
 
 def run(kernels: Kernels) -> Trained:
     schedule = Schedule(
-        budget=Budget(STEPS, None), resolution=((0, 1),), degree=1, degree_every=2, densify_from=2, densify_every=2,
+        budget=Budget(STEPS, None), resolution=((0, 1),), degree=1, densify_from=2, densify_every=2,
         densify_until=0.9,
     )  # fmt: skip
     plan = Plan(

@@ -82,7 +82,7 @@ def test_a_model_of_few_coefficients_is_given_more(trained: Path, tmp_path: Path
 def test_the_models_own_degree_is_kept(trained: Path, tmp_path: Path) -> None:
     assert ply.read(trained / "poses" / "m.ply").degree == 3
     outcome, _ = run(trained, tmp_path, start="m.ply", steps=20)
-    assert report_of(outcome)["plan"]["schedule"]["first_degree"] == 3
+    assert report_of(outcome)["plan"]["schedule"]["degree"] == 3
 
 
 def test_a_model_larger_than_allowed_keeps_its_most_opaque_part(trained: Path, tmp_path: Path) -> None:

@@ -32,7 +32,6 @@ def plan(steps: int | None = 300, seconds: float | None = None, **changes: Any) 
         budget=Budget(steps, seconds),
         resolution=((0, 2), (60, 1)),
         degree=1,
-        degree_every=100,
         densify_from=60,
         densify_every=40,
         densify_until=0.7,

@@ -76,7 +76,6 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         budget=budget,
         resolution=_resolution(steps, image_size, why),
         degree=_degree(facts, options, why),
-        degree_every=max(50, min(300, steps // 8)),
         densify_from=max(50, min(300, steps // 8)),
         densify_every=max(40, min(100, steps // 20)),
         densify_until=0.7,
@@ -276,7 +275,6 @@ def _continued(schedule: Schedule, start: Start, why: Reasons) -> Schedule:
         # Longer steps would first undo what the model has learnt.
         annealing=replace(schedule.annealing, boost=1.0),
         degree=degree,
-        first_degree=min(degree, start.degree),
     )
 
 

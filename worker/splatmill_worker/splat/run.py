@@ -96,14 +96,13 @@ class Run:
         number = self._next_view()
         target = self.views[number].reduced(reduction)
         rates = RateSchedule(self.extent, schedule.annealing, self.rate_scale).at(progress)
-        degree = schedule.degree_at(self.step, progress)
         try:
             if self.poses is not None:
                 target = target._replace(viewmat=self.poses.viewmat(number))
             if self.exposure is None:
-                result = self._plain_step(number, target, degree, rates)
+                result = self._plain_step(number, target, rates)
             else:
-                result = self._exposed_step(self.exposure, number, target, degree, rates)
+                result = self._exposed_step(self.exposure, number, target, rates)
         except MemoryError as short:
             raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
         self.loss = result.loss
@@ -212,13 +211,13 @@ class Run:
         if self.poses is not None:
             self.poses.restore(state["poses"])
 
-    def _plain_step(self, number: int, target: Target, degree: int, rates: Rates) -> StepResult:
+    def _plain_step(self, number: int, target: Target, rates: Rates) -> StepResult:
         background = self.background()
         return self.engine.train_photo(
             target.viewmat,
             target.K,
             target.over(background),
-            degree=degree,
+            degree=self.plan.schedule.degree,
             rates=rates,
             step=self.step,
             background=background,
@@ -227,16 +226,14 @@ class Run:
             key=(number, self.reduction) if target.alpha is None else None,
         )
 
-    def _exposed_step(
-        self, exposure: Exposure, number: int, target: Target, degree: int, rates: Rates
-    ) -> StepResult:
+    def _exposed_step(self, exposure: Exposure, number: int, target: Target, rates: Rates) -> StepResult:
         background = self.background()
         color, alpha, _ = self.engine.forward(
             target.viewmat,
             target.K,
             target.camera.width,
             target.camera.height,
-            degree=degree,
+            degree=self.plan.schedule.degree,
             background=background,
             antialias=self.plan.antialias,
         )
