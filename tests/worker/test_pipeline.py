@@ -57,6 +57,8 @@ def test_a_posed_capture_becomes_a_model_with_its_reports(tmp_path: Path) -> Non
     assert [row.step for row in report.curve] == sorted(row.step for row in report.curve)
     assert report.curve[-1].step == 150
     assert report.curve[-1].psnr == pytest.approx(written["result"]["psnr"])
+    assert report.curve[-1].train_psnr == pytest.approx(written["curve"][-1]["train_psnr"])
+    assert report.curve[-1].train_psnr is not None
     assert report.seconds.train > 0
     assert report.seconds.evaluate > 0
     assert report.plan["reasons"]
@@ -148,6 +150,7 @@ def test_nothing_held_out_is_reported_as_such(tmp_path: Path) -> None:
     assert report["result"]["psnr"] is None
     assert report["result"]["train_psnr"] > 10
     assert all(row["psnr"] is None for row in report["curve"])
+    assert report["curve"][-1]["train_psnr"] > 10
     assert (out / "report.png").stat().st_size > 5000
 
 

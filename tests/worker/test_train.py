@@ -77,6 +77,10 @@ def test_held_out_views_are_learned() -> None:
     assert trained.held_out is not None
     assert trained.held_out.psnr > 18.0
     assert trained.held_out.psnr == pytest.approx(curve[-1], abs=1e-6)
+    few = {view.name for view in views[:: math.ceil(len(views) / 4)]}
+    seen = [view.psnr for view in trained.on_training.views if view.name in few]
+    assert len(seen) == len(few)
+    assert trained.rows[-1].train_psnr == pytest.approx(sum(seen) / len(seen), abs=1e-6)
     assert 1500 < trained.gaussians.count <= 4000
     assert trained.gaussians.degree == 1
     assert bool(trained.gaussians.finite().all())

@@ -171,7 +171,7 @@ def _written(
     files[2].write_text(cameras.model_dump_json(exclude_none=True, indent=1))
     curve = [_point(row) for row in rows]
     files[3].write_text(json.dumps(plain(_report(photo, options, stored.count, score, curve)), indent=1))
-    draw_curve(files[4], curve, {"fit": rows[-1].seconds}, measured="PSNR of the picture (dB)")
+    draw_curve(files[4], curve, {"fit": rows[-1].seconds}, measured="the picture")
     return Result(stored.count, score, (*files, out / "fit.mp4") if options.video else tuple(files))
 
 

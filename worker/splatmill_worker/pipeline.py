@@ -298,6 +298,8 @@ class _Teller:
                 ssim=row.ssim,
                 gaussians=row.gaussians,
                 memory=row.memory,
+                train_psnr=row.train_psnr,
+                train_ssim=row.train_ssim,
             )
         )
         self.preview(engine, row.step)

@@ -52,7 +52,7 @@ class Progress(Response):
 
 
 class CurveRow(Response):
-    """One point of error against run time, measured on the held-out views with the training clock stopped."""
+    """One point of error against run time, measured with the training clock stopped. Psnr, ssim: on held-out views."""
 
     seconds: float = Field(ge=0, description="Training seconds.")
     step: int = Field(ge=0)
@@ -61,6 +61,8 @@ class CurveRow(Response):
     ssim: Measured = None
     gaussians: int = Field(ge=0)
     memory: int | None = Field(default=None, ge=0, description="Bytes that the attempt's process holds.")
+    train_psnr: Measured = Field(default=None, description="dB, on a few of the views that were trained on.")
+    train_ssim: Measured = None
 
 
 class StateEvent(Response):

@@ -16,64 +16,77 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 QUANTISATION_PSNR = 58.9
 """dB between a photo and its own 8-bit copy: nothing can be measured to be better."""
 
-ERROR, GAUSSIANS, MEMORY = "#1f6f8b", "#c97b3d", "#7a5c99"
+ERROR, TRAINED_ON, GAUSSIANS, MEMORY = "#1f6f8b", "#9aa5ad", "#c97b3d", "#7a5c99"
 
 
 def draw_curve(
-    path: Path,
-    curve: Sequence[dict[str, Any]],
-    seconds: dict[str, float],
-    *,
-    measured: str = "held-out PSNR (dB)",
+    path: Path, curve: Sequence[dict[str, Any]], seconds: dict[str, float], *, measured: str = "held out"
 ) -> None:
-    """PSNR (of what `measured` says) against training seconds; below it the Gaussians and, where known, the memory.
+    """PSNR and SSIM against training seconds, and what they took: the Gaussians and, where known, the memory.
 
-    Without any PSNR in the curve, the training loss is drawn.
+    measured: what psnr and ssim of the curve were measured on. Photos that were trained on have a line of their own
+    where the curve has it: what it gains alone is learnt by heart.
     """
-    figure = Figure(figsize=(7.2, 5.4), dpi=130, layout="constrained")
-    error, cost = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
-    times = [row["seconds"] for row in curve]
+    figure = Figure(figsize=(7.2, 6.4), dpi=130, layout="constrained")
+    panels: tuple[Axes, Axes, Axes] = figure.subplots(3, 1, sharex=True, height_ratios=(3, 1.5, 1.4))
+    psnr, ssim, cost = panels
+    for axes, name in ((psnr, "psnr"), (ssim, "ssim")):
+        _line(axes, *_course(curve, f"train_{name}"), TRAINED_ON, label="trained on")
+        _line(axes, *_course(curve, name), label=measured)
+    psnr.set_ylabel("PSNR (dB)")
+    ssim.set_ylabel("SSIM")
+    if len(psnr.lines) > 1:
+        psnr.legend(loc="upper left", frameon=False, fontsize=9)  # the corner that a rising curve leaves free
+    elif psnr.lines:
+        psnr.set_ylabel(f"PSNR (dB), {psnr.lines[0].get_label()}")
     judged = [row for row in curve if row["psnr"] is not None]
     if judged:
-        _line(error, [row["seconds"] for row in judged], [row["psnr"] for row in judged])
-        error.set_ylabel(measured)
         last = judged[-1]
-        # In the corner that a rising curve leaves free.
-        error.text(
+        psnr.text(
             0.985,
             0.06,
             f"{last['psnr']:.2f} dB, SSIM {last['ssim']:.3f}",
-            transform=error.transAxes,
+            transform=psnr.transAxes,
             ha="right",
             fontsize=10,
         )
-    else:
-        _line(error, times, [row["loss"] for row in curve])
-        error.set_ylabel("training loss (no photo was held out)")
-    _line(cost, times, [row["gaussians"] / 1000.0 for row in curve], GAUSSIANS)
-    cost.set_ylabel("thousand\nGaussians", color=GAUSSIANS)
-    cost.set_ylim(0, 1.1 * max((row["gaussians"] / 1000.0 for row in curve), default=1.0) or 1.0)
-    held = [(row["seconds"], row["memory"] / 1e9) for row in curve if row.get("memory")]
-    if held:
-        memory = cost.twinx()
-        _line(memory, [moment for moment, _ in held], [size for _, size in held], MEMORY)
-        memory.set_ylabel("memory (GB)", color=MEMORY)
-        memory.set_ylim(0, 1.25 * max(size for _, size in held))  # apart from the Gaussians' line
-        memory.spines["top"].set_visible(False)
+    _draw_cost(cost, curve)
+    times = [row["seconds"] for row in curve]
     if times and min(times) > 0:
         _logarithmic(cost)
     cost.set_xlabel("training seconds")
-    for axes in (error, cost):
+    for axes in panels:
         axes.grid(True, which="major", color="#dddddd", linewidth=0.5)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
     apart = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items() if value >= 0.05)
-    error.set_title(apart, fontsize=8, loc="left", color="#555555")
+    psnr.set_title(apart, fontsize=8, loc="left", color="#555555")
     figure.savefig(path)
 
 
-def _line(axes: Axes, x: Sequence[float], y: Sequence[float], color: str = ERROR) -> None:
-    axes.plot(x, y, "o-", color=color, ms=4 if color == ERROR else 2.5, linewidth=1.6)
+def _draw_cost(axes: Axes, curve: Sequence[dict[str, Any]]) -> None:
+    counts = [row["gaussians"] / 1000.0 for row in curve]
+    _line(axes, [row["seconds"] for row in curve], counts, GAUSSIANS)
+    axes.set_ylabel("thousand\nGaussians", color=GAUSSIANS)
+    axes.set_ylim(0, 1.1 * max(counts, default=1.0) or 1.0)
+    held = [(row["seconds"], row["memory"] / 1e9) for row in curve if row.get("memory")]
+    if held:
+        memory = axes.twinx()
+        _line(memory, [moment for moment, _ in held], [size for _, size in held], MEMORY)
+        memory.set_ylabel("memory (GB)", color=MEMORY)
+        memory.set_ylim(0, 1.25 * max(size for _, size in held))  # apart from the Gaussians' line
+        memory.spines["top"].set_visible(False)
+
+
+def _course(curve: Sequence[dict[str, Any]], name: str) -> tuple[list[float], list[float]]:
+    """Seconds and values of the points that have `name`."""
+    rows = [row for row in curve if row.get(name) is not None]
+    return [row["seconds"] for row in rows], [row[name] for row in rows]
+
+
+def _line(axes: Axes, x: Sequence[float], y: Sequence[float], color: str = ERROR, label: str = "") -> None:
+    if x:
+        axes.plot(x, y, "o-", color=color, ms=4 if color == ERROR else 2.5, linewidth=1.6, label=label)
 
 
 def _logarithmic(axes: Axes) -> None:

@@ -32,7 +32,11 @@ MEMORY_SHRINK = 0.8
 
 @dataclass(frozen=True)
 class Row:
-    """One point of error against run time, on the held-out views; None where there are none. memory: resident bytes."""
+    """One point of error against run time.
+
+    psnr and ssim: on the held-out views, None where there are none. train_psnr and train_ssim: on a few of those
+    trained on; what they gain while the others lose is learnt by heart. memory: resident bytes.
+    """
 
     seconds: float
     step: int
@@ -41,6 +45,8 @@ class Row:
     ssim: float | None
     gaussians: int
     memory: int | None = None
+    train_psnr: float | None = None
+    train_ssim: float | None = None
 
 
 @dataclass

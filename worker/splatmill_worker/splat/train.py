@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -25,6 +26,9 @@ MAX_RECOVERIES = 3
 TICK_SECONDS = 0.5
 MEASURED_AT = (0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Shares of the budget at which the held-out views are rendered: close together where the curve is steep."""
+
+ALSO_MEASURED = 4
+"""Training views, evenly chosen, that are rendered for each point of the curve beside the held-out ones."""
 
 FLAT_GAIN = 0.02
 """dB on the held-out views; training that gains less over FLAT_SHARE of its time is not worth it."""
@@ -246,9 +250,10 @@ def _measure(run: Run, held_out: Sequence[TrainingView], measuring: _Measuring) 
     started = time.perf_counter()
     while measuring.done < len(MEASURED_AT) and run.progress >= MEASURED_AT[measuring.done]:
         measuring.done += 1
-    score = None
-    if held_out:
-        score = evaluate(drawer(run.engine, run.plan), held_out, evaluation_background(run.plan, run.views))
+    draw, backdrop = drawer(run.engine, run.plan), evaluation_background(run.plan, run.views)
+    score = evaluate(draw, held_out, backdrop) if held_out else None
+    seen_from = run.views if run.poses is None else run.poses.corrected(run.views)
+    on_training = evaluate(draw, seen_from[:: math.ceil(len(seen_from) / ALSO_MEASURED)], backdrop)
     row = Row(
         run.clock.seconds,
         run.step,
@@ -257,6 +262,8 @@ def _measure(run: Run, held_out: Sequence[TrainingView], measuring: _Measuring) 
         None if score is None else score.ssim,
         run.engine.count,
         resident_memory(),
+        on_training.psnr,
+        on_training.ssim,
     )
     run.rows.append(row)
     measuring.seconds += time.perf_counter() - started
