@@ -178,7 +178,8 @@ def test_short_runs_take_longer_steps_and_fewer_gaussians() -> None:
     plain, boosted = RateSchedule(2.0).at(0.2), RateSchedule(2.0, Annealing(boost=4.0)).at(0.2)
     assert boosted.means == pytest.approx(4 * plain.means)
     assert boosted.logit_opacities == pytest.approx(2 * plain.logit_opacities)
-    assert boosted.sh_rest == pytest.approx(4 * plain.sh_rest)
+    assert boosted.sh_rest == pytest.approx(4 * 2 * 1.25e-4)
+    assert plain.sh_rest == pytest.approx(1.25e-4 * 2 / 3)
 
 
 def test_a_time_budget_is_laid_out_for_the_gaussians_it_pays_for() -> None:
@@ -215,7 +216,7 @@ def test_rates_fall_to_their_ends() -> None:
     assert start.means == pytest.approx(3.2e-4)
     assert end.means == pytest.approx(0.01 * start.means)
     assert end.sh_dc == pytest.approx(0.1 * start.sh_dc)
-    assert start.sh_rest == pytest.approx(start.sh_dc / 10)
+    assert start.sh_rest == pytest.approx(start.sh_dc / 30)
     halved = RateSchedule(extent=2.0, scale=0.5).at(0.3)
     assert halved.log_scales == pytest.approx(0.5 * rates.at(0.3).log_scales)
     assert all(math.isfinite(value) for value in end.rows())
