@@ -44,7 +44,7 @@ def views() -> list[TrainingView]:
 def run(kernels: Kernels) -> Trained:
     schedule = Schedule(
         budget=Budget(STEPS, None), resolution=((0, 1),), degree=1, densify_from=2, densify_every=2,
-        densify_until=0.9,
+        densify_until=0.9, expected_steps=STEPS,
     )  # fmt: skip
     plan = Plan(
         schedule=schedule, image_size=replica.WIDTH, max_gaussians=14, densify=True, initial="points",

@@ -15,6 +15,7 @@ from splatmill.schema import TrainOptions
 from splatmill_worker.splat.budget import Budget
 from splatmill_worker.splat.decide import decide
 from splatmill_worker.splat.facts import Facts, Speed
+from splatmill_worker.splat.pace import Pace
 from splatmill_worker.splat.plan import Plan
 from splatmill_worker.splat.rates import Annealing, RateSchedule
 from splatmill_worker.splat.schedule import Schedule
@@ -164,7 +165,7 @@ def test_a_budget_is_spent_by_whichever_ends_first() -> None:
 
 
 def test_the_schedule_goes_from_coarse_to_fine() -> None:
-    schedule = Schedule(Budget(1000), ((0, 4), (200, 2), (500, 1)), 3, 300, 100, 0.7)
+    schedule = Schedule(Budget(1000), ((0, 4), (200, 2), (500, 1)), 3, 300, 100, 0.7, 1000)
     assert [schedule.reduction(step) for step in (1, 200, 201, 500, 501, 1000)] == [4, 4, 2, 2, 1, 1]
     events = [step for step in range(1, 1001) if schedule.densifies(step, step / 1000)]
     assert events == [300, 400, 500, 600]
@@ -189,11 +190,31 @@ def test_a_time_budget_is_laid_out_for_the_gaussians_it_pays_for() -> None:
     assert counts[0] < counts[-1]
 
 
-def test_fewer_gaussians_than_a_budget_pays_for_leave_time_for_more_steps() -> None:
-    def laid_out(**values: object) -> float:
-        return planned(time_budget=60, **values).schedule.annealing.boost
+def test_a_time_budget_corrects_how_many_steps_it_holds() -> None:
+    plan = planned(time_budget=60)
+    assert plan.schedule.annealing.boost is None
+    assert f"{plan.schedule.expected_steps} steps" in plan.reasons["rates"]
+    assert planned(time_budget=60, steps=200).schedule.expected_steps == 200
+    pace, budget = Pace(30_000), Budget(None, 100.0)
+    for _ in range(99):
+        pace.timed(0.1)
+    assert pace.steps(budget, 99, 9.9) == 30_000
+    pace.timed(0.1)
+    assert pace.steps(budget, 100, 10.0) == 1000
+    for _ in range(2000):
+        pace.timed(0.2)
+    assert pace.steps(budget, 1100, 60.0) == pytest.approx(1300, abs=1)
+    assert pace.steps(Budget(1200, 100.0), 1100, 60.0) == 1200
+    assert pace.steps(budget, 1100, 100.5) == 1100
+    with pytest.raises(ValueError, match="only a run"):
+        RateSchedule(2.0, Annealing(boost=None)).at(0.5)
 
-    assert laid_out(max_gaussians=12_000) < laid_out()
+
+def test_fewer_gaussians_than_a_budget_pays_for_leave_time_for_more_steps() -> None:
+    def laid_out(**values: object) -> int:
+        return planned(time_budget=60, **values).schedule.expected_steps
+
+    assert laid_out(max_gaussians=12_000) > laid_out()
 
 
 def test_more_gaussians_asked_for_never_cut_those_at_the_start() -> None:

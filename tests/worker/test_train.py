@@ -15,12 +15,13 @@ import stillife
 import torch
 
 from splatmill_worker.splat import checkpoint, initialise
-from splatmill_worker.splat.budget import Budget
+from splatmill_worker.splat.budget import Budget, Clock
 from splatmill_worker.splat.engine import Engine, gaussians_of, open_engine
 from splatmill_worker.splat.exposure import Exposure
 from splatmill_worker.splat.failure import FailureName, TrainingFailed
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan import Plan
+from splatmill_worker.splat.rates import Annealing, boost_of
 from splatmill_worker.splat.run import Run
 from splatmill_worker.splat.schedule import Schedule
 from splatmill_worker.splat.train import Cancelled, Hooks, Tick, evaluation_background, train
@@ -35,6 +36,7 @@ def plan(steps: int | None = 300, seconds: float | None = None, **changes: Any) 
         densify_from=60,
         densify_every=40,
         densify_until=0.7,
+        expected_steps=steps or 1000,
     )
     fields: dict[str, Any] = {
         "schedule": schedule,
@@ -84,6 +86,23 @@ def test_held_out_views_are_learned() -> None:
     assert 1500 < trained.gaussians.count <= 4000
     assert trained.gaussians.degree == 1
     assert bool(trained.gaussians.finite().all())
+
+
+def test_steps_are_as_long_as_suits_what_the_time_turns_out_to_hold() -> None:
+    """The forecast of a million steps is wrong, and the run finds out."""
+    views, _ = split()
+    wrong = plan(None, 1000.0)
+    course = replace(wrong.schedule, annealing=Annealing(boost=None), expected_steps=10**6)
+    run = Run(first_engine(), replace(wrong, schedule=course), views, 1.1, None, lambda _: None)
+    assert run.rates(0.0).log_scales == pytest.approx(5e-3)
+    # Sixty steps on small photos, which tell nothing of the others, and a hundred that do.
+    for _ in range(159):
+        run.advance()
+        run.clock = Clock(run.clock.seconds + 0.5)
+    assert run.rates(0.0).log_scales == pytest.approx(5e-3)
+    run.advance()
+    run.pace.seconds = 1.0
+    assert run.rates(0.0).log_scales == pytest.approx(5e-3 * boost_of(160 + 920), rel=0.02)
 
 
 def test_there_are_never_more_gaussians_than_allowed() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -50,6 +51,12 @@ class Budget:
         by_steps = 0.0 if self.steps is None else step / self.steps
         by_time = 0.0 if self.seconds is None else seconds / self.seconds
         return min(1.0, max(by_steps, by_time))
+
+    def steps_left(self, step: int, seconds: float, each: float) -> float:
+        """Steps that what is left of the budget is worth, at `each` seconds a step."""
+        by_steps = math.inf if self.steps is None else self.steps - step
+        by_time = math.inf if self.seconds is None else (self.seconds - seconds) / each
+        return max(0.0, min(by_steps, by_time))
 
     def ending_at(self, progress: float, tail: float) -> Budget:
         """The budget that makes a run at `progress` end after another `tail` of what it has spent so far."""

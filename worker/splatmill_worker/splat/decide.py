@@ -13,7 +13,7 @@ from splatmill_worker.splat.facts import ENOUGH_POINTS, Facts, Speed
 from splatmill_worker.splat.initialise import RANDOM_GAUSSIANS
 from splatmill_worker.splat.needs import FEW_VIEWS, needs_of
 from splatmill_worker.splat.plan import Kernels, Plan
-from splatmill_worker.splat.rates import Annealing
+from splatmill_worker.splat.rates import PAPER_STEPS, Annealing, boost_of
 from splatmill_worker.splat.reasons import Reasons
 from splatmill_worker.splat.schedule import Schedule
 from splatmill_worker.splat.start import Start
@@ -34,11 +34,6 @@ OPACITY_DECAY = 0.9
 PIXELS_PER_GAUSSIAN = 50
 """Over all training photos; more Gaussians cost their time and show no more. On fox, 300 s with 160,000 of them (35
 pixels for each) ended as 300 s with 111,000: at 32.4 and 32.3 dB, over black."""
-
-PAPER_STEPS = 30_000
-MOST_BOOST = 8.0
-"""Times the paper's rates, which are made for PAPER_STEPS. The root of the ratio of steps, up to where nothing is won:
-on fox, 600 steps end at 26.6, 29.3, 30.3 and 30.9 dB with 1, 2, 4 and 8 times; 2500 steps at 31.9, 32.7 and 32.7."""
 
 UNKNOWN_SPEED = Speed(per_pixel=3e-8, per_gaussian=1e-7)
 BLURRED = 1.5  # grey levels of 255; below the noise of a phone's photo
@@ -80,7 +75,8 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         densify_every=max(40, min(100, steps // 20)),
         densify_until=0.7,
         opacity_decay=OPACITY_DECAY if densify else 1.0,
-        annealing=Annealing(boost=_boost(steps, why)),
+        annealing=_annealing(options, steps, why),
+        expected_steps=steps,
     )
     if facts.start is not None:
         schedule = _continued(schedule, facts.start, why)
@@ -278,12 +274,14 @@ def _continued(schedule: Schedule, start: Start, why: Reasons) -> Schedule:
     )
 
 
-def _boost(steps: int, why: Reasons) -> float:
-    boost = min(MOST_BOOST, max(1.0, math.sqrt(PAPER_STEPS / steps)))
-    why.chosen["rates"] = (
-        f"{steps} steps are taken {boost:.1f} times as long as those of a run of {PAPER_STEPS}."
-    )
-    return boost
+def _annealing(options: TrainOptions, steps: int, why: Reasons) -> Annealing:
+    boost = boost_of(steps)
+    taken = f"{steps} steps are taken {boost:.1f} times as long as those of a run of {PAPER_STEPS}"
+    if options.time_budget is None:
+        why.chosen["rates"] = f"{taken}."
+        return Annealing(boost=boost)
+    why.chosen["rates"] = f"{taken}; should the time hold more or fewer, their length follows."
+    return Annealing(boost=None)
 
 
 def _degree(facts: Facts, options: TrainOptions, why: Reasons) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import torch
@@ -18,9 +18,10 @@ from splatmill_worker.splat.engine import Engine, StepResult
 from splatmill_worker.splat.exposure import Exposure
 from splatmill_worker.splat.failure import FailureName, TrainingFailed
 from splatmill_worker.splat.health import Health
+from splatmill_worker.splat.pace import Pace
 from splatmill_worker.splat.plan import Plan
 from splatmill_worker.splat.poses import Poses
-from splatmill_worker.splat.rates import RateSchedule
+from splatmill_worker.splat.rates import RateSchedule, boost_of
 from splatmill_worker.splat.views import Target, TrainingView
 
 SNAPSHOT_SHARE = 0.04
@@ -74,6 +75,7 @@ class Run:
 
     def __post_init__(self) -> None:
         self.budget: Budget = self.plan.schedule.budget
+        self.pace = Pace(self.plan.schedule.expected_steps)
         self.random = torch.Generator().manual_seed(self.plan.seed)
         self._good: tuple[dict[str, Tensor], Tensor, Tensor] | None = None
         self._good_poses: dict[str, Tensor] | None = None
@@ -101,7 +103,8 @@ class Run:
             self.health.disturbed(self.step)
         number = self._next_view()
         target = self.views[number].reduced(reduction)
-        rates = RateSchedule(self.extent, schedule.annealing, self.rate_scale).at(progress)
+        rates = self.rates(progress)
+        began = self.clock.seconds
         try:
             if self.poses is not None:
                 target = target._replace(viewmat=self.poses.viewmat(number))
@@ -112,6 +115,8 @@ class Run:
         except MemoryError as short:
             raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
         self.loss = result.loss
+        if reduction == 1:
+            self.pace.timed(self.clock.seconds - began)
         if self.poses is not None and self.engine.pose_gradient is not None:
             self.poses.update(number, self.engine.pose_gradient, progress, self.rate_scale)
         self.ever_saw |= result.visible > 0
@@ -121,6 +126,14 @@ class Run:
         self.engine.keep_scores = "plain" if read else None
         if self.plan.densify and schedule.densifies(self.step, progress):
             self._densify()
+
+    def rates(self, progress: float) -> Rates:
+        """Of a step at `progress`; in a time budget as long as suits the steps that it turns out to hold."""
+        annealing = self.plan.schedule.annealing
+        if annealing.boost is None:
+            steps = self.pace.steps(self.budget, self.step, self.clock.seconds)
+            annealing = replace(annealing, boost=boost_of(steps))
+        return RateSchedule(self.extent, annealing, self.rate_scale).at(progress)
 
     def recover(self, failure: TrainingFailed) -> None:
         """Back to the last good state, with steps half as long."""

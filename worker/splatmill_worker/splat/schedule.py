@@ -16,6 +16,7 @@ class Schedule:
     steps gain as much from a small photo as from a large one. degree: of the spherical harmonics, from the first step.
     opacity_decay: factor on the opacities of those Gaussians that stay when others are added: what the photos need
     grows back, what they do not is pruned.
+    expected_steps: what the budget is laid out for.
     densify_from / densify_every in steps, densify_until as a share: after it, positions and colours settle.
     """
 
@@ -25,6 +26,7 @@ class Schedule:
     densify_from: int
     densify_every: int
     densify_until: float
+    expected_steps: int
     opacity_decay: float = 1.0
     annealing: Annealing = field(default_factory=Annealing)
 
