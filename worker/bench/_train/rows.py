@@ -130,12 +130,12 @@ def failed(row: Row) -> bool:
 
 
 def latest_default(rows: list[Row]) -> list[Row]:
-    """Of each scene the default's rows of the last code it ran with: those timed, or else those counted in steps."""
+    """Of each scene and budget the default's rows of the last code: those timed, or else those counted in steps."""
     defaults = [row for row in rows if row["kind"] == "run" and row["config"] == DEFAULT]
     timed = {row["scene"] for row in defaults if by_time(row)}
     mine = [row for row in defaults if by_time(row) or row["scene"] not in timed]
-    last = {row["scene"]: row["code"] for row in mine}
-    return once([row for row in mine if row["code"] == last[row["scene"]]])
+    last = {(row["scene"], row["budget"]): row["code"] for row in mine}
+    return once([row for row in mine if row["code"] == last[row["scene"], row["budget"]]])
 
 
 def by_time(row: Row) -> bool:

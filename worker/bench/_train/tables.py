@@ -20,7 +20,7 @@ COMMAND = "splatmill bench train"
 
 RULES = """Seconds are training seconds: cameras, loading and evaluation are clocked apart. Held-out views are the
 data set's own, else every 8th photo by name. Medians over seeds, least and largest in brackets. Every row is a run of
-its own in a process of its own, laid out for its budget."""
+its own in a process of its own, laid out for its budget; each budget is shown as the last code measured it."""
 
 AT_A_LEVEL = """Straight lines between the points of the curve. A shorter budget gets to a level sooner, as its rates
 fall sooner; the best budget that gets there with every seed counts."""
