@@ -13,8 +13,8 @@ POSITION_START = 1.6e-4
 SH_REST = 1.25e-4
 """The paper's. Short runs take twice of it, as few steps have to tell view from light: trials of 720 to 800 steps gain
 0.1 dB on lego (three seeds) and 0.6 on kermit (two), nothing clear on lund and the still life (three), and 3300 steps
-0.15 on fox (two). Long runs learn single photos by heart so: 300 s on fox ended at 32.5 and 32.9 dB, and at 33.0 to
-33.3 without."""
+0.15 on fox (two). Long runs rather lose: 300 s on fox ended at 32.5 and 32.9 dB so, and at 32.8 to 33.3 with the
+paper's rate or less (nine runs)."""
 
 PAPER_STEPS = 30_000
 MOST_BOOST = 8.0
@@ -22,7 +22,7 @@ MOST_BOOST = 8.0
 on fox, 600 steps end at 26.6, 29.3, 30.3 and 30.9 dB with 1, 2, 4 and 8 times; 2500 steps at 31.9, 32.7 and 32.7."""
 
 MOST_SH, SH_SHARE = 2.0, 2.0 / 3.0
-"""Times SH_REST: this share of the boost, so that from 3300 steps on the harmonics travel as far in any run."""
+"""Times SH_REST: this share of the boost, so that from 3300 to 30,000 steps the harmonics travel as far in any run."""
 
 
 @dataclass(frozen=True)
