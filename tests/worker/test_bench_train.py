@@ -234,6 +234,10 @@ def test_budgets_are_judged_by_all_their_runs(parts: Any, place: Path) -> None:
     text = budgets(latest([*good, again, broken]))
     assert "| tiny | 10s | 1 | 10.0 | 30.00 |" in text
     assert "60s" not in text
+    # Nor are they hidden by newer rows of another budget.
+    text = budgets(latest([*good, again]))
+    assert "| tiny | 10s | 1 | 10.0 | 30.00 |" in text
+    assert "| tiny | 60s | 3 | 60.6 (60.6 to 60.6) | 26.00 (25.00 to 27.00) |" in text
     assert "failed: divergence" in parts["_train.tables"].failures([*good, again, broken])
 
 

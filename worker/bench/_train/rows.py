@@ -45,20 +45,15 @@ def code_version() -> str:
 
 def computing(source: str) -> str:
     """What of Python `source` computes: a reworded comment or docstring leaves measured rows as they are."""
-    tree = ast.parse(source)
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):
-            node.body = [each for each in body if not _is_text(each)]  # type: ignore[attr-defined]  # has one, as seen
-    return ast.dump(tree)
+    return ast.dump(_Textless().visit(ast.parse(source)))
 
 
-def _is_text(node: ast.AST) -> bool:
-    return (
-        isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-    )
+class _Textless(ast.NodeTransformer):
+    """Takes out statements that are nothing but a string."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
+        alone = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if alone else self.generic_visit(node)
 
 
 @dataclass(frozen=True)
