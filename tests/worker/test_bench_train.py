@@ -315,7 +315,9 @@ def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: P
         (0, "black-background"),
     ]
     bare = replace(scene, points=False)
-    assert [run.config for run in rows.runs_of([bare], ["sky", "gaps", "sh-3"], [budget], [0])] == ["sh-3"]
+    assert [run.config for run in rows.runs_of([bare], ["far-shell", "gaps", "sh-3"], [budget], [0])] == [
+        "sh-3"
+    ]
     clear = replace(scene, transparent=True)
     assert [
         run.config

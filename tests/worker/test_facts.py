@@ -116,6 +116,7 @@ def test_what_points_leave_open_is_measured() -> None:
     assert 0.2 < seen.extent < 3.0
     assert 0.05 < seen.gap_share < 0.95
     assert seen.gap_points > 100
+    assert seen.shell_points > 100
     assert 0.0 <= seen.sky_share < 0.4
 
 

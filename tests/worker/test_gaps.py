@@ -1,4 +1,4 @@
-"""Proves where Gaussians are put for what the points leave open: gaps as deep as their neighbours, the sky far away.
+"""Proves where Gaussians are put for what the points leave open: gaps as deep as their neighbours, a shell far away.
 
 Does not prove that this pays on real photos: `bench train --configs` measures that. Which colours are sky is a
 rule, and is proven here on plain cases only.
@@ -15,8 +15,8 @@ import torch
 from test_train import plan
 
 from splatmill_worker.scene import Camera, Normalization, PointViews, Scene
-from splatmill_worker.splat import gaps, initialise, sky
-from splatmill_worker.splat.cells import Cells, cells_of, projected
+from splatmill_worker.splat import far_shell, gaps, initialise, sky
+from splatmill_worker.splat.cells import Cells, cells_of, located, projected
 from splatmill_worker.splat.views import Target, TrainingView
 
 BLUE, BRICK, CLOUD = (90, 140, 230), (140, 80, 60), (215, 218, 225)
@@ -100,19 +100,50 @@ def test_the_sky_is_blue_or_grey_and_has_nothing_above_it(
     )
 
 
-def test_the_shell_is_far_and_where_the_photos_show_it() -> None:
+def test_the_shell_is_far_and_wherever_photos_look() -> None:
     points = np.array([[-0.5, 0.3, 2.0], [0.0, 0.3, 2.0], [0.5, 0.3, 4.0]])
     grids = [Cells.of(street(x), points) for x in (-0.2, 0.0, 0.2)]
     assert sky.sky_share(grids) == pytest.approx(0.5)
-    places, colors = sky.shell(grids, points)
+    places, colors = far_shell.far_shell(grids, points)
     distance = np.linalg.norm(places, axis=1)
-    assert distance.min() > 0.99 * sky.DISTANCE * 3.0
+    assert distance.min() > 0.99 * far_shell.DISTANCE * 3.0
     assert distance.max() / distance.min() < 1.01
-    assert (colors == BLUE).all()
     for grid in grids:
-        seen = projected(grid.camera, places)
-        assert (seen[:, 1] < 16.5).all()
-        assert len(np.unique(seen[:, :2].astype(int), axis=0)) > 0.5 * 16 * 48
+        cells, on = located(grid.camera, places)
+        assert on.sum() > 0.7 * 16 * 24
+        up, down = cells[:, 1] < 14, cells[:, 1] > 18
+        assert (colors[up] == BLUE).all()
+        assert (colors[down] == BRICK).all()
+        # Beyond the borders too, by a few cells.
+        assert -far_shell.BEYOND - 2 < cells[:, 0].min() < -3
+        assert 48 + 3 < cells[:, 0].max() < 48 + far_shell.BEYOND + 2
+
+
+def test_what_a_photo_shows_outweighs_what_another_continues() -> None:
+    points = np.array([[-0.5, 0.3, 2.0], [0.0, 0.3, 2.0], [0.5, 0.3, 4.0]])
+    first = street()
+    # From the first one's middle to half a photo past its right border.
+    beside = replace(first.full.camera, cx=0.0)
+    grey = first.full._replace(camera=beside, rgb=torch.full_like(first.full.rgb, 200))
+    grids = [Cells.of(first, points), Cells.of(TrainingView("beside", {1: grey}), points)]
+    places, colors = far_shell.far_shell(grids, points)
+    cells, _ = located(grids[0].camera, places)
+    lower = cells[:, 1] > 18
+    left = lower & (cells[:, 0] > 19) & (cells[:, 0] < 20.5)
+    right = lower & (cells[:, 0] > 50) & (cells[:, 0] < 53)
+    assert left.any()
+    assert right.any()
+    assert np.abs(np.median(colors[left], axis=0) - BRICK).max() < 10
+    assert np.abs(np.median(colors[right], axis=0) - 200).max() < 10
+
+
+def test_masked_cells_leave_no_colour_on_the_shell() -> None:
+    mask = torch.ones(64, 96, dtype=torch.bool)
+    mask[:, :48] = False
+    points = np.array([[0.2, 0.3, 2.0], [0.3, 0.3, 2.0], [0.5, 0.3, 2.0]])
+    grid = Cells.of(street(mask=mask), points)
+    cells, _ = located(grid.camera, far_shell.far_shell([grid], points)[0])
+    assert cells[:, 0].min() > 23
 
 
 def scene() -> tuple[Scene, list[TrainingView]]:
@@ -137,5 +168,6 @@ def test_what_is_added_keeps_to_the_limit_and_to_what_the_plan_says() -> None:
     assert bool(whole.finite().all())
     most = first.count + 10
     assert (
-        initialise.completed(first, world, views, plan(gaps=True, sky=True, max_gaussians=most)).count == most
+        initialise.completed(first, world, views, plan(gaps=True, far_shell=True, max_gaussians=most)).count
+        == most
     )

@@ -159,7 +159,7 @@ def test_nothing_held_out_is_reported_as_such(tmp_path: Path) -> None:
     [
         ({"test_views": ["nowhere.png"]}, "holdout_empty"),
         ({"holdout": 1}, "holdout_empty"),
-        ({"sky": "on"}, "option_out_of_range"),
+        ({"far_shell": "on"}, "option_out_of_range"),
     ],
 )
 def test_what_cannot_be_done_is_refused_by_code(tmp_path: Path, asked: dict[str, object], code: str) -> None:

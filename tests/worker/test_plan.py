@@ -73,9 +73,10 @@ def test_every_field_has_its_reason_and_absent_ones_say_why() -> None:
         ({"exposure_spread": 0.3}, "exposure", True),
         ({"exposure_spread": None}, "exposure", False),
         ({"tint_spread": 0.2}, "exposure", True),
-        ({"sky_share": 0.2, "depth_ratio": 15.0, "sky_points": 800}, "sky", True),
-        ({"sky_share": 0.2, "depth_ratio": 2.0, "sky_points": 800}, "sky", False),
-        ({"sky_share": 0.01, "depth_ratio": 15.0}, "sky", False),
+        ({"sky_share": 0.0, "shell_points": 800}, "far_shell", True),
+        ({"sky_share": 0.3, "shell_points": 800, "views": 11}, "far_shell", False),
+        ({"sky_share": None}, "far_shell", False),
+        ({"sky_share": None, "transparent": 43}, "far_shell", False),
         ({"gap_share": 0.3, "gap_points": 5000}, "gaps", True),
         ({"gap_share": 0.02, "gap_points": 50}, "gaps", False),
         ({"reprojection": 2.5}, "pose_refinement", True),
@@ -106,6 +107,7 @@ def test_the_degree_follows_from_the_angles_between_views(angle: float | None, d
         ({"antialias": "on"}, "antialias", True),
         ({"pose_refinement": "on"}, "pose_refinement", True),
         ({"gaps": "off"}, "gaps", False),
+        ({"far_shell": "off"}, "far_shell", False),
         ({"densify": "on"}, "densify", True),
         ({"densify": "off"}, "densify", False),
         ({"background": "white"}, "background", "white"),
@@ -126,6 +128,9 @@ def test_what_is_added_to_start_with_counts_among_the_gaussians() -> None:
     assert plan.max_gaussians == 30_900
     assert "30000 Gaussians are put there" in plan.reasons["gaps"]
     assert planned(sparse, steps=100, gaps="off").max_gaussians < 30_000
+    walled = planned(replace(sparse, sky_share=0.12, shell_points=700), steps=100)
+    assert walled.max_gaussians == 31_600
+    assert "12 % of the photos look like sky: 700 Gaussians" in walled.reasons["far_shell"]
 
 
 def test_what_cannot_be_followed_is_refused() -> None:
@@ -133,8 +138,8 @@ def test_what_cannot_be_followed_is_refused() -> None:
         decide(FACTS, options(pose_refinement="on"), "gpu")
     with pytest.raises(ValueError, match="two photos"):
         planned(replace(FACTS, views=1), pose_refinement="on")
-    with pytest.raises(ValueError, match="sky=on needs points"):
-        planned(sky="on")
+    with pytest.raises(ValueError, match="far_shell=on needs points"):
+        planned(far_shell="on")
 
 
 def test_more_time_allows_more_steps_and_more_gaussians() -> None:

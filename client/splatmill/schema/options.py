@@ -167,9 +167,9 @@ class TrainOptions(Request):
         description="Fit an affine colour per photo, for photos whose exposure or white balance differ.",
         json_schema_extra=_PHOTOS,
     )
-    sky: Switch = Field(
+    far_shell: Switch = Field(
         default=Switch.auto,
-        description="Put a far shell of Gaussians where photos show sky.",
+        description="Put a far shell of Gaussians behind the scene, for the sky and for holes.",
         json_schema_extra=_PHOTOS,
     )
     gaps: Switch = Field(

@@ -81,8 +81,8 @@ CONFIGURATIONS = {
     "black-background": Configuration(
         "black behind the Gaussians", {"background": "black"}, {"background": "black"}, photos="opaque"
     ),
-    "sky": _option("a far shell of Gaussians where photos show sky", "sky", "on", True, points=True),
-    "no-sky": _option("no such shell", "sky", "off", False),
+    "far-shell": _option("a far shell of Gaussians behind the scene", "far_shell", "on", True, points=True),
+    "no-far-shell": _option("no such shell", "far_shell", "off", False),
     "gaps": _option("Gaussians where photos show what no point describes", "gaps", "on", True, points=True),
     "no-gaps": _option("no such Gaussians", "gaps", "off", False),
     "pose-refinement": _option("training cameras are corrected", "pose_refinement", "on", True),
@@ -92,10 +92,12 @@ CONFIGURATIONS = {
 
 TAKEN_OUT = {
     "absolute": "densification by absolute gradients (Ye et al. 2024)",
+    "sky": "a far shell of Gaussians where photos show sky, and only there",
+    "no-sky": "no such shell where photos show sky",
     "mcmc": "MCMC relocation and noise (Kheradmand et al. 2024)",
     "sh-at-once": "the last SH degree from the start, as now, against one after the other (Kerbl et al. 2023)",
 }
-"""Switches of rows measured before what they switch was taken out, because it did not pay."""
+"""Switches of rows measured before what they switch was taken out, as something else pays more."""
 
 
 def named(name: str) -> Configuration:

@@ -90,14 +90,21 @@ def points_of(scene: Scene, views: Sequence[TrainingView]) -> list[Float]:
     return [scene.points[of_view[number[view.name]]] for view in views]
 
 
-def projected(camera: Camera, points: Float) -> Float:
-    """Column, row and depth [k, 3] of those `points` [n, 3] that fall into the picture of `camera`."""
+def located(camera: Camera, points: Float) -> tuple[Float, Flags]:
+    """Column, row and depth [n, 3] of `points` [n, 3], and which of them fall into the picture of `camera` [n]."""
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     z = np.maximum(local[:, 2], 1e-9)
     u = local[:, 0] / z * camera.fx + camera.cx
     v = local[:, 1] / z * camera.fy + camera.cy
     on = (local[:, 2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    return np.stack([u[on], v[on], z[on]], axis=1)
+    return np.stack([u, v, z], axis=1), on
+
+
+def projected(camera: Camera, points: Float) -> Float:
+    """Column, row and depth [k, 3] of those `points` [n, 3] that fall into the picture of `camera`."""
+    places, on = located(camera, points)
+    inside: Float = places[on]
+    return inside
 
 
 def marked(seen: Float, shape: tuple[int, int], *, spread: int) -> Flags:

@@ -95,7 +95,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         max_memory=options.max_memory,
         stops_when_flat=options.steps is None and options.time_budget is None,
         seed=options.seed,
-        sky=needs.sky,
+        far_shell=needs.far_shell,
         gaps=needs.gaps,
         pose_refinement=needs.pose_refinement,
         reasons=why.chosen,

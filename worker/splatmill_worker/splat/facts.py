@@ -15,8 +15,9 @@ import torch
 from splatmill_worker.images.lens import distortion
 from splatmill_worker.scene import Scene
 from splatmill_worker.splat.cells import cells_of
+from splatmill_worker.splat.far_shell import far_shell
 from splatmill_worker.splat.gaps import filled, gap_share
-from splatmill_worker.splat.sky import shell, sky_share
+from splatmill_worker.splat.sky import sky_share
 from splatmill_worker.splat.start import Start
 from splatmill_worker.splat.views import TrainingView
 
@@ -54,7 +55,8 @@ class Facts:
     stereo added: that is looked for under few angles and in steps of its own. lens_residual: the farthest that
     distortion moves a pixel of this size. tint_spread: as exposure_spread, of the log ratios of red and blue to
     green. sightings: median number of points that a photo shows. sky_share, gap_share: shares of the photos that look
-    like sky, and that (sky apart) have no point near; sky_points, gap_points: what would stand for them.
+    like sky, and that (sky apart) have no point near; gap_points, shell_points: what would fill the gaps, and stand
+    behind all.
     extent: distance of the farthest tenth of the points over the radius of the cameras.
     start: the model to start from, if one was given.
     """
@@ -83,8 +85,8 @@ class Facts:
     sightings: float | None = None
     sky_share: float | None = None
     gap_share: float | None = None
-    sky_points: int = 0
     gap_points: int = 0
+    shell_points: int = 0
     extent: float | None = None
 
     @property
@@ -147,8 +149,8 @@ def _coverage(scene: Scene, views: Sequence[TrainingView]) -> dict[str, Any]:
         "sightings": float(np.median([len(grid.points) for grid in cells])),
         "sky_share": sky_share(cells),
         "gap_share": gap_share(cells),
-        "sky_points": len(shell(cells, scene.points)[0]),
         "gap_points": len(filled(cells)[0]),
+        "shell_points": len(far_shell(cells, scene.points)[0]),
         "extent": _extent(scene, views),
     }
 

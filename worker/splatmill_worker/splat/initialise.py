@@ -13,8 +13,8 @@ from torch import Tensor
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.scene import Camera, Scene
-from splatmill_worker.splat import gaps, sky
-from splatmill_worker.splat.cells import cells_of
+from splatmill_worker.splat import far_shell, gaps
+from splatmill_worker.splat.cells import cells_of, located
 from splatmill_worker.splat.facts import ENOUGH_POINTS
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians, concatenate
 from splatmill_worker.splat.plan import Plan
@@ -76,26 +76,27 @@ def completed(
     *,
     backend: ops.Backend | None = None,
 ) -> Gaussians:
-    """`gaussians` made from the points of `scene`, with what the plan adds before training: the sky, and the gaps.
+    """`gaussians` made from the points of `scene`, with what the plan adds before training.
 
-    No more than `plan.max_gaussians` result; what does not fit is left out evenly, the gaps before the sky.
+    No more than `plan.max_gaussians` result; what does not fit is left out evenly, the gaps before the far shell.
     """
-    if plan.initial != "points" or not (plan.sky or plan.gaps):
+    if plan.initial != "points" or not (plan.far_shell or plan.gaps):
         return gaussians
     cells = cells_of(scene, views)
-    room = max(0, plan.max_gaussians - gaussians.count)
+    found: list[tuple[Float, Pixels, float]] = []
+    if plan.far_shell:
+        found.append((*far_shell.far_shell(cells, scene.points), far_shell.OPACITY))
+    if plan.gaps:
+        found.append((*gaps.filled(cells), INITIAL_OPACITY))
     parts = [gaussians]
-    if plan.sky:
-        points, colors = _at_most(room, *sky.shell(cells, scene.points))
+    room = max(0, plan.max_gaussians - gaussians.count)
+    for points, colors, opacity in found:
+        points, colors = _at_most(room, points, colors)
         room -= len(points)
         if len(points) > 1:
-            far = from_points(torch.from_numpy(points), torch.from_numpy(colors), backend=backend)
-            parts.append(replace(far, logit_opacities=torch.full((far.count,), _logit(sky.OPACITY))))
-    if plan.gaps:
-        points, colors = _at_most(room, *gaps.filled(cells))
-        # As wide as their distance to each other: those of the reconstruction are elsewhere.
-        if len(points) > 1:
-            parts.append(from_points(torch.from_numpy(points), torch.from_numpy(colors), backend=backend))
+            # As wide as their distance to each other: those of the reconstruction are elsewhere.
+            more = from_points(torch.from_numpy(points), torch.from_numpy(colors), backend=backend)
+            parts.append(replace(more, logit_opacities=torch.full((more.count,), _logit(opacity))))
     return concatenate(*parts)
 
 
@@ -180,10 +181,7 @@ def _along_rays(cameras: Sequence[Camera], distance: float, count: int, random: 
 
 def _pixels(camera: Camera, points: Float) -> tuple[Index, Index, Index]:
     """Indices of the points that fall on the photo, with the row and the column that they fall on."""
-    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    z = np.maximum(local[:, 2], 1e-9)
-    u = local[:, 0] / z * camera.fx + camera.cx
-    v = local[:, 1] / z * camera.fy + camera.cy
-    on = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    places, on = located(camera, points)
     inside = np.flatnonzero(on)
-    return inside, v[inside].astype(np.int64), u[inside].astype(np.int64)
+    column, row = places[inside, :2].astype(np.int64).T
+    return inside, row, column

@@ -1,4 +1,4 @@
-"""What a scene needs beside Gaussians on its points: the sky, the gaps between points, better cameras."""
+"""What a scene needs beside Gaussians on its points: what stands behind all, gaps filled, better cameras."""
 
 from __future__ import annotations
 
@@ -8,12 +8,6 @@ from splatmill.schema import Switch, TrainOptions
 from splatmill_worker.splat.facts import Facts
 from splatmill_worker.splat.plan import Kernels
 from splatmill_worker.splat.reasons import Reasons
-
-MUCH_SKY = 0.05
-"""Of all photos; less is a window or a white wall."""
-
-OUTDOORS = 6.0
-"""Far over near depths; a table or a room has less, a street more."""
 
 MANY_GAPS = 0.1
 
@@ -27,7 +21,7 @@ POSES_OFF = 1.0
 class Needs(NamedTuple):
     """Fields of the plan, and the Gaussians that they add before the first step."""
 
-    sky: bool
+    far_shell: bool
     gaps: bool
     pose_refinement: bool
     added: int
@@ -42,19 +36,20 @@ def needs_of(
 
     Raises ValueError, as a sentence, for an option that this scene cannot follow.
     """
-    for name, asked in (("sky", options.sky), ("gaps", options.gaps)):
+    added = (("far_shell", options.far_shell), ("gaps", options.gaps))
+    for name, asked in added:
         if asked is Switch.on and facts.start is not None:
             raise ValueError(
                 f"{name}=on adds to points; this training starts from a model. Leave it at auto."
             )
-    sky = why.switch("sky", options.sky, *_sky(facts))
+    shell = why.switch("far_shell", options.far_shell, *_far_shell(facts))
     gaps = why.switch("gaps", options.gaps, *_gaps(facts))
     poses = why.switch("pose_refinement", options.pose_refinement, *_poses(facts, kernels, error_scale))
     if poses:
         why.chosen["pose_refinement"] += (
             " Held-out cameras stay as they came, so that their score is not flattered."
         )
-    for name, asked in (("sky", options.sky), ("gaps", options.gaps)):
+    for name, asked in added:
         if asked is Switch.on and facts.sightings is None:
             raise ValueError(
                 f"{name}=on needs points that the photos show, and there are none. Leave it at auto."
@@ -67,26 +62,20 @@ def needs_of(
         raise ValueError(
             "pose_refinement=on needs at least two photos: one alone shows any error of its camera."
         )
-    return Needs(sky, gaps, poses, sky * facts.sky_points + gaps * facts.gap_points)
+    return Needs(shell, gaps, poses, shell * facts.shell_points + gaps * facts.gap_points)
 
 
-def _sky(facts: Facts) -> tuple[bool, str]:
-    share, ratio = facts.sky_share, facts.depth_ratio
+def _far_shell(facts: Facts) -> tuple[bool, str]:
     if facts.start is not None:
         return False, "The model given stands for it."
-    if share is None:
-        return False, "Whether the photos show sky cannot be told without points in them."
-    if ratio is None:
-        return False, "How far the points are from the cameras that saw them is not known."
-    seen = f"{100 * share:.0f} % of the photos look like sky"
-    if share < MUCH_SKY:
-        return False, f"{seen}."
-    if ratio < OUTDOORS:
-        return False, f"{seen}, but depths differ by a factor of {ratio:.1f} only: this is not outdoors."
-    return (
-        True,
-        f"{seen}, and depths differ by a factor of {ratio:.0f}: {facts.sky_points} far Gaussians stand for it.",
-    )
+    if facts.transparent:
+        return False, f"{facts.transparent} photos are transparent: nothing stands behind the scene."
+    if facts.sky_share is None:
+        return False, "How far away the scene ends cannot be told without points in the photos."
+    seen = f"{100 * facts.sky_share:.0f} % of the photos look like sky"
+    if facts.views < FEW_VIEWS:
+        return False, f"{seen}, but {facts.views} photos are too few to tell what stands in front of it."
+    return True, f"{seen}: {facts.shell_points} Gaussians stand for it, and behind whatever has holes."
 
 
 def _gaps(facts: Facts) -> tuple[bool, str]:

@@ -20,7 +20,7 @@ class Plan:
     """The whole course of a run. What is not needed is None or absent.
 
     image_size: longest side in pixels. background: what is behind Gaussians and transparent photos while training.
-    sky: a far shell of Gaussians stands for it. gaps: Gaussians are put where photos show what no point describes.
+    far_shell: Gaussians stand behind all. gaps: Gaussians are put where photos show what no point describes.
     pose_refinement: training cameras are corrected. `reasons` has one sentence per field;
     `left_out` one per thing that this scene does not need; `forced` names the fields that an option fixed.
     """
@@ -38,7 +38,7 @@ class Plan:
     max_memory: int | None
     stops_when_flat: bool
     seed: int
-    sky: bool = False
+    far_shell: bool = False
     gaps: bool = False
     pose_refinement: bool = False
     reasons: dict[str, str] = field(default_factory=dict)
