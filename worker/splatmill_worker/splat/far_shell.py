@@ -15,7 +15,7 @@ OPACITY = 0.7
 """Of the shell when training begins: nothing stands behind it."""
 
 PATCH = 2.0
-"""Cells to a Gaussian's side: 600 steps on fox, lund and the still life end alike with 2 and 4 (trials of two seeds)."""
+"""Cells to a Gaussian's side: 600 steps on fox, lund and the still life end alike with 2 and 4 (two seeds)."""
 
 BEYOND = 6
 """Cells by which a photo's border goes on: held-out photos look a little past the others."""
