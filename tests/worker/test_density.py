@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -117,6 +118,13 @@ def test_what_cannot_be_seen_goes() -> None:
 def test_decayed_opacities_are_multiplied() -> None:
     logits = torch.tensor([-2.0, 0.0, 3.0])
     assert torch.allclose(torch.sigmoid(decayed(logits, 0.9)), 0.9 * torch.sigmoid(logits), atol=1e-6)
+
+
+def test_what_is_far_keeps_its_opacity() -> None:
+    engine = Held(gaussians(4), torch.zeros(4))
+    engine.held.means[:] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 9.0, 0.0], [2.0, 2.0, 0.0], [-8.0, 0.0, 0.0]])
+    densify(engine, random(), extent=1.0, allowed=4, opacity_decay=0.9, decay_within=5.0)  # type: ignore[arg-type]
+    assert torch.sigmoid(engine.held.logit_opacities).tolist() == pytest.approx([0.45, 0.5, 0.45, 0.5])
 
 
 def test_rotations_are_rotations() -> None:

@@ -117,6 +117,8 @@ def test_what_points_leave_open_is_measured() -> None:
     assert 0.05 < seen.gap_share < 0.95
     assert seen.gap_points > 100
     assert seen.shell_points > 100
+    assert seen.shell_distance is not None
+    assert seen.shell_distance > 4.0
     assert 0.0 <= seen.sky_share < 0.4
 
 

@@ -133,6 +133,12 @@ def test_what_is_added_to_start_with_counts_among_the_gaussians() -> None:
     assert "12 % of the photos look like sky: 700 Gaussians" in walled.reasons["far_shell"]
 
 
+def test_the_far_shell_keeps_its_opacities() -> None:
+    backed = replace(FACTS, sky_share=0.2, shell_points=700, shell_distance=20.0)
+    assert planned(backed).schedule.decay_within == 10.0
+    assert planned(backed, far_shell="off").schedule.decay_within is None
+
+
 def test_what_cannot_be_followed_is_refused() -> None:
     with pytest.raises(ValueError, match="gpu kernels"):
         decide(FACTS, options(pose_refinement="on"), "gpu")

@@ -75,6 +75,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         densify_every=max(40, min(100, steps // 20)),
         densify_until=0.7,
         opacity_decay=OPACITY_DECAY if densify else 1.0,
+        decay_within=0.5 * facts.shell_distance if needs.far_shell and facts.shell_distance else None,
         annealing=_annealing(options, steps, why),
         expected_steps=steps,
     )

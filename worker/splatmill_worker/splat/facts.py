@@ -56,7 +56,7 @@ class Facts:
     distortion moves a pixel of this size. tint_spread: as exposure_spread, of the log ratios of red and blue to
     green. sightings: median number of points that a photo shows. sky_share, gap_share: shares of the photos that look
     like sky, and that (sky apart) have no point near; gap_points, shell_points: what would fill the gaps, and stand
-    behind all.
+    behind all. shell_distance: of the nearest of those from the origin of the frame.
     extent: distance of the farthest tenth of the points over the radius of the cameras.
     start: the model to start from, if one was given.
     """
@@ -87,6 +87,7 @@ class Facts:
     gap_share: float | None = None
     gap_points: int = 0
     shell_points: int = 0
+    shell_distance: float | None = None
     extent: float | None = None
 
     @property
@@ -145,12 +146,14 @@ def _coverage(scene: Scene, views: Sequence[TrainingView]) -> dict[str, Any]:
     if len(scene.points) < ENOUGH_POINTS or any(view.full.alpha is not None for view in views):
         return {}
     cells = cells_of(scene, views)
+    shell, _ = far_shell(cells, scene.points)
     return {
         "sightings": float(np.median([len(grid.points) for grid in cells])),
         "sky_share": sky_share(cells),
         "gap_share": gap_share(cells),
         "gap_points": len(filled(cells)[0]),
-        "shell_points": len(far_shell(cells, scene.points)[0]),
+        "shell_points": len(shell),
+        "shell_distance": float(np.linalg.norm(shell, axis=1).min()) if len(shell) else None,
         "extent": _extent(scene, views),
     }
 

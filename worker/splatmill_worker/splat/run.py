@@ -278,6 +278,7 @@ class Run:
         allowed = min(self.plan.max_gaussians, self._most)
         if self.plan.max_memory is not None:
             allowed = min(allowed, self.plan.gaussians_within(self.plan.max_memory))
+        within = self.plan.schedule.decay_within
         try:
             clone_split.densify(
                 self.engine,
@@ -285,6 +286,7 @@ class Run:
                 extent=self.extent,
                 allowed=allowed,
                 opacity_decay=self.plan.schedule.opacity_decay,
+                decay_within=math.inf if within is None else within,
             )
         except MemoryError as short:
             raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short

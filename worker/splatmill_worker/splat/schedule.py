@@ -16,6 +16,8 @@ class Schedule:
     steps gain as much from a small photo as from a large one. degree: of the spherical harmonics, from the first step.
     opacity_decay: factor on the opacities of those Gaussians that stay when others are added: what the photos need
     grows back, what they do not is pruned.
+    decay_within: distance from the origin of the training world beyond which no opacity decays: the far shell is mostly
+    hidden from the photos, and is there for what they do not show. None: everywhere.
     expected_steps: what the budget is laid out for.
     densify_from / densify_every in steps, densify_until as a share: after it, positions and colours settle.
     """
@@ -28,6 +30,7 @@ class Schedule:
     densify_until: float
     expected_steps: int
     opacity_decay: float = 1.0
+    decay_within: float | None = None
     annealing: Annealing = field(default_factory=Annealing)
 
     def reduction(self, step: int) -> int:

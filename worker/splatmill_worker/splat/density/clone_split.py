@@ -31,12 +31,19 @@ class Change(NamedTuple):
 
 
 def densify(
-    engine: Engine, random: torch.Generator, *, extent: float, allowed: int, opacity_decay: float = 1.0
+    engine: Engine,
+    random: torch.Generator,
+    *,
+    extent: float,
+    allowed: int,
+    opacity_decay: float = 1.0,
+    decay_within: float = math.inf,
 ) -> Change:
     """The Gaussians with the largest mean gradient are doubled: the small are cloned, the large are split.
 
     extent: radius of the cameras in the training world. Of those above THRESHOLD, no more are taken than `allowed`
-    Gaussians leave room for, the largest scores first. opacity_decay: factor on the opacities of those that stay.
+    Gaussians leave room for, the largest scores first. opacity_decay: factor on the opacities of those that stay
+    and are nearer to the origin than `decay_within`.
     """
     before = engine.count
     score = engine.plain_sum / engine.visible_count.clamp_min(1)
@@ -52,7 +59,9 @@ def densify(
     )
     rows = rows.keep(stay & ~split)
     if opacity_decay < 1.0:
-        rows.gaussians.logit_opacities.copy_(decayed(rows.gaussians.logit_opacities, opacity_decay))
+        near = rows.gaussians.means.norm(dim=1) < decay_within
+        opacities = rows.gaussians.logit_opacities
+        opacities.copy_(torch.where(near, decayed(opacities, opacity_decay), opacities))
     rows = rows.grown(new)
     rows.into(engine)
     added = int(hot.sum())
