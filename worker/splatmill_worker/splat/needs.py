@@ -9,6 +9,9 @@ from splatmill_worker.splat.facts import Facts
 from splatmill_worker.splat.plan import Kernels
 from splatmill_worker.splat.reasons import Reasons
 
+MUCH_SKY = 0.05
+"""Of all photos; less is a window or a white wall."""
+
 MANY_GAPS = 0.1
 
 FEW_VIEWS = 12
@@ -73,8 +76,8 @@ def _far_shell(facts: Facts) -> tuple[bool, str]:
     if facts.sky_share is None:
         return False, "How far away the scene ends cannot be told without points in the photos."
     seen = f"{100 * facts.sky_share:.0f} % of the photos look like sky"
-    if facts.views < FEW_VIEWS:
-        return False, f"{seen}, but {facts.views} photos are too few to tell what stands in front of it."
+    if facts.views < FEW_VIEWS and facts.sky_share < MUCH_SKY:
+        return False, f"{seen}, and {facts.views} photos are too few to tell what else is that far."
     return True, f"{seen}: {facts.shell_points} Gaussians stand for it, and behind whatever has holes."
 
 
