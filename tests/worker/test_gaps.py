@@ -144,6 +144,9 @@ def test_masked_cells_leave_no_colour_on_the_shell() -> None:
     grid = Cells.of(street(mask=mask), points)
     cells, _ = located(grid.camera, far_shell.far_shell([grid], points)[0])
     assert cells[:, 0].min() > 23
+    masked = Cells.of(street(mask=torch.zeros(64, 96, dtype=torch.bool)), points)
+    places, colors = far_shell.far_shell([masked], points)
+    assert places.shape == colors.shape == (0, 3)
 
 
 def scene() -> tuple[Scene, list[TrainingView]]:

@@ -145,6 +145,8 @@ def test_what_cannot_be_followed_is_refused() -> None:
         decide(FACTS, options(pose_refinement="on"), "gpu")
     with pytest.raises(ValueError, match="two photos"):
         planned(replace(FACTS, views=1), pose_refinement="on")
+    with pytest.raises(ValueError, match="far_shell=on is for opaque photos, and 43"):
+        planned(replace(FACTS, transparent=43), far_shell="on")
     with pytest.raises(ValueError, match="far_shell=on needs points"):
         planned(far_shell="on")
 

@@ -54,6 +54,10 @@ def needs_of(
             " Held-out cameras stay as they came, so that their score is not flattered."
         )
     for name, asked in added:
+        if asked is Switch.on and facts.transparent:
+            raise ValueError(
+                f"{name}=on is for opaque photos, and {facts.transparent} of these are transparent. Leave it at auto."
+            )
         if asked is Switch.on and facts.sightings is None:
             raise ValueError(
                 f"{name}=on needs points that the photos show, and there are none. Leave it at auto."
