@@ -1,9 +1,8 @@
-"""Writing files so that they are there whole or not at all, and downloads that go on where an earlier try stopped."""
+"""Downloads that resume where an earlier attempt stopped, and write the file whole or not at all."""
 
 import asyncio
 import hashlib
 import os
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import httpx
 
 from splatmill.connection import Connection, pause
 from splatmill.errors import DownloadFailed, InvalidRequest, Unavailable
+from splatmill.files import move_into_place
 from splatmill.schema.captures import SHA256_HEADER
 
 AnyPath = str | os.PathLike[str]
@@ -23,21 +23,6 @@ def target_of(path: AnyPath, name: str) -> Path:
     target = Path(path).expanduser()
     if target.is_dir() or os.fspath(path).endswith(("/", os.sep)):
         target = target / name
-    return target
-
-
-def write_whole(target: Path, data: bytes) -> Path:
-    """Write `data` to `target`, which appears whole or not at all."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as sink:
-            sink.write(data)
-        Path(name).chmod(0o644)
-        Path(name).replace(target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
     return target
 
 
@@ -122,9 +107,7 @@ class _Part:
         self.etag_path.unlink(missing_ok=True)
 
     def finish(self) -> None:
-        with self.path.open("rb") as written:
-            os.fsync(written.fileno())
-        self.path.replace(self.target)
+        move_into_place(self.path, self.target, sync=True)
         self.etag_path.unlink(missing_ok=True)
 
 

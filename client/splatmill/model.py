@@ -8,8 +8,9 @@ import httpx
 from pydantic import ValidationError
 
 from splatmill.connection import Connection, read_answer
-from splatmill.downloads import AnyPath, OnBytes, download, target_of, write_whole
+from splatmill.downloads import AnyPath, OnBytes, download, target_of
 from splatmill.errors import invalid
+from splatmill.files import atomic_write
 from splatmill.schema import CameraSpec, Model, ModelCamera, ModelCameras, OrbitRequest, RenderRequest
 
 # A little longer than the server waits for its renderer, so that its sentence arrives instead of ours.
@@ -76,7 +77,9 @@ class AsyncModelHandle:
             repeatable=True,
             timeout=ORBIT_TIMEOUT,
         )
-        return write_whole(target_of(path, "orbit.mp4"), response.content)
+        target = target_of(path, "orbit.mp4")
+        atomic_write(target, response.content)
+        return target
 
 
 async def find_model(connection: Connection, model_id: str) -> AsyncModelHandle:

@@ -55,10 +55,6 @@ def capture_file(capture_id: str, role: Role, name: str) -> str:
     return f"captures/{capture_id}/files/{role}/{name}"
 
 
-def capture_digests(capture_id: str) -> str:
-    return f"captures/{capture_id}/sha256"
-
-
 def capture_digest(capture_id: str, role: Role, name: str) -> str:
     return f"captures/{capture_id}/sha256/{role}/{name}"
 

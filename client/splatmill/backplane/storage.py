@@ -18,6 +18,8 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, ObjectStore, from_url
 
+from splatmill.files import replacing
+
 if TYPE_CHECKING:  # These names exist in its stubs alone.
     from obstore.store import ClientConfig, RetryConfig
 
@@ -174,13 +176,9 @@ class Storage:
 
     def download(self, path: str, target: Path) -> None:
         """Copy a stored file to a local path, atomically. Raises FileNotFoundError."""
-        target.parent.mkdir(parents=True, exist_ok=True)
-        part = target.with_name(f".{target.name}.part")
-        with _sentences("read", path):
-            with part.open("wb") as file:
-                for chunk in obstore.get(self.store, path).stream(min_chunk_size=CHUNK):
-                    file.write(chunk)
-            part.replace(target)
+        with _sentences("read", path), replacing(target) as part, part.open("wb") as file:
+            for chunk in obstore.get(self.store, path).stream(min_chunk_size=CHUNK):
+                file.write(chunk)
 
     def download_prefix(self, prefix: str, folder: Path) -> list[str]:
         """Copy every file under `prefix` into `folder`; files there with the same size stay. Returns the names."""
@@ -191,16 +189,6 @@ class Storage:
             if not (target.is_file() and target.stat().st_size == entry.size):
                 self.download(entry.path, target)
             names.append(name)
-        return names
-
-    def upload_folder(self, folder: Path, prefix: str) -> list[str]:
-        """Store every file below a local folder under `prefix`. Returns the names."""
-        names = []
-        for path in sorted(folder.rglob("*")):
-            if path.is_file():
-                name = path.relative_to(folder).as_posix()
-                self.put(f"{prefix}/{name}", path)
-                names.append(name)
         return names
 
     def check(self) -> None:

@@ -33,7 +33,7 @@ def download_files(model: "ModelHandle", folder: Path) -> list[Path]:
 
 def write_novel_view(model: "ModelHandle", path: Path) -> Path:
     """Render from half-way between two cameras in the middle of the capture; returns the picture's path."""
-    from splatmill.downloads import write_whole
+    from splatmill.files import atomic_write
     from splatmill.schema import CameraSpec
 
     cameras = [entry.camera for entry in model.cameras()]
@@ -42,7 +42,8 @@ def write_novel_view(model: "ModelHandle", path: Path) -> Path:
             "The model has fewer than two cameras to stand between.", param_hint="--novel-view"
         )
     middle = len(cameras) // 2
-    return write_whole(path, model.render(CameraSpec.between(cameras[middle - 1], cameras[middle])))
+    atomic_write(path, model.render(CameraSpec.between(cameras[middle - 1], cameras[middle])))
+    return path
 
 
 def download(
@@ -77,7 +78,7 @@ def render(
     server: Server = None,
 ) -> None:
     """Render a picture of a model."""
-    from splatmill.downloads import write_whole
+    from splatmill.files import atomic_write
     from splatmill.schema import Format
 
     suffixes = {
@@ -99,7 +100,8 @@ def render(
         picture = model.render(
             chosen, output=output, background=background, format=suffixes[out.suffix.lower()]
         )
-    typer.echo(write_whole(out, picture))
+    atomic_write(out, picture)
+    typer.echo(out)
 
 
 def orbit(
