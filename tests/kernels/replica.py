@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from splatmill_worker.kernels.cpu.step import Rates
+from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.parallel import join, open_replica
 

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.kernels.cpu.step import Rates, Step
+from splatmill_worker.kernels.cpu.step import Step
+from splatmill_worker.kernels.records import Rates
 
 from .cases import GROUPS, Case, scene
 

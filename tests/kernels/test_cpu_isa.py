@@ -20,7 +20,8 @@ PROGRAM = """
 import json, torch
 from tests.kernels.cases import scene
 from splatmill_worker.kernels import cpu, ops
-from splatmill_worker.kernels.cpu.step import Rates, Step
+from splatmill_worker.kernels.cpu.step import Step
+from splatmill_worker.kernels.records import Rates
 case = scene("isa", 333, width=70, height=45)
 step = Step(*case.groups())
 photo = torch.randint(0, 256, (45, 70, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)

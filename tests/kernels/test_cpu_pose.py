@@ -13,7 +13,8 @@ from torch import Tensor
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu import isa
-from splatmill_worker.kernels.cpu.step import Rates, Step
+from splatmill_worker.kernels.cpu.step import Step
+from splatmill_worker.kernels.records import Rates
 
 from .cases import Case, scene
 from .proof import use

@@ -14,8 +14,8 @@ from torch import Tensor
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu import engine
 from splatmill_worker.kernels.cpu.loss import photo_stats
-from splatmill_worker.kernels.cpu.step import Rates, Step
-from splatmill_worker.kernels.records import Scores
+from splatmill_worker.kernels.cpu.step import Step
+from splatmill_worker.kernels.records import Rates, Scores
 from splatmill_worker.kernels.reference import adam_ as reference_adam_
 
 from .cases import GROUPS, Case, scene

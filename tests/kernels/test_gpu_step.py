@@ -8,8 +8,8 @@ enqueues, only that nothing in a step asks for a value, nor the recovery from a 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import astuple, replace
+from typing import Any
 
 import pytest
 import torch
@@ -26,6 +26,7 @@ from splatmill_worker.kernels.gpu import readback
 from splatmill_worker.kernels.gpu.project import project
 from splatmill_worker.kernels.gpu.record import pack
 from splatmill_worker.kernels.gpu.step import Step
+from splatmill_worker.kernels.records import Rates
 
 from .cases import GROUPS, Case, scene
 
@@ -34,16 +35,7 @@ DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 WIDTH, HEIGHT = 20, 12
 
 
-class Rates(NamedTuple):
-    means: float = 1e-3
-    log_scales: float = 5e-3
-    quats: float = 1e-3
-    logit_opacities: float = 5e-2
-    sh_dc: float = 2.5e-3
-    sh_rest: float = 1e-4
-
-
-RATES = Rates()
+RATES = Rates(means=1e-3, log_scales=5e-3, quats=1e-3, logit_opacities=5e-2, sh_dc=2.5e-3, sh_rest=1e-4)
 
 
 @pytest.fixture
@@ -104,14 +96,20 @@ class Exact:
         )
         reference.adam_(
             self.params, [torch.zeros_like(x) if x.grad is None else x.grad for x in leaves], self.exp_avg,
-            self.exp_avg_sq, RATES, step=step, visible=visible, last_step=self.last,
+            self.exp_avg_sq, astuple(RATES), step=step, visible=visible, last_step=self.last,
         )  # fmt: skip
         return loss.item(), int(visible.sum())
 
     def settle(self, step: int) -> None:
         everyone = torch.ones_like(self.last, dtype=torch.bool)
         reference.catch_up_(
-            self.params, self.exp_avg, self.exp_avg_sq, RATES, step=step, rows=everyone, last_step=self.last
+            self.params,
+            self.exp_avg,
+            self.exp_avg_sq,
+            astuple(RATES),
+            step=step,
+            rows=everyone,
+            last_step=self.last,
         )
 
 

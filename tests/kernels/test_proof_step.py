@@ -11,7 +11,8 @@ import torch
 
 from splatmill_worker.kernels import ops, reference
 from splatmill_worker.kernels.cpu import isa
-from splatmill_worker.kernels.cpu.step import Rates, Step
+from splatmill_worker.kernels.cpu.step import Step
+from splatmill_worker.kernels.records import Rates
 
 from .cases import CASES, GROUPS
 from .proof import EPS, alpha_error, brightest, define, run, use

@@ -24,8 +24,8 @@ from _scenes import Scene, cloud, fox
 from splatmill_worker.kernels import cpu, ops
 from splatmill_worker.kernels.cpu import isa
 from splatmill_worker.kernels.cpu.loss import photo_stats
-from splatmill_worker.kernels.cpu.step import Rates, Step
-from splatmill_worker.kernels.records import Scores
+from splatmill_worker.kernels.cpu.step import Step
+from splatmill_worker.kernels.records import Rates, Scores
 
 STILL = Rates(
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0

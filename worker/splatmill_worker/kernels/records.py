@@ -1,7 +1,8 @@
-"""What the ops hand to one another: the two records that every backend fills the same way."""
+"""The records that callers and kernels exchange, in the same form for every backend, and the constants they share."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 from torch import Tensor
@@ -35,3 +36,26 @@ class Bins(NamedTuple):
 
     offsets: Tensor  # int64 [tiles + 1]
     ids: Tensor  # int32 [pairs], front to back inside a tile, ties by index
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's learning rates (betas 0.9 and 0.999, eps 1e-15), in world units for the means."""
+
+    means: float
+    log_scales: float
+    quats: float
+    logit_opacities: float
+    sh_dc: float
+    sh_rest: float
+
+    def rows(self) -> list[float]:
+        """One rate for each of the 59 rows of a block."""
+        return [
+            *[self.means] * 3,
+            *[self.log_scales] * 3,
+            *[self.quats] * 4,
+            self.logit_opacities,
+            *[self.sh_dc] * 3,
+            *[self.sh_rest] * 45,
+        ]

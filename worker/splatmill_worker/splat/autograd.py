@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.kernels.cpu.step import Rates
-from splatmill_worker.kernels.records import Scores
+from splatmill_worker.kernels.records import Rates, Scores
 from splatmill_worker.splat.engine import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.poses import motion

@@ -8,8 +8,7 @@ from typing import NamedTuple, Protocol
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.kernels.cpu.step import Rates
-from splatmill_worker.kernels.records import Scores
+from splatmill_worker.kernels.records import Rates, Scores
 from splatmill_worker.splat.gaussians import Gaussians
 
 

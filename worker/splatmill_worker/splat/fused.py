@@ -7,7 +7,8 @@ from collections.abc import Hashable
 from torch import Tensor
 
 from splatmill_worker.kernels.cpu.loss import PhotoStats, photo_stats
-from splatmill_worker.kernels.cpu.step import Rates, Step
+from splatmill_worker.kernels.cpu.step import Step
+from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.engine import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 

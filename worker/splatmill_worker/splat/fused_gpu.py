@@ -6,7 +6,8 @@ from collections.abc import Hashable
 
 from torch import Tensor
 
-from splatmill_worker.kernels.gpu.step import Rates, Step, Together
+from splatmill_worker.kernels.gpu.step import Step, Together
+from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.engine import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 

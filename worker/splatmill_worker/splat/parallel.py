@@ -19,8 +19,8 @@ import torch.distributed as dist
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.kernels.cpu.step import Rates
 from splatmill_worker.kernels.gpu.device import interpreting
+from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.autograd import AutogradStep
 from splatmill_worker.splat.engine import Engine, StepResult
 from splatmill_worker.splat.gaussians import Gaussians

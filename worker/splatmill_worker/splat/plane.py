@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatmill_worker.kernels.cpu.step import Rates
+from splatmill_worker.kernels.records import Rates
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.budget import Budget, Clock
 from splatmill_worker.splat.density.rows import Rows

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
-from splatmill_worker.kernels.cpu.step import Rates
+from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.engine import Engine
 from splatmill_worker.splat.facts import Speed
 from splatmill_worker.splat.views import Target, TrainingView

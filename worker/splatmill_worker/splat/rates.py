@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from splatmill_worker.kernels.cpu.step import Rates
+from splatmill_worker.kernels.records import Rates
 
 POSITION_START = 1.6e-4
 """Per unit of scene extent (Kerbl et al. 2023, supplement)."""

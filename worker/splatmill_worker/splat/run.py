@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.kernels.cpu.step import Rates
+from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.budget import Budget, Clock
 from splatmill_worker.splat.density import clone_split
 from splatmill_worker.splat.engine import Engine, StepResult

@@ -2,40 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import checks
-from splatmill_worker.kernels.records import TILE, Scores
+from splatmill_worker.kernels.records import TILE, Rates, Scores
 
 from . import blocks, engine
 from .loss import PhotoStats, photo_stats
-
-
-@dataclass(frozen=True)
-class Rates:
-    """Adam's learning rates (betas 0.9 and 0.999, eps 1e-15), in world units for the means."""
-
-    means: float
-    log_scales: float
-    quats: float
-    logit_opacities: float
-    sh_dc: float
-    sh_rest: float
-
-    def rows(self) -> list[float]:
-        """One rate for each of the 59 rows of a block."""
-        return [
-            *[self.means] * 3,
-            *[self.log_scales] * 3,
-            *[self.quats] * 4,
-            self.logit_opacities,
-            *[self.sh_dc] * 3,
-            *[self.sh_rest] * 45,
-        ]
 
 
 class Visibility(NamedTuple):

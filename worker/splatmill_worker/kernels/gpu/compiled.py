@@ -22,6 +22,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from . import adam, bin, composite, composite_backward, knn, loss, project, project_backward, step
+from .blended import SEGMENT
 
 FLOATS = "*fp32"
 TYPES = {
@@ -79,11 +80,11 @@ def variants() -> Iterator[Variant]:
         bin.pairs_kernel, {**lists, "WRITE": False, "ends": None, "keys": None, "ids": None}, settings=warps
     )
     yield Variant(bin.pairs_kernel, {**lists, "WRITE": True}, settings=warps)
-    walk = {"SEGMENT": composite.SEGMENT, "BACKGROUND": True}
+    walk = {"SEGMENT": SEGMENT, "BACKGROUND": True}
     nothing = {"depth": None, "checkpoints": None, "first_segment": None, "segment_tile": None}
     yield Variant(composite.composite_kernel, {**walk, **nothing, "DEPTH": False, "CHECKPOINTS": False})
     yield Variant(composite.composite_kernel, {**walk, "DEPTH": False, "CHECKPOINTS": True, "depth": None})
-    back = {"SEGMENT": composite.SEGMENT}
+    back = {"SEGMENT": SEGMENT}
     yield Variant(
         composite_backward.composite_backward_kernel,
         {

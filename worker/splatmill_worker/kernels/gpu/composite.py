@@ -4,7 +4,6 @@ starts from.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -16,13 +15,9 @@ from torch.autograd.function import once_differentiable
 from ..records import TILE, Bins, Projected
 from . import device, record
 from .blend import PIXELS, STOP, STRIDE, advance, alpha_of, tile_pixels
+from .blended import SEGMENT, Blended
+from .composite_backward import blend_backward
 from .tuning import COMPOSITE, autotune
-
-SEGMENT = 128
-"""Splats between two checkpoints, and what one program of the backward pass walks: short enough that long
-lists spread over the chip, long enough that the 5 KB of a checkpoint are little beside the 128 records
-read.
-"""
 
 
 @autotune(COMPOSITE, key=["DEPTH", "CHECKPOINTS"])
@@ -90,24 +85,6 @@ def composite_kernel(
         tl.store(depth + out, deep, mask=inside)
 
 
-@dataclass(frozen=True)
-class Blended:
-    """One view's image and what the backward pass needs of the walk that made it."""
-
-    color: Tensor  # [H, W, 3], background blended in
-    transmittance: (
-        Tensor  # [H, W]: what is left; kept apart because 1 - alpha has no digits where it is small
-    )
-    depth: Tensor | None  # [H, W]
-    checkpoints: (
-        Tensor | None
-    )  # [segments, 5, 256]: red, green, blue, transmittance, depth before the segment
-    first_segment: Tensor | None  # int32 [tiles + 1]
-    segment_tile: (
-        Tensor | None
-    )  # int32 [segments]; -1 where the walk stopped before, or no such segment exists
-
-
 def blend(
     records: Tensor,
     bins: Bins,
@@ -161,8 +138,6 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, d_color: Tensor, d_alpha: Tensor, d_depth: Tensor) -> tuple[Tensor | None, ...]:
-        from .composite_backward import blend_backward
-
         records, background = ctx.saved_tensors
         width, height = ctx.size
         gradient = blend_backward(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..records import TILE, Bins
 from .blend import MOST, PIXELS, STOP, STRIDE, advance, alpha_of, tile_pixels
-from .composite import SEGMENT, Blended
+from .blended import SEGMENT, Blended
 from .constant import constant
 from .record import GRADIENT_WIDTH
 from .tuning import COMPOSITE_BACKWARD, autotune

@@ -16,6 +16,7 @@ from ..records import ALPHA_MIN, Projected
 from . import device, record
 from .constant import constant
 from .harmonics import shade
+from .project_backward import project_backward
 from .projection import (
     covariance,
     finite,
@@ -153,8 +154,6 @@ class _Project(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *d_fields: Tensor | None) -> tuple[Tensor | None, ...]:
-        from .project_backward import project_backward
-
         *groups, viewmat, K, records = ctx.saved_tensors
         width, height = ctx.size
         gradient = torch.zeros(records.shape[0], record.GRADIENT_WIDTH, device=records.device)

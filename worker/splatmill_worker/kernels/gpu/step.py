@@ -15,11 +15,12 @@ import triton.language as tl
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from splatmill_worker.kernels.records import Scores
+from splatmill_worker.kernels.records import Rates, Scores
 
 from . import adam, device
 from .bin import Lists, Room, lists
-from .composite import Blended, blend
+from .blended import Blended
+from .composite import blend
 from .composite_backward import blend_backward
 from .loss import loss_and_gradient
 from .project import project_records
@@ -33,23 +34,6 @@ SLACK, SPARE = 1.25, 4096
 """Room for a view's lists over what its last visit used: views change little from visit to visit,
 parameters move slowly.
 """
-
-
-class Rates(Protocol):
-    """Learning rates of one step, per parameter group."""
-
-    @property
-    def means(self) -> float: ...
-    @property
-    def log_scales(self) -> float: ...
-    @property
-    def quats(self) -> float: ...
-    @property
-    def logit_opacities(self) -> float: ...
-    @property
-    def sh_dc(self) -> float: ...
-    @property
-    def sh_rest(self) -> float: ...
 
 
 class Together(Protocol):
