@@ -6,16 +6,12 @@ from pathlib import Path
 
 from splatmill.errors import NothingToUpload
 from splatmill.schema.captures import Role, UnsafeName, safe_name
-
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif"})
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
-ARCHIVE_SUFFIXES = frozenset({".zip"})
+from splatmill.schema.photos import ARCHIVE_SUFFIXES, MASK_FOLDERS, PHOTO_SUFFIXES, VIDEO_SUFFIXES
 
 MODEL_SUFFIXES = frozenset({".bin", ".txt"})
 MODEL_STEMS = frozenset({"cameras", "images", "points3D", "rigs", "frames"})
 # Where tools put a COLMAP model; the first folder that has one wins.
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
-MASK_FOLDERS = ("masks", "mask")
 
 
 @dataclass(frozen=True)
@@ -84,11 +80,11 @@ def find_files(path: str | os.PathLike[str]) -> Found:
         else:
             ignored.append(name)
     if not any(file.role is Role.images for file in files):
-        whole = [name for name in ignored if _suffix(name) in VIDEO_SUFFIXES | ARCHIVE_SUFFIXES]
+        whole = [name for name in ignored if _suffix(name) in VIDEO_SUFFIXES + ARCHIVE_SUFFIXES]
         files += [_local(Role.images, name, root / name) for name in whole]
         ignored = [name for name in ignored if name not in whole]
         if not whole:
-            kinds = ", ".join(sorted(suffix.removeprefix(".") for suffix in IMAGE_SUFFIXES))
+            kinds = ", ".join(sorted(suffix.removeprefix(".") for suffix in PHOTO_SUFFIXES))
             raise NothingToUpload(
                 f"{root} holds no photos, no video and no zip.", f"Photos are {kinds} files."
             )
@@ -108,7 +104,7 @@ def start_file(path: Path) -> LocalFile:
 
 
 def _single(path: Path) -> Found:
-    if _suffix(path.name) not in IMAGE_SUFFIXES | VIDEO_SUFFIXES | ARCHIVE_SUFFIXES:
+    if _suffix(path.name) not in PHOTO_SUFFIXES + VIDEO_SUFFIXES + ARCHIVE_SUFFIXES:
         raise NothingToUpload(
             f"{path.name} is neither a photo, nor a video, nor a zip.",
             "Give a folder of photos, a zip or a video.",
@@ -166,7 +162,7 @@ def _local(role: Role, name: str, path: Path) -> LocalFile:
 
 
 def _is_image(name: str) -> bool:
-    return _suffix(name) in IMAGE_SUFFIXES
+    return _suffix(name) in PHOTO_SUFFIXES
 
 
 def _suffix(name: str) -> str:

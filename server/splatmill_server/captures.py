@@ -11,13 +11,12 @@ from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Entry, Storage
-from splatmill.schema import Capture, CaptureFile, CapturePage, Role, format_bytes, safe_name
+from splatmill.schema import PHOTO_SUFFIXES, Capture, CaptureFile, CapturePage, Role, format_bytes, safe_name
 from splatmill_server.metrics import Metrics
 from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError
 from splatmill_server.settings import Settings
 
-_PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif")
 _READS_AT_ONCE = 32
 _COUNTED_CAPTURES = 1000
 _STALE_SECONDS = 24 * 3600
@@ -115,7 +114,7 @@ class Captures:
                 "The capture holds no images.",
                 advice="Upload photos, a video or a zip with PUT /v1/captures/{id}/images/{name} first.",
             )
-        photos = all(entry.path.lower().endswith(_PHOTO_SUFFIXES) for entry in images)
+        photos = all(entry.path.lower().endswith(PHOTO_SUFFIXES) for entry in images)
         poses = self.storage.entries(layout.capture_files(capture_id, Role.poses))
         posed = any(not entry.path.lower().endswith(".ply") for entry in poses)  # a model to start from
         if len(images) == 1 and photos and not posed:

@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Sequence
 from typing import Any
 
-from splatmill.schema import MAX_PIXELS, MAX_SIDE, Problem, TrainOptions
+from splatmill.schema import MAX_RENDER_PIXELS, MAX_RENDER_SIDE, Problem, TrainOptions
 
 _RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_equal", "enum", "literal_error"}
 _RANGE |= {"too_short", "too_long", "finite_number", "multiple_of"}
@@ -44,8 +44,11 @@ def _named(error: Any) -> tuple[str, str, str | None] | None:
         return None
     if field in _SIZES and kind != "missing":
         detail = f"The picture's {field} cannot be {_short(given)}: {_sentence(error)}"
-        return "size_out_of_range", detail, f"Sides are 1 to {MAX_SIDE} pixels, {MAX_PIXELS} pixels in all."
-    if isinstance(given, dict) and kind == "value_error" and _pixels(given) > MAX_PIXELS:
+        limits = (
+            f"Give sides of 1 to {MAX_RENDER_SIDE} pixels, and at most {MAX_RENDER_PIXELS} pixels in all."
+        )
+        return "size_out_of_range", detail, limits
+    if isinstance(given, dict) and kind == "value_error" and _pixels(given) > MAX_RENDER_PIXELS:
         return "size_out_of_range", _sentence(error), "Ask for a smaller picture."
     if _LENS & set(loc):
         return "camera_invalid", f"The camera cannot be rendered from: {_sentence(error)}", None

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from splatmill.schema import MAX_PIXELS, CameraSpec, Format, OrbitRequest, Output, RenderRequest
+from splatmill.schema import MAX_RENDER_PIXELS, CameraSpec, Format, OrbitRequest, Output, RenderRequest
 
 EYE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 PINHOLE = {"width": 64, "height": 48, "fx": 50.0, "fy": 51.0, "cx": 31.5, "cy": 24.5}
@@ -109,7 +109,7 @@ def test_matrices_with_four_written_digits_pass():
     [
         ({"width": 0}, "greater than or equal to 1"),
         ({"width": 100_000}, "less than or equal to 8192"),
-        ({"width": 8192, "height": 8192}, str(MAX_PIXELS)),
+        ({"width": 8192, "height": 8192}, str(MAX_RENDER_PIXELS)),
         ({"fx": 0}, "greater than 0"),
         ({"fx": None}, "lens is missing"),
         ({"fov_y_deg": 50}, "given twice"),

@@ -11,10 +11,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from pydantic import ValidationError
 
 from splatmill.backplane.storage import StorageError
-from splatmill.schema import TrainOptions
+from splatmill.schema import MAX_PHOTO_PIXELS, MAX_RENDER_PIXELS, TrainOptions
 from splatmill_server import app as app_module
 from splatmill_server.app import create_app
-from splatmill_server.routes.status import MAX_IMAGE_PIXELS
 from splatmill_server.settings import Settings
 
 from .conftest import Running, Serve, problem, wait_for
@@ -37,11 +36,8 @@ def test_health_readiness_and_info(app: Running) -> None:
     info = app.http.get("/v1/info").json()
     assert (info["name"], info["queued"], info["storage"], info["workers"]) == ("splatmill", 1, "file", [])
     assert info["limits"]["max_file_bytes"] == app.settings.max_file_bytes
-
-
-def test_the_announced_limit_on_photos_is_the_one_that_holds() -> None:
-    prepare = pytest.importorskip("splatmill_worker.images.prepare")
-    assert prepare.MAX_PIXELS == MAX_IMAGE_PIXELS
+    assert info["limits"]["max_image_pixels"] == MAX_PHOTO_PIXELS
+    assert info["limits"]["max_render_pixels"] == MAX_RENDER_PIXELS
 
 
 def test_metrics_count_by_route_and_not_by_id(app: Running) -> None:

@@ -17,11 +17,10 @@ import torch
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from splatmill.schema import FitImageOptions, ModelCamera, ModelCameras
+from splatmill.schema import MAX_PHOTO_PIXELS, MIN_PHOTO_SIDE, FitImageOptions, ModelCamera, ModelCameras
 from splatmill_worker.film import Film, even, whole
 from splatmill_worker.images import load_view
 from splatmill_worker.images.decode import upright_size
-from splatmill_worker.images.prepare import MAX_PIXELS, MIN_SIDE
 from splatmill_worker.refusal import Refusal
 from splatmill_worker.scene import Normalization, View
 from splatmill_worker.splat import plane, ply
@@ -212,16 +211,16 @@ def _size(photo: Path, say: Say) -> tuple[int, int]:
     with Image.open(photo) as image:
         width, height = upright_size(image)
         pictures = getattr(image, "n_frames", 1)
-    if min(width, height) < MIN_SIDE:
+    if min(width, height) < MIN_PHOTO_SIDE:
         raise Refusal(
             "image_too_small",
-            f"{photo} is {width} x {height} pixels; sides of {MIN_SIDE} pixels at least are fitted.",
+            f"{photo} is {width} x {height} pixels; sides of {MIN_PHOTO_SIDE} pixels at least are fitted.",
             advice="Give a larger picture, or enlarge this one.",
         )
-    if width * height > MAX_PIXELS:
+    if width * height > MAX_PHOTO_PIXELS:
         raise Refusal(
             "image_too_large",
-            f"{photo} is {width} x {height} pixels; at most {MAX_PIXELS // 10**6} million are decoded.",
+            f"{photo} is {width} x {height} pixels; at most {MAX_PHOTO_PIXELS // 10**6} million are decoded.",
             advice="Scale the picture down first.",
         )
     if pictures > 1:

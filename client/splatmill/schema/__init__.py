@@ -8,8 +8,8 @@ from splatmill.schema.base import (
 )
 from splatmill.schema.cameras import (
     DEPTH_SCALE_HEADER,
-    MAX_PIXELS,
-    MAX_SIDE,
+    MAX_RENDER_PIXELS,
+    MAX_RENDER_SIDE,
     RIGID_TOLERANCE,
     CameraSpec,
     Color,
@@ -91,6 +91,15 @@ from splatmill.schema.options import (
     TrainOptions,
     describe_options,
 )
+from splatmill.schema.photos import (
+    ARCHIVE_SUFFIXES,
+    MASK_FOLDERS,
+    MASK_SUFFIXES,
+    MAX_PHOTO_PIXELS,
+    MIN_PHOTO_SIDE,
+    PHOTO_SUFFIXES,
+    VIDEO_SUFFIXES,
+)
 from splatmill.schema.problems import (
     PROBLEM_MEDIA_TYPE,
     PROBLEMS,
@@ -108,20 +117,27 @@ from splatmill.schema.quantities import (
 )
 
 __all__ = [
+    "ARCHIVE_SUFFIXES",
     "DEFAULT_PORT",
     "DEPTH_SCALE_HEADER",
     "EVENT",
     "FINAL_STATES",
     "IDEMPOTENCY_HEADER",
+    "MASK_FOLDERS",
+    "MASK_SUFFIXES",
     "MAX_NAME_BYTES",
     "MAX_PARTS",
     "MAX_PART_BYTES",
-    "MAX_PIXELS",
-    "MAX_SIDE",
+    "MAX_PHOTO_PIXELS",
+    "MAX_RENDER_PIXELS",
+    "MAX_RENDER_SIDE",
+    "MIN_PHOTO_SIDE",
+    "PHOTO_SUFFIXES",
     "PROBLEMS",
     "PROBLEM_MEDIA_TYPE",
     "RIGID_TOLERANCE",
     "SHA256_HEADER",
+    "VIDEO_SUFFIXES",
     "Backend",
     "Background",
     "ByteSize",

@@ -14,15 +14,15 @@ from pydantic import Field, model_validator
 
 from splatmill.schema.base import Request
 
-MAX_SIDE = 8192
-MAX_PIXELS = 2**25  # 33.5 million: one float32 RGBA picture of it is half a gigabyte
+MAX_RENDER_SIDE = 8192
+MAX_RENDER_PIXELS = 2**25  # 33.5 million: one float32 RGBA picture of it is half a gigabyte
 RIGID_TOLERANCE = 1e-3  # matrices travel as decimal text; four written digits must pass
 DEPTH_SCALE_HEADER = "Splatmill-Depth-Scale"
 """Response header of a 16-bit depth picture: depth = value * scale; value 0 is where nothing was hit."""
 
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
-Side = Annotated[int, Field(ge=1, le=MAX_SIDE, description="Pixels.")]
+Side = Annotated[int, Field(ge=1, le=MAX_RENDER_SIDE, description="Pixels.")]
 Color = Literal["black", "white", "transparent"]
 
 
@@ -229,9 +229,11 @@ class OrbitRequest(Request):
 
 
 def check_pixels(width: int, height: int) -> None:
-    """ValueError for a picture with more than MAX_PIXELS pixels."""
-    if width * height > MAX_PIXELS:
-        raise ValueError(f"{width} x {height} is {width * height} pixels; at most {MAX_PIXELS} are rendered.")
+    """ValueError for a picture with more than MAX_RENDER_PIXELS pixels."""
+    if width * height > MAX_RENDER_PIXELS:
+        raise ValueError(
+            f"{width} x {height} is {width * height} pixels; at most {MAX_RENDER_PIXELS} are rendered."
+        )
 
 
 def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:

@@ -12,7 +12,8 @@ import splatmill
 from splatmill.backplane import queue, rendering
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import (
-    MAX_PIXELS,
+    MAX_PHOTO_PIXELS,
+    MAX_RENDER_PIXELS,
     Health,
     Info,
     Limits,
@@ -26,9 +27,6 @@ from splatmill_server.routes.documented import problems
 from splatmill_server.service import Service, Shared
 
 router = APIRouter(tags=["service"])
-
-MAX_IMAGE_PIXELS = 250_000_000
-"""Photos with more pixels are left out by the worker, from their header alone."""
 
 
 @router.get("/v1/options", responses=problems())
@@ -48,8 +46,8 @@ def get_info(service: Shared) -> Info:
         limits=Limits(
             max_file_bytes=service.settings.max_file_bytes,
             max_files_per_capture=service.settings.max_files_per_capture,
-            max_image_pixels=MAX_IMAGE_PIXELS,
-            max_render_pixels=MAX_PIXELS,
+            max_image_pixels=MAX_PHOTO_PIXELS,
+            max_render_pixels=MAX_RENDER_PIXELS,
         ),
         details={"renderer": service.renderer is not None},
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+from splatmill.schema.photos import MASK_SUFFIXES
 
 
 def masks_under(directory: Path) -> dict[str, Path]:
@@ -12,12 +12,12 @@ def masks_under(directory: Path) -> dict[str, Path]:
     return {
         path.relative_to(directory).as_posix(): path
         for path in sorted(directory.rglob("*"))
-        if path.suffix.lower() in SUFFIXES and path.is_file()
+        if path.suffix.lower() in MASK_SUFFIXES and path.is_file()
     }
 
 
 def mask_of(name: str, masks: dict[str, Path]) -> Path | None:
     """The mask of the photo `name`: by COLMAP's convention (name.jpg.png), or by the same name or stem."""
     stem = str(PurePosixPath(name).with_suffix(""))
-    candidates = (f"{name}.png", f"{stem}.png", name, *(f"{stem}{suffix}" for suffix in SUFFIXES))
+    candidates = (f"{name}.png", f"{stem}.png", name, *(f"{stem}{suffix}" for suffix in MASK_SUFFIXES))
     return next((masks[candidate] for candidate in candidates if candidate in masks), None)

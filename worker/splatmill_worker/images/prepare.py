@@ -13,14 +13,11 @@ from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
+from splatmill.schema.photos import ARCHIVE_SUFFIXES, MAX_PHOTO_PIXELS, MIN_PHOTO_SIDE, VIDEO_SUFFIXES
 from splatmill_worker.images import archive, exif, video
 from splatmill_worker.images.decode import upright_size
 from splatmill_worker.images.masks import mask_of, masks_under
 
-VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
-ARCHIVES = (".zip",)
-MIN_SIDE = 16  # pixels: below, there is nothing to find features on and hardly a tile to train on
-MAX_PIXELS = 250_000_000  # the largest phone cameras make 200 million
 IGNORED_PREFIXES = (".", "__MACOSX")
 IGNORED_NAMES = ("thumbs.db", "desktop.ini")
 
@@ -140,7 +137,7 @@ def _expand(
     """Adds a file, or what a zip or video holds, to `found`; unpacked content is kept by its hash."""
     suffix = path.suffix.lower()
     try:
-        if suffix in ARCHIVES and inside is None:
+        if suffix in ARCHIVE_SUFFIXES and inside is None:
             folder = _once(
                 workdir / "unpacked" / _sha256(path)[:24],
                 lambda place: archive.unpack(path, place, cancelled),
@@ -148,9 +145,9 @@ def _expand(
             for inner in _files(folder):
                 inner_name = f"{Path(name).with_suffix('').as_posix()}/{inner.relative_to(folder).as_posix()}"
                 _expand(inner_name, inner, name, workdir, frames, found, cancelled)
-        elif suffix in ARCHIVES:
+        elif suffix in ARCHIVE_SUFFIXES:
             found.skipped.append((name, "a zip inside a zip is not unpacked"))
-        elif suffix in VIDEOS:
+        elif suffix in VIDEO_SUFFIXES:
             folder = _once(
                 workdir / "frames" / f"{_sha256(path)[:24]}_{frames}",
                 lambda place: video.sharpest_frames(path, place, frames, cancelled=cancelled),
@@ -191,10 +188,13 @@ def _look_at(name: str, path: Path, sequence: str | None) -> Usable | str:
             warnings.simplefilter("ignore")  # broken EXIF is not a reason to refuse a photo
             with Image.open(path) as image:
                 width, height = image.size
-                if min(width, height) < MIN_SIDE:
-                    return f"{width} x {height} pixels: sides under {MIN_SIDE} pixels are too small to use"
-                if width * height > MAX_PIXELS:
-                    return f"{width} x {height} pixels: more than the {MAX_PIXELS // 10**6} million that are decoded"
+                if min(width, height) < MIN_PHOTO_SIDE:
+                    return (
+                        f"{width} x {height} pixels: sides under {MIN_PHOTO_SIDE} pixels are too small to use"
+                    )
+                if width * height > MAX_PHOTO_PIXELS:
+                    limit = MAX_PHOTO_PIXELS // 10**6
+                    return f"{width} x {height} pixels: more than the {limit} million that are decoded"
                 width, height = upright_size(image)
                 tags = exif.read(image)
                 if image.format == "JPEG":

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from splatmill.schema.photos import MASK_FOLDERS, PHOTO_SUFFIXES
 from splatmill_worker.images.masks import mask_of, masks_under
-
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif")
-MASK_FOLDERS = ("masks", "mask")
 
 
 @dataclass(frozen=True)
@@ -27,7 +25,7 @@ class ImageFiles:
         found = {
             path.relative_to(root).as_posix(): path
             for path in sorted(root.rglob("*"))
-            if path.suffix.lower() in SUFFIXES and path.is_file()
+            if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()
         }
         if masks is not None and masks.is_relative_to(root):
             inner = masks.relative_to(root).as_posix() + "/"
@@ -66,6 +64,8 @@ class ImageFiles:
     def _by_last_part(self, last: str) -> list[str]:
         names = [name for name in self.photos if PurePosixPath(name).name == last]
         if not names:
-            stem = last if PurePosixPath(last).suffix.lower() not in SUFFIXES else PurePosixPath(last).stem
+            stem = (
+                last if PurePosixPath(last).suffix.lower() not in PHOTO_SUFFIXES else PurePosixPath(last).stem
+            )
             names = [name for name in self.photos if PurePosixPath(name).stem == stem]
         return names
