@@ -4,6 +4,7 @@ Does not prove anything about TLS or proxies, which are httpx's.
 """
 
 import json
+from typing import Any
 
 import httpx
 import pytest
@@ -22,7 +23,7 @@ JOB = {
 JOB_BYTES = json.dumps(JOB).encode()
 
 
-def problem(code: str) -> dict:
+def problem(code: str) -> dict[str, Any]:
     document = Problem.of(code, "It was so.", facts={"n": 1}, advice="Do that.")
     return {
         "status": document.status,

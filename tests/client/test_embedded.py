@@ -27,7 +27,7 @@ def family() -> set[int]:
 def runs(pid: int) -> bool:
     """Whether a process is there and not merely waiting to be collected."""
     try:
-        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+        return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:
         return False
 

@@ -4,8 +4,10 @@ Does not prove that a picture is right; the renderer's tests compare pictures wi
 """
 
 import math
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,22 +15,27 @@ from pydantic import ValidationError
 
 from splatmill.schema import MAX_RENDER_PIXELS, CameraSpec, Format, OrbitRequest, Output, RenderRequest
 
-EYE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 PINHOLE = {"width": 64, "height": 48, "fx": 50.0, "fy": 51.0, "cx": 31.5, "cy": 24.5}
 
 COORDINATES = st.floats(-1000, 1000, allow_subnormal=False)
 POINTS = st.tuples(COORDINATES, COORDINATES, COORDINATES)
 
 
+def camera_of(matrix: Any = IDENTITY, **lens: Any) -> CameraSpec:
+    """A camera as it comes off the wire; without `lens`, with the pinhole of all these tests."""
+    return CameraSpec.model_validate({"camera_to_world": matrix} | (lens or PINHOLE))
+
+
 def changed(**cells: float) -> list[list[float]]:
-    matrix = [list(map(float, row)) for row in EYE]
+    matrix = [list(map(float, row)) for row in IDENTITY]
     for cell, value in cells.items():
         matrix[int(cell[1])][int(cell[2])] = value
     return matrix
 
 
 @st.composite
-def rigid(draw: st.DrawFn) -> np.ndarray:
+def rigid(draw: st.DrawFn) -> npt.NDArray[np.float64]:
     quat = np.array(draw(st.tuples(*[st.floats(-1, 1)] * 4)))
     length = np.linalg.norm(quat)
     w, x, y, z = quat / length if length > 1e-3 else (1.0, 0.0, 0.0, 0.0)
@@ -43,25 +50,25 @@ def rigid(draw: st.DrawFn) -> np.ndarray:
 
 
 @given(rigid())
-def test_viewmat_is_the_inverse(matrix: np.ndarray):
-    camera = CameraSpec(camera_to_world=matrix.tolist(), **PINHOLE)
+def test_viewmat_is_the_inverse(matrix: npt.NDArray[np.float64]):
+    camera = camera_of(matrix.tolist())
     # Rounding: entries up to 1e3 with relative error 2e-16 each, a few sums of three products.
     np.testing.assert_allclose(np.array(camera.viewmat()) @ matrix, np.eye(4), atol=1e-11)
 
 
 @given(rigid())
-def test_opengl_axes_are_opencv_axes_with_y_and_z_turned(matrix: np.ndarray):
+def test_opengl_axes_are_opencv_axes_with_y_and_z_turned(matrix: npt.NDArray[np.float64]):
     opengl = matrix @ np.diag([1.0, -1.0, -1.0, 1.0])
-    one = CameraSpec(camera_to_world=matrix.tolist(), **PINHOLE)
-    other = CameraSpec(camera_to_world=opengl.tolist(), convention="opengl", **PINHOLE)
+    one = camera_of(matrix.tolist())
+    other = camera_of(opengl.tolist(), convention="opengl", **PINHOLE)
     np.testing.assert_allclose(one.viewmat(), other.viewmat(), atol=1e-12)
 
 
 @given(rigid(), st.sampled_from(["png", "webp"]), st.booleans())
-def test_a_query_is_the_same_request(matrix: np.ndarray, kind: str, by_angle: bool):
+def test_a_query_is_the_same_request(matrix: npt.NDArray[np.float64], kind: str, by_angle: bool):
     lens = {"fov_y_deg": 40.0, "width": 64, "height": 48} if by_angle else PINHOLE
-    camera = CameraSpec(camera_to_world=matrix.tolist(), **lens)
-    request = RenderRequest(camera=camera, format=kind, output="alpha", quality=70)
+    camera = camera_of(matrix.tolist(), **lens)
+    request = RenderRequest(camera=camera, format=Format(kind), output=Output.alpha, quality=70)
     assert RenderRequest.from_query(request.to_query()) == request
 
 
@@ -70,7 +77,7 @@ def test_a_query_is_the_same_request(matrix: np.ndarray, kind: str, by_angle: bo
     [{"camera_to_world": "1,2,3"}, {"camera_to_world": "a," * 16}, {"surprise": "1"}, {"width": "x"}],
 )
 def test_a_query_that_does_not_fit_is_refused(mangle: dict[str, str]):
-    query = RenderRequest(camera=CameraSpec(camera_to_world=EYE, **PINHOLE)).to_query()
+    query = RenderRequest(camera=camera_of()).to_query()
     with pytest.raises(ValidationError):
         RenderRequest.from_query(query | mangle)
     with pytest.raises(ValidationError):
@@ -95,13 +102,13 @@ def test_a_query_that_does_not_fit_is_refused(mangle: dict[str, str]):
 )
 def test_matrices_that_are_no_camera(matrix: list[list[float]], reason: str):
     with pytest.raises(ValidationError, match=reason):
-        CameraSpec(camera_to_world=matrix, **PINHOLE)
+        camera_of(matrix)
 
 
 def test_matrices_with_four_written_digits_pass():
     angle = 0.7
     c, s = round(math.cos(angle), 4), round(math.sin(angle), 4)
-    CameraSpec(camera_to_world=changed(m00=c, m01=-s, m10=s, m11=c), **PINHOLE)
+    camera_of(changed(m00=c, m01=-s, m10=s, m11=c))
 
 
 @pytest.mark.parametrize(
@@ -120,18 +127,18 @@ def test_matrices_with_four_written_digits_pass():
 )
 def test_lenses_and_sizes_that_are_refused(change: dict[str, float], reason: str):
     with pytest.raises(ValidationError, match=reason):
-        CameraSpec(camera_to_world=EYE, **PINHOLE | change)
+        camera_of(**PINHOLE | change)
 
 
 def test_an_angle_is_the_pinhole_it_means():
-    camera = CameraSpec(camera_to_world=EYE, width=200, height=100, fov_y_deg=90)
+    camera = camera_of(width=200, height=100, fov_y_deg=90)
     assert camera.pinhole() == pytest.approx((50, 50, 100, 50))
 
 
 @given(POINTS, POINTS)
 def test_looking_at_puts_the_target_in_the_middle(eye: tuple[float, ...], target: tuple[float, ...]):
     direction = np.subtract(target, eye)
-    distance = np.linalg.norm(direction)
+    distance = float(np.linalg.norm(direction))
     if distance < 1e-2 or abs(direction[2]) > 0.999 * distance:
         return
     camera = CameraSpec.looking_at(eye, target, width=64, height=48)
@@ -150,13 +157,13 @@ def test_looking_at_nothing_is_refused():
 
 
 def test_another_width_is_the_same_view():
-    camera = CameraSpec(camera_to_world=EYE, **PINHOLE).scaled_to(32)
+    camera = camera_of().scaled_to(32)
     assert (camera.width, camera.height) == (32, 24)
     assert camera.pinhole() == pytest.approx((25, 25.5, 15.75, 12.25))
 
 
 def test_pictures_that_cannot_be():
-    camera = CameraSpec(camera_to_world=EYE, **PINHOLE)
+    camera = camera_of()
     with pytest.raises(ValidationError, match="Depth cannot be a jpeg"):
         RenderRequest(camera=camera, output=Output.depth, format=Format.jpeg)
     with pytest.raises(ValidationError, match="cannot be transparent"):
@@ -166,9 +173,9 @@ def test_pictures_that_cannot_be():
 
 
 def test_canonical_bytes_know_the_picture_not_its_spelling():
-    one = CameraSpec(camera_to_world=EYE, width=64, height=48, fov_y_deg=60)
+    one = camera_of(width=64, height=48, fov_y_deg=60)
     fx, fy, cx, cy = one.pinhole()
-    same = CameraSpec(camera_to_world=EYE, width=64, height=48, fx=fx, fy=fy, cx=cx, cy=cy)
+    same = camera_of(width=64, height=48, fx=fx, fy=fy, cx=cx, cy=cy)
     assert RenderRequest(camera=one).canonical() == RenderRequest(camera=same).canonical()
     assert RenderRequest(camera=one).canonical() != RenderRequest(camera=one, quality=50).canonical()
     assert RenderRequest(camera=one).canonical() != RenderRequest(camera=one.scaled_to(32)).canonical()

@@ -7,6 +7,7 @@ import asyncio
 import itertools
 import json
 from collections.abc import AsyncIterator
+from datetime import UTC, datetime
 
 import pytest
 from hypothesis import given
@@ -55,8 +56,13 @@ def test_fields_of_the_standard():
 
 
 def message(number: int, event: StateEvent | LogEvent) -> bytes:
-    record = EventRecord(id=f"{number}-0", attempt=1, at="2026-01-01T00:00:00Z", event=event)
+    record = EventRecord(id=f"{number}-0", attempt=1, at=datetime(2026, 1, 1, tzinfo=UTC), event=event)
     return f"id: {number}-0\ndata: {record.model_dump_json()}\n\n".encode()
+
+
+def said(record: EventRecord) -> str:
+    assert isinstance(record.event, LogEvent)
+    return record.event.message
 
 
 def job(state: str) -> bytes:
@@ -82,7 +88,7 @@ def test_a_broken_stream_goes_on_after_the_last_event(peer, reply):
     with Client(peer.url) as client:
         handle = client.job("j1")
         records = list(handle.events())
-    assert [record.event.message for record in records] == ["line 0", "line 1", "line 2", "line 3"]
+    assert [said(record) for record in records] == ["line 0", "line 1", "line 2", "line 3"]
     asked = [seen.headers.get("last-event-id") for seen in peer.seen if seen.path.endswith("/events")]
     assert asked == [None, "0-0", "0-0", "0-0", "2-0"]
     assert handle.job.state.final
@@ -142,6 +148,6 @@ def test_leaving_the_loop_early_closes_the_stream(peer, reply):
     with Client(peer.url) as client:
         handle = client.job("j1")
         for record in handle.events():
-            assert record.event.message == "0"
+            assert said(record) == "0"
             break
         assert handle.refresh().state == "training"

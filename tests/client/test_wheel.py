@@ -96,7 +96,7 @@ def test_a_missing_part_is_a_sentence_with_the_command_that_installs_it(
     alone: Path, command: str, tmp_path: Path
 ):
     (tmp_path / "a.jpg").write_bytes(b"x")
-    arguments = [tmp_path, "-o", tmp_path / "out"] if command == "train" else []
+    arguments: list[str | Path] = [tmp_path, "-o", tmp_path / "out"] if command == "train" else []
     done = run(alone / "splatmill", command, *arguments)
     assert done.returncode == 8
     assert "is not installed" in done.stderr

@@ -25,6 +25,11 @@ def state(number: int, generation: int, attempt: int, name: str) -> Stored:
     return Stored(f"{number}-0", generation, attempt, StateEvent(state=JobState(name), problem=problem))
 
 
+def state_of(stored: Stored) -> JobState:
+    assert isinstance(stored.event, StateEvent)
+    return stored.event.state
+
+
 names = st.sampled_from([s.value for s in JobState])
 walks = st.lists(st.tuples(st.integers(1, 3), st.integers(1, 4), names), max_size=30)
 verdicts = st.none() | st.tuples(st.integers(0, 30), st.sampled_from(["cancelled", "failed"]))
@@ -50,13 +55,13 @@ def test_a_random_walk_keeps_every_rule(walk: Any, generation: int, verdict: Any
 
     # A worker's `cancelled` is never final, and what was appended after a verdict comes too late.
     counted = [
-        s for s in ours if s.event.state is not JobState.cancelled and (not verdict or s.order <= (after, 0))
+        s for s in ours if state_of(s) is not JobState.cancelled and (not verdict or s.order <= (after, 0))
     ]
     attempt, seen = 0, JobState.queued
     for stored in counted:
         if stored.attempt < attempt or seen.final:
             continue
-        attempt, seen = stored.attempt, stored.event.state
+        attempt, seen = stored.attempt, state_of(stored)
     assert job.attempt == attempt
     assert job.state is (seen if seen.final or not verdict else JobState(verdict[1]))
     assert (job.model is not None) == (job.state is JobState.succeeded)

@@ -32,7 +32,9 @@ def refusal(*options: str, **env: str) -> str:
     """What the server says on its way out, which must be one sentence and no traceback."""
     started = command(**env)
     started["args"] += options
-    done = subprocess.run(**started, capture_output=True, timeout=60, check=False)
+    done: subprocess.CompletedProcess[str] = subprocess.run(
+        **started, capture_output=True, timeout=60, check=False
+    )
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     return done.stderr

@@ -5,7 +5,7 @@ Not proved here: real processes (test_reaper, tests/service), and the fold's rul
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import redis
@@ -118,7 +118,7 @@ class Walk(RuleBasedStateMachine):
             return None
 
     def listed(self) -> set[str]:
-        return {key.decode() for key in self.redis.zrange(keys.JOBS, 0, -1)}
+        return {key.decode() for key in cast(list[bytes], self.redis.zrange(keys.JOBS, 0, -1))}
 
     @invariant()
     def final_is_final(self) -> None:
@@ -140,7 +140,7 @@ class Walk(RuleBasedStateMachine):
 
     @invariant()
     def the_reaper_knows_every_unfinished_job(self) -> None:
-        watched = {member.decode() for member in self.redis.smembers(keys.ACTIVE)}
+        watched = {member.decode() for member in cast(set[bytes], self.redis.smembers(keys.ACTIVE))}
         unfinished = {i for i in self.known if not self.service.jobs.get(i).state.final}
         assert unfinished <= watched
 
