@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops, reference
-
-from .proof import EPS, backends, use
+from tests.support.kernels.proof import EPS, backends, use
 
 SHAPES = [(3,), (3,), (4,), (), (1, 3), (15, 3)]
 RATES = [1.6e-4, 5e-3, 1e-3, 5e-2, 2.5e-3, 1.25e-4]

@@ -17,8 +17,7 @@ from torch import Tensor
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.kernels.records import Rates
-
-from .cases import GROUPS, Case, scene
+from tests.support.kernels.cases import GROUPS, Case, scene
 
 RATES = Rates(1e-3, 1e-3, 1e-3, 1e-2, 1e-3, 1e-4)
 

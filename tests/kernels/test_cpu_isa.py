@@ -18,7 +18,7 @@ from splatmill_worker.kernels.cpu import ISA, isa
 # One training step and the separate ops on a fixed scene, printed as sums in hexadecimal and as a few values.
 PROGRAM = """
 import json, torch
-from tests.kernels.cases import scene
+from tests.support.kernels.cases import scene
 from splatmill_worker.kernels import cpu, ops
 from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.kernels.records import Rates
@@ -113,8 +113,7 @@ def test_threads_follow_the_environment_and_the_affinity_mask() -> None:
 def test_denormals_are_flushed_inside_the_kernels_only() -> None:
     """A kernel must not leave its thread's floating-point state to the rest of the process."""
     from splatmill_worker.kernels import ops
-
-    from .cases import scene
+    from tests.support.kernels.cases import scene
 
     case = scene("state", 40)
     ops.project(*case.groups(), *case.camera(), case.width, case.height, degree=3)

@@ -15,9 +15,8 @@ from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu import isa
 from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.kernels.records import Rates
-
-from .cases import Case, scene
-from .proof import use
+from tests.support.kernels.cases import Case, scene
+from tests.support.kernels.proof import use
 
 STILL = Rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -69,7 +68,7 @@ def by_step(case: Case, threads: int = 2) -> Tensor:
 def test_it_is_that_of_the_ops_and_of_the_definition(degree: int, antialias: bool, build: str) -> None:
     case = replace(scene("pose", 150), degree=degree, antialias=antialias)
     exact = by_ops(case, "reference", torch.float64)
-    with use(f"cpu {build}"):
+    with use(f"cpu:{build}"):
         fused, separate = by_step(case), by_ops(case, "cpu", torch.float32)
     # As for the parameters' gradients (test_cpu_step): the roundings of the conic, and the exponential's error.
     assert float((fused - separate).norm() / exact.norm()) < 2e-5

@@ -17,8 +17,7 @@ from splatmill_worker.kernels.cpu.loss import photo_stats
 from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.kernels.records import Rates, Scores
 from splatmill_worker.kernels.reference import adam_ as reference_adam_
-
-from .cases import GROUPS, Case, scene
+from tests.support.kernels.cases import GROUPS, Case, scene
 
 RATES = Rates(means=1e-3, log_scales=5e-3, quats=1e-3, logit_opacities=5e-2, sh_dc=2.5e-3, sh_rest=1.25e-4)
 

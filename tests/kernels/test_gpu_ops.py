@@ -23,8 +23,7 @@ from splatmill_worker.kernels import ops, reference
 from splatmill_worker.kernels.records import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Bins, Projected
 from splatmill_worker.kernels.reference.bin import _least as least_of
 from splatmill_worker.kernels.reference.composite import _weights
-
-from .cases import CASES, GROUPS, Case
+from tests.support.kernels.cases import CASES, GROUPS, Case
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning"

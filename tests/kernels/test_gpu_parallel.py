@@ -18,8 +18,7 @@ import torch
 
 from splatmill_worker.kernels import ops, reference
 from splatmill_worker.splat.parallel import Replicas, join
-
-from . import replica
+from tests.support.kernels import replica
 
 STEPS = 3
 

@@ -27,8 +27,7 @@ from splatmill_worker.kernels.gpu.project import project
 from splatmill_worker.kernels.gpu.record import pack
 from splatmill_worker.kernels.gpu.step import Step
 from splatmill_worker.kernels.records import Rates
-
-from .cases import GROUPS, Case, scene
+from tests.support.kernels.cases import GROUPS, Case, scene
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"

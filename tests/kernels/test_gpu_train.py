@@ -16,8 +16,7 @@ from splatmill_worker.splat.plan import Kernels, Plan
 from splatmill_worker.splat.schedule import Schedule
 from splatmill_worker.splat.train import Trained, train
 from splatmill_worker.splat.views import Target, TrainingView
-
-from . import replica
+from tests.support.kernels import replica
 
 pytest.importorskip(
     "triton", reason="Triton comes with torch's GPU builds; pip install triton to prove this here"

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops, reference
-
-from .proof import EPS, backends, use
+from tests.support.kernels.proof import EPS, backends, use
 
 
 def _points(kind: str) -> Tensor:

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops, reference
-
-from .proof import EPS, backends, use
+from tests.support.kernels.proof import EPS, backends, use
 
 SIZES = [(1, 1), (15, 16), (17, 257), (257, 1), (40, 33), (23, 1100)]
 

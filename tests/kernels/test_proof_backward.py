@@ -13,9 +13,8 @@ from torch import Tensor
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import Projected
-
-from .cases import CASES, GROUPS, Case
-from .proof import EPS, Run, alpha_error, backends, define, margins, run, use
+from tests.support.kernels.cases import CASES, GROUPS, Case
+from tests.support.kernels.proof import EPS, Run, alpha_error, backends, define, margins, run, use
 
 _exact: dict[str, tuple[Run, tuple[Tensor, Tensor, Tensor], dict[str, Tensor]]] = {}
 

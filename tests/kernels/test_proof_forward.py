@@ -9,8 +9,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from .cases import CASES
-from .proof import EPS, Run, alpha_error, backends, brightest, define, margins, run, use
+from tests.support.kernels.cases import CASES
+from tests.support.kernels.proof import EPS, Run, alpha_error, backends, brightest, define, margins, run, use
 
 _exact: dict[str, Run] = {}
 

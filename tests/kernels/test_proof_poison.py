@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-
-from .cases import GROUPS, Case, scene
-from .proof import Run, backends, run, use
+from tests.support.kernels.cases import GROUPS, Case, scene
+from tests.support.kernels.proof import Run, backends, run, use
 
 INF, NAN = float("inf"), float("nan")
 LARGEST = torch.finfo(torch.float32).max

@@ -13,9 +13,9 @@ from splatmill_worker.kernels import ops, reference
 from splatmill_worker.kernels.cpu import isa
 from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.kernels.records import Rates
+from tests.support.kernels.cases import CASES, GROUPS
+from tests.support.kernels.proof import EPS, alpha_error, brightest, define, run, use
 
-from .cases import CASES, GROUPS
-from .proof import EPS, alpha_error, brightest, define, run, use
 from .test_proof_backward import image_weights
 
 NAMES = [

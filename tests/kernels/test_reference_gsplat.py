@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import reference
-
-from .cases import Case, scene
+from tests.support.kernels.cases import Case, scene
 
 pytest.importorskip("gsplat", reason="gsplat is a test dependency: pip install -c constraints.txt gsplat")
 

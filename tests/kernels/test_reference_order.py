@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import reference
-
-from .cases import GROUPS, Case, scene
+from tests.support.kernels.cases import GROUPS, Case, scene
 
 Function = Callable[[dict[str, Tensor]], Tensor]
 

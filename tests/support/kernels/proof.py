@@ -15,8 +15,7 @@ from torch import Tensor
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu import isa
 from splatmill_worker.kernels.records import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Bins, Projected
-
-from .cases import GROUPS, Case
+from tests.support.kernels.cases import GROUPS, Case
 
 EPS = 2.0**-24  # half a unit in the last place of float32
 EXP2_ERROR = 2e-5  # relative error the engines allow their vector 2^x on [-8, 0]
@@ -36,22 +35,35 @@ def backends() -> list[object]:
 
 @contextmanager
 def use(backend: str) -> Iterator[ops.Backend]:
-    """Run with one build of the CPU engine (`cpu:avx2`); gives the name that ops know the backend by."""
-    name, _, build = backend.partition(":")
-    if not build:
-        yield name  # type: ignore[misc]
-        return
-    engine = isa.load(build)
+    """Run with a backend, or with one build of the CPU engine (`cpu:avx2`); yields the backend's name as ops take it.
+
+    Raises ValueError for any other name, so that a misspelt build is not proven by another one.
+    """
+    if backend.startswith("cpu:"):
+        with _build(backend.removeprefix("cpu:")):
+            yield "cpu"
+    elif backend == "reference":
+        yield "reference"
+    elif backend == "gpu":
+        yield "gpu"
+    else:
+        raise ValueError(f"backend: expected reference, gpu or cpu:BUILD, got {backend!r}")
+
+
+@contextmanager
+def _build(name: str) -> Iterator[None]:
+    """Put one build of the CPU engine in the place of the chosen one, in every module that holds it."""
+    engine = isa.load(name)
     prefix = "splatmill_worker.kernels.cpu"
     modules = [m for k, m in sys.modules.items() if k.startswith(prefix) and hasattr(m, "engine")]
     before = [m.engine for m in modules]
     for m in modules:
-        m.engine = engine  # type: ignore[attr-defined]
+        m.engine = engine
     try:
-        yield "cpu"
+        yield
     finally:
         for m, old in zip(modules, before, strict=True):
-            m.engine = old  # type: ignore[attr-defined]
+            m.engine = old
 
 
 @dataclass
