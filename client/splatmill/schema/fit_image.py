@@ -13,45 +13,53 @@ _ENGINE: dict[str, Any] = {"group": "engine"}
 
 
 class FitImageOptions(Request):
-    """How to fit one picture by Gaussians in a plane."""
+    """How to fit one picture with Gaussians in a plane."""
 
     gaussians: int | None = Field(
         default=None,
         ge=1,
         le=2_000_000,
-        description="Use at most this many Gaussians. Left out: one for every 16 pixels.",
+        description="Largest number of Gaussians. Left out, one for every 16 pixels.",
         json_schema_extra=_BUDGET,
     )
     steps: int | None = Field(
         default=None,
         ge=1,
         le=1_000_000,
-        description="Stop after this many steps.",
+        description="Number of steps. Left out, the time budget alone ends the fit.",
         json_schema_extra=_BUDGET,
     )
     time_budget: Duration | None = Field(
         default=None,
         ge=1,
         le=86400,
-        description="Stop after this long (90s, 5m, or seconds). With neither this nor steps: 60s.",
+        description=(
+            "Time for the fit: 90s, 5m, or a number of seconds. With neither a time budget nor steps, 60s."
+        ),
         json_schema_extra=_BUDGET | {"kind": "duration"},
     )
     image_size: int = Field(
         default=1024,
         ge=16,
         le=8192,
-        description="Longest side in pixels; a larger picture is scaled down, a smaller one never enlarged.",
+        description=(
+            "Longest side of the fitted image, in pixels. A larger picture is scaled down; a smaller one is "
+            "not enlarged."
+        ),
         json_schema_extra=_PHOTOS,
     )
     video: bool = Field(
         default=False,
-        description="Also leave a video of the picture as it emerges.",
+        description="Also write fit.mp4, a video of the fit.",
         json_schema_extra=_PHOTOS,
     )
     seed: int = Field(
         default=0,
         ge=0,
         le=2**31 - 1,
-        description="Seed of every random choice; with steps, the same seed gives the same bytes.",
+        description=(
+            "Seed of every random choice. With steps and no time budget, the same seed on the same machine "
+            "gives the same bytes."
+        ),
         json_schema_extra=_ENGINE,
     )

@@ -72,158 +72,231 @@ _BUDGET, _PHOTOS, _CAMERAS, _ENGINE = map(_group, ("budget", "photos", "cameras"
 
 
 class TrainOptions(Request):
-    """How to train. What is left out is decided from the photos, and the plan says why."""
+    """How to train. The worker decides from the photos what is left out, and its plan gives the reasons."""
 
     preset: Preset = Field(
         default=Preset.balanced,
-        description="How far to go when no budget is given.",
+        description=(
+            "Length of the training when no budget is given, and largest photo size when image_size is not "
+            "given: draft for a quick look, quality for the best result."
+        ),
         json_schema_extra=_BUDGET,
     )
     steps: int | None = Field(
         default=None,
         ge=1,
         le=1_000_000,
-        description="Stop after this many training steps.",
+        description=(
+            "Number of training steps. Left out, the time budget or else the preset sets the length of the "
+            "training."
+        ),
         json_schema_extra=_BUDGET,
     )
     time_budget: Duration | None = Field(
         default=None,
         ge=1,
         le=7 * 86400,
-        description="Lay the training out to end after this long (90s, 5m, 1h30m, or seconds); "
-        "recovering the cameras is not counted.",
+        description=(
+            "Training time: 90s, 5m, 1h30m, or a number of seconds. The whole schedule is fitted into it. "
+            "Recovering the cameras and measuring quality take additional time."
+        ),
         json_schema_extra=_BUDGET | {"kind": "duration"},
     )
     target_psnr: float | None = Field(
         default=None,
         ge=5,
         le=60,
-        description="Stop when the held-out views reach this PSNR, in dB.",
+        description=(
+            "Stop as soon as the held-out photos reach this mean PSNR, in dB. Without another budget, "
+            "training ends at the latest after the steps of the preset quality."
+        ),
         json_schema_extra=_BUDGET,
     )
     max_gaussians: int | None = Field(
         default=None,
         ge=1,
         le=50_000_000,
-        description="Never hold more Gaussians than this.",
+        description=(
+            "Largest number of Gaussians. Left out, the length of the training, the pixels of the photos and "
+            "the memory limit it; set it for a smaller file or faster rendering."
+        ),
         json_schema_extra=_BUDGET,
     )
     max_memory: ByteSize | None = Field(
         default=None,
         ge=200 * 10**6,
         le=4 * 10**12,
-        description="Keep the attempt's memory under this (1.5GB, 2GiB, or bytes).",
+        description=(
+            "Memory for training: 1.5GB, 2GiB, or a number of bytes. It limits the number of Gaussians. Left "
+            "out, half of the machine's free memory, or the free memory of the GPU."
+        ),
         json_schema_extra=_BUDGET | {"kind": "bytes"},
     )
     image_size: int | None = Field(
         default=None,
         ge=16,
         le=8192,
-        description="Longest side the photos are trained at, in pixels; they are never enlarged. "
-        "Left out: what the photos resolve.",
+        description=(
+            "Longest side of the photos in training, in pixels; smaller photos are not enlarged. Left out, "
+            "the preset limits it, and photos without fine detail are reduced to half."
+        ),
         json_schema_extra=_PHOTOS,
     )
     holdout: int = Field(
         default=8,
         ge=0,
         le=1000,
-        description="Hold out every n-th photo, sorted by name, to measure with; 0 holds out none.",
+        description=(
+            "Hold out every n-th photo, in order of name, to measure quality on photos that were not trained "
+            "on. 0 holds out none. A test split that comes with the data set takes precedence."
+        ),
         json_schema_extra=_PHOTOS,
     )
     test_views: tuple[str, ...] | None = Field(
         default=None,
         min_length=1,
         max_length=10_000,
-        description="Hold out exactly the photos with these names, instead of every n-th.",
+        description="Names of the photos to hold out, in place of every n-th.",
         json_schema_extra=_PHOTOS,
     )
     max_video_frames: int = Field(
         default=150,
         ge=2,
         le=2000,
-        description="How many frames to take from a video, the sharpest ones.",
+        description=(
+            "Largest number of frames taken from a video: the sharpest one from each of as many equal parts. "
+            "Raise it for a long video."
+        ),
         json_schema_extra=_PHOTOS,
     )
     start: str | None = Field(
         default=None,
         max_length=512,
-        description="Start from a trained model instead of points: the id of a model on the server, or a .ply file, "
-        "by its path here or its name among the capture's poses. It must be in the world of the capture's cameras.",
+        description=(
+            "Model to start from, in place of the points of the reconstruction: the id of a model on the "
+            "server, or a .ply file, given by its path or by its name among the capture's poses. Its "
+            "coordinates must be those of the capture's cameras."
+        ),
         json_schema_extra=_PHOTOS,
     )
     progress_video: bool = Field(
         default=False,
-        description="Also leave a video of one view as it is trained.",
+        description="Also write progress.mp4, a video of one view in the course of the training.",
         json_schema_extra=_PHOTOS,
     )
     background: Background = Field(
         default=Background.auto,
-        description="What lies behind the scene while training; over random colours no hole passes for a surface, and "
-        "transparent photos stay transparent.",
+        description=(
+            "Colour behind the scene in training. With random, every step draws a new one, so that no hole is "
+            "hidden by a matching colour. With auto, it is random, except for a few opaque photos, where it "
+            "is black."
+        ),
         json_schema_extra=_PHOTOS,
     )
     exposure: Switch = Field(
         default=Switch.auto,
-        description="Fit an affine colour per photo, for photos whose exposure or white balance differ.",
+        description=(
+            "Fit an affine colour transform per photo, for photos that differ in exposure or white balance. "
+            "With auto, this is done where the same points differ in brightness or tint between photos."
+        ),
         json_schema_extra=_PHOTOS,
     )
     far_shell: Switch = Field(
         default=Switch.auto,
-        description="Put a far shell of Gaussians behind the scene, for the sky and for holes.",
+        description=(
+            "Add a distant shell of Gaussians around the scene, for the sky and for what is seen through "
+            "holes. With auto, opaque photos get one, unless they are few and show little sky."
+        ),
         json_schema_extra=_PHOTOS,
     )
     gaps: Switch = Field(
         default=Switch.auto,
-        description="Put Gaussians where photos show what no point of the reconstruction describes.",
+        description=(
+            "Add Gaussians before training where the photos show surfaces on which the reconstruction has no "
+            "points. With auto, this is done where such surfaces fill much of the photos and there are enough "
+            "photos to correct the guessed depths."
+        ),
         json_schema_extra=_PHOTOS,
     )
     mapper: Mapper = Field(
         default=Mapper.auto,
-        description="How the cameras are recovered: one photo after another, or all at once.",
+        description=(
+            "Method that recovers the cameras: incremental adds one photo after another, global solves for "
+            "all at once. With auto, the number of photos and of matching pairs decides, and the other method "
+            "is tried if too few photos can be placed."
+        ),
         json_schema_extra=_CAMERAS,
     )
     matcher: Matcher = Field(
         default=Matcher.auto,
-        description="Which photos are compared: all pairs, neighbours in time, or neighbours by GPS.",
+        description=(
+            "Pairs of photos that are matched: exhaustive matches all pairs, sequential neighbours in order "
+            "of name, spatial neighbours by GPS. With auto, all pairs of a small set are matched, otherwise "
+            "those that a quick comparison suggests."
+        ),
         json_schema_extra=_CAMERAS,
     )
     sfm_effort: Effort = Field(
         default=Effort.auto,
-        description="How much detail is looked for in each photo to recover the cameras.",
+        description=(
+            "Number and resolution of the features from which the cameras are recovered. With auto, lean is "
+            "tried first, and more effort is spent only if too few photos can be placed. Choose high for "
+            "photos with little texture."
+        ),
         json_schema_extra=_CAMERAS,
     )
     pose_refinement: Switch = Field(
         default=Switch.auto,
-        description="Keep correcting the cameras while training.",
+        description=(
+            "Refine the training cameras during training. With auto, this is done where their reprojection "
+            "error exceeds one pixel. The gpu backend cannot refine cameras."
+        ),
         json_schema_extra=_CAMERAS,
     )
     sh_degree: int | None = Field(
         default=None,
         ge=0,
         le=3,
-        description="Degree of the spherical harmonics that let colour change with the viewing direction.",
+        description=(
+            "Degree of the spherical harmonics, which let colour depend on the viewing direction; 0 makes it "
+            "constant. Left out, the angles between the views of a point decide."
+        ),
         json_schema_extra=_ENGINE,
     )
     densify: Switch = Field(
         default=Switch.auto,
-        description="Add Gaussians where the photos ask for more, by cloning and splitting.",
+        description=(
+            "Add Gaussians during training by cloning and splitting. With auto, this is done unless the "
+            "training starts with as many as it may have."
+        ),
         json_schema_extra=_ENGINE,
     )
     antialias: Switch = Field(
         default=Switch.auto,
-        description="Keep the brightness of Gaussians smaller than a pixel, for views at several distances.",
+        description=(
+            "Compensate the opacity of Gaussians smaller than a pixel, so that their brightness does not "
+            "change with distance. With auto, this is done where points are seen from widely different "
+            "distances."
+        ),
         json_schema_extra=_ENGINE,
     )
     backend: Backend = Field(
         default=Backend.auto,
-        description="What computes: plain torch, the C++ kernels, or a GPU.",
+        description=(
+            "Implementation that trains: reference is plain PyTorch and slow, cpu the C++ kernels, gpu the "
+            "Triton kernels. With auto, the GPU is used where the machine has a usable one, otherwise the "
+            "CPU."
+        ),
         json_schema_extra=_ENGINE,
     )
     seed: int = Field(
         default=0,
         ge=0,
         le=2**31 - 1,
-        description="Seed of every random choice; the same seed on the same machine gives the same bytes.",
+        description=(
+            "Seed of every random choice. Without a time budget, the same seed on the same machine gives the "
+            "same bytes."
+        ),
         json_schema_extra=_ENGINE,
     )
 
