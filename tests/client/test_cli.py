@@ -132,7 +132,7 @@ def test_the_options_of_train_are_those_of_the_schema():
         (["--steps", "0"], Exit.usage, "greater than or equal to 1"),
         (["--steps", "many"], Exit.usage, "--steps"),
         (["--preset", "best"], Exit.usage, "best"),
-        (["--time-budget", "soon"], Exit.usage, "'soon' is no duration"),
+        (["--time-budget", "soon"], Exit.usage, "'soon' is not a duration"),
         (["--max-memory", "1MB"], Exit.usage, "greater than or equal to 200000000"),
         (["--stepps", "3"], Exit.usage, "No such option"),
         (["--detach"], Exit.usage, "Without --server"),

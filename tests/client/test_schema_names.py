@@ -86,7 +86,7 @@ def test_two_spellings_of_one_accent_are_one_name():
 
 def test_a_capture_file_has_a_safe_name_and_a_digest():
     CaptureFile(role=Role.images, name="a.jpg", size=1, sha256="0" * 64)
-    with pytest.raises(ValidationError, match="must not climb"):
+    with pytest.raises(ValidationError, match=r"contains the part '\.\.'"):
         CaptureFile(role=Role.images, name="../a.jpg", size=1, sha256="0" * 64)
     with pytest.raises(ValidationError, match="pattern"):
         CaptureFile(role=Role.images, name="a.jpg", size=1, sha256="0" * 63 + "G")

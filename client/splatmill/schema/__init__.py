@@ -1,4 +1,4 @@
-"""The wire: every request, response, event and error of the service, once."""
+"""The wire schema: every request, response, event, option and problem of the service."""
 
 from splatmill.schema.base import (
     Measured,
@@ -16,10 +16,10 @@ from splatmill.schema.cameras import (
     Convention,
     Format,
     Matrix,
+    MatrixRow,
     OrbitRequest,
     Output,
     RenderRequest,
-    Row,
     Side,
 )
 from splatmill.schema.captures import (
@@ -170,6 +170,7 @@ __all__ = [
     "Mapper",
     "Matcher",
     "Matrix",
+    "MatrixRow",
     "Measured",
     "MetricEvent",
     "Model",
@@ -194,7 +195,6 @@ __all__ = [
     "Request",
     "Response",
     "Role",
-    "Row",
     "Side",
     "StageSeconds",
     "StateEvent",

@@ -1,4 +1,4 @@
-"""The two kinds of message on the wire, and the number types they share."""
+"""The base classes of all messages on the wire, and the number and time types they share."""
 
 import math
 from datetime import datetime
@@ -8,26 +8,26 @@ from pydantic import AwareDatetime, BaseModel, BeforeValidator, ConfigDict
 
 
 class Request(BaseModel):
-    """What a client sends. An unknown field is an error: a misspelt option must not pass unnoticed."""
+    """A message from a client. An unknown field is an error, so that a misspelt option does not pass unnoticed."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, validate_default=True)
 
 
 class Response(BaseModel):
-    """What the service sends. Unknown fields are ignored, so that an older SDK reads a newer server."""
+    """A message from the service. Unknown fields are ignored, so that an older SDK can read a newer server."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
 
 def _finite_or_none(value: Any) -> Any:
-    # JSON has no NaN: a measurement that is not a number is one that is absent.
+    # JSON has no NaN, so a measurement that is not finite counts as absent.
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 Measured = Annotated[float | None, BeforeValidator(_finite_or_none)]
-"""A measured number; NaN and infinities become None."""
+"""A measured number, or None where nothing was measured. NaN and infinities become None."""
 
 Time = AwareDatetime
-"""A moment with its time zone, ISO 8601 on the wire."""
+"""A point in time with its time zone; ISO 8601 on the wire."""
 
 __all__ = ["Measured", "Request", "Response", "Time", "datetime"]

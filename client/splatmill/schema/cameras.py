@@ -1,7 +1,7 @@
-"""Cameras and pictures: from where a model is rendered, and what is wanted back.
+"""Requests for rendered images and videos, and the cameras they are rendered from.
 
-A camera is a 4x4 row-major camera-to-world matrix with OpenCV axes (x right, y down, z forward) or OpenGL
-axes (x right, y up, z backward), and a pinhole in pixels whose centres lie at half-integers.
+A camera has a pose, a 4x4 row-major camera-to-world matrix with OpenCV axes (x right, y down, z forward) or OpenGL
+axes (x right, y up, z backward), and a pinhole projection in pixels. Pixel centres lie at half-integers.
 """
 
 import json
@@ -15,14 +15,14 @@ from pydantic import Field, model_validator
 from splatmill.schema.base import Request
 
 MAX_RENDER_SIDE = 8192
-MAX_RENDER_PIXELS = 2**25  # 33.5 million: one float32 RGBA picture of it is half a gigabyte
-RIGID_TOLERANCE = 1e-3  # matrices travel as decimal text; four written digits must pass
+MAX_RENDER_PIXELS = 2**25  # 33.5 million; one float32 RGBA image of this size takes 0.5 GB
+RIGID_TOLERANCE = 1e-3  # matrices arrive as decimal text, and four digits must be enough
 DEPTH_SCALE_HEADER = "Splatmill-Depth-Scale"
-"""Response header of a 16-bit depth picture: depth = value * scale; value 0 is where nothing was hit."""
+"""Response header of a 16-bit depth image: depth = pixel value * scale. The value 0 marks pixels without depth."""
 
-Row = tuple[float, float, float, float]
-Matrix = tuple[Row, Row, Row, Row]
-Side = Annotated[int, Field(ge=1, le=MAX_RENDER_SIDE, description="Pixels.")]
+MatrixRow = tuple[float, float, float, float]
+Matrix = tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
+Side = Annotated[int, Field(ge=1, le=MAX_RENDER_SIDE, description="In pixels.")]
 Color = Literal["black", "white", "transparent"]
 
 
@@ -32,18 +32,28 @@ class Convention(StrEnum):
 
 
 class CameraSpec(Request):
-    """A view: where the camera stands, its picture size, and its lens as pixels or as a vertical angle."""
+    """A camera: its pose, its image size, and its intrinsics in pixels or as a vertical field of view."""
 
-    camera_to_world: Matrix = Field(description="4x4, row-major; rotation and position, no scale.")
-    convention: Convention = Field(default=Convention.opencv, description="Which axes the camera has.")
+    camera_to_world: Matrix = Field(
+        description="Camera-to-world matrix, 4x4, row-major: a rotation and a position, without scale."
+    )
+    convention: Convention = Field(
+        default=Convention.opencv,
+        description=(
+            "Axes of the camera: opencv (x right, y down, z forward) or opengl (x right, y up, z backward)."
+        ),
+    )
     width: Side
     height: Side
-    fx: float | None = Field(default=None, gt=0, le=1e7, description="Focal length in pixels.")
-    fy: float | None = Field(default=None, gt=0, le=1e7, description="Focal length in pixels.")
-    cx: float | None = Field(default=None, ge=-1e6, le=1e6, description="Principal point in pixels.")
-    cy: float | None = Field(default=None, ge=-1e6, le=1e6, description="Principal point in pixels.")
+    fx: float | None = Field(default=None, gt=0, le=1e7, description="Horizontal focal length in pixels.")
+    fy: float | None = Field(default=None, gt=0, le=1e7, description="Vertical focal length in pixels.")
+    cx: float | None = Field(default=None, ge=-1e6, le=1e6, description="x of the principal point in pixels.")
+    cy: float | None = Field(default=None, ge=-1e6, le=1e6, description="y of the principal point in pixels.")
     fov_y_deg: float | None = Field(
-        default=None, gt=0, lt=180, description="Vertical field of view in degrees."
+        default=None,
+        gt=0,
+        lt=180,
+        description="Vertical field of view in degrees, in place of fx, fy, cx and cy.",
     )
 
     @model_validator(mode="after")
@@ -51,9 +61,14 @@ class CameraSpec(Request):
         check_pixels(self.width, self.height)
         pixels = (self.fx, self.fy, self.cx, self.cy)
         if self.fov_y_deg is None and any(value is None for value in pixels):
-            raise ValueError("The lens is missing: give fx, fy, cx and cy in pixels, or fov_y_deg alone.")
+            raise ValueError(
+                "The camera's intrinsics are missing: give fx, fy, cx and cy in pixels, or fov_y_deg alone."
+            )
         if self.fov_y_deg is not None and any(value is not None for value in pixels):
-            raise ValueError("The lens is given twice: give fx, fy, cx and cy in pixels, or fov_y_deg alone.")
+            raise ValueError(
+                "The camera's intrinsics are given twice: give fx, fy, cx and cy in pixels, or "
+                "fov_y_deg alone."
+            )
         _check_rigid(self.camera_to_world)
         return self
 
@@ -68,12 +83,15 @@ class CameraSpec(Request):
         fov_y_deg: float = 50.0,
         up: Sequence[float] = (0.0, 0.0, 1.0),
     ) -> Self:
-        """A camera at `eye` that looks at `target`, `up` pointing up in the picture (world units throughout).
+        """Return a camera at `eye` that looks at `target`, with `up` pointing upwards in the image.
 
-        Raises ValueError when eye and target coincide, or when the view runs along `up`.
+        `eye` and `target` are in world units, `fov_y_deg` is the vertical field of view in degrees. Raises ValueError
+        when eye and target coincide, or when the viewing direction is parallel to `up`.
         """
-        forward = _unit([b - a for a, b in zip(eye, target, strict=True)], "Eye and target are one point.")
-        right = _unit(_cross(forward, up), "The view runs along the up direction; give another `up`.")
+        forward = _unit(
+            [b - a for a, b in zip(eye, target, strict=True)], "Eye and target coincide; move one of them."
+        )
+        right = _unit(_cross(forward, up), "The viewing direction is parallel to `up`; give another `up`.")
         down = _cross(forward, right)
         rows = [(right[i], down[i], forward[i], float(eye[i])) for i in range(3)]
         matrix: Matrix = (rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0))
@@ -81,18 +99,19 @@ class CameraSpec(Request):
 
     @classmethod
     def between(cls, a: "CameraSpec", b: "CameraSpec") -> Self:
-        """A view that no photo took: half-way between two cameras, with the lens and size of `a`.
+        """Return a camera half-way between `a` and `b`, with the intrinsics and image size of `a`.
 
-        The axes are the mean of both, made rigid again. Raises ValueError for cameras that look away from each other.
+        Its axes are the mean of theirs, made orthonormal. Raises ValueError for cameras whose viewing directions or
+        upward directions differ by too much.
         """
         m, n = a.opencv_to_world(), b.opencv_to_world()
         down, forward = ([m[i][j] + n[i][j] for i in range(3)] for j in (1, 2))
         if sum(x * x for x in forward) < 1.0 or sum(x * x for x in down) < 1.0:
             raise ValueError(
-                "The two cameras look in directions too far apart; there is no view between them."
+                "The two cameras look in directions too far apart; there is no view half-way between them."
             )
         z = _unit(forward, "")
-        x = _unit(_cross(down, z), "The two cameras are turned against each other about the view axis.")
+        x = _unit(_cross(down, z), "The two cameras are rolled too far apart about the viewing axis.")
         y = _cross(z, x)
         rows = [(x[i], y[i], z[i], (m[i][3] + n[i][3]) / 2) for i in range(3)]
         fx, fy, cx, cy = a.pinhole()
@@ -100,23 +119,23 @@ class CameraSpec(Request):
         return cls(camera_to_world=matrix, width=a.width, height=a.height, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def opencv_to_world(self) -> Matrix:
-        """The camera-to-world matrix with OpenCV axes, whichever convention it came in."""
+        """Return the camera-to-world matrix with OpenCV axes, whatever the convention of the request."""
         if self.convention is Convention.opencv:
             return self.camera_to_world
         flipped = [(r[0], -r[1], -r[2], r[3]) for r in self.camera_to_world[:3]]
         return (flipped[0], flipped[1], flipped[2], (0.0, 0.0, 0.0, 1.0))
 
     def viewmat(self) -> Matrix:
-        """World-to-camera with OpenCV axes: the transposed rotation, and its inverse translation."""
+        """Return the world-to-camera matrix with OpenCV axes."""
         m = self.opencv_to_world()
-        rows: list[Row] = []
+        rows: list[MatrixRow] = []
         for axis in range(3):
             column = (m[0][axis], m[1][axis], m[2][axis])
             rows.append((*column, -sum(c * m[i][3] for i, c in enumerate(column))))
         return (rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0))
 
     def pinhole(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy in pixels, whichever way the lens was given."""
+        """Return fx, fy, cx and cy in pixels, also for a camera that was given a field of view."""
         if self.fov_y_deg is not None:
             focal = 0.5 * self.height / math.tan(math.radians(self.fov_y_deg) / 2)
             return focal, focal, self.width / 2, self.height / 2
@@ -127,7 +146,7 @@ class CameraSpec(Request):
         return self.fx, self.fy, self.cx, self.cy
 
     def scaled_to(self, width: int) -> Self:
-        """The same view at another width in pixels; the height follows the proportions."""
+        """Return the same view at another width in pixels; the aspect ratio stays."""
         factor = width / self.width
         fields = self.model_dump() | {"width": width, "height": max(1, round(self.height * factor))}
         if self.fov_y_deg is None:
@@ -143,7 +162,7 @@ class Output(StrEnum):
 
 
 class Format(StrEnum):
-    """`png` is 8 bit for colour and alpha, 16 bit for depth; `npy` is float32."""
+    """The image format. `png` has 8 bits for colour and alpha and 16 for depth; `npy` holds float32."""
 
     png = "png"
     jpeg = "jpeg"
@@ -152,33 +171,43 @@ class Format(StrEnum):
 
     @property
     def media_type(self) -> str:
-        """The content type of the answer."""
+        """The Content-Type of a response in this format."""
         return "application/x-npy" if self is Format.npy else f"image/{self.value}"
 
 
 class RenderRequest(Request):
-    """A picture of a model from a camera."""
+    """An image of a model from a camera."""
 
     camera: CameraSpec
     output: Output = Field(
-        default=Output.color, description="Colour, depth along the view axis, or coverage."
+        default=Output.color,
+        description=(
+            "What is rendered: color, depth (distance along the viewing axis, in units of the model) "
+            "or alpha (opacity)."
+        ),
     )
     format: Format = Field(
-        default=Format.png, description="Depth: png (16 bit, scale in a header) or npy (float32)."
+        default=Format.png,
+        description=(
+            "Format of the image. Depth is a png (16 bit; the header Splatmill-Depth-Scale holds the scale) "
+            "or an npy (float32)."
+        ),
     )
-    background: Color = Field(default="black", description="What shows where the model is not.")
-    quality: int = Field(default=90, ge=1, le=100, description="Of jpeg and webp.")
+    background: Color = Field(default="black", description="Colour behind the model.")
+    quality: int = Field(default=90, ge=1, le=100, description="Quality of jpeg and webp.")
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
         if self.output is Output.depth and self.format not in (Format.png, Format.npy):
             raise ValueError(f"Depth cannot be a {self.format.value}; ask for png (16 bit) or npy (float32).")
         if self.output is Output.color and self.format is Format.jpeg and self.background == "transparent":
-            raise ValueError("A jpeg cannot be transparent; ask for png or webp, or for a background.")
+            raise ValueError(
+                "A jpeg cannot be transparent; ask for png or webp, or for the background black or white."
+            )
         return self
 
     def to_query(self) -> dict[str, str]:
-        """The request as query parameters of the cacheable GET; defaults are left out."""
+        """Return the query parameters of the GET request for the same image; defaults are left out."""
         flat = self.model_dump(mode="json", exclude={"camera"}, exclude_defaults=True)
         camera = self.camera.model_dump(mode="json", exclude_defaults=True)
         matrix = camera.pop("camera_to_world")
@@ -187,7 +216,7 @@ class RenderRequest(Request):
 
     @classmethod
     def from_query(cls, query: Mapping[str, str]) -> Self:
-        """The request of such a query; pydantic's ValidationError where it does not fit."""
+        """Return the request of a query as `to_query` makes it. Raises pydantic.ValidationError for any other."""
         fields: dict[str, Any] = dict(query)
         camera = {name: fields.pop(name) for name in CameraSpec.model_fields if name in fields}
         if "camera_to_world" in camera:
@@ -196,7 +225,7 @@ class RenderRequest(Request):
         return cls.model_validate(fields | {"camera": camera})
 
     def canonical(self) -> bytes:
-        """The same bytes for the same picture, for an ETag; ways of writing one camera are not told apart."""
+        """Return bytes for an ETag: equal for requests of the same image, however the camera is written."""
         shown = self.model_dump(mode="json", exclude={"camera"})
         camera = {
             "viewmat": self.camera.viewmat(),
@@ -207,32 +236,35 @@ class RenderRequest(Request):
 
 
 class OrbitRequest(Request):
-    """A video (MP4) of a camera that circles the scene once."""
+    """A video (MP4) from a camera that circles the scene once."""
 
-    seconds: float = Field(default=6.0, ge=0.5, le=60, description="Length of the video.")
+    seconds: float = Field(default=6.0, ge=0.5, le=60, description="Length of the video in seconds.")
     fps: int = Field(default=24, ge=1, le=60, description="Frames per second.")
     width: int = Field(
-        default=640, ge=16, le=3840, multiple_of=2, description="Pixels; video needs even sides."
+        default=640, ge=16, le=3840, multiple_of=2, description="Width in pixels; must be even."
     )
     height: int = Field(
-        default=480, ge=16, le=2160, multiple_of=2, description="Pixels; video needs even sides."
+        default=480, ge=16, le=2160, multiple_of=2, description="Height in pixels; must be even."
     )
     fov_y_deg: float | None = Field(
-        default=None, gt=1, lt=170, description="Left out: that of the training cameras."
+        default=None,
+        gt=1,
+        lt=170,
+        description="Vertical field of view in degrees. Left out, that of the training cameras.",
     )
-    background: Literal["black", "white"] = "black"
+    background: Literal["black", "white"] = Field(default="black", description="Colour behind the model.")
 
     @property
     def frames(self) -> int:
-        """How many pictures the video has."""
+        """The number of frames in the video."""
         return max(1, round(self.seconds * self.fps))
 
 
 def check_pixels(width: int, height: int) -> None:
-    """ValueError for a picture with more than MAX_RENDER_PIXELS pixels."""
+    """Raise ValueError for an image of more than MAX_RENDER_PIXELS pixels."""
     if width * height > MAX_RENDER_PIXELS:
         raise ValueError(
-            f"{width} x {height} is {width * height} pixels; at most {MAX_RENDER_PIXELS} are rendered."
+            f"{width} x {height} is {width * height} pixels; at most {MAX_RENDER_PIXELS} can be rendered."
         )
 
 
@@ -253,7 +285,7 @@ def _check_rigid(m: Matrix) -> None:
     if any(abs(x - y) > 1e-6 for x, y in zip(m[3], (0, 0, 0, 1), strict=True)):
         raise ValueError(f"The last row of camera_to_world is {list(m[3])}; it must be [0, 0, 0, 1].")
     if any(abs(m[i][3]) > 1e9 for i in range(3)):
-        raise ValueError("The camera stands further than 1e9 from the origin.")
+        raise ValueError("The camera is more than 1e9 units away from the origin.")
     columns = [(m[0][j], m[1][j], m[2][j]) for j in range(3)]
     lengths = [math.hypot(*column) for column in columns]
     if any(abs(length - 1) > RIGID_TOLERANCE for length in lengths):
@@ -269,4 +301,6 @@ def _check_rigid(m: Matrix) -> None:
         if abs(dot) > 2 * RIGID_TOLERANCE:
             raise ValueError(f"camera_to_world is not rigid: its axes {i} and {j} are not at right angles.")
     if det < 0:
-        raise ValueError("camera_to_world is a mirror: its determinant is -1; check its axes.")
+        raise ValueError(
+            "camera_to_world holds a reflection: its determinant is -1; check the direction of its axes."
+        )

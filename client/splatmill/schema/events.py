@@ -1,6 +1,6 @@
-"""What a worker tells about an attempt: the whole protocol, one union.
+"""The events that a worker reports about an attempt at a job: the whole protocol, as one union.
 
-The payloads know nothing of where they are stored. The envelope `EventRecord` adds id, attempt and time.
+An event does not depend on where it is stored. `EventRecord` adds its id, the attempt and the time.
 """
 
 from enum import StrEnum
@@ -13,7 +13,7 @@ from splatmill.schema.problems import Problem
 
 
 class JobState(StrEnum):
-    """The life of a job, in order; the last three are final."""
+    """The states of a job, in order; the last three are final."""
 
     queued = "queued"
     preparing = "preparing"
@@ -26,7 +26,7 @@ class JobState(StrEnum):
 
     @property
     def final(self) -> bool:
-        """Whether nothing follows."""
+        """Whether no other state follows."""
         return self in FINAL_STATES
 
 
@@ -34,39 +34,41 @@ FINAL_STATES = frozenset({JobState.succeeded, JobState.failed, JobState.cancelle
 
 
 class Progress(Response):
-    """How far an attempt has come. What a stage does not measure is absent."""
+    """Progress of one stage of an attempt. A value that the stage does not measure is null."""
 
-    stage: str = Field(max_length=64, description="What is being done: features, matching, training, ...")
-    done: int = Field(default=0, ge=0, description="How many units of the stage are done.")
+    stage: str = Field(max_length=64, description="Name of the stage: features, matching, training, ...")
+    done: int = Field(default=0, ge=0, description="Number of units of the stage that are done.")
     total: int | None = Field(
-        default=None, ge=0, description="How many there are; absent where it is not known."
+        default=None, ge=0, description="Number of units in the stage; null where it is not known."
     )
-    note: str | None = Field(default=None, max_length=2000)
-    step: int | None = Field(default=None, ge=0, description="Training step.")
+    note: str | None = Field(default=None, max_length=2000, description="What is worked on, for people.")
+    step: int | None = Field(default=None, ge=0, description="Training steps done.")
     loss: Measured = None
-    psnr: Measured = Field(default=None, description="dB, on held-out views when last measured.")
-    ssim: Measured = None
-    gaussians: int | None = Field(default=None, ge=0)
+    psnr: Measured = Field(
+        default=None, description="Mean over the held-out photos when last measured, in dB."
+    )
+    ssim: Measured = Field(default=None, description="Mean over the held-out photos when last measured.")
+    gaussians: int | None = Field(default=None, ge=0, description="Number of Gaussians.")
     seconds: Measured = Field(default=None, description="Seconds spent in this stage.")
-    eta: Measured = Field(default=None, description="Seconds until the stage ends, estimated.")
+    eta: Measured = Field(default=None, description="Estimated seconds until the stage ends.")
 
 
 class CurveRow(Response):
-    """One point of error against run time, measured with the training clock stopped. Psnr, ssim: on held-out views."""
+    """One measurement of error against run time. The training clock is stopped while it is taken."""
 
-    seconds: float = Field(ge=0, description="Training seconds.")
-    step: int = Field(ge=0)
-    loss: Measured = None
-    psnr: Measured = None
-    ssim: Measured = None
-    gaussians: int = Field(ge=0)
-    memory: int | None = Field(default=None, ge=0, description="Bytes that the attempt's process holds.")
-    train_psnr: Measured = Field(default=None, description="dB, on a few of the views that were trained on.")
-    train_ssim: Measured = None
+    seconds: float = Field(ge=0, description="Training time in seconds.")
+    step: int = Field(ge=0, description="Training steps done.")
+    loss: Measured = Field(default=None, description="Training loss.")
+    psnr: Measured = Field(default=None, description="Mean over the held-out photos, in dB.")
+    ssim: Measured = Field(default=None, description="Mean over the held-out photos.")
+    gaussians: int = Field(ge=0, description="Number of Gaussians.")
+    memory: int | None = Field(default=None, ge=0, description="Resident memory of the process, in bytes.")
+    train_psnr: Measured = Field(default=None, description="Mean over some of the training photos, in dB.")
+    train_ssim: Measured = Field(default=None, description="Mean over some of the training photos.")
 
 
 class StateEvent(Response):
-    """The attempt entered a state. A failure says why."""
+    """The job entered a state. `problem` is the reason for the state failed."""
 
     type: Literal["state"] = "state"
     state: JobState
@@ -74,19 +76,19 @@ class StateEvent(Response):
 
 
 class ProgressEvent(Progress):
-    """How far the attempt has come."""
+    """New progress of a stage."""
 
     type: Literal["progress"] = "progress"
 
 
 class MetricEvent(CurveRow):
-    """A new point of the curve."""
+    """A new measurement of error against run time."""
 
     type: Literal["metric"] = "metric"
 
 
 class LogEvent(Response):
-    """A line for people."""
+    """A log line."""
 
     type: Literal["log"] = "log"
     level: Literal["debug", "info", "warning", "error"] = "info"
@@ -94,15 +96,17 @@ class LogEvent(Response):
 
 
 class PreviewEvent(Response):
-    """A new preview picture of the scene was stored."""
+    """A new preview image of the scene was stored."""
 
     type: Literal["preview"] = "preview"
-    path: str = Field(description="Where it is stored, relative to the storage root (or the work folder).")
-    step: int | None = Field(default=None, ge=0)
+    path: str = Field(
+        description="Path of the image, relative to the storage root or to the job's work folder."
+    )
+    step: int | None = Field(default=None, ge=0, description="Training steps done.")
 
 
 class PlanEvent(Response):
-    """What the trainer decided to do and to leave out; each entry carries the fact that decided it."""
+    """The plan of the training: what is done and what is left out, each with the fact that decided it."""
 
     type: Literal["plan"] = "plan"
     plan: dict[str, Any]
@@ -114,13 +118,17 @@ Event = Annotated[
 ]
 
 EVENT: TypeAdapter[Event] = TypeAdapter(Event)
-"""Reads an event: `EVENT.validate_json(text)`."""
+"""Parses an event: `EVENT.validate_json(text)`."""
 
 
 class EventRecord(Response):
-    """An event as it is stored and streamed."""
+    """An event with its id, attempt and time, as it is streamed to clients."""
 
-    id: str = Field(description="Grows within a job; send it back as Last-Event-ID to go on after it.")
-    attempt: int = Field(ge=0, description="Which attempt said it; 0 is the service itself.")
+    id: str = Field(
+        description="Position in the job's events. Send it as Last-Event-ID to resume after this event."
+    )
+    attempt: int = Field(
+        ge=0, description="Number of the attempt that reported it; 0 for the service itself."
+    )
     at: Time
     event: Event

@@ -1,4 +1,4 @@
-"""Every setting of `splatmill fit-image`, once: type, default, range and help text."""
+"""The options of `splatmill fit-image`: type, default, range and help text of each."""
 
 from typing import Any
 

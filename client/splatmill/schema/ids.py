@@ -1,4 +1,4 @@
-"""The shape of the ids that captures, jobs and models are known by."""
+"""The pattern of the ids of captures, jobs and models."""
 
 import re
 

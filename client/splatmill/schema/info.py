@@ -1,4 +1,4 @@
-"""What the service says of itself."""
+"""What the service reports about itself: version, limits, workers, health."""
 
 from typing import Any, Literal
 
@@ -7,49 +7,51 @@ from pydantic import Field
 from splatmill.schema.base import Response, Time
 
 DEFAULT_PORT = 8080
-"""Where a server listens, and where a client looks for one, unless told otherwise."""
+"""The port that a server listens on and that a client connects to by default."""
 
 
 class WorkerInfo(Response):
-    """A worker that is registered with the queue."""
+    """A worker that is registered with the job queue."""
 
     name: str
     queues: list[str] = Field(default_factory=list)
     state: str = Field(description="idle, busy, suspended, ...")
-    job: str | None = None
+    job: str | None = Field(default=None, description="Id of the job it works on.")
     last_heartbeat: Time | None = None
 
 
 class Limits(Response):
-    """What the service accepts at most."""
+    """Upper limits of what the service accepts."""
 
-    max_file_bytes: int
-    max_files_per_capture: int
-    max_image_pixels: int
-    max_render_pixels: int
+    max_file_bytes: int = Field(description="Size of one uploaded file, in bytes.")
+    max_files_per_capture: int = Field(description="Number of files in a capture.")
+    max_image_pixels: int = Field(
+        description="Pixels of a photo; larger photos are left out of the training."
+    )
+    max_render_pixels: int = Field(description="Pixels of a rendered image.")
 
 
 class Info(Response):
-    """What `/v1/info` answers."""
+    """The response of `/v1/info`."""
 
     name: Literal["splatmill"] = "splatmill"
     version: str
     api: str = "v1"
-    storage: str = Field(description="The kind of storage: file, s3.")
+    storage: str = Field(description="Kind of storage: file or s3.")
     workers: list[WorkerInfo] = Field(default_factory=list)
-    queued: int = Field(default=0, ge=0, description="Jobs that wait.")
+    queued: int = Field(default=0, ge=0, description="Number of jobs that wait for a worker.")
     limits: Limits
     details: dict[str, Any] = Field(default_factory=dict)
 
 
 class Health(Response):
-    """The process answers."""
+    """The response of `/healthz`: the process runs."""
 
     status: Literal["ok"] = "ok"
 
 
 class Ready(Response):
-    """Whether the service can do its work; each part says `ok` or what is wrong with it."""
+    """Whether the service can run jobs. Each check holds `ok` or a description of what is wrong."""
 
     ready: bool
     checks: dict[str, str] = Field(default_factory=dict)

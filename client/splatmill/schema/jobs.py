@@ -1,4 +1,4 @@
-"""Jobs: what is asked for, and what a client sees of it."""
+"""Jobs: the request that creates one, and its record as clients see it."""
 
 from typing import Annotated, Any
 
@@ -10,26 +10,26 @@ from splatmill.schema.options import TrainOptions
 from splatmill.schema.problems import Problem
 
 IDEMPOTENCY_HEADER = "Idempotency-Key"
-"""Two requests to create a job with the same key make one job."""
+"""Request header. Requests to create a job that carry the same key create one job."""
 
 
 class CreateJob(Request):
-    """Train a capture."""
+    """A request to train a capture."""
 
-    capture: str = Field(min_length=1, max_length=64, description="The capture's id.")
-    name: str | None = Field(default=None, max_length=200, description="A name for people.")
+    capture: str = Field(min_length=1, max_length=64, description="Id of the capture.")
+    name: str | None = Field(default=None, max_length=200, description="A name to recognise the job by.")
     options: TrainOptions = Field(default_factory=TrainOptions)
 
 
 def _known_options(value: Any) -> Any:
-    # A newer server may have settings that this version does not know; reading its jobs must not fail.
+    # A newer server may have options that this version does not know; its jobs must still be readable.
     if isinstance(value, dict):
         return {name: kept for name, kept in value.items() if name in TrainOptions.model_fields}
     return value
 
 
 class Job(Response):
-    """A job as a client sees it: the request, the wishes, and what the attempts told."""
+    """A job as clients see it: the request, its state, and what its attempts reported."""
 
     id: str
     capture: str
@@ -39,21 +39,25 @@ class Job(Response):
     created_at: Time
     started_at: Time | None = None
     finished_at: Time | None = None
-    attempt: int = Field(default=0, ge=0, description="How many attempts have begun.")
-    cancel_requested: bool = False
+    attempt: int = Field(default=0, ge=0, description="Number of attempts that have begun.")
+    cancel_requested: bool = Field(default=False, description="Whether a client has asked to cancel it.")
     progress: Progress | None = None
-    plan: dict[str, Any] | None = Field(default=None, description="What the trainer decided, with reasons.")
+    plan: dict[str, Any] | None = Field(
+        default=None, description="What was decided for the training, with the reasons."
+    )
     problem: Problem | None = Field(default=None, description="Why the job failed.")
-    model: str | None = Field(default=None, description="The finished model's id.")
-    links: dict[str, str] = Field(default_factory=dict, description="Addresses, relative to the server.")
+    model: str | None = Field(default=None, description="Id of the finished model.")
+    links: dict[str, str] = Field(
+        default_factory=dict, description="Addresses of what belongs to the job, relative to the server."
+    )
 
 
 class JobPage(Response):
-    """Jobs, newest first."""
+    """A page of jobs, newest first."""
 
     jobs: list[Job]
     cursor: str | None = Field(
-        default=None, description="Send it back as ?cursor= for the next page; null on the last."
+        default=None, description="Send it as ?cursor= to get the next page; null on the last page."
     )
 
 
@@ -65,6 +69,6 @@ class LogLine(LogEvent):
 
 
 class LogPage(Response):
-    """What `/v1/jobs/{id}/logs` answers, oldest first."""
+    """The response of `/v1/jobs/{id}/logs`, oldest line first."""
 
     lines: list[LogLine]

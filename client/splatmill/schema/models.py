@@ -10,54 +10,58 @@ from splatmill.schema.events import CurveRow
 
 
 class ModelFile(Response):
-    """One file of a model: model.ply, report.json, report.png, report.html, cameras.json, preview.jpg, progress.mp4."""
+    """A file of a model: model.ply, report.json, report.png, report.html, cameras.json, preview.jpg, progress.mp4."""
 
     name: str
-    size: int = Field(ge=0, description="Bytes.")
+    size: int = Field(ge=0, description="Size in bytes.")
     sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$")
     media_type: str = "application/octet-stream"
 
 
 class Model(Response):
-    """A trained scene; its id is that of the job that made it."""
+    """A trained scene. Its id is that of the job that made it."""
 
     id: str
     job: str
     name: str | None = None
     created_at: Time
-    gaussians: int = Field(ge=0)
-    bytes: int = Field(ge=0, description="Size of model.ply.")
-    sh_degree: int = Field(ge=0, le=3)
-    psnr: Measured = Field(default=None, description="dB, mean over the held-out views.")
-    ssim: Measured = None
+    gaussians: int = Field(ge=0, description="Number of Gaussians.")
+    bytes: int = Field(ge=0, description="Size of model.ply in bytes.")
+    sh_degree: int = Field(ge=0, le=3, description="Degree of the spherical harmonics.")
+    psnr: Measured = Field(default=None, description="Mean over the held-out photos, in dB.")
+    ssim: Measured = Field(default=None, description="Mean over the held-out photos.")
     files: list[ModelFile] = Field(default_factory=list)
-    links: dict[str, str] = Field(default_factory=dict)
+    links: dict[str, str] = Field(
+        default_factory=dict, description="Addresses of what belongs to the model, relative to the server."
+    )
 
 
 class ModelPage(Response):
-    """Models, newest first."""
+    """A page of models, newest first."""
 
     models: list[Model]
-    cursor: str | None = None
+    cursor: str | None = Field(
+        default=None, description="Send it as ?cursor= to get the next page; null on the last page."
+    )
 
 
 class ModelCamera(Response):
-    """A camera of the capture, in the model's world, at the size it was trained with."""
+    """A camera of the capture in the coordinates of the model, at the size of the training photos."""
 
     name: str = Field(description="The photo's name.")
-    split: str = Field(default="train", description="train or test (held out).")
+    split: str = Field(default="train", description="train, or test for a held-out photo.")
     camera: CameraSpec
-    psnr: Measured = None
+    psnr: Measured = Field(default=None, description="PSNR of this photo, in dB.")
 
 
 class ModelCameras(Response):
-    """What `/v1/models/{id}/cameras` answers (and cameras.json holds)."""
+    """The response of `/v1/models/{id}/cameras`, and the contents of cameras.json."""
 
     cameras: list[ModelCamera]
 
 
 class StageSeconds(Response):
-    """Seconds of each stage; the training clock stops during evaluation."""
+    """Duration of each stage in seconds. The training clock is stopped during evaluation."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -67,13 +71,13 @@ class StageSeconds(Response):
 
 
 class Report(Response):
-    """report.json: error against run time, and what led to it."""
+    """The contents of report.json: error against run time, the plan, and where it ran."""
 
     model_config = ConfigDict(extra="allow")
 
     curve: list[CurveRow]
     seconds: StageSeconds
     plan: dict[str, Any] = Field(default_factory=dict)
-    left_out: list[Any] = Field(default_factory=list, description="What was not done or not used, and why.")
+    left_out: list[Any] = Field(default_factory=list, description="What was left out, and why.")
     versions: dict[str, Any] = Field(default_factory=dict)
     machine: dict[str, Any] = Field(default_factory=dict)

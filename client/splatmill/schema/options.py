@@ -1,6 +1,6 @@
-"""Every setting of a training run, once: type, default, range and help text.
+"""The options of a training: type, default, range and help text of each.
 
-`/v1/options`, the OpenAPI document and the command line's help are generated from this model.
+`/v1/options`, the OpenAPI document and the command line are generated from this model.
 """
 
 from enum import StrEnum
@@ -46,7 +46,7 @@ class Backend(StrEnum):
 class Mapper(StrEnum):
     auto = "auto"
     incremental = "incremental"
-    # `global` is a keyword of Python; the wire says "global".
+    # `global` is a keyword of Python.
     global_ = "global"
 
 
@@ -187,7 +187,8 @@ class TrainOptions(Request):
     background: Background = Field(
         default=Background.auto,
         description=(
-            "Colour behind the scene in training. With random, every step draws a new one, so that no hole is "
+            "Colour behind the scene in training. With random, every step draws a new one, so "
+            "that no hole is "
             "hidden by a matching colour. With auto, it is random, except for a few opaque photos, where it "
             "is black."
         ),
@@ -213,7 +214,8 @@ class TrainOptions(Request):
         default=Switch.auto,
         description=(
             "Add Gaussians before training where the photos show surfaces on which the reconstruction has no "
-            "points. With auto, this is done where such surfaces fill much of the photos and there are enough "
+            "points. With auto, this is done where such surfaces fill much of the photos and "
+            "there are enough "
             "photos to correct the guessed depths."
         ),
         json_schema_extra=_PHOTOS,
@@ -222,7 +224,8 @@ class TrainOptions(Request):
         default=Mapper.auto,
         description=(
             "Method that recovers the cameras: incremental adds one photo after another, global solves for "
-            "all at once. With auto, the number of photos and of matching pairs decides, and the other method "
+            "all at once. With auto, the number of photos and of matching pairs decides, and the "
+            "other method "
             "is tried if too few photos can be placed."
         ),
         json_schema_extra=_CAMERAS,
@@ -306,17 +309,17 @@ class TrainOptions(Request):
         if start is None or ID.fullmatch(start):
             return start
         if not start.lower().endswith(".ply"):
-            raise ValueError(f"{start[:80]!r} is neither a model's id nor the name of a .ply file")
+            raise ValueError(f"{start[:80]!r} is neither the id of a model nor the name of a .ply file")
         return safe_name(start)
 
     @property
     def start_file(self) -> str | None:
-        """The file among the capture's poses that `start` names, if it names one."""
+        """The name of a file among the capture's poses, if `start` is one."""
         return self.start if self.start is not None and self.start.lower().endswith(".ply") else None
 
     @property
     def start_model(self) -> str | None:
-        """The model that `start` names, if it names one."""
+        """The id of a model, if `start` is one."""
         return None if self.start_file is not None else self.start
 
     @field_validator("test_views")
@@ -331,27 +334,27 @@ OptionType = Literal["integer", "number", "text", "list", "choice", "duration", 
 
 
 class OptionHelp(Response):
-    """One setting as `/v1/options` and the command line's help show it."""
+    """One option as `/v1/options` and the help of the command line show it."""
 
     name: str
     type: OptionType
     default: bool | int | float | str | list[str] | None = Field(
-        description="The value when left out; null where it is decided from the photos."
+        description="Value used when the option is left out; null where it is decided from the photos."
     )
     minimum: int | float | None = None
     maximum: int | float | None = None
     choices: list[str] | None = None
-    group: str = Field(description="Which settings belong together: budget, photos, cameras, engine.")
+    group: str = Field(description="Group of related options: budget, photos, cameras or engine.")
     help: str
 
     @property
     def flag(self) -> str:
-        """The command line's spelling."""
+        """The option on the command line: `--time-budget`."""
         return "--" + self.name.replace("_", "-")
 
     @property
     def range_text(self) -> str:
-        """`16..8192`, `auto|on|off`, or nothing."""
+        """The accepted values as text: `16..8192`, `auto|on|off`, or empty."""
         if self.choices:
             return "|".join(self.choices)
         if self.minimum is None or self.maximum is None or self.type == "list":
@@ -360,13 +363,13 @@ class OptionHelp(Response):
 
 
 class OptionList(Response):
-    """What `/v1/options` answers."""
+    """The response of `/v1/options`."""
 
     options: list[OptionHelp]
 
 
 def describe_options(model: type[Request] = TrainOptions) -> list[OptionHelp]:
-    """Every field of `model`, in order, with its type, default, range or choices, group and help."""
+    """Return a description of every field of `model`, in order."""
     return [_describe(name, field) for name, field in model.model_fields.items()]
 
 

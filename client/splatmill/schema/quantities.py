@@ -1,4 +1,4 @@
-"""Durations and byte sizes as people write them: `90s`, `5m`, `1h30m`, `1.5GB`."""
+"""Durations and sizes as people write them: `90s`, `5m`, `1h30m`, `1.5GB`."""
 
 import re
 from typing import Annotated, Any
@@ -16,9 +16,9 @@ _PLAIN = re.compile(r"\d+(?:\.\d+)?", re.ASCII)
 
 
 def parse_duration(value: Any) -> Any:
-    """Seconds of `"90s"`, `"5m"`, `"1h30m"`, `"2.5"` or a number; other types are left to pydantic.
+    """Return the seconds of `"90s"`, `"5m"`, `"1h30m"` or `"2.5"`; a value that is no text is returned unchanged.
 
-    Raises ValueError with the accepted forms for a text that is none of them.
+    Raises ValueError, which names the accepted forms, for any other text.
     """
     if not isinstance(value, str):
         return value
@@ -26,29 +26,29 @@ def parse_duration(value: Any) -> Any:
     if _PLAIN.fullmatch(text):
         return float(text)
     if not _DURATION.fullmatch(text):
-        raise ValueError(f"{value!r} is no duration; write seconds (90), or 90s, 5m, 1h30m")
+        raise ValueError(f"{value!r} is not a duration; write seconds (90), or 90s, 5m, 1h30m")
     return sum(float(number) * _SECONDS[unit] for number, unit in _DURATION_PART.findall(text))
 
 
 def parse_bytes(value: Any) -> Any:
-    """Bytes of `"500MB"`, `"1.5GB"`, `"2GiB"` or a number; other types are left to pydantic.
+    """Return the bytes of `"500MB"`, `"1.5GB"` or `"2GiB"`; a value that is no text is returned unchanged.
 
-    Raises ValueError with the accepted forms for a text that is none of them.
+    Raises ValueError, which names the accepted forms, for any other text.
     """
     if not isinstance(value, str):
         return value
     match = _SIZE.fullmatch(value.strip())
     if match is None:
-        raise ValueError(f"{value!r} is no size; write bytes (500000000), or 500MB, 1.5GB, 2GiB")
+        raise ValueError(f"{value!r} is not a size; write bytes (500000000), or 500MB, 1.5GB, 2GiB")
     number, unit, binary = match.groups()
     if binary and not unit:
-        raise ValueError(f"{value!r} is no size; write bytes (500000000), or 500MB, 1.5GB, 2GiB")
+        raise ValueError(f"{value!r} is not a size; write bytes (500000000), or 500MB, 1.5GB, 2GiB")
     factor = _BYTES_BINARY[unit.lower()] if binary else _BYTES[unit.lower()]
     return round(float(number) * factor)
 
 
 def format_duration(seconds: float) -> str:
-    """`4.2s`, `1m05s`, `2h03m`: for people, not for parsing back exactly."""
+    """Return seconds as rounded text for people: `4.2s`, `1m05s`, `2h03m`."""
     if seconds < 9.95:
         return f"{seconds:.1f}s"
     whole = round(seconds)
@@ -61,7 +61,7 @@ def format_duration(seconds: float) -> str:
 
 
 def format_bytes(count: float) -> str:
-    """`512 B`, `1.5 MB`, `23.0 GB` (decimal units, as disks and downloads are sold)."""
+    """Return a number of bytes as text in decimal units: `512 B`, `1.5 MB`, `23.0 GB`."""
     for unit in ("B", "kB", "MB", "GB"):
         if count < 999.5:
             return f"{count:.0f} B" if unit == "B" else f"{count:.1f} {unit}"
@@ -70,7 +70,7 @@ def format_bytes(count: float) -> str:
 
 
 Duration = Annotated[float, BeforeValidator(parse_duration)]
-"""Seconds; a text such as `5m` is accepted."""
+"""Seconds; `parse_duration` accepts a text such as `5m`."""
 
 ByteSize = Annotated[int, BeforeValidator(parse_bytes)]
-"""Bytes; a text such as `1.5GB` is accepted."""
+"""Bytes; `parse_bytes` accepts a text such as `1.5GB`."""
