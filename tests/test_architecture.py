@@ -50,7 +50,7 @@ def test_every_backend_has_the_same_stems(backend: str):
         ("splatmill.schema", {"torch", "numpy", "redis", "rq", "obstore", "fastapi"}),
         ("splatmill_server.app", {"torch", "numpy", "pycolmap", "splatmill_worker"}),
         # The queue worker forks an attempt; torch's and COLMAP's threads do not survive a fork.
-        ("splatmill_worker.rq_worker", {"torch", "pycolmap", "splatmill_server"}),
+        ("splatmill_worker.service.rq_worker", {"torch", "pycolmap", "splatmill_server"}),
         ("splatmill_worker.kernels", {"triton", "pycolmap", "redis", "splatmill"}),
     ],
 )

@@ -10,8 +10,8 @@ import pytest
 from splatmill.errors import NothingToUpload
 from splatmill.layout import find_files
 from splatmill.schema import Role
+from tests.support.paths import DATA
 
-DATA = Path(__file__).parents[3] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the shared data sets are not on this machine")
 
 

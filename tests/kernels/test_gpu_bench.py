@@ -8,13 +8,12 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
-from pathlib import Path
 from types import ModuleType
 
 import pytest
 import torch
 
-BENCH = Path(__file__).resolve().parents[2] / "worker" / "bench"
+from tests.support.paths import BENCH
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from splatmill_worker.kernels import ops, reference
-from splatmill_worker.splat.parallel import Replicas, join
+from splatmill_worker.splat.engine.parallel import Replicas, join
 from tests.support.kernels import replica
 
 STEPS = 3

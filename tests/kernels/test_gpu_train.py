@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from splatmill_worker.scene import Camera
-from splatmill_worker.splat.budget import Budget
-from splatmill_worker.splat.engine import open_engine
-from splatmill_worker.splat.plan import Kernels, Plan
-from splatmill_worker.splat.schedule import Schedule
-from splatmill_worker.splat.train import Trained, train
+from splatmill_worker.splat.engine.open import open_engine
+from splatmill_worker.splat.plan.budget import Budget
+from splatmill_worker.splat.plan.plan import Kernels, Plan
+from splatmill_worker.splat.plan.schedule import Schedule
+from splatmill_worker.splat.train.loop import Trained, train
 from splatmill_worker.splat.views import Target, TrainingView
 from tests.support.kernels import replica
 

@@ -24,7 +24,7 @@ from .conftest import Running, Serve, wait_for
 WORKER = textwrap.dedent(
     """
     import os, pathlib, sys, time, types
-    module = types.ModuleType("splatmill_worker.job")
+    module = types.ModuleType("splatmill_worker.service.job")
     def run_attempt(job_id):
         pathlib.Path(sys.argv[2]).write_text(str(os.getpid()))
         if sys.argv[3] == "die":
@@ -33,7 +33,7 @@ WORKER = textwrap.dedent(
             time.sleep(0.05)
     module.run_attempt = run_attempt
     sys.modules["splatmill_worker"] = types.ModuleType("splatmill_worker")
-    sys.modules["splatmill_worker.job"] = module
+    sys.modules["splatmill_worker.service.job"] = module
     from rq import Worker
     from splatmill.backplane import queue
     from splatmill.backplane.connection import connect

@@ -13,9 +13,9 @@ import redis
 from splatmill.backplane import events, keys
 from splatmill.backplane.process import ProcessIdentity, start_time
 from splatmill.schema import JobState, LogEvent, ProgressEvent, StateEvent
-from splatmill_worker.attempt import Attempt
-from splatmill_worker.lock import STALE_MS, Held, JobLock
-from splatmill_worker.outbox import Outbox
+from splatmill_worker.service.attempt import Attempt
+from splatmill_worker.service.lock import STALE_MS, Held, JobLock
+from splatmill_worker.service.outbox import Outbox
 
 from .conftest import RedisServer, wait_for
 

@@ -23,9 +23,9 @@ from PIL import Image
 from splatmill.backplane import layout, rendering
 from splatmill.backplane.storage import Storage
 from splatmill.schema import DEPTH_SCALE_HEADER, CameraSpec, OrbitRequest, RenderRequest
-from splatmill_worker import orbit
-from splatmill_worker.model_cache import ModelCache, NoModelError
-from splatmill_worker.renderer import Busy, Turns
+from splatmill_worker.render_service import orbit
+from splatmill_worker.render_service.model_cache import ModelCache, NoModelError
+from splatmill_worker.render_service.renderer import Busy, Turns
 
 from . import standin
 from .conftest import wait_for

@@ -146,9 +146,7 @@ def test_the_idle_service_is_small(service: Up) -> None:
 
 def test_a_worker_started_by_hand_says_that_redis_is_away(tmp_path: Path) -> None:
     environment = dict(os.environ) | {"REDIS_URL": f"unix://{tmp_path}/nothing.sock"}
-    code = (
-        "import splatmill_worker.__main__ as m; m.REDIS_PATIENCE = 0.1; raise SystemExit(m.main(['train']))"
-    )
+    code = "import splatmill_worker.service.command as c; c.REDIS_PATIENCE = 0.1; raise SystemExit(c.serve(None))"
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60
     )

@@ -14,9 +14,12 @@ import redis
 from splatmill.backplane import keys, layout
 from splatmill.backplane.storage import Storage, StorageError, StorageFullError
 from splatmill.schema import Role
-from splatmill_worker import reconstruction, sweep, workspace
-from splatmill_worker.mishap import Transient, problem_of
-from splatmill_worker.workspace import FolderInUseError, Mirror, StartGoneError, Workspace, in_use
+from splatmill_worker.errors import SfmFailed
+from splatmill_worker.service import clean_up as sweep
+from splatmill_worker.service import shared_cameras as reconstruction
+from splatmill_worker.service import workspace
+from splatmill_worker.service.problems import Transient, problem_of
+from splatmill_worker.service.workspace import FolderInUseError, Mirror, ModelNotStored, Workspace, in_use
 
 JOB, CAPTURE = "job00001", "capture1"
 
@@ -162,17 +165,20 @@ def test_the_sweep_takes_only_what_nobody_will_miss(local: Storage, connection: 
     assert sweep.sweep(connection) == []
 
 
-class Named(Exception):
-    code = "sfm_no_parallax"
-    message = "The camera turned but did not move."
-    facts = {"parallax_deg": 0.2}  # noqa: RUF012
-    advice = "Walk around the thing."
+NO_PARALLAX = SfmFailed(
+    "sfm_no_parallax", "The camera only turned.", {"parallax_deg": 0.2}, "Walk around the scene."
+)
 
 
 @pytest.mark.parametrize(
     ("error", "code"),
     [
-        (Named(), "sfm_no_parallax"),
+        (
+            SfmFailed(
+                "sfm_no_parallax", "The camera only turned.", {"parallax_deg": 0.2}, "Walk around the scene."
+            ),
+            "sfm_no_parallax",
+        ),
         (MemoryError(), "out_of_memory"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "out_of_memory"),
         (OSError(errno.ENOSPC, "No space left on device", "x"), "storage_full"),
@@ -189,11 +195,15 @@ def test_every_mishap_has_a_name_and_advice(error: Exception, code: str) -> None
 
 
 def test_a_named_failure_keeps_its_facts() -> None:
-    assert problem_of(Named()).facts == {"parallax_deg": 0.2}
+    assert problem_of(
+        SfmFailed(
+            "sfm_no_parallax", "The camera only turned.", {"parallax_deg": 0.2}, "Walk around the scene."
+        )
+    ).facts == {"parallax_deg": 0.2}
 
 
 def test_numerical_failures_get_the_codes_of_the_wire() -> None:
-    from splatmill_worker.splat.failure import FailureName, TrainingFailed
+    from splatmill_worker.errors import FailureName, TrainingFailed
 
     codes = {
         name: problem_of(TrainingFailed(name, "Something was seen.", step=7)).code for name in FailureName
@@ -232,7 +242,7 @@ def test_a_stored_model_is_brought_along_to_start_from(where: str, request: pyte
     assert not (space.run / "start.ply").is_symlink()
     space.start_over()
     for gone in ("model001", "../../etc"):
-        with pytest.raises(StartGoneError) as missing:
+        with pytest.raises(ModelNotStored) as missing:
             space.stage_start(gone)
         assert problem_of(missing.value).code == "model_not_found"
     space.close()

@@ -14,8 +14,8 @@ import pytest
 from PIL import Image
 
 from splatmill_worker.film import Film, whole
-from splatmill_worker.progress_film import HELD, ProgressFilm
-from splatmill_worker.splat.plan import Plan
+from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.report.progress_film import HELD, ProgressFilm
 from splatmill_worker.splat.views import TrainingView
 
 GREY = np.full((16, 32, 3), 128, np.uint8)

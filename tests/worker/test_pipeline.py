@@ -11,19 +11,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import stillife
 import torch
 from PIL import Image
 
 from splatmill.schema import Event, JobState, ModelCameras, Report, TrainOptions
 from splatmill_worker import pipeline
-from splatmill_worker.refusal import Refusal
+from splatmill_worker.errors import Refusal
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat import ply
 from splatmill_worker.splat.evaluate import compare
 from splatmill_worker.splat.render import render
-
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+from tests.support import still_life
+from tests.support.paths import DATA
 
 
 def options(**values: object) -> TrainOptions:
@@ -38,7 +37,7 @@ def run(
 
 
 def test_a_posed_capture_becomes_a_model_with_its_reports(tmp_path: Path) -> None:
-    capture = stillife.posed_capture(tmp_path / "capture")
+    capture = still_life.posed_capture(tmp_path / "capture")
     outcome, events = run(capture, tmp_path / "work", options())
     assert outcome.ended == "succeeded"
     kinds = [event.type for event in events]
@@ -75,13 +74,13 @@ def test_a_posed_capture_becomes_a_model_with_its_reports(tmp_path: Path) -> Non
 
 
 def test_corrected_cameras_are_exported_and_held_out_ones_are_not_touched(tmp_path: Path) -> None:
-    capture = stillife.posed_capture(tmp_path / "capture")
+    capture = still_life.posed_capture(tmp_path / "capture")
     out = run(capture, tmp_path / "work", options(pose_refinement="on"))[0].out
     report = json.loads((out / "report.json").read_text())
     assert 0.0 < report["result"]["cameras_moved_pixels"] < 5.0
     assert "Held-out cameras stay as they came" in report["plan"]["reasons"]["pose_refinement"]
     cameras = ModelCameras.model_validate_json((out / "cameras.json").read_text()).cameras
-    given = {view.name: view.camera.center for view in stillife.scene().views}
+    given = {view.name: view.camera.center for view in still_life.scene().views}
     moves = {
         camera.name: float(
             np.linalg.norm(np.array(camera.camera.camera_to_world)[:3, 3] - given[camera.name])
@@ -93,18 +92,18 @@ def test_corrected_cameras_are_exported_and_held_out_ones_are_not_touched(tmp_pa
 
 
 def test_the_model_shows_the_photos_at_the_reported_error_in_the_captures_own_world(tmp_path: Path) -> None:
-    capture = stillife.posed_capture(tmp_path / "capture")
+    capture = still_life.posed_capture(tmp_path / "capture")
     out = run(capture, tmp_path / "work", options(steps=120))[0].out
     scene = ply.read(out / "model.ply")
     assert bool(scene.finite().all())
     cameras = ModelCameras.model_validate_json((out / "cameras.json").read_text()).cameras
     judged = [row for row in cameras if row.split == "test"]
     assert {row.name for row in judged} == {"00.png", "08.png"}
-    assert len(cameras) == stillife.COUNT
+    assert len(cameras) == still_life.COUNT
     for row in judged:
         fx, fy, cx, cy = row.camera.pinhole()
         viewmat = np.array(row.camera.viewmat())
-        true = stillife.pictures()[int(row.name[:2])][0]
+        true = still_life.pictures()[int(row.name[:2])][0]
         assert np.allclose(viewmat, true.viewmat, atol=1e-5)
         camera = Camera(row.camera.width, row.camera.height, fx, fy, cx, cy, viewmat)
         with Image.open(capture / "images" / row.name) as opened:
@@ -115,8 +114,8 @@ def test_the_model_shows_the_photos_at_the_reported_error_in_the_captures_own_wo
 
 
 def test_a_cancelled_run_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    capture = stillife.posed_capture(tmp_path / "capture")
-    monkeypatch.setattr("splatmill_worker.splat.train.Hooks.checkpoint_seconds", 0.0)
+    capture = still_life.posed_capture(tmp_path / "capture")
+    monkeypatch.setattr("splatmill_worker.splat.train.loop.Hooks.checkpoint_seconds", 0.0)
     metrics = 0
 
     def count(event: Event) -> None:
@@ -137,14 +136,14 @@ def test_a_cancelled_run_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch
 
 
 def test_a_finished_run_asked_again_gives_the_same_model(tmp_path: Path) -> None:
-    capture = stillife.posed_capture(tmp_path / "capture")
+    capture = still_life.posed_capture(tmp_path / "capture")
     asked = options(steps=60)
     first = (run(capture, tmp_path / "a", asked)[0].out / "model.ply").read_bytes()
     assert (run(capture, tmp_path / "b", asked)[0].out / "model.ply").read_bytes() == first
 
 
 def test_nothing_held_out_is_reported_as_such(tmp_path: Path) -> None:
-    capture = stillife.posed_capture(tmp_path / "capture")
+    capture = still_life.posed_capture(tmp_path / "capture")
     out = run(capture, tmp_path / "work", options(steps=40, holdout=0))[0].out
     report = json.loads((out / "report.json").read_text())
     assert report["result"]["psnr"] is None
@@ -163,7 +162,7 @@ def test_nothing_held_out_is_reported_as_such(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_done_is_refused_by_code(tmp_path: Path, asked: dict[str, object], code: str) -> None:
-    capture = stillife.posed_capture(tmp_path / "capture")
+    capture = still_life.posed_capture(tmp_path / "capture")
     with pytest.raises(Refusal) as refused:
         run(capture, tmp_path / "work", options(**asked))
     assert refused.value.code == code
@@ -171,7 +170,7 @@ def test_what_cannot_be_done_is_refused_by_code(tmp_path: Path, asked: dict[str,
 
 
 def test_poses_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
-    capture = stillife.posed_capture(tmp_path / "capture")
+    capture = still_life.posed_capture(tmp_path / "capture")
     (capture / "poses" / "transforms.json").write_text("{")
     with pytest.raises(Refusal) as refused:
         run(capture, tmp_path / "work", options())
@@ -180,7 +179,7 @@ def test_poses_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
 
 def test_far_from_the_origin_the_model_keeps_local_coordinates(tmp_path: Path) -> None:
     """At northing 5e6 float32 has steps of half a metre; the offset is taken out and reported."""
-    capture = stillife.posed_capture(tmp_path / "capture")
+    capture = still_life.posed_capture(tmp_path / "capture")
     path = capture / "poses" / "transforms.json"
     document = json.loads(path.read_text())
     for frame in document["frames"]:

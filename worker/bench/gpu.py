@@ -26,15 +26,15 @@ from splatmill_worker.kernels.gpu import device
 from splatmill_worker.pipeline import EXTENT
 from splatmill_worker.scene import Camera, Normalization, split
 from splatmill_worker.sfm import posed
-from splatmill_worker.splat import initialise
-from splatmill_worker.splat.decide import decide
-from splatmill_worker.splat.engine import open_engine
+from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.evaluate import evaluate
-from splatmill_worker.splat.facts import measure
 from splatmill_worker.splat.gaussians import Gaussians
-from splatmill_worker.splat.probe import STILL, probe
+from splatmill_worker.splat.plan.decide import decide
+from splatmill_worker.splat.plan.facts import measure
+from splatmill_worker.splat.plan.probe import STILL, probe
 from splatmill_worker.splat.render import render
-from splatmill_worker.splat.train import train
+from splatmill_worker.splat.start.points import from_points
+from splatmill_worker.splat.train.loop import train
 from splatmill_worker.splat.views import Target, TrainingView
 
 WIDTH, HEIGHT = 1920, 1080
@@ -150,7 +150,7 @@ def curves(capture: Path, size: int, steps: int, seed: int) -> list[Row]:
     world = frame.apply(scene)
     chosen, kept = split(scene)
     views, held_out = ([TrainingView.of(p, frame) for p in load_views(v, size)] for v in (chosen, kept))
-    first = initialise.from_points(torch.from_numpy(world.points), torch.from_numpy(world.colors))
+    first = from_points(torch.from_numpy(world.points), torch.from_numpy(world.colors))
 
     speed = probe(open_engine(first, "gpu"), views)
     options = TrainOptions(image_size=size, seed=seed)

@@ -38,12 +38,14 @@ from _plot import axes, save
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from splatmill.schema import TrainOptions
-from splatmill_worker import pipeline, sfm, synthetic, textures
+from splatmill_worker import pipeline, sfm, synthetic
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images import prepare
 from splatmill_worker.scene import Camera, Scene
-from splatmill_worker.sfm import colmap_model, pairs, posed
+from splatmill_worker.sfm import pairs, posed
 from splatmill_worker.sfm.files import ImageFiles
+from splatmill_worker.sfm.posed import colmap_model
+from splatmill_worker.synthetic import textures
 
 Float = npt.NDArray[np.float64]
 FOLDERS = {name: _data.FOLDERS[name] for name in ("fox", "lund", "kermit", "unrelated", "rotation")}

@@ -5,10 +5,7 @@ import ctypes
 import importlib.util
 import os
 import sys
-import time
 from pathlib import Path
-
-from splatmill_worker import places
 
 SPINS = "1000"
 """How often a thread looks before it sleeps at a barrier of the kernels. OpenMP's default spins for milliseconds,
@@ -18,9 +15,6 @@ training step took ten times as long. On a quiet machine this costs 2 %."""
 OWN_PAGES = 8 * 2**20
 """Bytes from which an allocation has pages of its own, which go back when it is freed. glibc moves this limit up to
 32 MiB by itself; the rows that densification copies then leave holes, and an attempt kept 200 MB more."""
-
-REDIS_PATIENCE = 60.0
-"""Seconds a starting worker waits for Redis, which may be starting beside it."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -53,13 +47,16 @@ def main(argv: list[str] | None = None) -> int:
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", SPINS)  # read once, when torch is loaded
     if chosen.program == "train":
-        return _train(chosen.stop_grace)
-    if chosen.program == "renderer":
-        from splatmill_worker.renderer import serve
+        give_memory_back()
+        from splatmill_worker.service.command import serve
 
-        return serve(chosen.host, chosen.port, chosen.uds, chosen.backend)
+        return serve(chosen.stop_grace)
+    if chosen.program == "renderer":
+        from splatmill_worker.render_service.renderer import serve as serve_renders
+
+        return serve_renders(chosen.host, chosen.port, chosen.uds, chosen.backend)
     if chosen.program == "fit-image":
-        from splatmill_worker.fit_image import main as fit_image_main
+        from splatmill_worker.fit_image.command import main as fit_image_main
 
         return fit_image_main(chosen.photo, chosen.out, chosen.options)
     if chosen.program == "doctor":
@@ -76,32 +73,6 @@ def give_memory_back() -> None:
     if mallopt is not None and sys.platform == "linux":
         mallopt(mmap_threshold, OWN_PAGES)
         mallopt(arena_max, 2)
-
-
-def _train(stop_grace: float | None) -> int:
-    give_memory_back()
-    # The imports of this process are those of every attempt it forks: nothing with threads of its own.
-    import redis
-
-    from splatmill.backplane.connection import connect
-    from splatmill_worker.rq_worker import STOP_GRACE, AttemptWorker
-
-    url = places.redis_url()
-    connection = connect(url)
-    deadline = time.monotonic() + REDIS_PATIENCE
-    while True:
-        try:
-            connection.ping()
-            break
-        except redis.exceptions.ConnectionError as error:
-            if time.monotonic() > deadline:
-                print(
-                    f"Redis cannot be reached at {url}: {error}. Start it, or set REDIS_URL.", file=sys.stderr
-                )
-                return 1
-            time.sleep(0.05)
-    AttemptWorker(connection, stop_grace=STOP_GRACE if stop_grace is None else stop_grace).work()
-    return 0
 
 
 def _bench(name: str, arguments: list[str]) -> int:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from splatmill.schema import Backend, TrainOptions
 from splatmill_worker import sfm
+from splatmill_worker.errors import Refusal
 from splatmill_worker.kernels.gpu.device import absence
-from splatmill_worker.refusal import Refusal
 from splatmill_worker.scene import Scene, View, split
 from splatmill_worker.sfm import posed
-from splatmill_worker.splat.plan import Kernels
+from splatmill_worker.splat.plan.plan import Kernels
 
 OnProgress = Callable[[str, int, int, str], None]
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from splatmill.schema import format_bytes
-from splatmill_worker import places
+from splatmill_worker import settings
 
 ROOMY = 2 << 30
 ROOMY_DISK = 5 << 30
@@ -144,7 +144,7 @@ def _cgroup_limit() -> int | None:
 
 
 def _disk() -> Iterator[Finding]:
-    folder = places.data_folder()
+    folder = settings.data_folder()
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     if not os.access(existing, os.W_OK):
         advice = "Set SPLATMILL_DATA to a folder this user may write."
@@ -162,7 +162,7 @@ def _redis() -> Iterator[Finding]:
     from splatmill.backplane.connection import connect
 
     if os.environ.get("REDIS_URL"):
-        url = places.redis_url()
+        url = settings.redis_url()
         try:
             version = connect(url, timeout=3, retries=0).info("server")["redis_version"]
         except redis.RedisError as error:
@@ -187,7 +187,7 @@ def _redis() -> Iterator[Finding]:
 def _storage() -> Iterator[Finding]:
     from splatmill.backplane.storage import Storage, StorageError
 
-    url = places.storage_url()
+    url = settings.storage_url()
     if url.startswith("file:") and not os.environ.get("SPLATMILL_STORAGE"):
         yield Finding("storage", "ok", f"{url} (SPLATMILL_STORAGE is not set)")
         return

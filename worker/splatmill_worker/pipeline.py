@@ -25,28 +25,31 @@ from splatmill.schema import (
     StateEvent,
     TrainOptions,
 )
-from splatmill_worker import sfm
 from splatmill_worker.capture import cameras_of, held_out_of, kernels_of, start_file
+from splatmill_worker.errors import Cancelled, Refusal
 from splatmill_worker.images import load_views
 from splatmill_worker.kernels.gpu.device import absence, describe
-from splatmill_worker.progress_film import ProgressFilm
-from splatmill_worker.refusal import Refusal
 from splatmill_worker.scene import Normalization, Scene, View
-from splatmill_worker.splat import checkpoint, initialise
-from splatmill_worker.splat.decide import decide, loading_size
-from splatmill_worker.splat.engine import Engine, open_engine
-from splatmill_worker.splat.export import Frame, export
-from splatmill_worker.splat.facts import ENOUGH_POINTS, Facts, measure
+from splatmill_worker.splat.engine.open import open_engine
+from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.picture import save_jpeg
-from splatmill_worker.splat.plan import Plan
-from splatmill_worker.splat.probe import probe
-from splatmill_worker.splat.report import write_report
-from splatmill_worker.splat.run import Row
-from splatmill_worker.splat.stages import Stages
-from splatmill_worker.splat.start import Start, StartUnusableError, judge, strongest
-from splatmill_worker.splat.start import read as read_start
-from splatmill_worker.splat.train import Cancelled, Hooks, Tick, Trained, drawer, evaluation_background, train
+from splatmill_worker.splat.plan.decide import decide, loading_size
+from splatmill_worker.splat.plan.facts import Facts, measure
+from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.plan.probe import probe
+from splatmill_worker.splat.report.export import Frame, export
+from splatmill_worker.splat.report.progress_film import ProgressFilm
+from splatmill_worker.splat.report.report import write_report
+from splatmill_worker.splat.report.stages import Stages
+from splatmill_worker.splat.start.completion import completed
+from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS, in_frusta
+from splatmill_worker.splat.start.given_model import Start, judge, strongest
+from splatmill_worker.splat.start.given_model import read as read_start
+from splatmill_worker.splat.start.points import ENOUGH_POINTS, from_points
+from splatmill_worker.splat.train import checkpoint
+from splatmill_worker.splat.train.loop import Hooks, Tick, Trained, drawer, evaluation_background, train
+from splatmill_worker.splat.train.run import Row
 from splatmill_worker.splat.views import TrainingView
 
 Emit = Callable[[Event], None]
@@ -119,7 +122,16 @@ def run(
                     _loaded(test_views, plan.image_size, frame),
                 )
 
-        engine = open_engine(initialise.completed(gaussians, world, views, plan), plan.kernels)
+        if plan.initial == "points":
+            gaussians = completed(
+                gaussians,
+                world,
+                views,
+                fill_gaps=plan.gaps,
+                add_far_shell=plan.far_shell,
+                max_gaussians=plan.max_gaussians,
+            )
+        engine = open_engine(gaussians, plan.kernels)
         resumable = _resumable(workdir, views)
         film = None
         if options.progress_video:
@@ -142,7 +154,7 @@ def run(
             ),
             resume_from=resumable,
         )
-    except (Cancelled, sfm.Cancelled):
+    except Cancelled:
         return Outcome("cancelled", out)
 
     views = list(trained.views)
@@ -179,15 +191,8 @@ def _start(
     path = start_file(capture, workdir, options)
     if path is None:
         return None
-    try:
-        gaussians = read_start(path, frame)
-        return _Model(gaussians, judge(gaussians, views))
-    except StartUnusableError as error:
-        raise Refusal(
-            "start_unusable",
-            str(error),
-            advice="Give a 3D Gaussian .ply that was trained on cameras of the same capture, or leave start out.",
-        ) from error
+    gaussians = read_start(path, frame)
+    return _Model(gaussians, judge(gaussians, views))
 
 
 def _doubt(start: Start) -> str:
@@ -206,8 +211,8 @@ def _first_gaussians(world: Scene, views: list[TrainingView], options: TrainOpti
         points, colors = torch.from_numpy(world.points), torch.from_numpy(world.colors)
     else:
         targets = [view.full for view in views]
-        points, colors = initialise.in_frusta(targets, initialise.RANDOM_GAUSSIANS, options.seed)
-    return initialise.from_points(points, colors)
+        points, colors = in_frusta(targets, RANDOM_GAUSSIANS, options.seed)
+    return from_points(points, colors)
 
 
 def _plan(

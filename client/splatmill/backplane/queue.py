@@ -20,7 +20,7 @@ opens a small window in which RQ loses a job."""
 
 QUEUES = (TRAIN,)
 
-ATTEMPT = "splatmill_worker.job.run_attempt"
+ATTEMPT = "splatmill_worker.service.job.run_attempt"
 """What a worker calls, with the job id as its one argument; the generation is in the RQ job's id."""
 
 SERIALIZER = JSONSerializer

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels.records import Rates
+from splatmill_worker.splat.engine.parallel import join, open_replica
 from splatmill_worker.splat.gaussians import Gaussians
-from splatmill_worker.splat.parallel import join, open_replica
 
 WIDTH, HEIGHT = 20, 12
 RATES = Rates(means=1e-3, log_scales=5e-3, quats=1e-3, logit_opacities=5e-2, sh_dc=2.5e-3, sh_rest=1e-4)

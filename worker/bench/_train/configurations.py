@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal
 
 from _train.scenes import Scene
-from splatmill_worker.splat.plan import Plan
+from splatmill_worker.splat.plan.plan import Plan
 
 DEFAULT = "default"
 

@@ -24,16 +24,15 @@ from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline, sfm, synthetic
 from splatmill_worker.__main__ import give_memory_back
 from splatmill_worker.capture import cameras_of, held_out_of, kernels_of
+from splatmill_worker.errors import ModelUnreadable, Refusal, TrainingFailed
 from splatmill_worker.images import load_views
-from splatmill_worker.refusal import Refusal
 from splatmill_worker.scene import Normalization, Scene
 from splatmill_worker.sfm import posed
 from splatmill_worker.splat import ply
 from splatmill_worker.splat.evaluate import evaluate, judged_over
-from splatmill_worker.splat.failure import TrainingFailed
-from splatmill_worker.splat.plan import Plan
+from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.render import render
-from splatmill_worker.splat.report import plain
+from splatmill_worker.splat.report.report import plain
 from splatmill_worker.splat.views import Target, TrainingView
 
 NAMED = (Refusal, TrainingFailed, sfm.SfmFailed)
@@ -112,7 +111,7 @@ def judge(job: Row) -> Row:
         gaussians = ply.read(path)
         scene = _posed(job, options)
         _, test = held_out_of(scene, options)
-    except (ply.PlyUnreadableError, *NAMED) as failure:
+    except (ModelUnreadable, *NAMED) as failure:
         return {"failure": str(failure)}
     if not test or options.image_size is None:
         return {"failure": f"{job['scene']} holds out no view, so that nothing can be judged on it."}

@@ -7,6 +7,8 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
+from splatmill_worker.errors import Cancelled
+
 MAX_ENTRIES = 20_000
 MAX_FILE_BYTES = 2 * 2**30
 MAX_TOTAL_BYTES = 16 * 2**30
@@ -83,7 +85,7 @@ def _write(
     with archive.open(entry) as source, place.open("wb") as sink:
         while chunk := source.read(CHUNK):
             if cancelled():
-                raise InterruptedError(f"Unpacking {entry.filename} was cancelled.")
+                raise Cancelled(f"Unpacking {entry.filename} was cancelled.")
             size += len(chunk)
             total += len(chunk)
             if size > entry.file_size or size > MAX_FILE_BYTES or total > MAX_TOTAL_BYTES:

@@ -14,6 +14,7 @@ from pathlib import Path
 from PIL import Image, UnidentifiedImageError
 
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, MAX_PHOTO_PIXELS, MIN_PHOTO_SIDE, VIDEO_SUFFIXES
+from splatmill_worker.errors import Cancelled
 from splatmill_worker.images import archive, exif, video
 from splatmill_worker.images.decode import upright_size
 from splatmill_worker.images.masks import mask_of, masks_under
@@ -80,7 +81,7 @@ def prepare(
     with the same bytes. Masks are found in `masks`, or beside a photo as name.jpg.png. `on_progress` gets the
     stage, files done, files in all, and the file's name.
 
-    Raises InterruptedError when cancelled.
+    Raises Cancelled when cancelled.
     """
     found = _Found()
     for path in _files(images):
@@ -94,7 +95,7 @@ def prepare(
         looked = pool.map(lambda file: None if cancelled() else _look_at(*file), candidates)
         for done, ((name, _, _), result) in enumerate(zip(candidates, looked, strict=True), 1):
             if result is None:
-                raise InterruptedError("Looking through the photos was cancelled.")
+                raise Cancelled("Looking through the photos was cancelled.")
             on_progress("images", done, len(candidates), name)
             if isinstance(result, str):
                 found.skipped.append((name, result))
@@ -158,7 +159,7 @@ def _expand(
             found.notes.append(f"{len(pictures)} frames were taken from {name}.")
         else:
             found.files.append((name, path, None))
-    except InterruptedError:
+    except Cancelled:
         raise
     except (ValueError, OSError) as error:
         found.skipped.append((name, str(error)))

@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from splatmill_worker.errors import Cancelled
+
 SHARPNESS_SIDE = 480  # pixels of the longest side on which sharpness is judged
 QUALITY = 95
 
@@ -26,7 +28,7 @@ def sharpest_frames(
 
     The video is cut into `count` stretches of equal length, and the frame with the largest variance of its
     Laplacian is taken from each; a video with fewer frames gives all of them. The rotation in the file is
-    applied. Raises ValueError where the file holds no video that decodes, InterruptedError when cancelled.
+    applied. Raises ValueError where the file holds no video that decodes, Cancelled when cancelled.
     """
     if count < 1:
         raise ValueError(f"{count} frames were asked for; at least 1 is needed.")
@@ -43,7 +45,7 @@ def sharpest_frames(
             stretch = 0
             for number, frame in enumerate(container.decode(stream)):
                 if cancelled():
-                    raise InterruptedError("Reading the video was cancelled.")
+                    raise Cancelled("Reading the video was cancelled.")
                 time = frame.time if frame.time is not None else number / 30.0
                 at = min(count - 1, max(stretch, int(time / length * count)))
                 if at != stretch and best is not None:

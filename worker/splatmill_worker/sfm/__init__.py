@@ -1,6 +1,6 @@
 """From photos to cameras: structure from motion, or the cameras a capture brings along."""
 
-from splatmill_worker.sfm.failure import Cancelled, SfmFailed
+from splatmill_worker.errors import Cancelled, SfmFailed
 from splatmill_worker.sfm.options import SfmOptions
 from splatmill_worker.sfm.solve import reconstruct, reconstruct_photos
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.sfm.failure import Cancelled
+from splatmill_worker.errors import Cancelled
 
 POLL_SECONDS = 0.1
 

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.errors import SfmFailed
 from splatmill_worker.sfm.cameras import FOCAL_BOUNDS
-from splatmill_worker.sfm.failure import SfmFailed
 from splatmill_worker.sfm.geometry import MIN_INLIERS, TURNED_ONLY, Verified
 from splatmill_worker.sfm.pairs import Pair
 

@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.errors import SfmFailed
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.scene import Scene
 from splatmill_worker.sfm import cameras, checks, stereo
-from splatmill_worker.sfm.attempt import ENOUGH, attempt, edges
 from splatmill_worker.sfm.cancellation import stop_if
-from splatmill_worker.sfm.failure import Cancelled, SfmFailed
-from splatmill_worker.sfm.finish import read, store
+from splatmill_worker.sfm.effort import ENOUGH, attempt, edges
 from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions, fitted
 from splatmill_worker.sfm.run import VERSION, OnProgress, Progress, Run, digest, torch_threads
+from splatmill_worker.sfm.stored_model import read, store
 
 
 def reconstruct(
@@ -39,12 +39,9 @@ def reconstruct(
     Raises SfmFailed with facts and advice, and Cancelled within a fraction of a second of `cancelled()` turning
     true (the global mapper and a single bundle adjustment finish first).
     """
-    try:
-        prepared = prepare(
-            images, masks, workdir, frames=options.frames, on_progress=on_progress, cancelled=cancelled
-        )
-    except InterruptedError as error:
-        raise Cancelled(str(error)) from error
+    prepared = prepare(
+        images, masks, workdir, frames=options.frames, on_progress=on_progress, cancelled=cancelled
+    )
     return reconstruct_photos(prepared, workdir, options, on_progress, cancelled)
 
 

@@ -19,8 +19,8 @@ import numpy.typing as npt
 from splatmill_worker.images import load_view
 from splatmill_worker.scene import PointViews, Scene, View
 from splatmill_worker.sfm.cancellation import stop_if
+from splatmill_worker.sfm.plane_sweep import AGREE, Found, Shot, placed, sweep
 from splatmill_worker.sfm.run import OnProgress
-from splatmill_worker.sfm.sweep import AGREE, Found, Shot, placed, sweep
 
 Float = npt.NDArray[np.float64]
 

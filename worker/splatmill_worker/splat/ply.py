@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.gaussians import Gaussians
 
 MIN_OPACITY = 1.0 / 255.0
@@ -18,10 +19,6 @@ MIN_OPACITY = 1.0 / 255.0
 _DEGREE_OF_REST = {0: 0, 9: 1, 24: 2, 45: 3}
 _HEAD_BYTES = 65536
 _OPAQUE = 16.0  # logit: 1 - 1e-7, the last opacity under 1 in float32
-
-
-class PlyUnreadableError(ValueError):
-    """The file is no 3D Gaussian `.ply`; the message says what was found and what was expected."""
 
 
 def property_names(degree: int) -> list[str]:
@@ -90,7 +87,7 @@ def write(
 def offset(path: Path) -> tuple[float, float, float]:
     """By how much `export` moved the scene to keep float32 exact (world = file + offset); zeros where it did not.
 
-    Raises PlyUnreadableError for a comment that says so and holds no three numbers.
+    Raises ModelUnreadable for a comment that says so and holds no three numbers.
     """
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES).partition(b"end_header")[0]
@@ -100,9 +97,7 @@ def offset(path: Path) -> tuple[float, float, float]:
             try:
                 x, y, z = (float(word) for word in words[2:])
             except ValueError as error:
-                raise PlyUnreadableError(
-                    f"{path.name} has a broken offset in its header: {line!r}."
-                ) from error
+                raise ModelUnreadable(f"{path.name} has a broken offset in its header: {line!r}.") from error
             return x, y, z
     return 0.0, 0.0, 0.0
 
@@ -111,35 +106,33 @@ def read(path: Path) -> Gaussians:
     """Read any tool's 3D Gaussian `.ply` (binary of either byte order, or text) as float32 tensors.
 
     Properties are found by name; unknown ones are ignored, as are normals. Rows that hold a non-finite value
-    are dropped. Raises PlyUnreadableError for anything that is no such file.
+    are dropped. Raises ModelUnreadable for anything that is no such file.
     """
     try:
         document = PlyData.read(str(path))
     except FileNotFoundError:
         raise
     except (PlyParseError, ValueError, UnicodeDecodeError, OSError) as error:
-        raise PlyUnreadableError(f"{path.name} could not be read as a .ply file: {error}") from error
+        raise ModelUnreadable(f"{path.name} could not be read as a .ply file: {error}") from error
     elements = {element.name: element for element in document.elements}
     if "chunk" in elements:
-        raise PlyUnreadableError(
+        raise ModelUnreadable(
             f"{path.name} is a packed (quantised) splat .ply; convert it to the standard float layout first."
         )
     if "vertex" not in elements:
-        raise PlyUnreadableError(
-            f"{path.name} has no vertex element (found: {', '.join(elements) or 'none'})."
-        )
+        raise ModelUnreadable(f"{path.name} has no vertex element (found: {', '.join(elements) or 'none'}).")
     vertex = elements["vertex"]
     present = [p.name for p in vertex.properties]
     rest = sum(name.startswith("f_rest_") for name in present)
     if rest not in _DEGREE_OF_REST:
-        raise PlyUnreadableError(
+        raise ModelUnreadable(
             f"{path.name} has {rest} f_rest properties; 0, 9, 24 or 45 are needed (SH degree 0 to 3)."
         )
     degree = _DEGREE_OF_REST[rest]
     wanted = [name for name in property_names(degree) if name not in ("nx", "ny", "nz")]
     missing = [name for name in wanted if name not in present]
     if missing:
-        raise PlyUnreadableError(
+        raise ModelUnreadable(
             f"{path.name} is no 3D Gaussian .ply: it lacks the properties {', '.join(missing)}."
         )
 

@@ -108,7 +108,7 @@ class Step:
     ones use room from the visit before. Adam moves the Gaussians that a view shows; the others are brought up
     to date when they are seen again, or read.
 
-    together: the processes whose views a step is averaged over; see `splat.parallel`. Raises GpuUnavailable
+    together: the processes whose views a step is averaged over; see `splat.engine.parallel`. Raises GpuUnavailable
     where these kernels cannot run, and GpuMemoryShort when memory runs out, with the scene as it was before
     the call.
     """

@@ -1,0 +1,352 @@
+"""Proves `bench train` on a tiny capture: a real row, going on from it, a peer judged alike, what tables say of rows.
+
+Does not prove that any figure is good, nor SfM and the shared scenes, which need minutes.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from splatmill.schema import TrainOptions
+from splatmill_worker import pipeline
+from splatmill_worker.__main__ import main
+from splatmill_worker.splat.plan.plan import Plan
+from tests.support import still_life
+from tests.support.paths import BENCH
+
+Row = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture, and the rows that one call of the benchmark left for it."""
+    folder = tmp_path_factory.mktemp("bench")
+    still_life.posed_capture(folder / "tiny")
+    assert run(folder, "--budgets", "30steps", "--configs", "sh-0", "--seeds", "3") == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(place: Path) -> pipeline.Outcome:
+    """The same capture through the pipeline itself, in 40 steps."""
+    options = TrainOptions(steps=40, image_size=480, backend="cpu")
+    return pipeline.run(place / "tiny", place / "trained", options, lambda _: None, lambda: False)
+
+
+def run(folder: Path, *arguments: str) -> int:
+    files = ["--results", str(folder / "rows.jsonl"), "--work", str(folder / "work")]
+    return main(["bench", "train", "--scenes", str(folder / "tiny"), *files, *arguments])
+
+
+def rows_of(folder: Path) -> list[Row]:
+    return [json.loads(line) for line in (folder / "rows.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture
+def parts(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The benchmark's own modules, which find one another by name."""
+    monkeypatch.syspath_prepend(str(BENCH))
+    names = (
+        "_rows",
+        *(
+            f"_train.{name}"
+            for name in (
+                "ablation",
+                "budgets",
+                "configurations",
+                "rows",
+                "scenes",
+                "spread",
+                "tables",
+                "unequal",
+            )
+        ),
+    )
+    return {name: importlib.import_module(name) for name in names}
+
+
+def test_a_row_says_what_was_run_and_what_came_out(place: Path) -> None:
+    row = next(row for row in rows_of(place) if row["kind"] == "run")
+    assert (row["scene"], row["config"], row["budget"], row["seed"]) == ("tiny", "sh-0", "30steps", 3)
+    assert row["outcome"] == "trained"
+    assert row["steps"] == 30
+    assert row["options"] == {"image_size": 480, "holdout": 8, "sh_degree": 0}
+    assert row["plan"]["schedule"]["degree"] == 0
+    assert row["plan"]["seed"] == 3
+    assert row["plan"]["left_out"]["alpha"]
+    assert row["views"] == {"train": 12, "test": 2}
+    assert row["curve"][-1]["step"] == 30
+    assert row["curve"][-1]["psnr"] == pytest.approx(row["psnr"], abs=1e-3)
+    assert 0 < row["curve"][0]["seconds"] < row["curve"][-1]["seconds"] <= row["seconds"]["train"]
+    assert row["seconds"]["train"] < row["wall_seconds"]
+    assert row["peak_memory"] > 10**8
+    assert row["cpu_seconds"] > 0
+    assert {"commit", "code", "machine", "versions", "backend"} <= row.keys()
+
+
+def test_what_is_there_is_not_run_again_and_is_drawn_again(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (place / "rows.jsonl").read_bytes()
+    for drawn in ("rows.md", "rows.png"):
+        (place / drawn).unlink()
+    assert run(place, "--budgets", "30steps", "--configs", "sh-0", "--seeds", "3") == 0
+    assert "1 rows are asked for; 0 are not there yet." in capsys.readouterr().out
+    assert (place / "rows.jsonl").read_bytes() == before
+    assert "![error against run time](rows.png)" in (place / "rows.md").read_text()
+    with Image.open(place / "rows.png") as figure:
+        assert figure.size[0] > 1000
+    (place / "rows.md").unlink()
+    assert run(place, "--plot-only") == 0
+    assert (place / "rows.md").is_file()
+
+
+def test_a_peers_model_is_judged_as_the_run_that_made_it(place: Path, trained: pipeline.Outcome) -> None:
+    assert trained.trained is not None
+    score = trained.trained.held_out
+    assert score is not None
+    assert run(place, "--peer", f"itself={trained.out / 'model.ply'}@12.5") == 0
+    row = next(row for row in rows_of(place) if row["kind"] == "peer")
+    assert (row["name"], row["scene"], row["seconds"]) == ("itself", "tiny", 12.5)
+    # The .ply holds float32 in another frame; that is all that lies between the two.
+    assert row["psnr"] == pytest.approx(score.psnr, abs=0.02)
+    assert row["ssim"] == pytest.approx(score.ssim, abs=1e-3)
+    assert "itself" in (place / "rows.md").read_text()
+
+
+def test_a_file_that_is_no_model_is_refused_by_name(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "no.ply").write_text("nothing")
+    before = (place / "rows.jsonl").read_bytes()
+    assert run(place, "--peer", f"broken={place / 'no.ply'}@3") == 1
+    assert "broken: no.ply could not be read as a .ply file" in capsys.readouterr().err
+    assert (place / "rows.jsonl").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--scenes", "nowhere"], "'nowhere' is neither a scene (fox, lego"),
+        (["--configs", "faster"], "There is no configuration 'faster'; there are default, "),
+        (["--budgets", "soon"], "'soon' is no budget; write steps (600steps) or a time"),
+        (["--budgets", "0steps"], "A budget of 0 steps trains nothing"),
+        (["--budgets", "0.2s"], "the least is 1s"),
+        (["--seeds", "one"], "'one' is no seed; give whole numbers from 0"),
+        (["--peer", "a=b.ply@3"], "--peer is judged on one scene"),
+        (
+            ["--scenes", "synthetic", "--peer", "a=b.ply"],
+            "'a=b.ply' is no peer; write NAME=model.ply@SECONDS",
+        ),
+        (["--scenes", "synthetic", "--peer", "a=b.ply@3"], "a's model b.ply is not there."),
+    ],
+)
+def test_input_that_names_nothing_is_refused_with_a_sentence(
+    arguments: list[str], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as refused:
+        main(["bench", "train", "--results", str(tmp_path / "rows.jsonl"), *arguments])
+    assert refused.value.code == 2
+    assert sentence in capsys.readouterr().err
+    assert not (tmp_path / "rows.jsonl").exists()
+
+
+def test_nothing_to_draw_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "train", "--plot-only", "--results", str(tmp_path / "none.jsonl")]) == 1
+    assert "There are no rows" in capsys.readouterr().err
+
+
+def test_a_line_that_was_cut_short_is_dropped(parts: Any, tmp_path: Path) -> None:
+    rows, path = parts["_rows"], tmp_path / "rows.jsonl"
+    rows.append(path, {"n": 1})
+    with path.open("a") as stream:
+        stream.write('{"n": 2, "cur')
+    assert rows.lines(path) == [{"n": 1}]
+    rows.append(path, {"n": 3})
+    assert rows.lines(path) == [{"n": 1}, {"n": 3}]
+
+
+def test_every_switch_is_an_option_or_changes_the_plan(parts: Any, trained: pipeline.Outcome) -> None:
+    configurations = parts["_train.configurations"]
+    stored = json.loads((trained.out.parent / "plan.json").read_text())
+    plan = Plan.from_dict(stored["plan"])
+    for name, switch in configurations.CONFIGURATIONS.items():
+        assert TrainOptions.model_validate(switch.options).model_fields_set == set(switch.options)
+        revised = configurations.revised(plan, switch.plan)
+        assert revised.forced == (*plan.forced, *switch.plan)
+        assert bool(switch.options or switch.plan) == (name != configurations.DEFAULT)
+    revised = configurations.revised(
+        plan, {"schedule.resolution": [[0, 2]], "schedule.annealing.rest_fall": 0.7}
+    )
+    assert revised.schedule.resolution == ((0, 2),)
+    assert revised.schedule.annealing.rest_fall == 0.7
+    assert revised.schedule.annealing.hold == plan.schedule.annealing.hold
+    with pytest.raises(ValueError, match=r"schedule\.speed leads to no field: Schedule has budget, "):
+        configurations.revised(plan, {"schedule.speed": 2})
+
+
+def test_a_level_is_reached_between_two_points_of_the_curve(parts: Any) -> None:
+    seconds_to = parts["_train.spread"].seconds_to
+    curve = [
+        {"seconds": s, "psnr": p}
+        for s, p in ((1.0, 20.0), (2.0, None), (3.0, 24.0), (4.0, 23.0), (9.0, 30.0))
+    ]
+    assert seconds_to({"curve": curve}, 22.0) == pytest.approx(2.0)
+    assert seconds_to({"curve": curve}, 24.0) == pytest.approx(3.0)
+    assert seconds_to({"curve": curve}, 26.5) == pytest.approx(6.5)
+    assert seconds_to({"curve": curve}, 12.0) == 1.0
+    assert seconds_to({"curve": curve}, 30.1) is None
+
+
+def like(row: Row, **changes: Any) -> Row:
+    """The measured row as if it had ended otherwise; `train` are its training seconds."""
+    train = changes.pop("train", row["seconds"]["train"])
+    return {**row, "others_cpu_seconds": 0.0, **changes, "seconds": {**row["seconds"], "train": train}}
+
+
+def test_budgets_are_judged_by_all_their_runs(parts: Any, place: Path) -> None:
+    budgets, latest = parts["_train.tables"].budgets, parts["_train.rows"].latest_default
+    row = next(row for row in rows_of(place) if row["kind"] == "run") | {"config": "default"}
+    good = [
+        like(row, budget=f"{seconds}s", seed=seed, psnr=psnr + seed, train=seconds * 1.01)
+        for seconds, psnr in ((10, 20.0), (60, 25.0))
+        for seed in (0, 1, 2)
+    ]
+    text = budgets(latest(good))
+    assert "| tiny | 10s | 3 | 10.1 (10.1 to 10.1) | 21.00 (20.00 to 22.00) |" in text
+    assert text.count(": yes.") == 2
+    assert "beyond 10 % of the run's own: none." in text
+    late = like(row, budget="60s", seed=3, psnr=1.0, train=64.0, others_cpu_seconds=1e3)
+    worse = [late | {"seed": seed} for seed in (4, 5, 6)]
+    text = budgets(latest([*good, late, *worse]))
+    assert "NO: tiny at 60s is 6.7 % off" in text
+    assert "NO: tiny: 60s gives 1.00 dB, 10s gave 21.00 dB" in text
+    assert "NO: tiny at 60s, seed 3" in text
+    # Rows of older code are not mixed in, and failed runs give no figure.
+    again = like(row, budget="10s", code="newer", psnr=30.0, train=10.0)
+    broken = like(row, budget="60s", code="newer", outcome="failed: divergence", psnr=None)
+    text = budgets(latest([*good, again, broken]))
+    assert "| tiny | 10s | 1 | 10.0 | 30.00 |" in text
+    assert "60s" not in text
+    # Nor are they hidden by newer rows of another budget.
+    text = budgets(latest([*good, again]))
+    assert "| tiny | 10s | 1 | 10.0 | 30.00 |" in text
+    assert "| tiny | 60s | 3 | 60.6 (60.6 to 60.6) | 26.00 (25.00 to 27.00) |" in text
+    assert "failed: divergence" in parts["_train.tables"].failures([*good, again, broken])
+
+
+def test_switches_are_compared_seed_by_seed_on_the_same_code(parts: Any, place: Path) -> None:
+    ablation = parts["_train.ablation"].ablation
+    row = next(row for row in rows_of(place) if row["kind"] == "run")
+    default, changed = row | {"config": "default"}, {**row["plan"], "exposure": True}
+    rows = [like(default, seed=seed, psnr=20.0 + 3 * seed, train=10.0) for seed in (0, 1, 2)]
+    for seed, gain in enumerate((0.1, 0.3, 0.2)):
+        rows.append(
+            like(row, config="exposure", plan=changed, seed=seed, psnr=20.0 + 3 * seed + gain, train=11.0)
+        )
+        rows.append(
+            like(row, config="antialias", plan=changed, seed=seed, psnr=20.0 + 3 * seed - gain, train=9.0)
+        )
+    rows.append(like(row, config="older", plan=changed, code="older", psnr=40.0))
+    text = ablation(rows)
+    assert "| 3 | +0.20 (+0.10 to +0.30) | +0.0000 (+0.0000 to +0.0000) | +10 (+10 to +10) | better |" in text
+    assert "| 3 | -0.20 (-0.30 to -0.10) | +0.0000 (+0.0000 to +0.0000) | -10 (-10 to -10) | worse |" in text
+    assert "| `exposure` | 1 | tiny, 30steps | nowhere | +0.20 |" in text
+    assert "1 rows of a switch have no default of the same code" in text
+    assert "`older`" not in text
+    busy = [each | {"others_cpu_seconds": 1e3} for each in rows if each["seed"] == 2]
+    text = ablation([*rows, *busy])
+    assert "| 3 | +0.20 (+0.10 to +0.30) | +0.0000 (+0.0000 to +0.0000) | +10 (+10 to +10) | better |" in text
+    assert "| +0.0000 (+0.0000 to +0.0000) | busy machine | better |" in ablation(
+        [each | {"others_cpu_seconds": 1e3} for each in rows]
+    )
+    unclear = like(row, config="exposure", plan=changed, seed=2, psnr=25.9, train=11.0)
+    assert "| no clear difference |" in ablation([*rows, unclear])
+    alone = ablation([rows[0], like(row, config="exposure", plan=changed, seed=0, psnr=21.0)])
+    assert "one seed says nothing" in alone
+    same = ablation([like(default, seed=0), like(row, config="antialias", seed=0)])
+    assert "the default's plan is the same" in same
+    elsewhere = [like(default, scene="flat", seed=seed) for seed in (0, 1)]
+    elsewhere += [like(row, scene="flat", config="sh-3", plan=changed, seed=0)]
+    assert "Not measured, since the default's plan is that already: `exposure` on flat" not in ablation(
+        [*rows, *elsewhere]
+    )
+    has_it = [like(default, scene="flat", seed=seed, plan=changed) for seed in (0, 1)]
+    has_it += [like(row, scene="flat", config="sh-3", seed=0)]
+    assert "the default's plan is that already: `exposure` on flat at 30steps." in ablation([*rows, *has_it])
+
+
+def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: Path) -> None:
+    """tiny has no tracks, so that its plan leaves out antialiasing, and no densification at 30 steps."""
+    rows = parts["_train.rows"]
+    default = next(row for row in rows_of(place) if row["kind"] == "run") | {"config": "default"}
+    scene = parts["_train.scenes"].Scene(default["scene"], place / "tiny")
+    budget = parts["_train.budgets"].parse(default["budget"])
+
+    def idle(config: str, plan: Row) -> bool:
+        measured = default | {"plan": plan, "code": rows.code_version()}
+        return bool(rows.idle(rows.Run(scene, config, budget, default["seed"]), [measured]))
+
+    assert "densify" not in default["plan"]
+    assert idle("no-densification", default["plan"])
+    assert not idle("exposure", default["plan"])
+    assert idle("exposure", default["plan"] | {"exposure": True})
+    assert idle("no-coarse-to-fine", default["plan"])
+    assert idle("no-antialias", default["plan"])
+    assert not idle("antialias", default["plan"])
+    assert idle("sh-0", default["plan"])
+    assert not idle("sh-3", default["plan"])
+    assert not idle("default", default["plan"])
+    wanted = rows.runs_of(
+        [scene], ["exposure", "default", "no-random-background", "black-background"], [budget], [1, 0]
+    )
+    assert [(run.seed, run.config) for run in wanted] == [
+        (1, "default"),
+        (1, "exposure"),
+        (1, "black-background"),
+        (0, "default"),
+        (0, "exposure"),
+        (0, "black-background"),
+    ]
+    bare = replace(scene, points=False)
+    assert [run.config for run in rows.runs_of([bare], ["far-shell", "gaps", "sh-3"], [budget], [0])] == [
+        "sh-3"
+    ]
+    clear = replace(scene, transparent=True)
+    assert [
+        run.config
+        for run in rows.runs_of([clear], ["no-random-background", "black-background"], [budget], [0])
+    ] == ["no-random-background"]
+
+
+def test_a_reworded_comment_leaves_measured_rows_as_they_are(parts: Any) -> None:
+    computing = parts["_train.rows"].computing
+    said = computing(
+        '"""A."""\n\n\ndef f(x):\n    """B."""\n    return x + 1  # C\n\n\nY = "text"\n"""D."""\n'
+    )
+    assert said == computing('def f(x):\n    return x + 1\n\n\nY = "text"\n')
+    assert said != computing('def f(x):\n    return x + 2\n\n\nY = "text"\n')
+    assert said != computing('def f(x):\n    return x + 1\n\n\nY = "other"\n')
+
+
+def test_exposures_differ_but_for_the_photos_that_are_held_out(parts: Any, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0110] = "Ray caster"
+    for number in range(10):
+        Image.fromarray(np.full((8, 8, 3), 100, np.uint8)).save(tmp_path / f"{number}.jpg", exif=exif)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    parts["_train.unequal"].expose(tmp_path)
+    same = {name for name, data in before.items() if (tmp_path / name).read_bytes() == data}
+    assert same == {"0.jpg", "8.jpg"}
+    levels = []
+    for name in sorted(before.keys() - same):
+        with Image.open(tmp_path / name) as photo:
+            levels.append(float(np.asarray(photo).mean()))
+            assert photo.getexif()[0x0110] == "Ray caster"
+    assert 0.15 < float(np.log(levels).std()) < 0.6

@@ -1,0 +1,219 @@
+"""Points found by sweeping patches over known cameras lie on the scene's surfaces, in places that had none.
+
+Proven on generated photos, whose cameras and depths are known exactly. It does not prove that training gains from
+such points on real photos, which the benchmarks measure.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from splatmill.schema import TrainOptions
+from splatmill_worker import synthetic
+from splatmill_worker.capture import cameras_of
+from splatmill_worker.images import load_views
+from splatmill_worker.scene import Lens, Scene, View
+from splatmill_worker.sfm import Cancelled, posed, stereo
+from splatmill_worker.sfm.plane_sweep import Shot, placed, sweep
+from tests.support import still_life
+
+WIDTH, HEIGHT = 320, 240
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """Photos with their true cameras and no points."""
+    folder = tmp_path_factory.mktemp("stereo")
+    truth = synthetic.capture(folder, 18, WIDTH, HEIGHT, samples=1)
+    views = tuple(View(name, camera, folder / name) for name, camera in sorted(truth.items()))
+    return Scene(views, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "transforms")
+
+
+@pytest.fixture(scope="module")
+def added(bare: Scene) -> stereo.Added:
+    return stereo.find(bare)
+
+
+def depth_errors(scene: Scene, points: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Relative depth error of each point in the first view that saw it; the nearest true depth of 3 x 3 pixels."""
+    still, errors = synthetic.still_life(), []
+    for index, view in enumerate(scene.views):
+        own = seen[:, index] & ~seen[:, :index].any(axis=1)
+        _, x, y, z = placed(view.camera, points[own])
+        _, depth = synthetic.photograph(still, view.camera, samples=1)
+        rows = np.clip(y.astype(int)[:, None] + np.repeat([-1, 0, 1], 3), 0, HEIGHT - 1)
+        columns = np.clip(x.astype(int)[:, None] + np.tile([-1, 0, 1], 3), 0, WIDTH - 1)
+        errors.append(np.abs(depth[rows, columns] / z[:, None] - 1.0).min(axis=1))
+    return np.concatenate(errors)
+
+
+def test_points_are_found_on_the_surfaces_without_any_to_begin_with(bare: Scene, added: stereo.Added) -> None:
+    assert not added.given_up
+    assert len(added.points) > 500
+    errors = depth_errors(bare, added.points, added.seen)
+    # A pixel between views 9 degrees apart is 1/300/tan(9) = 2 per cent of the depth; half of that is usual.
+    assert np.median(errors) < 0.01
+    assert np.mean(errors < 0.03) > 0.9
+    assert (added.seen.sum(axis=1) >= 3).all()  # the photo itself and two that agree
+    assert added.errors.min() >= 0.0
+    assert added.errors.max() <= 1.0
+
+
+def test_colours_are_those_of_the_photos(bare: Scene, added: stereo.Added) -> None:
+    camera = bare.views[0].camera
+    own = np.flatnonzero(added.seen[:, 0])
+    inside, x, y, _ = placed(camera, added.points[own])
+    photo = np.asarray(Image.open(bare.views[0].image)).astype(float)
+    there = photo[y[inside].astype(int), x[inside].astype(int)]
+    assert np.median(np.abs(there - added.colors[own][inside])) < 12
+
+
+def test_known_points_stay_and_empty_places_are_filled(bare: Scene, added: stereo.Added) -> None:
+    few = replace(
+        added,
+        points=added.points[::3],
+        colors=added.colors[::3],
+        errors=added.errors[::3],
+        seen=added.seen[::3],
+    )
+    first = stereo.add(bare, few)
+    more = stereo.find(first)
+    assert 200 < len(more.points) < len(added.points)
+    both = stereo.add(first, more)
+    np.testing.assert_array_equal(both.points[: len(few.points)], few.points)
+    assert both.point_views is not None
+    assert both.point_views.offsets[-1] == len(both.point_views.views)
+    np.testing.assert_array_equal(np.diff(both.point_views.offsets), both.track_lengths)
+    assert both.facts["sparse_points"] == len(few.points)
+    assert both.facts["stereo_points"] == len(more.points)
+    assert str(len(more.points)) in both.notes[-1]
+
+
+def test_masked_places_get_no_points(bare: Scene, tmp_path: Path) -> None:
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, : WIDTH // 2] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    views = [replace(view, mask=tmp_path / "mask.png") for view in bare.views[:3]]
+    shots = [Shot.of(photo) for photo in load_views(views, WIDTH)]
+    found = sweep(1, shots[1], [(0, shots[0]), (2, shots[2])], bare.points, 3, 1.5, 12.0)
+    assert found.tried > 50
+    assert len(found.points) > 20
+    _, x, _, _ = placed(shots[1].camera, found.points)
+    assert x.min() >= WIDTH // 2
+
+
+def of_noise(scene: Scene, count: int, folder: Path) -> Scene:
+    """The first `count` cameras of the scene, each with a photo of blobs that no other photo shows."""
+    random, views = np.random.default_rng(0), []
+    for view in scene.views[:count]:
+        noise = random.integers(0, 255, (HEIGHT // 4, WIDTH // 4, 3), np.uint8)
+        Image.fromarray(noise).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC).save(folder / view.name)
+        views.append(replace(view, image=folder / view.name))
+    return replace(scene, views=tuple(views))
+
+
+def test_photos_without_a_common_scene_are_given_up(bare: Scene, tmp_path: Path) -> None:
+    found = stereo.find(of_noise(bare, len(bare.views), tmp_path))
+    assert found.given_up
+    assert len(found.points) == 0
+    assert stereo.add(bare, found).facts["stereo_points"] == 0
+
+
+def test_posed_captures_without_points_get_them_once(bare: Scene, tmp_path: Path) -> None:
+    first = posed.completed(bare, tmp_path)
+    assert len(first.points) > 500
+    stored = list((tmp_path / "sfm").iterdir())
+    assert len(stored) == 1
+    again = posed.completed(bare, tmp_path)
+    np.testing.assert_array_equal(again.points, first.points)
+    lens = Lens("OPENCV", (250.0, 250.0, 160.0, 120.0, 0.0, 0.0, 0.0, 0.0), WIDTH, HEIGHT)
+    other = replace(bare, views=tuple(replace(view, lens=lens) for view in bare.views))
+    posed.completed(other, tmp_path)
+    assert len(list((tmp_path / "sfm").iterdir())) == 2
+
+
+def test_other_points_and_masks_are_searched_anew(bare: Scene, tmp_path: Path) -> None:
+    few = replace(bare, views=bare.views[:3], points=np.full((5, 3), 0.1), colors=np.zeros((5, 3), np.uint8))
+    Image.fromarray(np.full((HEIGHT, WIDTH), 255, np.uint8)).save(tmp_path / "white.png")
+    masked = tuple(replace(view, mask=tmp_path / "white.png") for view in few.views)
+    stages: list[str] = []
+    scenes = [few, replace(few, points=np.full((5, 3), 0.2)), replace(few, views=masked), few]
+    for done, scene in enumerate(scenes):
+        posed.completed(scene, tmp_path / "work", lambda stage, *_: stages.append(stage))
+        assert len(list((tmp_path / "work" / "sfm").iterdir())) == min(done + 1, 3)
+    assert stages == ["stereo"] * 9  # three photos, three times; the fourth time all is there
+
+
+def test_a_photo_that_does_not_decode_is_no_fault_of_the_poses(tmp_path: Path) -> None:
+    capture = still_life.posed_capture(tmp_path / "capture")
+    photo = capture / "images" / "03.png"
+    photo.write_bytes(photo.read_bytes()[:2000])  # its size can still be read
+    stages: list[str] = []
+    with pytest.raises(OSError, match=r"truncated|broken"):
+        cameras_of(
+            capture, tmp_path / "work", TrainOptions(), lambda stage, *_: stages.append(stage), lambda: False
+        )
+    assert stages == []
+
+
+def test_scenes_with_enough_points_or_transparent_surroundings_are_left_as_they_are(
+    bare: Scene, tmp_path: Path
+) -> None:
+    middle = np.random.default_rng(0).normal(0.0, 0.2, (2000, 3))
+    full = replace(bare, points=middle, colors=np.zeros((2000, 3), np.uint8))
+    assert stereo.sightings_per_view(full) > 1900
+    assert posed.completed(full, tmp_path) is full
+    blender = replace(bare, source="blender")
+    assert posed.completed(blender, tmp_path) is blender
+
+
+def test_cancelling_ends_the_search(bare: Scene) -> None:
+    with pytest.raises(Cancelled):
+        stereo.find(bare, cancelled=lambda: True)
+
+
+def test_cancelling_reaches_the_loading_of_photos(bare: Scene, tmp_path: Path) -> None:
+    asked = iter([False, False, True])
+    gone = [replace(view, image=tmp_path / "gone.png") for view in bare.views[6:]]
+    with pytest.raises(Cancelled):  # and not OSError: the photos that are gone are not waited for
+        stereo.find(replace(bare, views=(*bare.views[:6], *gone)), cancelled=lambda: next(asked))
+
+
+def test_three_photos_are_judged_as_well(bare: Scene, tmp_path: Path) -> None:
+    found = stereo.find(of_noise(bare, 3, tmp_path))
+    assert found.given_up
+    assert len(found.points) == 0
+
+
+def test_photos_held_out_by_the_data_set_take_no_part(bare: Scene, tmp_path: Path) -> None:
+    tests = (0, 9)
+    views = tuple(
+        replace(view, split="test", image=tmp_path / "gone.png")
+        if i in tests
+        else replace(view, split="train")
+        for i, view in enumerate(bare.views)
+    )
+    found = stereo.find(replace(bare, views=views))
+    assert len(found.points) > 300
+    assert found.seen.shape == (len(found.points), len(views))
+    assert not found.seen[:, tests].any()
+    assert found.seen[:, 1].any()
+    assert np.median(depth_errors(bare, found.points, found.seen)) < 0.01
+
+
+def test_points_without_tracks_are_not_said_to_be_seen_by_no_photo(bare: Scene, added: stereo.Added) -> None:
+    own = np.random.default_rng(0).normal(0.0, 0.2, (30, 3))
+    both = stereo.add(replace(bare, points=own, colors=np.zeros((30, 3), np.uint8)), added)
+    assert len(both.points) == 30 + len(added.points)
+    assert both.point_views is None
+    assert both.track_lengths is None
+    assert both.point_errors is not None
+    assert np.isnan(both.point_errors[:30]).all()
+    np.testing.assert_array_equal(both.point_errors[30:], added.errors)
+
+
+def test_without_any_points_the_sentence_says_so(bare: Scene, added: stereo.Added) -> None:
+    assert "no points" in stereo.add(bare, added).notes[-1]

@@ -1,0 +1,130 @@
+"""Proves what is measured about a scene before it is planned: exposures, white balance, gaps, sky, lens, pixels.
+
+On rendered photos whose answers are known. Does not prove that thresholds on these facts are the best ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from splatmill_worker.scene import Lens, PointViews, Scene
+from splatmill_worker.splat.plan.facts import Facts, measure
+from splatmill_worker.splat.views import TrainingView
+from tests.support import still_life
+from tests.support.training import sparse_scene
+
+
+def facts(world: Scene, views: list[TrainingView]) -> Facts:
+    return measure(world, views, 0, None)
+
+
+def darkened(views: list[TrainingView], gains: tuple[float, float, float]) -> None:
+    """Every second photo as if it had been taken with these gains of red, green and blue."""
+    for view in views[1::2]:
+        view.full.rgb.copy_((view.full.rgb.float() * torch.tensor(gains)).to(torch.uint8))
+
+
+def test_photos_that_agree_are_said_to_agree() -> None:
+    world, views = sparse_scene()
+    seen = facts(world, views)
+    assert seen.exposure_spread is not None
+    assert seen.tint_spread is not None
+    assert seen.exposure_spread < 0.05
+    assert seen.tint_spread < 0.05
+
+
+def test_exposures_are_measured_in_logs() -> None:
+    world, views = sparse_scene()
+    darkened(views, (0.6, 0.6, 0.6))
+    seen = facts(world, views)
+    assert seen.exposure_spread is not None
+    assert seen.tint_spread is not None
+    # Half of the photos are log(0.6) apart from the other half; the robust deviation of that is 1.4826 halves of it.
+    assert 0.25 < seen.exposure_spread < 0.8
+    assert seen.tint_spread < 0.06
+
+
+def test_white_balance_is_apart_from_exposure() -> None:
+    world, views = sparse_scene()
+    darkened(views, (1.0, 0.8, 0.65))
+    seen = facts(world, views)
+    assert seen.tint_spread is not None
+    assert seen.tint_spread > 0.12
+
+
+def test_errors_and_lenses_are_in_pixels_of_the_training_size() -> None:
+    world, views = sparse_scene()
+    size = 4 * still_life.WIDTH
+    lens = Lens("SIMPLE_RADIAL", (300.0, size / 2, 3 * size / 8, 0.1), size, 3 * size // 4)
+    bent = replace(
+        world,
+        point_errors=np.full(len(world.points), 2.0),
+        views=tuple(replace(view, lens=lens) for view in world.views),
+    )
+    seen = facts(bent, views)
+    assert seen.reprojection == pytest.approx(0.5)
+    # k r^3 at the corner, r = 240 / 300 focal lengths from the centre; a quarter of it at the training size.
+    corner = np.hypot(size / 2, 3 * size / 8) / 300.0
+    assert seen.lens_residual == pytest.approx(0.1 * corner**3 * 300.0 / 4, rel=1e-6)
+    assert seen.distorted == len(views)
+    assert facts(world, views).lens_residual is None
+
+
+def test_points_of_stereo_say_nothing_about_errors_and_angles() -> None:
+    world, views = sparse_scene()
+    own = len(world.points)
+    assert world.point_views is not None
+    first_view = np.zeros(own, np.int32)
+    more = replace(
+        world,
+        points=np.concatenate([world.points, world.points]),
+        colors=np.concatenate([world.colors, world.colors]),
+        point_errors=np.concatenate([np.full(own, 2.0), np.full(own, 0.01)]),
+        point_views=PointViews(
+            np.concatenate([world.point_views.offsets, world.point_views.offsets[-1] + 1 + np.arange(own)]),
+            np.concatenate([world.point_views.views, first_view]),
+        ),
+    )
+    told = facts(replace(more, facts={"sparse_points": own}), views)
+    assert told.reprojection == pytest.approx(2.0)
+    assert told.view_angle == pytest.approx(facts(world, views).view_angle, rel=0.1)
+    only = facts(replace(more, facts={"sparse_points": 0}), views)
+    assert (only.reprojection, only.view_angle) == (None, None)
+    assert only.exposure_spread is not None
+
+
+def test_errors_that_are_not_known_do_not_count() -> None:
+    world, views = sparse_scene()
+    errors = np.full(len(world.points), np.nan)
+    assert facts(replace(world, point_errors=errors), views).reprojection is None
+    errors[3:6] = 1.5
+    assert facts(replace(world, point_errors=errors), views).reprojection == pytest.approx(1.5)
+
+
+def test_what_points_leave_open_is_measured() -> None:
+    world, views = sparse_scene()
+    seen = facts(world, views)
+    assert seen.sightings is not None
+    assert seen.gap_share is not None
+    assert seen.sky_share is not None
+    assert seen.sightings > 50
+    assert seen.extent is not None
+    assert 0.2 < seen.extent < 3.0
+    assert 0.05 < seen.gap_share < 0.95
+    assert seen.gap_points > 100
+    assert seen.shell_points > 100
+    assert seen.shell_distance is not None
+    assert seen.shell_distance > 4.0
+    assert 0.0 <= seen.sky_share < 0.4
+
+
+def test_nothing_is_said_where_nothing_can_be_known() -> None:
+    world, views = sparse_scene()
+    bare = replace(world, points=world.points[:3], colors=world.colors[:3], point_views=None)
+    seen = facts(bare, views)
+    assert (seen.exposure_spread, seen.tint_spread, seen.gap_share, seen.sky_share) == (None,) * 4
+    assert facts(world, still_life.training_views(alpha=True)).gap_share is None

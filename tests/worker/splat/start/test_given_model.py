@@ -1,0 +1,185 @@
+"""Proves that a model given is started from, judged on the photos first, and refused by name where it cannot serve;
+and that a training is filmed from one view, over attempts.
+
+Does not prove how much a start saves on real photos.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+
+from splatmill.schema import Event, TrainOptions
+from splatmill_worker import pipeline
+from splatmill_worker.errors import Refusal
+from splatmill_worker.splat import ply
+from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.start.points import from_points
+from tests.support import still_life
+
+
+def run(
+    capture: Path, work: Path, cancelled: Callable[[], bool] = lambda: False, **values: object
+) -> tuple[pipeline.Outcome, list[Event]]:
+    events: list[Event] = []
+    asked = TrainOptions.model_validate({"steps": 60, "seed": 1, "max_gaussians": 3000, **values})
+    return pipeline.run(capture, work, asked, events.append, cancelled), events
+
+
+def report_of(outcome: pipeline.Outcome) -> dict[str, object]:
+    read: dict[str, object] = json.loads((outcome.out / "report.json").read_text())
+    return read
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture whose poses hold a model of its own, m.ply, made in 150 steps from its points."""
+    folder = tmp_path_factory.mktemp("start")
+    capture = still_life.posed_capture(folder / "capture")
+    scene = still_life.scene()
+    first = from_points(torch.from_numpy(scene.points), torch.from_numpy(scene.colors))
+    ply.write(capture / "poses" / "m.ply", replace(first, logit_opacities=torch.full((first.count,), 2.0)))
+    outcome, _ = run(capture, folder / "work", steps=150, start="m.ply")
+    (outcome.out / "model.ply").rename(capture / "poses" / "m.ply")
+    return capture
+
+
+def changed(trained: Path, tmp_path: Path, change: Callable[[Gaussians], Gaussians]) -> Path:
+    """The capture with another model in place of its own."""
+    capture = still_life.posed_capture(tmp_path / "capture")
+    ply.write(capture / "poses" / "m.ply", change(ply.read(trained / "poses" / "m.ply")))
+    return capture
+
+
+def test_training_goes_on_where_the_model_stood(trained: Path, tmp_path: Path) -> None:
+    before = ply.read(trained / "poses" / "m.ply")
+    outcome, events = run(trained, tmp_path, start="m.ply", steps=250)
+    report = report_of(outcome)
+    assert report["plan"]["initial"] == "model"
+    assert f"The {before.count} Gaussians of the model given" in report["plan"]["reasons"]["initial"]
+    assert report["plan"]["schedule"]["resolution"] == [[0, 1]]
+    shown = report["facts"]["start"]["psnr"]
+    assert shown > report["facts"]["start"]["one_color"] + 1.0
+    assert shown > report["facts"]["start"]["another"] + 3.0
+    assert report["result"]["train_psnr"] > shown
+    assert report["curve"][0]["gaussians"] <= before.count
+    warned = any(event.type == "log" and "model given shows" in event.message for event in events)
+    assert warned == (shown <= report["facts"]["start"]["one_color"] + 3.0)
+
+
+def test_a_model_of_few_coefficients_is_given_more(trained: Path, tmp_path: Path) -> None:
+    capture = changed(trained, tmp_path, lambda model: model.padded(0))
+    outcome, _ = run(capture, tmp_path / "work", start="m.ply", sh_degree=2, steps=20)
+    assert ply.read(outcome.out / "model.ply").degree == 2
+
+
+def test_the_models_own_degree_is_kept(trained: Path, tmp_path: Path) -> None:
+    assert ply.read(trained / "poses" / "m.ply").degree == 3
+    outcome, _ = run(trained, tmp_path, start="m.ply", steps=20)
+    assert report_of(outcome)["plan"]["schedule"]["degree"] == 3
+
+
+def test_a_model_larger_than_allowed_keeps_its_most_opaque_part(trained: Path, tmp_path: Path) -> None:
+    outcome, _ = run(trained, tmp_path, start="m.ply", max_gaussians=500, steps=20)
+    assert ply.read(outcome.out / "model.ply").count <= 500
+
+
+def test_a_model_far_from_the_origin_is_brought_home(tmp_path: Path) -> None:
+    capture = still_life.posed_capture(tmp_path / "capture")
+    path = capture / "poses" / "transforms.json"
+    document = json.loads(path.read_text())
+    for frame in document["frames"]:
+        frame["transform_matrix"][0][3] += 450_000.0
+    path.write_text(json.dumps(document))
+    first, _ = run(capture, tmp_path / "a", steps=100)
+    assert ply.offset(first.out / "model.ply")[0] == pytest.approx(450_000.0, abs=3.0)
+    (capture / "poses" / "m.ply").write_bytes((first.out / "model.ply").read_bytes())
+    second, _ = run(capture, tmp_path / "b", start="m.ply", steps=20)
+    known = report_of(second)["facts"]["start"]
+    assert known["psnr"] == pytest.approx(report_of(first)["result"]["train_psnr"], abs=1.0)
+
+
+def elsewhere(model: Gaussians) -> Gaussians:
+    return model.moved(1.0, torch.tensor([4.0, -3.0, 1.0]))
+
+
+def spoilt(model: Gaussians) -> Gaussians:
+    return model.select(torch.zeros(model.count, dtype=torch.bool))
+
+
+@pytest.mark.parametrize(("change", "says"), [(elsewhere, "not in the world"), (spoilt, "holds no Gaussian")])
+def test_a_model_that_shows_something_else_is_refused(
+    trained: Path, tmp_path: Path, change: Callable[[Gaussians], Gaussians], says: str
+) -> None:
+    with pytest.raises(Refusal, match=says) as refused:
+        run(changed(trained, tmp_path, change), tmp_path / "work", start="m.ply")
+    assert refused.value.code == "start_unusable"
+
+
+@pytest.mark.parametrize(
+    ("content", "says"), [(b"ply\nhello", "could not be read"), (None, "no file 'broken.ply'")]
+)
+def test_a_file_that_is_no_model_is_refused(
+    trained: Path, tmp_path: Path, content: bytes | None, says: str
+) -> None:
+    capture = still_life.posed_capture(tmp_path / "capture")
+    if content is not None:
+        (capture / "poses" / "broken.ply").write_bytes(content)
+    with pytest.raises(Refusal, match=says) as refused:
+        run(capture, tmp_path / "work", start="broken.ply")
+    assert refused.value.code == "start_unusable"
+    assert refused.value.advice
+
+
+def test_infinite_logits_of_other_tools_are_read_as_opaque(trained: Path, tmp_path: Path) -> None:
+    path = tmp_path / "m.ply"
+    model = ply.read(trained / "poses" / "m.ply")
+    ply.write(path, model)
+    raw = path.read_bytes()
+    head, body = raw.split(b"end_header\n", 1)
+    table = np.frombuffer(body, "<f4").reshape(model.count, -1).copy()
+    table[0, -8] = np.inf  # opacity, before three scales and four of the quaternion
+    path.write_bytes(head + b"end_header\n" + table.tobytes())
+    read = ply.read(path)
+    assert read.count == model.count
+    assert 0.999 < float(torch.sigmoid(read.logit_opacities[0])) <= 1.0
+
+
+def frames_of(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as video:
+        return [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+
+
+def test_a_training_is_filmed_from_one_view_off_the_clock(tmp_path: Path) -> None:
+    capture = still_life.posed_capture(tmp_path / "capture")
+    outcome, _ = run(capture, tmp_path / "work", steps=100, progress_video=True)
+    frames = frames_of(outcome.out / "progress.mp4")
+    assert 50 <= len(frames) <= 121
+    assert frames[0].shape == (still_life.HEIGHT, still_life.WIDTH, 3)
+    photo = still_life.pictures()[0][1].astype(float)  # 00.png is held out
+    first, last = (np.abs(frame - photo).mean() for frame in (frames[0], frames[-1]))
+    assert last < first
+    assert report_of(outcome)["seconds"]["film"] > 0
+
+
+def test_a_film_goes_on_after_a_cancelled_attempt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splatmill_worker.splat.train.loop.Hooks.checkpoint_seconds", 0.0)
+    capture = still_life.posed_capture(tmp_path / "capture")
+    film = tmp_path / "work" / "film"
+
+    def halfway() -> bool:
+        return film.is_dir() and len(list(film.glob("*.jpg"))) >= 20
+
+    assert run(capture, tmp_path / "work", halfway, steps=100, progress_video=True)[0].ended == "cancelled"
+    first = {path.name: path.read_bytes() for path in film.glob("*.jpg")}
+    outcome, _ = run(capture, tmp_path / "work", steps=100, progress_video=True)
+    assert {name: (film / name).read_bytes() for name in first} == first
+    assert len(list(film.glob("*.jpg"))) > len(first) + 10
+    assert (outcome.out / "progress.mp4").stat().st_size > 1000

@@ -1,0 +1,138 @@
+"""Proves what densification does to Gaussians and moments, one event at a time.
+
+Does not prove that it helps: the ablation table of `bench train` measures that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+from torch import Tensor
+
+from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.train.density import prune
+from splatmill_worker.splat.train.density.clone_split import Change, decayed, densify
+from splatmill_worker.splat.train.density.rows import rotations
+
+
+def gaussians(n: int, scale: float = 0.05, opacity: float = 0.5) -> Gaussians:
+    generator = torch.Generator().manual_seed(0)
+    return Gaussians(
+        torch.randn(n, 3, generator=generator),
+        torch.full((n, 3), math.log(scale)),
+        torch.randn(n, 4, generator=generator),
+        torch.full((n,), math.log(opacity / (1 - opacity))),
+        torch.randn(n, 16, 3, generator=generator),
+    )
+
+
+@dataclass
+class Held:
+    """The state of an engine without its kernels: densification touches nothing else."""
+
+    held: Gaussians
+    plain: Tensor
+    exp_avg: Tensor = field(init=False)
+    exp_avg_sq: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        n = self.held.count
+        self.exp_avg = torch.arange(n)[:, None].expand(n, 59).float().clone()
+        self.exp_avg_sq = self.exp_avg.clone()
+        self.visible_count = torch.ones(n)
+        self.max_extent = torch.zeros(n)
+
+    @property
+    def count(self) -> int:
+        return self.held.count
+
+    @property
+    def plain_sum(self) -> Tensor:
+        return self.plain
+
+    def parameters(self) -> dict[str, Tensor]:
+        return {name: value.clone() for name, value in self.held.parameters().items()}
+
+    def moments(self) -> tuple[Tensor, Tensor]:
+        return self.exp_avg.clone(), self.exp_avg_sq.clone()
+
+    def replace(
+        self, parameters: dict[str, Tensor], exp_avg: Tensor | None, exp_avg_sq: Tensor | None
+    ) -> None:
+        self.held = Gaussians(**parameters)
+        assert exp_avg is not None
+        assert exp_avg_sq is not None
+        self.exp_avg, self.exp_avg_sq = exp_avg, exp_avg_sq
+
+
+def random() -> torch.Generator:
+    return torch.Generator().manual_seed(3)
+
+
+def doubled(engine: Held, allowed: int = 1000) -> Change:
+    return densify(engine, random(), extent=1.0, allowed=allowed)  # type: ignore[arg-type]
+
+
+def test_small_ones_are_cloned_and_keep_their_moments() -> None:
+    engine = Held(gaussians(6, scale=0.005), torch.tensor([0.0, 1e-3, 0.0, 0.0, 3e-4, 1e-4]))
+    change = doubled(engine)
+    assert (change.added, change.removed) == (2, 0)
+    assert engine.count == 8
+    assert torch.equal(engine.held.means[6:], engine.held.means[[1, 4]])
+    assert torch.equal(engine.exp_avg[:6, 0], torch.arange(6.0))
+    assert torch.equal(engine.exp_avg[6:], torch.zeros(2, 59))
+
+
+def test_large_ones_are_split_in_two_smaller_ones() -> None:
+    before = gaussians(4, scale=0.05)
+    engine = Held(before, torch.tensor([0.0, 1e-3, 0.0, 0.0]))
+    doubled(engine)
+    assert engine.count == 5
+    assert torch.equal(engine.held.means[:3], before.means[[0, 2, 3]])
+    assert torch.allclose(engine.held.log_scales[3:].exp(), torch.tensor(0.05 / 1.6))
+    apart = (engine.held.means[3:] - before.means[1]).norm(dim=1)
+    assert bool((apart > 0).all())
+    assert bool((apart < 5 * 0.05).all())
+
+
+def test_the_budget_takes_the_largest_scores() -> None:
+    engine = Held(gaussians(8, scale=0.005), torch.arange(8) * 1e-3)
+    doubled(engine, allowed=10)
+    assert engine.count == 10
+    assert torch.equal(engine.held.means[8:], engine.held.means[[6, 7]])
+
+
+def test_what_cannot_be_seen_goes() -> None:
+    scene = gaussians(6)
+    scene.logit_opacities[0] = -9.0
+    scene.means[1, 0] = math.nan
+    scene.quats[2] = 0.0
+    extent = torch.tensor([0.0, 0.0, 0.0, 9.0, 0.0, math.nan])
+    assert prune.keep(scene, extent).tolist() == [False, False, False, False, True, False]
+    assert prune.keep(scene, None).tolist() == [False, False, False, True, True, True]
+
+
+def test_decayed_opacities_are_multiplied() -> None:
+    logits = torch.tensor([-2.0, 0.0, 3.0])
+    assert torch.allclose(torch.sigmoid(decayed(logits, 0.9)), 0.9 * torch.sigmoid(logits), atol=1e-6)
+
+
+def test_what_is_far_keeps_its_opacity() -> None:
+    engine = Held(gaussians(4), torch.zeros(4))
+    engine.held.means[:] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 9.0, 0.0], [2.0, 2.0, 0.0], [-8.0, 0.0, 0.0]])
+    densify(engine, random(), extent=1.0, allowed=4, opacity_decay=0.9, decay_within=5.0)  # type: ignore[arg-type]
+    assert torch.sigmoid(engine.held.logit_opacities).tolist() == pytest.approx([0.45, 0.5, 0.45, 0.5])
+
+
+def test_rotations_are_rotations() -> None:
+    turn = rotations(torch.randn(50, 4, generator=random()).double())
+    identity = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
+    assert torch.allclose(turn @ turn.transpose(1, 2), identity, atol=1e-12)
+    assert torch.allclose(torch.linalg.det(turn), torch.ones(50, dtype=torch.float64))
+    quarter = rotations(torch.tensor([[math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4)]]))
+    assert torch.allclose(
+        quarter[0] @ torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]), atol=1e-6
+    )

@@ -1,0 +1,57 @@
+"""Running out of memory in mid-training goes back to the last good state and on with fewer Gaussians, said
+aloud.
+
+The shortage is made by an engine that refuses to hold more than so many Gaussians; a real device's allocator
+is not involved.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from splatmill_worker.errors import FailureName, TrainingFailed
+from splatmill_worker.splat.engine.cpu import FusedStep
+from splatmill_worker.splat.train.loop import Hooks, train
+from tests.support import still_life
+from tests.support.training import first_engine, plan
+
+
+class Cramped:
+    """An engine whose steps run out of memory above `room` Gaussians."""
+
+    def __init__(self, engine: FusedStep, room: int) -> None:
+        self._engine, self._room = engine, room
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._engine, name)
+
+    def train_photo(self, *arguments: Any, **options: Any) -> Any:
+        if self._engine.count > self._room:
+            raise MemoryError(f"No room for {self._engine.count} Gaussians.")
+        return self._engine.train_photo(*arguments, **options)
+
+
+def test_training_shrinks_and_goes_on() -> None:
+    engine = first_engine()
+    room = engine.count + 50  # the first densification outgrows it
+    said: list[str] = []
+    cramped = Cramped(engine, room)  # type: ignore[arg-type]
+    views = still_life.training_views()
+    done = train(cramped, views[1:], views[:1], plan(200), extent=1.1, hooks=Hooks(warn=said.append))  # type: ignore[arg-type]
+    assert done.failure is None
+    assert done.steps == 200
+    assert 0 < done.gaussians.count <= room
+    assert torch.isfinite(done.gaussians.means).all()
+    assert done.recoveries >= 1
+    assert all("No room for" in sentence and "at most" in sentence for sentence in said)
+
+
+def test_memory_that_never_suffices_is_a_named_failure() -> None:
+    cramped = Cramped(first_engine(), 0)  # type: ignore[arg-type]
+    views = still_life.training_views()
+    with pytest.raises(TrainingFailed) as raised:
+        train(cramped, views[1:], views[:1], plan(200), extent=1.1)  # type: ignore[arg-type]
+    assert raised.value.name is FailureName.memory

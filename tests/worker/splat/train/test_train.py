@@ -1,0 +1,318 @@
+"""Proves that training learns held-out views, ends on its budget, resumes, stops and recovers; on a tiny scene.
+
+Does not prove quality or speed on real photos: those are measured by `bench train` and by the data tests.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from splatmill_worker.errors import Cancelled, FailureName, TrainingFailed
+from splatmill_worker.splat.engine.open import gaussians_of, open_engine
+from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.plan.budget import Budget, Clock
+from splatmill_worker.splat.plan.rates import Annealing, boost_of
+from splatmill_worker.splat.start import frusta
+from splatmill_worker.splat.start.points import from_points
+from splatmill_worker.splat.train import checkpoint
+from splatmill_worker.splat.train.exposure import Exposure
+from splatmill_worker.splat.train.loop import Hooks, Tick, evaluation_background, train
+from splatmill_worker.splat.train.run import Run
+from splatmill_worker.splat.views import TrainingView
+from tests.support import still_life
+from tests.support.training import first_engine, plan, split
+
+
+def test_held_out_views_are_learned() -> None:
+    views, held_out = split()
+    trained = train(first_engine(), views, held_out, plan(400), extent=1.1)
+    assert trained.stopped == "the budget is spent"
+    assert trained.steps == 400
+    curve = [row.psnr for row in trained.rows]
+    assert curve[-1] is not None
+    assert curve[0] is not None
+    assert curve[-1] > curve[0] + 4.0
+    assert trained.held_out is not None
+    assert trained.held_out.psnr > 18.0
+    assert trained.held_out.psnr == pytest.approx(curve[-1], abs=1e-6)
+    few = {view.name for view in views[:: math.ceil(len(views) / 4)]}
+    seen = [view.psnr for view in trained.on_training.views if view.name in few]
+    assert len(seen) == len(few)
+    assert trained.rows[-1].train_psnr == pytest.approx(sum(seen) / len(seen), abs=1e-6)
+    assert 1500 < trained.gaussians.count <= 4000
+    assert trained.gaussians.degree == 1
+    assert bool(trained.gaussians.finite().all())
+
+
+def test_steps_are_as_long_as_suits_what_the_time_turns_out_to_hold() -> None:
+    """The forecast of a million steps is wrong, and the run finds out."""
+    views, _ = split()
+    wrong = plan(None, 1000.0)
+    course = replace(wrong.schedule, annealing=Annealing(boost=None), expected_steps=10**6)
+    run = Run(first_engine(), replace(wrong, schedule=course), views, 1.1, None, lambda _: None)
+    assert run.rates(0.0).log_scales == pytest.approx(5e-3)
+    # Sixty steps on small photos, which tell nothing of the others, and a hundred that do.
+    for _ in range(159):
+        run.advance()
+        run.clock = Clock(run.clock.seconds + 0.5)
+    assert run.rates(0.0).log_scales == pytest.approx(5e-3)
+    run.advance()
+    run.pace.seconds = 1.0
+    assert run.rates(0.0).log_scales == pytest.approx(5e-3 * boost_of(160 + 920), rel=0.02)
+
+
+def test_there_are_never_more_gaussians_than_allowed() -> None:
+    views, held_out = split()
+    trained = train(first_engine(), views, held_out, plan(300, max_gaussians=2200), extent=1.1)
+    assert trained.held_out is not None
+    assert trained.held_out.psnr > 17.0
+    assert trained.gaussians.count <= 2200
+
+
+def test_dark_surfaces_are_no_holes_over_random_colours() -> None:
+    """Over black, what is not there looks like a dark wall, and training has no reason to put one."""
+    views = [
+        TrainingView(view.name, {1: view.full._replace(rgb=torch.full_like(view.full.rgb, 4))})
+        for view in split()[0]
+    ]
+    through: dict[str, float] = {}
+    for background in ("black", "random"):
+        engine = first_engine()
+        train(engine, views, [], plan(400, background=background), extent=1.1)
+        target = views[0].full
+        _, alpha, _ = engine.forward(
+            target.viewmat, target.K, target.camera.width, target.camera.height, degree=1
+        )
+        through[background] = float((alpha < 0.9).float().mean())
+    assert through["black"] > 0.5
+    assert through["random"] < 0.2
+
+
+def test_opaque_photos_are_judged_over_black_and_transparent_ones_over_white() -> None:
+    views, _ = split()
+    opaque = views[0]
+    clear = TrainingView("clear", {1: opaque.full._replace(alpha=opaque.full.rgb[..., 0])})
+    for background, judged, colour in (
+        ("random", [opaque], 0.0),
+        ("random", [opaque, clear], 1.0),
+        ("white", [opaque], 1.0),
+        ("black", [clear], 0.0),
+    ):
+        assert evaluation_background(plan(background=background), judged).tolist() == [colour] * 3
+
+
+def test_the_same_seed_gives_the_same_bytes() -> None:
+    views, _ = split()
+    first = train(first_engine(), views, [], plan(120), extent=1.1).gaussians
+    second = train(first_engine(), views, [], plan(120), extent=1.1).gaussians
+    other = train(first_engine(), views, [], plan(120, seed=1), extent=1.1).gaussians
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    assert other.count != first.count or not torch.equal(other.means, first.means)
+
+
+def test_the_reference_trains_through_the_same_loop_and_agrees() -> None:
+    views, _ = split()
+    course = replace(plan().schedule, budget=Budget(12), resolution=((0, 2),))
+    losses: dict[str, list[float]] = {}
+    for kernels in ("cpu", "reference"):
+        short = plan(densify=False, kernels=kernels)
+        short = replace(short, schedule=course)
+        trained = train(first_engine(kernels, 200), views, [], short, extent=1.1)
+        losses[kernels] = [row.loss for row in trained.rows] + [trained.on_training.mse]
+    # Adam divides by the gradient's own size, so that parameters with almost none (the turn of a ball) may take
+    # either sign of a full step; what is seen stays together.
+    assert losses["cpu"] == pytest.approx(losses["reference"], rel=2e-3)
+
+
+def test_a_time_budget_ends_on_time_with_rates_annealed() -> None:
+    views, held_out = split()
+    ticks: list[Tick] = []
+    hooks = Hooks(tick=ticks.append)
+    trained = train(first_engine(), views, held_out, plan(None, 2.0), extent=1.1, hooks=hooks)
+    assert trained.seconds == pytest.approx(2.0, rel=0.05)
+    assert trained.rows[-1].seconds == pytest.approx(trained.seconds, abs=0.1)
+    assert ticks
+    assert all(tick.steps >= tick.step for tick in ticks)
+
+
+def test_a_resumed_run_goes_on_where_it_was(tmp_path: Path) -> None:
+    views, held_out = split()
+    whole = plan(240)
+
+    class PowerCutError(Exception):
+        pass
+
+    def save_and_die(state: dict[str, Any]) -> None:
+        if state["step"] >= 100:
+            checkpoint.save(tmp_path, state)
+            raise PowerCutError
+
+    with pytest.raises(PowerCutError):
+        train(
+            first_engine(), views, held_out, whole, extent=1.1,
+            hooks=Hooks(checkpoint=save_and_die, checkpoint_seconds=0.0),
+        )  # fmt: skip
+    state = checkpoint.load(tmp_path)
+    assert state is not None
+    assert state["step"] == 100
+    resumed = train(first_engine(), views, held_out, whole, extent=1.1, resume_from=state)
+    straight = train(first_engine(), views, held_out, whole, extent=1.1)
+    assert resumed.steps == 240
+    assert resumed.seconds > state["seconds"]
+    assert [row.step for row in resumed.rows] == [row.step for row in straight.rows]
+    assert resumed.held_out is not None
+    assert straight.held_out is not None
+    assert resumed.held_out.psnr == pytest.approx(straight.held_out.psnr, abs=0.5)
+
+
+def test_a_run_that_had_ended_is_measured_and_delivered_when_resumed() -> None:
+    views, held_out = split()
+    last: list[dict[str, Any]] = []
+    whole = plan(40, densify=False)
+    hooks = Hooks(checkpoint=last.append, checkpoint_seconds=0.0)
+    train(first_engine(), views, held_out, whole, extent=1.1, hooks=hooks)
+    assert last[-1]["step"] == 39
+    ended = last[-1] | {"step": 40}
+    resumed = train(first_engine(), views, held_out, whole, extent=1.1, resume_from=ended)
+    assert resumed.rows[-1].step == resumed.steps
+    assert resumed.held_out is not None
+
+
+def test_a_cancel_is_seen_at_the_next_step() -> None:
+    views, held_out = split()
+    asked = iter(range(10_000))
+    with pytest.raises(Cancelled):
+        train(
+            first_engine(),
+            views,
+            held_out,
+            plan(300),
+            extent=1.1,
+            hooks=Hooks(cancelled=lambda: next(asked) >= 7),
+        )
+    assert next(asked) == 8
+
+
+def test_a_target_ends_the_run() -> None:
+    views, held_out = split()
+    trained = train(first_engine(), views, held_out, plan(2000, target_psnr=16.0), extent=1.1)
+    assert trained.steps < 2000
+    assert "reached" in trained.stopped
+
+
+class Sabotaged:
+    """An engine whose parameters are thrown far away at given steps, as a diverging optimiser would."""
+
+    def __init__(self, engine: Any, at: set[int], spoil: Any) -> None:
+        self._engine, self._at, self._spoil = engine, at, spoil
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._engine, name)
+
+    def train_photo(self, *args: Any, step: int, **named: Any) -> Any:
+        result = self._engine.train_photo(*args, step=step, **named)
+        if step in self._at:
+            parameters = self._engine.parameters()
+            self._spoil(parameters)
+            self._engine.replace(parameters, *self._engine.moments())
+        return result
+
+
+def thrown_away(parameters: dict[str, torch.Tensor]) -> None:
+    parameters["sh"] += 40.0
+
+
+def spoilt(parameters: dict[str, torch.Tensor]) -> None:
+    parameters["means"][:5] = math.nan
+
+
+@pytest.mark.parametrize("spoil", [thrown_away, spoilt])
+def test_a_planted_divergence_is_rolled_back(spoil: Any) -> None:
+    views, held_out = split()
+    warnings: list[str] = []
+    engine = Sabotaged(first_engine(), {330}, spoil)
+    course = plan(600, densify=False)
+    trained = train(engine, views, held_out, course, extent=1.1, hooks=Hooks(warn=warnings.append))
+    assert trained.recoveries == 1
+    assert len(warnings) == 1
+    assert "last good state" in warnings[0]
+    assert trained.failure is None
+    assert trained.held_out is not None
+    assert trained.held_out.psnr > 17.5
+    assert bool(trained.gaussians.finite().all())
+
+
+def test_what_diverges_again_and_again_stops_with_the_last_good_state() -> None:
+    views, held_out = split()
+    engine = Sabotaged(first_engine(), set(range(330, 5000, 5)), thrown_away)
+    trained = train(engine, views, held_out, plan(900, densify=False), extent=1.1)
+    assert trained.failure is not None
+    assert trained.failure.name is FailureName.divergence
+    assert trained.stopped == str(trained.failure)
+    assert trained.held_out is not None
+    assert trained.held_out.psnr > 15.0
+    assert bool(trained.gaussians.finite().all())
+
+
+def test_a_scene_that_no_camera_sees_is_empty_by_name() -> None:
+    views, held_out = split()
+    behind = gaussians_of(first_engine())
+    behind.means.add_(torch.tensor([0.0, 0.0, 500.0]))
+    with pytest.raises(TrainingFailed) as failed:
+        train(open_engine(behind, "cpu"), views, [], plan(300, densify=False), extent=1.1)
+    assert failed.value.name is FailureName.empty_scene
+    assert held_out
+
+
+def test_transparent_photos_train_over_random_backgrounds() -> None:
+    views = still_life.training_views(alpha=True)
+    targets = [view.full for view in views]
+    points, colors = frusta.in_frusta(targets, 2500, 0)
+    engine = open_engine(from_points(points, colors), "cpu")
+    trained = train(engine, views[1:], views[:1], plan(400, background="random", densify=False), extent=1.1)
+    assert trained.held_out is not None
+    assert trained.held_out.psnr > 17.0
+    target = views[0].full
+    _, alpha, _ = engine.forward(
+        target.viewmat, target.K, target.camera.width, target.camera.height, degree=1
+    )
+    assert target.alpha is not None
+    hidden = target.alpha == 0
+    assert float(alpha[hidden].mean()) < 0.25
+    assert float(alpha[~hidden].mean()) > 0.8
+
+
+def test_exposures_are_fitted_where_photos_differ() -> None:
+    views = still_life.training_views()
+    for view in views[1::2]:
+        view.full.rgb.copy_((view.full.rgb.float() * 0.7).to(torch.uint8))
+    exposure = Exposure(len(views))
+    course = plan(500, exposure=True, densify=False)
+    run = Run(first_engine(), course, views, 1.1, exposure, warn=lambda _: None)
+    while run.progress < 1.0:
+        run.advance()
+    gains = exposure.affine.detach()[:, :, :3].diagonal(dim1=1, dim2=2).mean(dim=1)
+    assert float(gains[1::2].max()) < float(gains[0::2].min())
+    assert float(gains[0::2].mean() / gains[1::2].mean()) > 1.05
+
+
+def test_masked_pixels_teach_nothing() -> None:
+    views, _ = split()
+    target = views[0].full
+    mask = torch.ones(target.rgb.shape[:2], dtype=torch.bool)
+    mask[:, : target.rgb.shape[1] // 2] = False
+    spoilt_rgb = target.rgb.clone()
+    spoilt_rgb[~mask] = 255
+    results: list[Gaussians] = []
+    for rgb in (target.rgb, spoilt_rgb):
+        view = replace(views[0], levels={1: target._replace(rgb=rgb, mask=mask)})
+        course = plan(30, densify=False)
+        course = replace(course, schedule=replace(course.schedule, resolution=((0, 1),)))
+        results.append(train(first_engine(), [view], [], course, extent=1.1).gaussians)
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))

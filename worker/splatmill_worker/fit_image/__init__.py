@@ -1,0 +1,1 @@
+"""Fits one picture by Gaussians in a plane (`splatmill fit-image`)."""

@@ -1,0 +1,1 @@
+"""A training step over all Gaussians: the protocol, and its implementations by backend."""

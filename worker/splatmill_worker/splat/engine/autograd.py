@@ -1,0 +1,186 @@
+"""The training step through torch's autograd, for any backend whose ops are differentiable."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+
+import torch
+from torch import Tensor
+
+from splatmill_worker.kernels import ops
+from splatmill_worker.kernels.records import Rates, Scores
+from splatmill_worker.splat.engine.protocol import StepResult
+from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.motion import motion
+
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+
+
+class AutogradStep:
+    """An Engine over `kernels.ops`: slow on a CPU, and the same optimisation as the fused step does.
+
+    Adam runs over all Gaussians, those that a photo does not show with a zero gradient.
+    """
+
+    def __init__(self, gaussians: Gaussians, *, backend: ops.Backend) -> None:
+        self._backend = backend
+        self.keep_scores: Scores | None = "plain"  # autograd has them anyway
+        self.keep_pose_gradient = False
+        self.pose_gradient: Tensor | None = None
+        self.replace(gaussians.padded(3).parameters(), None, None)
+
+    @property
+    def count(self) -> int:
+        return self._gaussians.count
+
+    def parameters(self) -> dict[str, Tensor]:
+        return {name: value.detach().clone() for name, value in self._gaussians.parameters().items()}
+
+    def moments(self) -> tuple[Tensor, Tensor]:
+        return self._packed(self._exp_avg), self._packed(self._exp_avg_sq)
+
+    def replace(
+        self, parameters: dict[str, Tensor], exp_avg: Tensor | None, exp_avg_sq: Tensor | None
+    ) -> None:
+        leaves = {name: value.detach().clone().requires_grad_() for name, value in parameters.items()}
+        self._gaussians = Gaussians(**leaves)
+        self._exp_avg = self._unpacked(exp_avg)
+        self._exp_avg_sq = self._unpacked(exp_avg_sq)
+        self.plain_sum = torch.zeros(self.count)
+        self.visible_count = torch.zeros(self.count)
+        self.max_extent = torch.zeros(self.count)
+        self._twist: Tensor | None = None
+        self._pending: tuple[ops.Projected, Tensor, Tensor, Tensor] | None = None
+
+    def forward(
+        self,
+        viewmat: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        *,
+        degree: int,
+        background: Tensor | None = None,
+        antialias: bool = False,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        gaussians = self._gaussians
+        self._twist = None
+        if self.keep_pose_gradient and torch.is_grad_enabled():
+            self._twist = torch.zeros(6, requires_grad=True)
+            viewmat = motion(self._twist) @ viewmat
+        projected = ops.project(
+            gaussians.means,
+            gaussians.log_scales,
+            gaussians.quats,
+            gaussians.logit_opacities,
+            gaussians.sh,
+            viewmat,
+            K,
+            width,
+            height,
+            degree=degree,
+            antialias=antialias,
+            backend=self._backend,
+        )
+        if projected.means2d.requires_grad:
+            projected.means2d.retain_grad()
+        bins = ops.bin(projected, width, height, backend=self._backend)
+        color, alpha, depth = ops.composite(
+            projected, bins, width, height, background=background, backend=self._backend
+        )
+        self._pending = (projected, color, alpha, depth)
+        self._pairs = int(bins.ids.numel())
+        return color.detach(), alpha.detach(), depth.detach()
+
+    def backward_update(
+        self,
+        d_color: Tensor,
+        d_alpha: Tensor | None = None,
+        d_depth: Tensor | None = None,
+        *,
+        rates: Rates,
+        step: int,
+    ) -> None:
+        if self._pending is None:
+            raise RuntimeError("backward_update needs a forward pass before it.")
+        projected, *outputs = self._pending
+        wanted = [
+            (out, grad)
+            for out, grad in zip(outputs, (d_color, d_alpha, d_depth), strict=True)
+            if grad is not None
+        ]
+        torch.autograd.backward([out for out, _ in wanted], [grad for _, grad in wanted])
+        height, width = outputs[0].shape[:2]
+        self._score(projected, width, height)
+        self.pose_gradient = None if self._twist is None else self._twist.grad
+        self._adam(rates, step)
+        self._pending = None
+
+    def train_photo(
+        self,
+        viewmat: Tensor,
+        K: Tensor,
+        photo: Tensor,
+        *,
+        degree: int,
+        rates: Rates,
+        step: int,
+        background: Tensor | None = None,
+        mask: Tensor | None = None,
+        antialias: bool = False,
+        key: Hashable | None = None,
+    ) -> StepResult:
+        height, width = photo.shape[:2]
+        color, _, _ = self.forward(
+            viewmat, K, width, height, degree=degree, background=background, antialias=antialias
+        )
+        color.requires_grad_()
+        loss = ops.loss(color, photo, mask=mask, backend=self._backend)
+        (gradient,) = torch.autograd.grad(loss, color)
+        assert self._pending is not None
+        visible = int((self._pending[0].extents[:, 0] > 0).sum())
+        self.backward_update(gradient, rates=rates, step=step)
+        return StepResult(float(loss.detach()), visible, self._pairs)
+
+    def _score(self, projected: ops.Projected, width: int, height: int) -> None:
+        gradient = projected.means2d.grad
+        if gradient is None:
+            return
+        with torch.no_grad():
+            visible = projected.extents[:, 0] > 0
+            ndc = gradient * gradient.new_tensor([width / 2, height / 2])
+            self.plain_sum += torch.linalg.vector_norm(ndc, dim=1)
+            self.visible_count += visible
+            extent = 2.0 * projected.extents.amax(dim=1) / max(width, height)
+            self.max_extent = torch.maximum(self.max_extent, extent)
+
+    def _adam(self, rates: Rates, step: int) -> None:
+        """Kingma & Ba 2015, with bias correction, on every group."""
+        correction = (1.0 - BETA2**step) ** 0.5 / (1.0 - BETA1**step)
+        for name, value in self._gaussians.parameters().items():
+            gradient = torch.zeros_like(value) if value.grad is None else value.grad
+            average, square = self._exp_avg[name], self._exp_avg_sq[name]
+            average.lerp_(gradient, 1.0 - BETA1)
+            square.mul_(BETA2).addcmul_(gradient, gradient, value=1.0 - BETA2)
+            move = correction * average / (square.sqrt() + EPSILON)
+            with torch.no_grad():
+                if name == "sh":
+                    value[:, :1] -= rates.sh_dc * move[:, :1]
+                    value[:, 1:] -= rates.sh_rest * move[:, 1:]
+                else:
+                    value -= getattr(rates, name) * move
+            value.grad = None
+
+    def _packed(self, groups: dict[str, Tensor]) -> Tensor:
+        return torch.cat([value.reshape(self.count, -1) for value in groups.values()], dim=1)
+
+    def _unpacked(self, packed: Tensor | None) -> dict[str, Tensor]:
+        shapes = {name: value.shape for name, value in self._gaussians.parameters().items()}
+        if packed is None:
+            return {name: torch.zeros(shape) for name, shape in shapes.items()}
+        widths = [shape[1:].numel() for shape in shapes.values()]
+        parts = torch.split(packed, widths, dim=1)
+        return {
+            name: part.reshape(shape).clone()
+            for (name, shape), part in zip(shapes.items(), parts, strict=True)
+        }

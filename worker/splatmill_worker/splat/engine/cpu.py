@@ -1,0 +1,77 @@
+"""The fused CPU step as the training loop drives it: photos that come again keep what was computed about them."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+
+from torch import Tensor
+
+from splatmill_worker.kernels.cpu.loss import PhotoStats, photo_stats
+from splatmill_worker.kernels.cpu.step import Step
+from splatmill_worker.kernels.records import Rates
+from splatmill_worker.splat.engine.protocol import StepResult
+from splatmill_worker.splat.gaussians import Gaussians
+
+KEPT_BYTES = 400 * 10**6
+"""For the photos' statistics, at 28 bytes a pixel; beyond it they are computed anew at every visit."""
+
+
+class FusedStep(Step):
+    """An Engine on the C++ kernels."""
+
+    def __init__(self, gaussians: Gaussians, *, threads: int | None = None) -> None:
+        super().__init__(**gaussians.padded(3).parameters(), threads=threads)
+        self.keep_pose_gradient = False
+        self._kept: dict[Hashable, PhotoStats] = {}
+        self._kept_bytes = 0
+
+    def backward_update(
+        self,
+        d_color: Tensor,
+        d_alpha: Tensor | None = None,
+        d_depth: Tensor | None = None,
+        *,
+        rates: Rates,
+        step: int,
+        pose_gradient: bool = False,
+    ) -> int:
+        asked = pose_gradient or self.keep_pose_gradient
+        return super().backward_update(d_color, d_alpha, d_depth, rates=rates, step=step, pose_gradient=asked)
+
+    def train_photo(
+        self,
+        viewmat: Tensor,
+        K: Tensor,
+        photo: Tensor,
+        *,
+        degree: int,
+        rates: Rates,
+        step: int,
+        background: Tensor | None = None,
+        mask: Tensor | None = None,
+        antialias: bool = False,
+        key: Hashable | None = None,
+    ) -> StepResult:
+        seen = self.train(
+            viewmat,
+            K,
+            None,
+            degree=degree,
+            rates=rates,
+            step=step,
+            background=background,
+            photo_stats=self._stats(photo, mask, key),
+            antialias=antialias,
+            pose_gradient=self.keep_pose_gradient,
+        )
+        return StepResult(seen.loss, seen.visible, seen.pairs)
+
+    def _stats(self, photo: Tensor, mask: Tensor | None, key: Hashable | None) -> PhotoStats:
+        if key is not None and key in self._kept:
+            return self._kept[key]
+        stats = photo_stats(photo, mask=mask)
+        size = 28 * stats.used.numel()
+        if key is not None and self._kept_bytes + size <= KEPT_BYTES:
+            self._kept[key] = stats
+            self._kept_bytes += size
+        return stats

@@ -1,0 +1,1 @@
+"""Facts about a scene, the decisions that follow from them, and the plan that training keeps to."""

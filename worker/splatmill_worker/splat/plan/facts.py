@@ -1,0 +1,300 @@
+"""What can be measured about a scene in seconds, before it is decided how to train it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import psutil
+import torch
+
+from splatmill_worker.images.lens import distortion
+from splatmill_worker.scene import Scene
+from splatmill_worker.splat.start.cells import cells_of
+from splatmill_worker.splat.start.far_shell import far_shell
+from splatmill_worker.splat.start.gaps import filled, gap_share
+from splatmill_worker.splat.start.given_model import Start
+from splatmill_worker.splat.start.points import ENOUGH_POINTS
+from splatmill_worker.splat.start.sky import sky_share
+from splatmill_worker.splat.views import TrainingView
+
+Float = npt.NDArray[np.float64]
+MAX_POINTS = 4000  # enough for a median, and a fraction of a second
+DARK = 4.0  # grey levels: below, ratios are noise
+SAME = 0.02  # log brightness: sightings nearer to their mean than this agree
+ROUNDS = 30
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Seconds per training step, from a short probe: a part per pixel and a part per Gaussian."""
+
+    per_pixel: float
+    per_gaussian: float
+
+    def step(self, pixels: float, gaussians: float) -> float:
+        """Seconds of one step."""
+        return self.per_pixel * pixels + self.per_gaussian * gaussians
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Figures of one scene at the size of the loaded photos. None: it cannot be measured here.
+
+    exposure_spread: robust standard deviation between photos of the log brightness of the same points.
+    halving_loss: median RMS difference, in grey levels of 255, between a photo and its half-size copy enlarged.
+    view_angle: median over points of the largest angle between two views of it, in degrees. distance_ratio:
+    90th percentile over points of largest over smallest pixel footprint. depth_ratio: 95th over 5th percentile
+    of depths. reprojection: median error of the points in pixels of this size. Neither it nor view_angle counts what
+    stereo added: that is looked for under few angles and in steps of its own. lens_residual: the farthest that
+    distortion moves a pixel of this size. tint_spread: as exposure_spread, of the log ratios of red and blue to
+    green. sightings: median number of points that a photo shows. sky_share, gap_share: shares of the photos that look
+    like sky, and that (sky apart) have no point near; gap_points, shell_points: what would fill the gaps, and stand
+    behind all. shell_distance: of the nearest of those from the origin of the frame.
+    extent: distance of the farthest tenth of the points over the radius of the cameras.
+    start: the model to start from, if one was given.
+    """
+
+    views: int
+    held_out: int
+    width: int
+    height: int
+    native_longest: int
+    points: int
+    source: str
+    transparent: int
+    masked: int
+    distorted: int
+    halving_loss: float
+    exposure_spread: float | None
+    view_angle: float | None
+    distance_ratio: float | None
+    depth_ratio: float | None
+    reprojection: float | None
+    memory_available: int
+    speed: Speed | None = None
+    start: Start | None = None
+    tint_spread: float | None = None
+    lens_residual: float | None = None
+    sightings: float | None = None
+    sky_share: float | None = None
+    gap_share: float | None = None
+    gap_points: int = 0
+    shell_points: int = 0
+    shell_distance: float | None = None
+    extent: float | None = None
+
+    @property
+    def pixels(self) -> int:
+        """Of one photo."""
+        return self.width * self.height
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the report."""
+        return asdict(self)
+
+
+def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: Speed | None) -> Facts:
+    """Facts of `scene` (in any frame) whose training photos are `views`, in the same frame."""
+    sizes = np.array([[view.full.camera.width, view.full.camera.height] for view in views])
+    width, height = (int(value) for value in np.median(sizes, axis=0))
+    seen = _Sightings.of(scene, views)
+    return Facts(
+        views=len(views),
+        held_out=held_out,
+        width=width,
+        height=height,
+        native_longest=max((max(view.camera.width, view.camera.height) for view in scene.views), default=0),
+        points=len(scene.points),
+        source=scene.source,
+        transparent=sum(view.full.alpha is not None for view in views),
+        masked=sum(view.full.mask is not None for view in views),
+        distorted=sum(view.lens is not None for view in scene.views),
+        halving_loss=float(np.median([halving_loss(view.full.rgb) for view in views])),
+        exposure_spread=None if seen is None else exposure_spread(seen),
+        tint_spread=None if seen is None else tint_spread(seen),
+        view_angle=None if seen is None else seen.view_angle(_own_points(scene)),
+        distance_ratio=None if seen is None else seen.distance_ratio(),
+        depth_ratio=None if seen is None else seen.depth_ratio(),
+        reprojection=_reprojection(scene, max(width, height)),
+        lens_residual=_lens_residual(scene, max(width, height)),
+        memory_available=int(psutil.virtual_memory().available),
+        speed=speed,
+        **_coverage(scene, views),
+    )
+
+
+def halving_loss(rgb: torch.Tensor) -> float:
+    """RMS difference in grey levels between a photo uint8 [H, W, 3] and its half-size copy enlarged again."""
+    planes = rgb.permute(2, 0, 1)[None].float()
+    height, width = planes.shape[2:]
+    if min(height, width) < 4:
+        return math.inf
+    small = torch.nn.functional.interpolate(planes, size=(height // 2, width // 2), mode="area")
+    again = torch.nn.functional.interpolate(small, size=(height, width), mode="bicubic", align_corners=False)
+    return float((again - planes).square().mean().sqrt())
+
+
+def _coverage(scene: Scene, views: Sequence[TrainingView]) -> dict[str, Any]:
+    """What the points leave open; nothing is known without enough of them, or where photos are transparent."""
+    if len(scene.points) < ENOUGH_POINTS or any(view.full.alpha is not None for view in views):
+        return {}
+    cells = cells_of(scene, views)
+    shell, _ = far_shell(cells, scene.points)
+    return {
+        "sightings": float(np.median([len(grid.points) for grid in cells])),
+        "sky_share": sky_share(cells),
+        "gap_share": gap_share(cells),
+        "gap_points": len(filled(cells)[0]),
+        "shell_points": len(shell),
+        "shell_distance": float(np.linalg.norm(shell, axis=1).min()) if len(shell) else None,
+        "extent": _extent(scene, views),
+    }
+
+
+def _extent(scene: Scene, views: Sequence[TrainingView]) -> float:
+    centers = np.array([view.full.camera.center for view in views])
+    middle = centers.mean(axis=0)
+    radius = float(np.linalg.norm(centers - middle, axis=1).max())
+    return float(np.percentile(np.linalg.norm(scene.points - middle, axis=1), 90)) / max(radius, 1e-12)
+
+
+def _reprojection(scene: Scene, longest: int) -> float | None:
+    """Median error of the points, from pixels of the photos that the cameras were recovered from to `longest`."""
+    errors = np.zeros(0) if scene.point_errors is None else scene.point_errors[: _own_points(scene)]
+    known = errors[np.isfinite(errors)]
+    if not len(known):
+        return None
+    sizes = [view.camera if view.lens is None else view.lens for view in scene.views]
+    own = float(np.median([max(size.width, size.height) for size in sizes]))
+    return float(np.median(known)) * longest / own
+
+
+def _own_points(scene: Scene) -> int:
+    """How many of the points, the first ones, came with the cameras and not from stereo over them."""
+    return int(scene.facts.get("sparse_points", len(scene.points)))
+
+
+def _lens_residual(scene: Scene, longest: int) -> float | None:
+    """The farthest that any photo's distortion moves a pixel on its border, in pixels of a photo `longest` wide."""
+    lenses = {view.lens for view in scene.views if view.lens is not None}
+    moves = [distortion(lens) * longest / max(lens.width, lens.height) for lens in lenses]
+    return max(moves, default=None)
+
+
+def exposure_spread(seen: _Sightings) -> float | None:
+    """Spread between the photos of their log exposures; None with too few sightings."""
+    return _spread(seen, np.log(np.maximum(seen.color.mean(axis=1), DARK)))
+
+
+def tint_spread(seen: _Sightings) -> float | None:
+    """Spread between the photos of their white balance: the larger one of red and of blue over green, in logs."""
+    red, green, blue = np.log(np.maximum(seen.color.astype(np.float64), DARK)).T
+    spreads = [_spread(seen, red - green), _spread(seen, blue - green)]
+    return max((spread for spread in spreads if spread is not None), default=None)
+
+
+def _spread(seen: _Sightings, log: Float) -> float | None:
+    """Spread between the photos of the part that is theirs in `log` (one value per sighting).
+
+    Each value is a point's own plus its photo's. Both are solved for by alternating means whose weights fall with
+    what is left over, so that outliers (highlights, occlusions) move little.
+    """
+    share = np.zeros(seen.photos)
+    weight = np.ones(len(log))
+    for _ in range(ROUNDS):
+        point = _group_mean(log - share[seen.photo], weight, seen.point, seen.points)
+        share = _group_mean(log - point[seen.point], weight, seen.photo, seen.photos)
+        share -= np.median(share)
+        left = log - point[seen.point] - share[seen.photo]
+        weight = 1.0 / np.maximum(np.abs(left), SAME)
+    enough = np.bincount(seen.photo, minlength=seen.photos) >= 10
+    if enough.sum() < 3:
+        return None
+    return float(1.4826 * np.median(np.abs(share[enough] - np.median(share[enough]))))
+
+
+@dataclass(frozen=True)
+class _Sightings:
+    """Which photo shows which point, one row each: indices, colour 0..255, distance over focal length."""
+
+    points: int
+    photos: int
+    point: npt.NDArray[np.int64]
+    photo: npt.NDArray[np.int64]
+    color: npt.NDArray[np.uint8]
+    depth: Float
+    footprint: Float
+    direction: Float
+
+    @staticmethod
+    def of(scene: Scene, views: Sequence[TrainingView]) -> _Sightings | None:
+        """None without tracks (which photo sees which point), or with too few of them."""
+        if scene.point_views is None or len(scene.points) < 20:
+            return None
+        number = {view.name: i for i, view in enumerate(views)}
+        of_scene = np.array([number.get(view.name, -1) for view in scene.views], dtype=np.int64)
+        offsets, track = scene.point_views
+        point = np.repeat(np.arange(len(scene.points)), np.diff(offsets))
+        photo = of_scene[track]
+        stride = max(1, len(scene.points) // MAX_POINTS)
+        keep = (photo >= 0) & (point % stride == 0)
+        point, photo = point[keep], photo[keep]
+        columns: list[tuple[Any, ...]] = []
+        for i, view in enumerate(views):
+            rows = point[photo == i]
+            camera, rgb = view.full.camera, view.full.rgb.numpy()
+            local = scene.points[rows] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+            z = np.maximum(local[:, 2], 1e-9)
+            u = (local[:, 0] / z * camera.fx + camera.cx).astype(np.int64)
+            v = (local[:, 1] / z * camera.fy + camera.cy).astype(np.int64)
+            on = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+            away = scene.points[rows[on]] - camera.center
+            direction = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+            columns.append(
+                (rows[on], np.full(on.sum(), i), rgb[v[on], u[on]], z[on], z[on] / camera.fx, direction)
+            )
+        joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
+        if len(joined[0]) < 40:
+            return None
+        return _Sightings(len(scene.points), len(views), *joined)
+
+    def view_angle(self, first: int) -> float | None:
+        """Median over the `first` points of the largest angle between two of its views, in degrees; None without."""
+        own = self.point < first
+        if not own.any():
+            return None
+        return float(np.median([_widest(rows) for rows in _by_point(self.point[own], self.direction[own])]))
+
+    def distance_ratio(self) -> float:
+        """90th percentile over points of the largest over the smallest footprint of a pixel on it."""
+        ratios = [rows.max() / rows.min() for rows in _by_point(self.point, self.footprint)]
+        return float(np.percentile(ratios, 90))
+
+    def depth_ratio(self) -> float:
+        """95th over 5th percentile of all depths."""
+        low, high = np.percentile(self.depth, [5, 95])
+        return float(high / max(low, 1e-12))
+
+
+def _by_point(point: npt.NDArray[np.int64], values: Float) -> list[Float]:
+    """The values of each point's sightings, of points with at least two where there are any such."""
+    order = np.argsort(point, kind="stable")
+    starts = np.flatnonzero(np.diff(point[order], prepend=-1))
+    groups = np.split(values[order], starts[1:])
+    return [group for group in groups if len(group) >= 2] or groups
+
+
+def _widest(directions: Float) -> float:
+    return float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0))))
+
+
+def _group_mean(values: Float, weights: Float, group: npt.NDArray[np.int64], groups: int) -> Float:
+    """Weighted mean of `values` per group; 0 where a group is empty."""
+    total = np.bincount(group, weights, minlength=groups)
+    mean: Float = np.bincount(group, weights * values, minlength=groups) / np.maximum(total, 1e-12)
+    return mean

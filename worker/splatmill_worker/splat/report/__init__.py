@@ -1,0 +1,1 @@
+"""What a finished training leaves: the model's files and the report of error against run time."""

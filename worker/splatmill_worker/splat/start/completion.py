@@ -1,0 +1,63 @@
+"""What is added to the Gaussians made from points before training: the filled gaps and the far shell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from splatmill_worker.kernels import ops
+from splatmill_worker.scene import Scene
+from splatmill_worker.splat.gaussians import Gaussians, concatenate
+from splatmill_worker.splat.start import far_shell, gaps
+from splatmill_worker.splat.start.cells import cells_of
+from splatmill_worker.splat.start.points import INITIAL_OPACITY, from_points, logit
+from splatmill_worker.splat.views import TrainingView
+
+Float = npt.NDArray[np.float64]
+Pixels = npt.NDArray[np.uint8]
+
+
+def completed(
+    gaussians: Gaussians,
+    scene: Scene,
+    views: Sequence[TrainingView],
+    *,
+    fill_gaps: bool,
+    add_far_shell: bool,
+    max_gaussians: int,
+    backend: ops.Backend | None = None,
+) -> Gaussians:
+    """`gaussians` made from the points of `scene`, with Gaussians in the gaps between them and on a far shell.
+
+    No more than `max_gaussians` result; what does not fit is left out evenly, the gaps before the far shell.
+    """
+    if not (fill_gaps or add_far_shell):
+        return gaussians
+    cells = cells_of(scene, views)
+    found: list[tuple[Float, Pixels, float]] = []
+    if add_far_shell:
+        found.append((*far_shell.far_shell(cells, scene.points), far_shell.OPACITY))
+    if fill_gaps:
+        found.append((*gaps.filled(cells), INITIAL_OPACITY))
+    parts = [gaussians]
+    room = max(0, max_gaussians - gaussians.count)
+    for points, colors, opacity in found:
+        points, colors = _at_most(room, points, colors)
+        room -= len(points)
+        if len(points) > 1:
+            # As wide as their distance to each other: those of the reconstruction are elsewhere.
+            more = from_points(torch.from_numpy(points), torch.from_numpy(colors), backend=backend)
+            parts.append(replace(more, logit_opacities=torch.full((more.count,), logit(opacity))))
+    return concatenate(*parts)
+
+
+def _at_most(room: int, points: Float, colors: Pixels) -> tuple[Float, Pixels]:
+    """Evenly chosen rows where there are more than `room`."""
+    if len(points) <= room:
+        return points, colors
+    rows = np.linspace(0, len(points), room, endpoint=False).astype(np.int64)
+    return points[rows], colors[rows]

@@ -1,0 +1,60 @@
+"""Rows of a scene under optimisation: parameters and moments, cut, grown and written back together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from splatmill_worker.splat.engine.protocol import Engine
+from splatmill_worker.splat.gaussians import Gaussians, concatenate
+
+
+@dataclass
+class Rows:
+    """N Gaussians with Adam's moments [N, 59]; new rows start with zero moments."""
+
+    gaussians: Gaussians
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+
+    @staticmethod
+    def of(engine: Engine) -> Rows:
+        """A copy of what the engine holds."""
+        return Rows(Gaussians(**engine.parameters()), *engine.moments())
+
+    def keep(self, rows: Tensor) -> Rows:
+        """The rows picked by a boolean mask or by indices."""
+        return Rows(self.gaussians.select(rows), self.exp_avg[rows], self.exp_avg_sq[rows])
+
+    def grown(self, new: Gaussians) -> Rows:
+        """With `new` appended."""
+        zeros = self.exp_avg.new_zeros(new.count, self.exp_avg.shape[1])
+        return Rows(
+            concatenate(self.gaussians, new),
+            torch.cat([self.exp_avg, zeros]),
+            torch.cat([self.exp_avg_sq, zeros]),
+        )
+
+    def into(self, engine: Engine) -> None:
+        """Hand the rows back to the engine; its scores start again at zero."""
+        engine.replace(self.gaussians.parameters(), self.exp_avg, self.exp_avg_sq)
+
+
+def rotations(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions wxyz [N, 4] with any norm above zero."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(rows, dim=1).reshape(-1, 3, 3)
+
+
+def offsets(gaussians: Gaussians, random: torch.Generator) -> Tensor:
+    """One random displacement per Gaussian [N, 3], drawn from the Gaussian itself."""
+    # Drawn on the CPU, so that a seed means the same on every device.
+    local = torch.randn(gaussians.count, 3, generator=random).to(gaussians.means)
+    return torch.einsum("nij,nj->ni", rotations(gaussians.quats), local * gaussians.log_scales.exp())

@@ -1,0 +1,5 @@
+"""A built-in still life and the photos of it: the demo's capture, and ground truth for tests and benchmarks."""
+
+from splatmill_worker.synthetic.ray_caster import StillLife, capture, look_at, orbit, photograph, still_life
+
+__all__ = ["StillLife", "capture", "look_at", "orbit", "photograph", "still_life"]

@@ -1,0 +1,23 @@
+"""`python -m splatmill_worker.synthetic DIR` photographs the still life into a folder."""
+
+import argparse
+from pathlib import Path
+
+from splatmill_worker.synthetic import capture
+
+
+def main() -> None:
+    """Write the photos, and say where they are."""
+    parser = argparse.ArgumentParser(prog="python -m splatmill_worker.synthetic", description=__doc__)
+    parser.add_argument("directory", type=Path)
+    parser.add_argument("--count", type=int, default=40)
+    parser.add_argument("--width", type=int, default=640)
+    parser.add_argument("--height", type=int, default=480)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    capture(given.directory, given.count, given.width, given.height, given.seed)
+    print(f"{given.count} photos of the built-in still life are in {given.directory}")
+
+
+if __name__ == "__main__":
+    main()

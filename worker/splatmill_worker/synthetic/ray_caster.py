@@ -1,0 +1,323 @@
+"""A small ray caster that "photographs" a textured still life: the demo's capture, and ground truth for tests.
+
+Every surface is hit analytically (discs, boxes, spheres, cylinders, a dome), so cameras and depths are exact;
+only colour is sampled (a box filter of `samples`^2 rays a pixel over mip-mapped textures). The world has z up,
+units of about a table's half width, and cameras in OpenCV axes (x right, y down, z forward).
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from splatmill_worker.scene import Camera
+from splatmill_worker.synthetic.textures import MipMap, painted, planks, sky
+
+Tensor = torch.Tensor
+
+_FAR = 1e9
+_LIGHT = np.array([0.45, -0.35, 0.82])
+_AMBIENT = 0.42
+_DOME_RADIUS = 40.0
+_RAYS_AT_ONCE = 16384  # a band of the picture whose intermediate results stay in the cache
+
+
+@dataclass(frozen=True)
+class Disc:
+    """A horizontal disc at height z, textured in the plane: `scale` texture widths a unit of length."""
+
+    z: float
+    radius: float
+    texture: MipMap
+    scale: float
+
+    def hit(self, origin: Tensor, rays: Tensor) -> Tensor:
+        t = (self.z - origin[..., 2]) / rays[..., 2]
+        x = origin[..., 0] + t * rays[..., 0]
+        y = origin[..., 1] + t * rays[..., 1]
+        return torch.where((t > 1e-4) & (x * x + y * y < self.radius**2), t, _FAR)
+
+    def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        normal = torch.zeros_like(points)
+        normal[:, 2] = 1.0
+        return points[:, :2] * self.scale, normal
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box turned by `turn` radians about z; every face shows another part of the texture."""
+
+    center: tuple[float, float, float]
+    half: tuple[float, float, float]
+    turn: float
+    texture: MipMap
+    scale: float
+    shine: float = 0.0
+
+    def _local(self, v: Tensor) -> Tensor:
+        c, s = math.cos(self.turn), math.sin(self.turn)
+        return torch.stack([c * v[..., 0] + s * v[..., 1], c * v[..., 1] - s * v[..., 0], v[..., 2]], -1)
+
+    def hit(self, origin: Tensor, rays: Tensor) -> Tensor:
+        o = self._local(origin - torch.tensor(self.center))
+        inverse = 1.0 / self._local(rays)
+        half = torch.tensor(self.half)
+        a, b = (-half - o) * inverse, (half - o) * inverse
+        near = torch.minimum(a, b).amax(-1)
+        far = torch.maximum(a, b).amin(-1)
+        return torch.where((near < far) & (near > 1e-4), near, _FAR)
+
+    def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        local = self._local(points - torch.tensor(self.center))
+        unit = local / torch.tensor(self.half)
+        axis = unit.abs().argmax(-1)
+        sign = torch.sign(unit.gather(-1, axis[:, None]))
+        normal = torch.zeros_like(points).scatter_(-1, axis[:, None], sign)
+        c, s = math.cos(self.turn), math.sin(self.turn)
+        turned = torch.stack(
+            [c * normal[:, 0] - s * normal[:, 1], s * normal[:, 0] + c * normal[:, 1], normal[:, 2]], -1
+        )
+        u = torch.where(axis == 0, local[:, 1], local[:, 0])
+        v = torch.where(axis == 2, local[:, 1], local[:, 2])
+        face = axis.to(u.dtype) + 3.0 * (sign[:, 0] > 0)
+        return torch.stack([u * self.scale + 0.37 * face, v * self.scale + 0.61 * face], -1), turned
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere, textured by longitude and latitude; `shine` is the strength of its highlight."""
+
+    center: tuple[float, float, float]
+    radius: float
+    texture: MipMap
+    scale: float
+    shine: float = 0.0
+
+    def hit(self, origin: Tensor, rays: Tensor) -> Tensor:
+        o = origin - torch.tensor(self.center)
+        b = (o * rays).sum(-1)
+        disc = b * b - ((o * o).sum(-1) - self.radius**2)
+        t = -b - disc.clamp(min=0).sqrt()
+        return torch.where((disc > 0) & (t > 1e-4), t, _FAR)
+
+    def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        normal = (points - torch.tensor(self.center)) / self.radius
+        u = torch.atan2(normal[:, 1], normal[:, 0]) / (2 * math.pi)
+        v = torch.asin(normal[:, 2].clamp(-1, 1)) / math.pi
+        return torch.stack([u * 2 * self.scale, v * self.scale], -1), normal
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """An upright cylinder with a lid."""
+
+    center: tuple[float, float, float]
+    radius: float
+    half_height: float
+    texture: MipMap
+    scale: float
+    shine: float = 0.0
+
+    def hit(self, origin: Tensor, rays: Tensor) -> Tensor:
+        o = origin - torch.tensor(self.center)
+        a = (rays[..., :2] ** 2).sum(-1)
+        b = (o[..., :2] * rays[..., :2]).sum(-1)
+        disc = b * b - a * ((o[..., :2] ** 2).sum(-1) - self.radius**2)
+        side = (-b - disc.clamp(min=0).sqrt()) / a
+        on_side = (disc > 0) & (side > 1e-4) & ((o[..., 2] + side * rays[..., 2]).abs() < self.half_height)
+        lid = (self.half_height - o[..., 2]) / rays[..., 2]
+        at = o[..., :2] + lid[..., None] * rays[..., :2]
+        on_lid = (lid > 1e-4) & ((at * at).sum(-1) < self.radius**2)
+        return torch.minimum(torch.where(on_side, side, _FAR), torch.where(on_lid, lid, _FAR))
+
+    def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        local = points - torch.tensor(self.center)
+        lid = local[:, 2] > self.half_height - 1e-3
+        around = torch.atan2(local[:, 1], local[:, 0]) * self.radius
+        normal = torch.where(
+            lid[:, None],
+            torch.tensor([0.0, 0.0, 1.0]),
+            torch.stack([local[:, 0], local[:, 1], torch.zeros_like(local[:, 0])], -1) / self.radius,
+        )
+        u = torch.where(lid, local[:, 0], around)
+        v = torch.where(lid, local[:, 1] + 5.0, local[:, 2])
+        return torch.stack([u, v], -1) * self.scale, normal
+
+
+Solid = Disc | Box | Sphere | Cylinder
+
+
+@dataclass(frozen=True)
+class StillLife:
+    """The scene: solids on a round table, on a floor, under a dome of sky; `light` is a unit vector."""
+
+    solids: tuple[Solid, ...]
+    dome: MipMap
+    light: np.ndarray
+
+
+def still_life(seed: int = 0) -> StillLife:
+    """The demo scene. The same seed gives the same scene; another seed paints and places it anew."""
+    rng = np.random.default_rng(seed)
+    solids: list[Solid] = [
+        Disc(0.0, 1.9, MipMap(painted(rng, 1024, density=900)), 0.27),
+        Disc(-0.9, 11.0, MipMap(planks(rng, 1024)), 0.12),
+    ]
+    for angle, ring, half in (
+        (0.3, 0.75, (0.34, 0.26, 0.42)),
+        (2.5, 0.95, (0.28, 0.34, 0.24)),
+        (4.4, 1.0, (0.2, 0.2, 0.6)),
+    ):
+        a = angle + rng.uniform(-0.15, 0.15)
+        center = (ring * math.cos(a), ring * math.sin(a), half[2])
+        solids.append(
+            Box(center, half, float(rng.uniform(0, 3)), MipMap(painted(rng, 512, density=220)), 0.9)
+        )
+    for angle, ring, radius, shine in ((1.4, 0.85, 0.36, 0.5), (3.4, 0.8, 0.3, 0.0), (5.4, 1.15, 0.26, 0.8)):
+        a = angle + rng.uniform(-0.15, 0.15)
+        center = (ring * math.cos(a), ring * math.sin(a), radius)
+        solids.append(Sphere(center, radius, MipMap(painted(rng, 512, density=160)), 1.0, shine))
+    solids.append(Cylinder((0.0, 0.05, 0.55), 0.27, 0.55, MipMap(painted(rng, 512, density=200)), 0.8))
+    return StillLife(tuple(solids), MipMap(sky(rng, 2048)), _LIGHT / np.linalg.norm(_LIGHT))
+
+
+def orbit(count: int, width: int, height: int, seed: int = 0) -> list[Camera]:
+    """`count` cameras around the table on a rising spiral, hand-held: each is a little off its place and aim."""
+    rng = np.random.default_rng([seed, 7])
+    focal = 0.82 * max(width, height)
+    cameras = []
+    for k in range(count):
+        turns = 2 if count >= 24 else 1
+        angle = 2 * math.pi * turns * (k + 0.3 * rng.uniform(-0.5, 0.5)) / count
+        rise = 0.32 + 0.5 * k / max(count - 1, 1) + rng.uniform(-0.04, 0.04)
+        distance = 3.7 + rng.uniform(-0.2, 0.2)
+        eye = distance * np.array(
+            [math.cos(angle) * math.cos(rise), math.sin(angle) * math.cos(rise), math.sin(rise)]
+        )
+        target = np.array([0.0, 0.0, 0.25]) + rng.uniform(-0.12, 0.12, 3)
+        cameras.append(look_at(eye, target, width, height, focal))
+    return cameras
+
+
+def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, focal: float) -> Camera:
+    """A level pinhole camera at `eye` [3] that looks at `target` [3]; `focal` in pixels, centre in the middle."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ eye
+    return Camera(width, height, focal, focal, width / 2, height / 2, viewmat)
+
+
+def photograph(scene: StillLife, camera: Camera, samples: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """What `camera` sees: colour, uint8 [H, W, 3], and camera-space depth at pixel centres, float32 [H, W]."""
+    rgb = np.empty((camera.height, camera.width, 3), np.uint8)
+    depth = np.empty((camera.height, camera.width), np.float32)
+    offsets = [(k + 0.5) / samples for k in range(samples)]
+    band = max(1, _RAYS_AT_ONCE // camera.width)
+    for top in range(0, camera.height, band):
+        rows = slice(top, min(top + band, camera.height))
+        shaded = torch.stack([_cast(scene, camera, rows, u, v)[0] for u in offsets for v in offsets])
+        rgb[rows] = (shaded.mean(0).clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+        depth[rows] = _cast(scene, camera, rows, 0.5, 0.5, shade=False)[1].numpy()
+    return rgb, depth
+
+
+def capture(
+    directory: Path, count: int = 40, width: int = 640, height: int = 480, seed: int = 0, samples: int = 2
+) -> dict[str, Camera]:
+    """Photograph the still life: `count` JPEGs with EXIF under `directory`; returns the true camera of each name."""
+    directory.mkdir(parents=True, exist_ok=True)
+    scene = still_life(seed)
+    cameras = {f"still_{k + 1:04d}.jpg": c for k, c in enumerate(orbit(count, width, height, seed))}
+
+    def shoot(name: str) -> None:
+        camera = cameras[name]
+        rgb, _ = photograph(scene, camera, samples)
+        exif = Image.Exif()
+        exif[0x010F], exif[0x0110] = "Splatmill", "Ray caster"
+        # 35 mm equivalent over the longer side, which is how SfM reads it back into pixels.
+        exif.get_ifd(0x8769)[0xA405] = round(35 * camera.fx / max(width, height))
+        Image.fromarray(rgb).save(directory / name, quality=95, exif=exif)
+
+    # One photo a thread: bands are too small for torch's own threads to pay.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(shoot, cameras))
+    finally:
+        torch.set_num_threads(threads)
+    return cameras
+
+
+def _cast(
+    scene: StillLife, camera: Camera, rows: slice, du: float, dv: float, shade: bool = True
+) -> tuple[Tensor, Tensor]:
+    """One ray a pixel of `rows` through (column + du, row + dv): colour [rows, W, 3] and depth [rows, W]."""
+    rotation = torch.from_numpy(camera.viewmat[:3, :3].astype(np.float32))
+    eye = torch.from_numpy((-camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]).astype(np.float32))
+    x = (torch.arange(camera.width) + du - camera.cx) / camera.fx
+    y = (torch.arange(rows.start, rows.stop) + dv - camera.cy) / camera.fy
+    grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)
+    local = torch.cat([grid, torch.ones_like(grid[..., :1])], -1).reshape(-1, 3)
+    length = local.norm(dim=-1)
+    rays = (local @ rotation) / length[:, None]
+
+    dome = Sphere((0.0, 0.0, 0.0), _DOME_RADIUS, scene.dome, 1.0)
+    b = (eye * rays).sum(-1)
+    nearest = -b + (b * b - (eye @ eye - _DOME_RADIUS**2)).sqrt()  # from inside, the far root
+    which = torch.full(nearest.shape, -1)
+    for k, solid in enumerate(scene.solids):
+        t = solid.hit(eye, rays)
+        closer = t < nearest
+        nearest = torch.where(closer, t, nearest)
+        which = torch.where(closer, k, which)
+    shape = (len(y), len(x))
+    depth = (nearest / length).reshape(shape)
+    if not shade:
+        return torch.empty(0), depth
+
+    points = eye + nearest[:, None] * rays
+    color = torch.empty_like(points)
+    pixel = nearest / camera.fx  # the width of a pixel's footprint where it lands
+    for k in range(-1, len(scene.solids)):
+        chosen = (which == k).nonzero()[:, 0]
+        if len(chosen) == 0:
+            continue
+        surface: Solid = dome if k < 0 else scene.solids[k]
+        uv, normal = surface.surface(points[chosen])
+        if k < 0:
+            color[chosen] = surface.texture.sample(uv, torch.zeros(len(chosen)))
+            continue
+        albedo = surface.texture.sample(uv, pixel[chosen] * surface.scale)
+        color[chosen] = _lit(scene, surface, points[chosen], normal, rays[chosen], albedo)
+    return color.reshape(*shape, 3), depth
+
+
+def _lit(
+    scene: StillLife, surface: Solid, points: Tensor, normal: Tensor, rays: Tensor, albedo: Tensor
+) -> Tensor:
+    """Lambert under one sun with hard shadows, and a Phong highlight where the surface shines."""
+    light = torch.from_numpy(scene.light.astype(np.float32))
+    lambert = (normal @ light).clamp(min=0)
+    start = points + 1e-3 * normal
+    blocked = torch.zeros(len(points), dtype=torch.bool)
+    for solid in scene.solids:
+        if not isinstance(solid, Disc):
+            blocked |= solid.hit(start, light.expand_as(start)) < _FAR
+    sun = lambert * (~blocked)
+    color = albedo * (_AMBIENT + (1 - _AMBIENT) * sun)[:, None]
+    shine = getattr(surface, "shine", 0.0)
+    if shine:
+        mirrored = rays - 2 * (rays * normal).sum(-1, keepdim=True) * normal
+        color = color + shine * ((mirrored @ light).clamp(min=0) ** 24 * sun)[:, None]
+    return color
