@@ -1,11 +1,9 @@
-"""The whole path of a capture: images -> cameras -> plan -> train -> evaluate -> export."""
+"""The whole path of a capture: photos -> cameras -> plan -> training -> evaluation -> files."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,30 +11,20 @@ from typing import Any
 import av
 import torch
 
-from splatmill.schema import (
-    Backend,
-    Event,
-    JobState,
-    LogEvent,
-    MetricEvent,
-    PlanEvent,
-    PreviewEvent,
-    ProgressEvent,
-    StateEvent,
-    TrainOptions,
-)
+from splatmill.schema import Backend, JobState, LogEvent, PlanEvent, StateEvent, TrainOptions
 from splatmill_worker.capture import cameras_of, held_out_of, kernels_of, start_file
 from splatmill_worker.errors import Cancelled, Refusal
+from splatmill_worker.events import Emit, TrainingEvents, progress_events
 from splatmill_worker.images import load_views
 from splatmill_worker.kernels.gpu.device import absence, describe
 from splatmill_worker.scene import Normalization, Scene, View
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.gaussians import Gaussians
-from splatmill_worker.splat.picture import save_jpeg
 from splatmill_worker.splat.plan.decide import decide, loading_size
 from splatmill_worker.splat.plan.facts import Facts, measure
-from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.plan.plan import Kernels, Plan
+from splatmill_worker.splat.plan.plan_file import read_plan, write_plan
 from splatmill_worker.splat.plan.probe import probe
 from splatmill_worker.splat.report.export import Frame, export
 from splatmill_worker.splat.report.progress_film import ProgressFilm
@@ -48,14 +36,13 @@ from splatmill_worker.splat.start.given_model import Start, judge, strongest
 from splatmill_worker.splat.start.given_model import read as read_start
 from splatmill_worker.splat.start.points import ENOUGH_POINTS, from_points
 from splatmill_worker.splat.train import checkpoint
-from splatmill_worker.splat.train.loop import Hooks, Tick, Trained, drawer, evaluation_background, train
-from splatmill_worker.splat.train.run import Row
+from splatmill_worker.splat.train.loop import Hooks, Trained, train
 from splatmill_worker.splat.views import TrainingView
-
-Emit = Callable[[Event], None]
 
 EXTENT = 1.1
 """Radius of the cameras in the training world, where the farthest is at 1, with the paper's tenth added."""
+
+Revise = Callable[[Plan], Plan]
 
 
 @dataclass(frozen=True)
@@ -74,125 +61,149 @@ def run(
     emit: Emit,
     cancelled: Callable[[], bool],
     *,
-    revise: Callable[[Plan], Plan] = lambda plan: plan,
+    revise: Revise = lambda plan: plan,
 ) -> Outcome:
-    """Train a scene from `capture` and leave model.ply, cameras.json and the reports in `workdir/out`.
+    """Train a scene from `capture`, and leave model.ply, cameras.json and the reports in `workdir/out`.
 
-    `workdir` survives attempts: what is there is gone on from. Events are emitted as things happen; states are
-    sfm, training and exporting, the final one is the caller's to say. `revise` changes the plan once it is made,
-    which is how an ablation takes one decision back. Raises Refusal, sfm.SfmFailed and
-    TrainingFailed, each with a sentence for the person who asked.
+    capture: folder with images/, and masks/ and poses/ where they were given.
+    workdir: survives attempts; what an earlier attempt left there is used again.
+    emit: gets each event as it happens. The states are sfm, training and exporting; the final one is the caller's.
+    cancelled: asked often; when it turns true, the run stores a checkpoint and ends.
+    revise: changes the plan once it is made, which is how an ablation takes one decision back.
+
+    Raises Refusal, SfmFailed and TrainingFailed (see `errors`).
     """
-    out = workdir / "out"
-    out.mkdir(parents=True, exist_ok=True)
     stages = Stages(workdir / "stages.json")
     try:
-        kernels = kernels_of(options)
-        if kernels == "cpu" and options.backend is Backend.auto and torch.cuda.is_available():
-            emit(LogEvent(level="warning", message=f"{absence()} Training runs on the CPU."))
-
+        task = Task(capture, workdir, options, kernels_of(options), emit, cancelled)
+        task.out.mkdir(parents=True, exist_ok=True)
+        _warn_of_idle_gpu(task)
         emit(StateEvent(state=JobState.sfm))
-        with stages.measured("sfm"):
-            scene = cameras_of(capture, workdir, options, _sfm_progress(emit), cancelled)
-        for note in scene.notes:
-            emit(LogEvent(message=note))
-        for name, reason in scene.left_out:
-            emit(LogEvent(level="warning", message=f"{name} is left out: {reason}"))
-
+        cameras = _cameras(task, stages)
         emit(StateEvent(state=JobState.training))
-        with stages.measured("load"):
-            frame = Normalization.of(scene)
-            world = frame.apply(scene)
-            train_views, test_views = held_out_of(scene, options)
-            size = loading_size(options, kernels)
-            views, held_out = _loaded(train_views, size, frame), _loaded(test_views, size, frame)
+        probed = _photos(cameras, loading_size(options, task.kernels), stages)
         with stages.measured("plan"):
-            start = _start(capture, workdir, options, frame, views)
-            if start is not None and start.facts.doubtful:
-                emit(LogEvent(level="warning", message=_doubt(start.facts)))
-            gaussians = _first_gaussians(world, views, options) if start is None else start.gaussians
-            known = None if start is None else start.facts
-            plan, facts = _plan(world, views, held_out, gaussians, known, options, workdir, revise)
-            gaussians = strongest(gaussians, plan.max_gaussians)
+            first, start = _first_gaussians(task, cameras, probed)
+            facts = _facts(task, cameras, probed, first, start)
+            plan = _plan(task, facts, revise)
         emit(PlanEvent(plan=plan.as_dict()))
-        if plan.image_size < max(facts.width, facts.height):
-            with stages.measured("load"):
-                views, held_out = (
-                    _loaded(train_views, plan.image_size, frame),
-                    _loaded(test_views, plan.image_size, frame),
-                )
-
-        if plan.initial == "points":
-            gaussians = completed(
-                gaussians,
-                world,
-                views,
-                fill_gaps=plan.gaps,
-                add_far_shell=plan.far_shell,
-                max_gaussians=plan.max_gaussians,
-            )
-        engine = open_engine(gaussians, plan.kernels)
-        resumable = _resumable(workdir, views)
-        film = None
-        if options.progress_video:
-            anew = resumable is None
-            film = ProgressFilm(workdir / "film", (held_out or views)[0], plan, anew=anew)
-        teller = _Teller(emit, workdir, plan, (held_out or views)[0])
-        trained = train(
-            engine,
-            views,
-            held_out,
-            plan,
-            extent=EXTENT,
-            hooks=Hooks(
-                tick=teller.tick,
-                measured=teller.measured,
-                warn=teller.warn,
-                cancelled=cancelled,
-                checkpoint=lambda state: checkpoint.save(workdir / "checkpoints", state),
-                watcher=film,
-            ),
-            resume_from=resumable,
-        )
+        photos = _photos_as_planned(cameras, probed, plan, facts, stages)
+        engine = open_engine(_completed(first, cameras, photos, plan), plan.kernels)
+        training = _trained(task, engine, photos, plan)
     except Cancelled:
-        return Outcome("cancelled", out)
-
-    views = list(trained.views)
+        return Outcome("cancelled", workdir / "out")
     emit(StateEvent(state=JobState.exporting))
-    with stages.measured("export"):
-        home = Frame.of(frame, scene)
-        written = export(out, trained, plan, home, views, held_out)
-        teller.preview(engine, trained.steps)
-    if film is not None:
-        try:
-            film.develop(out / "progress.mp4")
-        except (av.FFmpegError, OSError, ValueError) as error:
-            # The model is worth more than its film.
-            teller.warn(f"The film of the training could not be written: {error}.")
-        stages.add("film", film.seconds)
-    write_report(
-        out, trained, plan, facts, scene, stages, written, home, engine, views, held_out, teller.warnings
-    )
-    return Outcome("succeeded", out, trained)
+    _leave(task, cameras, photos, facts, plan, engine, training, stages)
+    return Outcome("succeeded", task.out, training.trained)
 
 
 @dataclass(frozen=True)
-class _Model:
-    """The model to start from, in the training world, and what is known of it."""
+class Task:
+    """What was asked for, where it is done, and who is told; the arguments of `run`, with the kernels chosen."""
 
-    gaussians: Gaussians
-    facts: Start
+    capture: Path
+    workdir: Path
+    options: TrainOptions
+    kernels: Kernels
+    emit: Emit
+    cancelled: Callable[[], bool]
+
+    @property
+    def out(self) -> Path:
+        """The folder for what the job leaves."""
+        return self.workdir / "out"
 
 
-def _start(
-    capture: Path, workdir: Path, options: TrainOptions, frame: Normalization, views: list[TrainingView]
-) -> _Model | None:
-    """The model given: a file beside the capture's poses, or the one that was fetched into `workdir`."""
-    path = start_file(capture, workdir, options)
-    if path is None:
-        return None
-    gaussians = read_start(path, frame)
-    return _Model(gaussians, judge(gaussians, views))
+@dataclass(frozen=True)
+class Cameras:
+    """The posed scene in its own world and in the training world, and its split.
+
+    scene: cameras and points in the world that they came in.
+    normalization: from that world to the training world.
+    world: the scene in the training world.
+    training, held_out: the views to train on and to evaluate on.
+    """
+
+    scene: Scene
+    normalization: Normalization
+    world: Scene
+    training: tuple[View, ...]
+    held_out: tuple[View, ...]
+
+
+@dataclass(frozen=True)
+class Photos:
+    """The photos of both parts of the split as tensors, in the training world."""
+
+    training: list[TrainingView]
+    held_out: list[TrainingView]
+
+    @property
+    def shown(self) -> TrainingView:
+        """The view of previews and of the progress film: a held-out one where there is any."""
+        return (self.held_out or self.training)[0]
+
+
+@dataclass(frozen=True)
+class Training:
+    """A finished training: its result, its events with the warnings, and its film where one was asked for."""
+
+    trained: Trained
+    events: TrainingEvents
+    film: ProgressFilm | None
+
+
+def _warn_of_idle_gpu(task: Task) -> None:
+    if task.kernels == "cpu" and task.options.backend is Backend.auto and torch.cuda.is_available():
+        task.emit(LogEvent(level="warning", message=f"{absence()} Training runs on the CPU."))
+
+
+def _cameras(task: Task, stages: Stages) -> Cameras:
+    """The cameras that came with the photos or are recovered from them, and which photos are held out."""
+    with stages.measured("sfm"):
+        scene = cameras_of(
+            task.capture, task.workdir, task.options, progress_events(task.emit), task.cancelled
+        )
+    for note in scene.notes:
+        task.emit(LogEvent(message=note))
+    for name, reason in scene.left_out:
+        task.emit(LogEvent(level="warning", message=f"{name} is left out: {reason}"))
+    normalization = Normalization.of(scene)
+    training, held_out = held_out_of(scene, task.options)
+    return Cameras(scene, normalization, normalization.apply(scene), training, held_out)
+
+
+def _photos(cameras: Cameras, size: int, stages: Stages) -> Photos:
+    """All photos, undistorted, with `size` pixels at most on the longer side."""
+    with stages.measured("load"):
+        training, held_out = (
+            [TrainingView.of(photo, cameras.normalization) for photo in load_views(views, size)]
+            for views in (cameras.training, cameras.held_out)
+        )
+    return Photos(training, held_out)
+
+
+def _photos_as_planned(cameras: Cameras, loaded: Photos, plan: Plan, facts: Facts, stages: Stages) -> Photos:
+    """The photos that are `loaded`, or smaller ones where the plan needs no more."""
+    if plan.image_size >= max(facts.width, facts.height):
+        return loaded
+    return _photos(cameras, plan.image_size, stages)
+
+
+def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaussians, Start | None]:
+    """The Gaussians to start with, and what is known of the model they are, where one was given."""
+    path = start_file(task.capture, task.workdir, task.options)
+    if path is not None:
+        given = read_start(path, cameras.normalization)
+        start = judge(given, photos.training)
+        if start.doubtful:
+            task.emit(LogEvent(level="warning", message=_doubt(start)))
+        return given, start
+    world = cameras.world
+    if len(world.points) >= ENOUGH_POINTS:
+        return from_points(torch.from_numpy(world.points), torch.from_numpy(world.colors)), None
+    targets = [view.full for view in photos.training]
+    return from_points(*in_frusta(targets, RANDOM_GAUSSIANS, task.options.seed)), None
 
 
 def _doubt(start: Start) -> str:
@@ -202,118 +213,116 @@ def _doubt(start: Start) -> str:
     )
 
 
-def _loaded(views: tuple[View, ...], size: int, frame: Normalization) -> list[TrainingView]:
-    return [TrainingView.of(photo, frame) for photo in load_views(views, size)]
+def _facts(task: Task, cameras: Cameras, photos: Photos, gaussians: Gaussians, start: Start | None) -> Facts:
+    """What can be measured before training: the scene, and how fast this machine trains it."""
+    speed = probe(open_engine(gaussians, task.kernels), photos.training)
+    facts = replace(measure(cameras.world, photos.training, len(photos.held_out), speed), start=start)
+    card = describe() if task.kernels == "gpu" else None
+    return facts if card is None else replace(facts, memory_available=card.free_bytes)
 
 
-def _first_gaussians(world: Scene, views: list[TrainingView], options: TrainOptions) -> Gaussians:
-    if len(world.points) >= ENOUGH_POINTS:
-        points, colors = torch.from_numpy(world.points), torch.from_numpy(world.colors)
-    else:
-        targets = [view.full for view in views]
-        points, colors = in_frusta(targets, RANDOM_GAUSSIANS, options.seed)
-    return from_points(points, colors)
-
-
-def _plan(
-    world: Scene,
-    views: list[TrainingView],
-    held_out: list[TrainingView],
-    gaussians: Gaussians,
-    start: Start | None,
-    options: TrainOptions,
-    workdir: Path,
-    revise: Callable[[Plan], Plan],
-) -> tuple[Plan, Facts]:
-    """The plan, made once: an attempt that goes on keeps the one it started with."""
-    kernels = kernels_of(options)
-    stored = workdir / "plan.json"
-    facts = measure(world, views, len(held_out), probe(open_engine(gaussians, kernels), views))
-    card = describe() if kernels == "gpu" else None
-    if card is not None:
-        facts = replace(facts, memory_available=card.free_bytes)
-    facts = replace(facts, start=start)
-    if stored.is_file():
-        kept = json.loads(stored.read_text())
-        if kept["options"] == options.model_dump(mode="json"):
-            # A plan of another version has other fields; then one is made anew.
-            with suppress(KeyError, TypeError):
-                return Plan.from_dict(kept["plan"]), facts
+def _plan(task: Task, facts: Facts, revise: Revise) -> Plan:
+    """The plan, made once: an attempt that goes on keeps the one that it started with."""
+    stored = task.workdir / "plan.json"
+    kept = read_plan(stored, task.options)
+    if kept is not None:
+        return kept
     try:
-        plan = revise(decide(facts, options, kernels))
+        plan = revise(decide(facts, task.options, task.kernels))
     except ValueError as error:
         raise Refusal(
             "option_out_of_range", str(error), advice="Change the option and start again."
         ) from error
-    # What an attempt with another plan left cannot be gone on from.
-    shutil.rmtree(workdir / "checkpoints", ignore_errors=True)
-    part = stored.with_suffix(".part")
-    part.write_text(
-        json.dumps({"options": options.model_dump(mode="json"), "plan": plan.as_dict(whole=True)})
+    # A checkpoint of another plan cannot be resumed.
+    shutil.rmtree(task.workdir / "checkpoints", ignore_errors=True)
+    write_plan(stored, task.options, plan)
+    return plan
+
+
+def _completed(first: Gaussians, cameras: Cameras, photos: Photos, plan: Plan) -> Gaussians:
+    """The first Gaussians within the plan's limit, with what the plan adds to those made from points."""
+    gaussians = strongest(first, plan.max_gaussians)
+    if plan.initial != "points":
+        return gaussians
+    return completed(
+        gaussians,
+        cameras.world,
+        photos.training,
+        fill_gaps=plan.gaps,
+        add_far_shell=plan.far_shell,
+        max_gaussians=plan.max_gaussians,
     )
-    part.replace(stored)
-    return plan, facts
 
 
-def _resumable(workdir: Path, views: list[TrainingView]) -> dict[str, Any] | None:
-    """The state of an earlier attempt at the same photos."""
-    state = checkpoint.load(workdir / "checkpoints")
-    return state if state is not None and state["views"] == [view.name for view in views] else None
+def _trained(task: Task, engine: Engine, photos: Photos, plan: Plan) -> Training:
+    """Train to the end of the budget, from the checkpoint of an earlier attempt where there is one."""
+    checkpoints = task.workdir / "checkpoints"
+    earlier = _resumable(checkpoints, photos)
+    film = None
+    if task.options.progress_video:
+        film = ProgressFilm(task.workdir / "film", photos.shown, plan, anew=earlier is None)
+    events = TrainingEvents(task.emit, task.workdir, plan, photos.shown)
+    trained = train(
+        engine,
+        photos.training,
+        photos.held_out,
+        plan,
+        extent=EXTENT,
+        hooks=Hooks(
+            tick=events.progress,
+            measured=events.measured,
+            warn=events.warn,
+            cancelled=task.cancelled,
+            checkpoint=lambda state: checkpoint.save(checkpoints, state),
+            watcher=film,
+        ),
+        resume_from=earlier,
+    )
+    return Training(trained, events, film)
 
 
-def _sfm_progress(emit: Emit) -> Callable[[str, int, int, str], None]:
-    def tell(stage: str, done: int, total: int, note: str) -> None:
-        emit(ProgressEvent(stage=stage, done=done, total=total or None, note=note or None))
+def _resumable(checkpoints: Path, photos: Photos) -> dict[str, Any] | None:
+    """The checkpoint of an earlier attempt at the same photos."""
+    state = checkpoint.load(checkpoints)
+    same = state is not None and state["views"] == [view.name for view in photos.training]
+    return state if same else None
 
-    return tell
 
-
-class _Teller:
-    """Turns what training says into events, and keeps the preview picture up to date."""
-
-    def __init__(self, emit: Emit, workdir: Path, plan: Plan, view: TrainingView) -> None:
-        self._emit, self._workdir, self._plan, self._view = emit, workdir, plan, view
-        self._last: Row | None = None
-        self.warnings: list[str] = []
-
-    def tick(self, tick: Tick) -> None:
-        self._emit(
-            ProgressEvent(
-                stage="training",
-                done=tick.step,
-                total=tick.steps,
-                step=tick.step,
-                loss=tick.loss,
-                psnr=None if self._last is None else self._last.psnr,
-                ssim=None if self._last is None else self._last.ssim,
-                gaussians=tick.gaussians,
-                seconds=tick.seconds,
-                eta=tick.eta,
-            )
-        )
-
-    def measured(self, row: Row, engine: Engine) -> None:
-        self._last = row
-        self._emit(
-            MetricEvent(
-                seconds=row.seconds,
-                step=row.step,
-                loss=row.loss,
-                psnr=row.psnr,
-                ssim=row.ssim,
-                gaussians=row.gaussians,
-                memory=row.memory,
-                train_psnr=row.train_psnr,
-                train_ssim=row.train_ssim,
-            )
-        )
-        self.preview(engine, row.step)
-
-    def warn(self, message: str) -> None:
-        self.warnings.append(message)
-        self._emit(LogEvent(level="warning", message=message))
-
-    def preview(self, engine: Engine, step: int) -> None:
-        color = drawer(engine, self._plan)(self._view.full, evaluation_background(self._plan, [self._view]))
-        save_jpeg(self._workdir / "out" / "preview.jpg", color)
-        self._emit(PreviewEvent(path="out/preview.jpg", step=step))
+def _leave(
+    task: Task,
+    cameras: Cameras,
+    photos: Photos,
+    facts: Facts,
+    plan: Plan,
+    engine: Engine,
+    training: Training,
+    stages: Stages,
+) -> None:
+    """Write the model, its cameras, the last preview, the film and the report."""
+    trained, events = training.trained, training.events
+    frame = Frame.of(cameras.normalization, cameras.scene)
+    views = list(trained.views)
+    with stages.measured("export"):
+        written = export(task.out, trained, plan, frame, views, photos.held_out)
+        events.preview(engine, trained.steps)
+    if training.film is not None:
+        try:
+            training.film.develop(task.out / "progress.mp4")
+        except (av.FFmpegError, OSError, ValueError) as error:
+            # The model is worth more than its film.
+            events.warn(f"The film of the training could not be written: {error}.")
+        stages.add("film", training.film.seconds)
+    write_report(
+        task.out,
+        trained,
+        plan,
+        facts,
+        cameras.scene,
+        stages,
+        written,
+        frame,
+        engine,
+        views,
+        photos.held_out,
+        events.warnings,
+    )

@@ -1,0 +1,83 @@
+"""Turns what structure from motion and training report into the events of a job."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from splatmill.schema import Event, LogEvent, MetricEvent, PreviewEvent, ProgressEvent
+from splatmill_worker.splat.engine.protocol import Engine
+from splatmill_worker.splat.picture import save_jpeg
+from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.train.loop import Tick, drawer, evaluation_background
+from splatmill_worker.splat.train.run import Row
+from splatmill_worker.splat.views import TrainingView
+
+Emit = Callable[[Event], None]
+
+
+def progress_events(emit: Emit) -> Callable[[str, int, int, str], None]:
+    """A callback (stage, done, total, note) that emits each call as a progress event."""
+
+    def tell(stage: str, done: int, total: int, note: str) -> None:
+        emit(ProgressEvent(stage=stage, done=done, total=total or None, note=note or None))
+
+    return tell
+
+
+class TrainingEvents:
+    """Emits the progress, metrics and warnings of a training run, and keeps its preview picture up to date.
+
+    The preview shows `view` and is written to out/preview.jpg below `workdir`. `warnings` collects what was warned of.
+    """
+
+    def __init__(self, emit: Emit, workdir: Path, plan: Plan, view: TrainingView) -> None:
+        self._emit, self._workdir, self._plan, self._view = emit, workdir, plan, view
+        self._last: Row | None = None
+        self.warnings: list[str] = []
+
+    def progress(self, tick: Tick) -> None:
+        """Emit how far the run is, with the last measured PSNR and SSIM."""
+        self._emit(
+            ProgressEvent(
+                stage="training",
+                done=tick.step,
+                total=tick.steps,
+                step=tick.step,
+                loss=tick.loss,
+                psnr=None if self._last is None else self._last.psnr,
+                ssim=None if self._last is None else self._last.ssim,
+                gaussians=tick.gaussians,
+                seconds=tick.seconds,
+                eta=tick.eta,
+            )
+        )
+
+    def measured(self, row: Row, engine: Engine) -> None:
+        """Emit a point of the curve, and renew the preview."""
+        self._last = row
+        self._emit(
+            MetricEvent(
+                seconds=row.seconds,
+                step=row.step,
+                loss=row.loss,
+                psnr=row.psnr,
+                ssim=row.ssim,
+                gaussians=row.gaussians,
+                memory=row.memory,
+                train_psnr=row.train_psnr,
+                train_ssim=row.train_ssim,
+            )
+        )
+        self.preview(engine, row.step)
+
+    def warn(self, message: str) -> None:
+        """Emit a warning, and keep it for the report."""
+        self.warnings.append(message)
+        self._emit(LogEvent(level="warning", message=message))
+
+    def preview(self, engine: Engine, step: int) -> None:
+        """Render the preview from what `engine` holds, and emit where it is."""
+        color = drawer(engine, self._plan)(self._view.full, evaluation_background(self._plan, [self._view]))
+        save_jpeg(self._workdir / "out" / "preview.jpg", color)
+        self._emit(PreviewEvent(path="out/preview.jpg", step=step))
