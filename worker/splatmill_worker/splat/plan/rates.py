@@ -11,18 +11,17 @@ POSITION_START = 1.6e-4
 """Per unit of scene extent (Kerbl et al. 2023, supplement)."""
 
 SH_REST = 1.25e-4
-"""The paper's. Short runs take twice of it, as few steps have to tell view from light: trials of 720 to 800 steps gain
-0.1 dB on lego (three seeds) and 0.6 on kermit (two), nothing clear on lund and the still life (three), and 3300 steps
-0.15 on fox (two). Long runs rather lose: 300 s on fox ended at 32.5 and 32.9 dB so, and at 32.8 to 33.3 with the
-paper's rate or less (nine runs)."""
+"""Rate per step of the spherical harmonics above degree 0, as in the paper."""
 
 PAPER_STEPS = 30_000
+"""Steps of the run for which the paper's rates are made."""
+
 MOST_BOOST = 8.0
-"""Times the paper's rates, which are made for PAPER_STEPS. The root of the ratio of steps, up to where nothing is won:
-on fox, 600 steps end at 26.6, 29.3, 30.3 and 30.9 dB with 1, 2, 4 and 8 times; 2500 steps at 31.9, 32.7 and 32.7."""
+"""Largest factor on the paper's rates (decisions: MOST_BOOST)."""
 
 MOST_SH, SH_SHARE = 2.0, 2.0 / 3.0
-"""Times SH_REST: this share of the boost, so that from 3300 to 30,000 steps the harmonics travel as far in any run."""
+"""The factor on SH_REST is SH_SHARE times the boost, at most MOST_SH (decisions: SH_REST). From 3300 to 30,000 steps,
+this rate times the root of the number of steps is the same in every run."""
 
 
 @dataclass(frozen=True)
