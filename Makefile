@@ -8,9 +8,12 @@ PIP_ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 KERNELS := $(shell find worker/splatmill_worker/kernels/cpu -name '*.[ch]pp' 2>/dev/null) worker/CMakeLists.txt
-PARTS := constraints.txt client/pyproject.toml server/pyproject.toml worker/pyproject.toml
+PARTS := constraints.txt $(wildcard */pyproject.toml) client/splatmill/__init__.py server/setup.py worker/version.py
+# The tests run in this many processes, a file in one process.
+WORKERS ?= 2
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --cov
 
-.PHONY: help install demo test check bench serve sanitize clean
+.PHONY: help install demo test check wheels bench serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -21,14 +24,17 @@ demo: install ## photos in, splats out, into demo/ (PHOTOS=path takes your own)
 	@test -n "$(PHOTOS)" || $(BIN)/python -m splatmill_worker.synthetic demo/photos
 	@$(BIN)/splatmill train "$(or $(PHOTOS),demo/photos)" -o demo --novel-view --orbit
 
-test: $(VENV)/.installed-dev ## run all tests
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+test: $(VENV)/.installed-dev ## run all tests and print their coverage (PYTEST_ARGS="..." chooses)
+	$(PYTEST) $(PYTEST_ARGS)
 
 check: $(VENV)/.installed-dev ## ruff, mypy, import rules
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+wheels: $(VENV)/.installed-dev ## build the wheels and source distributions of the three parts into dist/
+	for part in client server worker; do $(BIN)/python -m build --no-isolation --outdir dist $$part || exit 1; done
 
 bench: install ## error against run time: kernels, stability, SfM, training (takes a while)
 	for name in kernels stability sfm train; do $(BIN)/splatmill bench $$name || exit 1; done
@@ -40,7 +46,7 @@ sanitize: $(VENV)/.installed-dev ## the kernels' tests under AddressSanitizer an
 	worker/sanitize/run
 
 clean: ## remove what the other targets made, except demo/ and your data
-	rm -rf $(VENV) worker/build client/*.egg-info server/*.egg-info
+	rm -rf $(VENV) dist client/build server/build worker/build client/*.egg-info server/*.egg-info
 
 $(VENV)/.prerequisites:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
@@ -56,7 +62,9 @@ $(VENV)/.prerequisites:
 
 $(VENV)/.installed: $(VENV)/.prerequisites $(PARTS) $(KERNELS)
 	$(BIN)/python -m pip install -q $(PIP_ARGS) -U pip
-	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt -e ./client -e './server[embedded]' -e ./worker
+	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --group build -e ./client -e './server[embedded]'
+	# Without isolation, worker/build keeps what is compiled: another build compiles only what has changed.
+	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --no-build-isolation -e ./worker
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed pyproject.toml

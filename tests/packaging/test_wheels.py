@@ -1,0 +1,159 @@
+"""The wheels of the three parts stand alone: installed without the source tree, the client's talks to servers with few
+libraries, and all three train the built-in scene from the command line.
+
+Does not prove that the newest versions of the dependencies work (constraints.txt names those that were tried), nor
+anything about wheels of other processors and systems. The worker's wheel takes what is compiled from worker/build, as
+`make install` does; CMake compiles again what has changed since.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from tests.support.wheels import PARTS, ROOT, build, environment, metadata, run, watch
+
+FOREIGN = ("torch", "numpy", "redis", "rq", "obstore", "fastapi", "splatmill_server", "splatmill_worker")
+MODULES = ("splatmill", "splatmill_server", "splatmill_worker")
+
+
+@pytest.fixture(scope="session")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The wheel of each part, by its folder."""
+    folder = tmp_path_factory.mktemp("wheels")
+    # setuptools keeps modules that are gone in its build folder, so these two are built from their sdists.
+    return {
+        "client": build(ROOT / "client", folder / "client"),
+        "server": build(ROOT / "server", folder / "server"),
+        "worker": build(ROOT / "worker", folder / "worker", "--wheel"),
+    }
+
+
+@pytest.fixture(scope="session")
+def alone(tmp_path_factory: pytest.TempPathFactory, wheels: dict[str, Path]) -> Path:
+    """The `bin` folder of an environment with the client's wheel."""
+    return environment(tmp_path_factory.mktemp("alone"), wheels["client"])
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory: pytest.TempPathFactory, wheels: dict[str, Path]) -> Path:
+    """The `bin` folder of an environment with all three wheels."""
+    return environment(tmp_path_factory.mktemp("whole"), *wheels.values())
+
+
+def bare(**more: str) -> dict[str, str]:
+    """This process's variables without those that name other code or another service."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "SPLATMILL", "REDIS", "COV"))}
+    return kept | more
+
+
+def test_the_wheels_have_one_version_and_their_licence(wheels: dict[str, Path]) -> None:
+    client = metadata(wheels["client"])
+    text = (ROOT / "LICENSE").read_text()
+    for name, folder in PARTS.items():
+        found = metadata(wheels[folder])
+        assert found.metadata["Name"] == name
+        assert found.version == client.version
+        assert found.read_text("licenses/LICENSE") == text
+        assert str(found.metadata["Description"]).startswith(f"# {name}\n")
+
+
+def test_the_client_imports_without_the_other_parts_and_their_libraries(alone: Path) -> None:
+    code = f"""
+import importlib.util, sys
+assert not [name for name in {FOREIGN} if importlib.util.find_spec(name)], "the environment is not a bare one"
+import splatmill
+assert "pydantic" not in sys.modules, "import splatmill must cost nothing"
+import splatmill.schema, splatmill.client, splatmill.aio, splatmill.cli.app, splatmill.cli.train
+for name in splatmill.__all__:
+    getattr(splatmill, name)
+assert not [name for name in {FOREIGN} if name in sys.modules]
+print(splatmill.__file__)
+"""
+    done = run(alone / "python", "-W", "error", "-I", "-c", code)
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.strip()).is_relative_to(alone.parent)
+
+
+def test_the_clients_command_line_runs(alone: Path, wheels: dict[str, Path]) -> None:
+    version = metadata(wheels["client"]).version
+    assert run(alone / "splatmill", "--version").stdout == f"splatmill {version}\n"
+    options = run(alone / "splatmill", "options")
+    assert "--time-budget" in options.stdout
+    for command in ("train", "render", "orbit", "jobs", "status", "cancel", "download"):
+        assert run(alone / "splatmill", command, "--help").returncode == 0
+
+
+@pytest.mark.parametrize("command", ["up", "doctor", "bench", "train"])
+def test_a_missing_part_is_a_sentence_with_the_command_that_installs_it(
+    alone: Path, command: str, tmp_path: Path
+) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"x")
+    arguments: list[str | Path] = [tmp_path, "-o", tmp_path / "out"] if command == "train" else []
+    done = run(alone / "splatmill", command, *arguments)
+    assert done.returncode == 8
+    assert "is not installed" in done.stderr
+    assert "pip install splatmill splatmill-server" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_the_types_are_shipped(whole: Path) -> None:
+    (packages,) = whole.parent.glob("lib/python*/site-packages")
+    assert all((packages / module / "py.typed").is_file() for module in MODULES)
+
+
+def test_the_three_wheels_train_a_scene_from_the_command_line(whole: Path, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    watch(whole, log)
+    environment = bare(PATH=f"{whole}{os.pathsep}{os.environ['PATH']}")
+
+    modules = f"import {', '.join(MODULES)}; print(*(m.__file__ for m in ({', '.join(MODULES)})))"
+    files = run(whole / "python", "-c", modules, cwd=tmp_path, env=environment).stdout.split()
+    assert len(files) == 3
+    assert all(Path(file).is_relative_to(whole.parent) for file in files)
+
+    photos = ("photos", "--count", "20", "--width", "240", "--height", "180")
+    done = run(whole / "python", "-m", "splatmill_worker.synthetic", *photos, cwd=tmp_path, env=environment)
+    assert done.returncode == 0, done.stderr
+    done = run(
+        *(whole / "splatmill", "train", "photos", "-o", "out", "--steps", "30"),
+        cwd=tmp_path,
+        env=environment,
+        timeout=250,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    model = (tmp_path / "out" / "model.ply").read_bytes()
+    assert model.startswith(b"ply\nformat binary_little_endian 1.0\n")
+    assert len(model) > 5000
+    assert (tmp_path / "out" / "report.html").is_file()
+
+    lines = log.read_text().splitlines()
+    # Every process writes to the log: the command, the service that it starts, and the service's worker.
+    for process in ("bin/splatmill train", "splatmill_server.up", "splatmill_worker train"):
+        assert any(line.startswith("began") and process in line for line in lines), lines
+    assert not [line for line in lines if line.startswith("opened")]
+
+
+@pytest.mark.parametrize("folder", PARTS.values())
+def test_a_source_distribution_holds_what_its_build_reads(folder: str, tmp_path: Path) -> None:
+    """Its own folder is enough: the version, which a checkout reads from the client, comes from PKG-INFO."""
+    sdist = build(ROOT / folder, tmp_path / "dist", "--sdist")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(tmp_path / "unpacked", filter="data")
+    (source,) = (tmp_path / "unpacked").iterdir()
+    assert {"README.md", "LICENSE", "PKG-INFO", "pyproject.toml"} <= {path.name for path in source.iterdir()}
+    if folder == "worker":
+        suffixes = {".py", ".cpp", ".hpp"}
+        kept = {str(p.relative_to(source)) for p in source.rglob("*") if p.suffix in suffixes}
+        package = ROOT / "worker" / "splatmill_worker"
+        ours = {str(p.relative_to(ROOT / "worker")) for p in package.rglob("*") if p.suffix in suffixes}
+        assert ours | {"version.py"} <= kept
+        assert not [name for name in kept if name.startswith(("bench", "sanitize", "build"))]
+    program = "import sys, build.util; print(build.util.project_wheel_metadata(sys.argv[1], isolated=False)['Version'])"
+    done = run(sys.executable, "-c", program, source)
+    assert done.returncode == 0, done.stderr
+    assert sdist.name.removesuffix(".tar.gz").endswith(f"-{done.stdout.split()[-1]}")
