@@ -1,7 +1,7 @@
 """Splatmill: photos in, Gaussian splats out. The SDK, the wire schema and the command line.
 
-`from splatmill import Client` is the whole beginning. Names are loaded when they are first used, so that
-`import splatmill` (which the server and the worker do as well, for the schema) costs nothing.
+Start with `from splatmill import Client`. Names are imported when they are first used, so that `import splatmill`
+stays fast; the server and the worker import it too, for the schema.
 """
 
 from importlib import import_module
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from splatmill.model import AsyncModelHandle
     from splatmill.schema import CameraSpec, OrbitRequest, RenderRequest, TrainOptions
 
-_HOMES = {
+_MODULES = {
     "AsyncClient": "splatmill.aio",
     "AsyncJobHandle": "splatmill.job",
     "AsyncModelHandle": "splatmill.model",
@@ -52,10 +52,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    home = _HOMES.get(name)
-    if home is None:
+    module = _MODULES.get(name)
+    if module is None:
         raise AttributeError(f"module 'splatmill' has no attribute {name!r}")
-    return getattr(import_module(home), name)
+    return getattr(import_module(module), name)
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""`python -m splatmill` is the command line."""
+"""Runs the command line: `python -m splatmill`."""
 
 from splatmill.cli import main
 

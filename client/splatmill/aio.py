@@ -1,4 +1,4 @@
-"""The asynchronous SDK: everything the service offers, on one event loop."""
+"""The asynchronous SDK: `AsyncClient`."""
 
 import uuid
 from collections.abc import AsyncIterator, Mapping
@@ -10,9 +10,9 @@ from pydantic import ValidationError
 
 from splatmill.connection import RETRIES, TIMEOUT, Connection, read_answer
 from splatmill.downloads import AnyPath
-from splatmill.errors import invalid
+from splatmill.errors import invalid_request
 from splatmill.job import AsyncJobHandle
-from splatmill.layout import find_files, start_file
+from splatmill.local_capture import find_files, start_model
 from splatmill.model import AsyncModelHandle, find_model
 from splatmill.schema import (
     IDEMPOTENCY_HEADER,
@@ -31,11 +31,13 @@ from splatmill.uploads import OnProgress, Uploaded, upload
 
 
 class AsyncClient:
-    """A Splatmill server.
+    """A client of a Splatmill server. Use it as a context manager, or call `close`.
 
-    `server` is its address (default: SPLATMILL_SERVER, then the local one), `api_key` its key (default:
-    SPLATMILL_API_KEY), `transport` what carries the requests (an `httpx.ASGITransport` needs no socket).
-    Use it as a context manager, or call `close`.
+    server: address of the server; by default SPLATMILL_SERVER, else the server on this machine.
+    api_key: key of the server; by default SPLATMILL_API_KEY.
+    timeout: seconds to wait for a connection or for data.
+    transport: httpx transport; an `httpx.ASGITransport` calls an app in this process without a socket.
+    retries: how often a failed request is sent again, if that is safe.
     """
 
     def __init__(
@@ -64,13 +66,16 @@ class AsyncClient:
     async def train(
         self, path: AnyPath, *, name: str | None = None, on_progress: OnProgress | None = None, **options: Any
     ) -> AsyncJobHandle:
-        """Upload what lies at `path` (photos, a zip, a video or a posed data set) and start a job on it.
+        """Upload the capture at `path` (photos, a zip archive, a video or a posed data set) and start a job on it.
 
-        `options` are those of `TrainOptions`; they and the path are checked before anything is sent. `start` may
-        also be the path of a .ply file here, or its name in the folder at `path`; it is uploaded beside the poses.
-        The job goes on whatever becomes of this connection. `handle.refused` names photos the server would not take.
+        `options` are the fields of `TrainOptions`. `start` may also be the path of a .ply file on this machine, or its
+        name in the folder `path`; the file is then uploaded with the poses. The options and the path are checked before
+        anything is sent. The job continues when the connection is closed. `refused` of the returned handle lists the
+        photos that the server refused.
+
+        Raises NothingToUpload, ConnectionFailed, or a subclass of `Refused`.
         """
-        options, model = with_start_file(options, path)
+        options, model = with_start_model(options, path)
         checked = train_options(options)
         capture, uploaded = await self.upload(path, name=name, on_progress=on_progress, model=model)
         handle = await self.submit(capture.id, checked, name=name)
@@ -86,11 +91,12 @@ class AsyncClient:
         on_progress: OnProgress | None = None,
         model: Path | None = None,
     ) -> tuple[Capture, Uploaded]:
-        """Send what lies at `path` into a new capture, or into `capture` (files that are there are not sent twice).
+        """Upload the capture at `path` into a new capture, or into the one with the id `capture`.
 
-        `model`: a .ply to start from, to be sent along.
+        Files that are already stored are not stored twice. `model` is the path of a .ply file to start from, which is
+        uploaded with the poses. Raises NothingToUpload, ConnectionFailed, or a subclass of `Refused`.
         """
-        files = [*find_files(path).files, *([start_file(model)] if model is not None else [])]
+        files = [*find_files(path).files, *([start_model(model)] if model is not None else [])]
         if capture is None:
             body = {"name": name or Path(path).expanduser().resolve().name}
             response = await self.connection.request("POST", "/v1/captures", json=body)
@@ -102,31 +108,31 @@ class AsyncClient:
     async def submit(
         self, capture: str, options: TrainOptions | None = None, *, name: str | None = None
     ) -> AsyncJobHandle:
-        """Start a job on a capture that is already stored."""
+        """Start a job on the stored capture with the id `capture`."""
         chosen = options.model_dump(mode="json", exclude_unset=True) if options is not None else {}
         body = {"capture": capture, "name": name, "options": chosen}
         response = await self.connection.request(
             "POST",
             "/v1/jobs",
             json=body,
-            # The same key on every try: an answer that got lost does not start a second job.
+            # Every attempt carries the same key, so that a lost response does not lead to a second job.
             headers={IDEMPOTENCY_HEADER: str(uuid.uuid4())},
             repeatable=True,
         )
         return AsyncJobHandle(self.connection, read_answer(Job, response))
 
     async def capture(self, capture_id: str) -> Capture:
-        """A stored capture with its files."""
+        """Return a stored capture with its files."""
         response = await self.connection.request("GET", f"/v1/captures/{capture_id}")
         return read_answer(Capture, response)
 
     async def job(self, job_id: str) -> AsyncJobHandle:
-        """A job by its id."""
+        """Return the job with this id."""
         response = await self.connection.request("GET", f"/v1/jobs/{job_id}")
         return AsyncJobHandle(self.connection, read_answer(Job, response))
 
     async def jobs(self, *, limit: int | None = None) -> AsyncIterator[Job]:
-        """All jobs, newest first, page by page; `limit` at most."""
+        """Yield the jobs, newest first, at most `limit` of them. Pages are requested as needed."""
         cursor: str | None = None
         left = limit
         while left is None or left > 0:
@@ -141,11 +147,11 @@ class AsyncClient:
                 return
 
     async def model(self, model_id: str) -> AsyncModelHandle:
-        """A finished model by its id, which is that of its job."""
+        """Return the finished model with this id, which is that of its job."""
         return await find_model(self.connection, model_id)
 
     async def models(self) -> AsyncIterator[Model]:
-        """All finished models, newest first."""
+        """Yield the finished models, newest first."""
         cursor: str | None = None
         while True:
             params = {"cursor": cursor} if cursor else None
@@ -158,28 +164,31 @@ class AsyncClient:
                 return
 
     async def options(self) -> list[OptionHelp]:
-        """Every setting this server takes, with type, default, range and help."""
+        """Return the training options of the server, with type, default, range and help."""
         response = await self.connection.request("GET", "/v1/options")
         return read_answer(OptionList, response).options
 
     async def info(self) -> Info:
-        """What the server is, who works for it, and what it accepts."""
+        """Return the version, the workers and the limits of the server."""
         response = await self.connection.request("GET", "/v1/info")
         return read_answer(Info, response)
 
     async def ready(self) -> Ready:
-        """Whether the service can do its work, part by part."""
+        """Return whether the service can run jobs, with a check for each part."""
         try:
-            response = await self.connection.http.get("/readyz")  # 503 is an answer here, not a failure
+            response = await self.connection.http.get(
+                "/readyz"
+            )  # here, a response with status 503 is a valid answer
         except httpx.TransportError as error:
             raise self.connection.lost(error) from error
         return read_answer(Ready, response)
 
 
-def with_start_file(options: Mapping[str, Any], folder: AnyPath) -> tuple[dict[str, Any], Path | None]:
-    """The options with a local .ply in `start` replaced by its name in the capture, and its path, if it is one.
+def with_start_model(options: Mapping[str, Any], folder: AnyPath) -> tuple[dict[str, Any], Path | None]:
+    """Return `options` with the path of a .ply in `start` replaced by its name in the capture, and that path or None.
 
-    A .ply that is not there is looked for in `folder`, the data set. Raises NothingToUpload for one that is in neither.
+    A relative path is looked up in the working folder, then in `folder`, the data set. Raises NothingToUpload where
+    neither holds the file.
     """
     start = options.get("start")
     if start is None or not str(start).lower().endswith(".ply"):
@@ -188,13 +197,13 @@ def with_start_file(options: Mapping[str, Any], folder: AnyPath) -> tuple[dict[s
     inside = Path(folder).expanduser() / path
     if not path.is_file() and inside.is_file():
         path = inside
-    return {**options, "start": start_file(path).name}, path
+    return {**options, "start": start_model(path).name}, path
 
 
 def train_options(options: Mapping[str, Any]) -> TrainOptions:
-    """The options a person gave, checked; raises InvalidRequest with one clause per value that does not fit."""
+    """Validate options. Raises InvalidRequest, with one clause per value that is not valid."""
     try:
         return TrainOptions.model_validate(dict(options))
     except ValidationError as error:
         unknown = any(entry["type"] == "extra_forbidden" for entry in error.errors())
-        raise invalid(error, "unknown_option" if unknown else "option_out_of_range") from error
+        raise invalid_request(error, "unknown_option" if unknown else "option_out_of_range") from error

@@ -1,4 +1,4 @@
-"""The synchronous SDK: the asynchronous one, waited for. `aio`, `job` and `model` say what each call does."""
+"""The synchronous SDK. Each method waits for the method of the same name in `aio`, `job` or `model`, which see."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -32,11 +32,13 @@ from splatmill.uploads import OnProgress, Uploaded
 
 
 class Client:
-    """A Splatmill server.
+    """A client of a Splatmill server. Use it as a context manager, or call `close`.
 
-    `server` is its address (default: SPLATMILL_SERVER, then the local one), `api_key` its key (default:
-    SPLATMILL_API_KEY), `transport` what carries the requests (an `httpx.ASGITransport` needs no socket).
-    Use it as a context manager, or call `close`.
+    server: address of the server; by default SPLATMILL_SERVER, else the server on this machine.
+    api_key: key of the server; by default SPLATMILL_API_KEY.
+    timeout: seconds to wait for a connection or for data.
+    transport: httpx transport; an `httpx.ASGITransport` calls an app in this process without a socket.
+    retries: how often a failed request is sent again, if that is safe.
     """
 
     def __init__(
@@ -67,13 +69,13 @@ class Client:
 
     @property
     def server(self) -> str:
-        """The server's address."""
+        """The address of the server."""
         return self._async.connection.server
 
     def train(
         self, path: AnyPath, *, name: str | None = None, on_progress: OnProgress | None = None, **options: Any
     ) -> "JobHandle":
-        """Upload photos, a zip, a video or a posed data set, and start a job on it."""
+        """Upload the capture at `path` (photos, a zip archive, a video or a posed data set) and start a job on it."""
         handle = self._loop.run_reporting(
             lambda report: self._async.train(path, name=name, on_progress=report, **options), on_progress
         )
@@ -88,7 +90,7 @@ class Client:
         on_progress: OnProgress | None = None,
         model: Path | None = None,
     ) -> tuple[Capture, Uploaded]:
-        """Send what lies at `path` into a new capture, or into `capture`, and `model`, a .ply to start from."""
+        """Upload the capture at `path`, and `model`, a .ply file to start from, into a new capture or `capture`."""
         return self._loop.run_reporting(
             lambda report: self._async.upload(
                 path, name=name, capture=capture, on_progress=report, model=model
@@ -99,44 +101,44 @@ class Client:
     def submit(
         self, capture: str, options: TrainOptions | None = None, *, name: str | None = None
     ) -> "JobHandle":
-        """Start a job on a capture that is already stored."""
+        """Start a job on the stored capture with the id `capture`."""
         return JobHandle(self._loop, self._loop.run(self._async.submit(capture, options, name=name)))
 
     def capture(self, capture_id: str) -> Capture:
-        """A stored capture with its files."""
+        """Return a stored capture with its files."""
         return self._loop.run(self._async.capture(capture_id))
 
     def job(self, job_id: str) -> "JobHandle":
-        """A job by its id."""
+        """Return the job with this id."""
         return JobHandle(self._loop, self._loop.run(self._async.job(job_id)))
 
     def jobs(self, *, limit: int | None = None) -> Iterator[Job]:
-        """All jobs, newest first; `limit` at most."""
+        """Yield the jobs, newest first, at most `limit` of them."""
         return self._loop.iterate(self._async.jobs(limit=limit))
 
     def model(self, model_id: str) -> "ModelHandle":
-        """A finished model by its id, which is that of its job."""
+        """Return the finished model with this id, which is that of its job."""
         return ModelHandle(self._loop, self._loop.run(self._async.model(model_id)))
 
     def models(self) -> Iterator[Model]:
-        """All finished models, newest first."""
+        """Yield the finished models, newest first."""
         return self._loop.iterate(self._async.models())
 
     def options(self) -> list[OptionHelp]:
-        """Every setting this server takes, with type, default, range and help."""
+        """Return the training options of the server, with type, default, range and help."""
         return self._loop.run(self._async.options())
 
     def info(self) -> Info:
-        """What the server is, who works for it, and what it accepts."""
+        """Return the version, the workers and the limits of the server."""
         return self._loop.run(self._async.info())
 
     def ready(self) -> Ready:
-        """Whether the service can do its work, part by part."""
+        """Return whether the service can run jobs, with a check for each part."""
         return self._loop.run(self._async.ready())
 
 
 class JobHandle:
-    """A job on the server. `job` is what was last heard of it."""
+    """A job on the server."""
 
     def __init__(self, loop: BackgroundLoop, handle: AsyncJobHandle) -> None:
         self._loop = loop
@@ -144,62 +146,62 @@ class JobHandle:
 
     @property
     def id(self) -> str:
-        """The job's id, and its model's."""
+        """The id of the job and of its model."""
         return self._async.id
 
     @property
     def job(self) -> Job:
-        """The job when last heard of."""
+        """The record of the job, as of the last request."""
         return self._async.job
 
     @property
     def state(self) -> JobState:
-        """The state when last heard of."""
+        """The state, as of the last request."""
         return self._async.state
 
     @property
     def refused(self) -> tuple[tuple[str, Problem], ...]:
-        """Photos the server would not take, with its reasons."""
+        """Names of the photos that the server refused in the upload, each with the reason."""
         return self._async.refused
 
     def refresh(self) -> Job:
-        """Ask for the job's present state."""
+        """Request the current record of the job."""
         return self._loop.run(self._async.refresh())
 
     def events(self, after: str | None = None) -> Iterator[EventRecord]:
-        """What happens, as it happens, until the job's end; lost connections are taken up again."""
+        """Yield the events of the job until it ends. A lost connection is restored without losing events."""
         return self._loop.iterate(self._async.events(after))
 
     def wait(self, on_progress: OnProgress | None = None) -> "ModelHandle":
-        """The model, once the job is done; raises JobFailed or JobCancelled when it ends without one."""
+        """Wait for the job to end and return its model. Raises JobFailed or JobCancelled when it ends without one."""
         return ModelHandle(self._loop, self._loop.run_reporting(self._async.wait, on_progress))
 
     def result(self) -> "ModelHandle":
-        """The model of a job that has ended; raises JobFailed, JobCancelled, or Conflict while it runs."""
+        """Return the model of a job that has ended. Raises JobFailed, JobCancelled, or Conflict while it runs."""
         return ModelHandle(self._loop, self._loop.run(self._async.result()))
 
     def cancel(self) -> Job:
-        """Ask for the job's end; it is reported as cancelled once its process is gone."""
+        """Request the cancellation of the job. Its state becomes cancelled once its process has ended."""
         return self._loop.run(self._async.cancel())
 
     def restart(self) -> Job:
-        """Run a job that has ended once more, going on from its last checkpoint where there is one."""
+        """Run a job that has ended again, from its last checkpoint if there is one."""
         return self._loop.run(self._async.restart())
 
     def delete(self) -> None:
-        """Remove the job, its model and its files."""
+        """Delete the job, its model and its files."""
         self._loop.run(self._async.delete())
 
     def report(self) -> Report:
-        """Error against run time, and what led to it."""
+        """Return the report: error against run time, the plan, and where it ran."""
         return self._loop.run(self._async.report())
 
     def logs(self) -> list[LogLine]:
-        """The job's log, oldest line first."""
+        """Return the log of the job, oldest line first."""
         return self._loop.run(self._async.logs())
 
     def preview(self) -> bytes:
-        """The newest preview picture (JPEG)."""
+        """Return the newest preview image (JPEG)."""
         return self._loop.run(self._async.preview())
 
 
@@ -212,26 +214,26 @@ class ModelHandle:
 
     @property
     def id(self) -> str:
-        """The model's id."""
+        """The id of the model."""
         return self._async.id
 
     @property
     def model(self) -> Model:
-        """The model's record."""
+        """The record of the model."""
         return self._async.model
 
     def download(self, path: AnyPath, *, file: str = "model.ply", on_bytes: OnBytes | None = None) -> Path:
-        """Write one of the model's files to `path` (a file, or a folder that exists), whole or not at all."""
+        """Download a file of the model to `path`, a file or an existing folder. A partial download is resumed."""
         return self._loop.run(self._async.download(path, file=file, on_bytes=on_bytes))
 
     def cameras(self) -> list[ModelCamera]:
-        """The cameras of the capture in the model's world, held-out ones marked `test`."""
+        """Return the cameras of the capture in the coordinates of the model; `split` marks the held-out ones."""
         return self._loop.run(self._async.cameras())
 
-    def render(self, camera: CameraSpec | Mapping[str, Any], **wishes: Any) -> bytes:
-        """The picture from `camera`; `wishes` are `output`, `format`, `background` and `quality` of RenderRequest."""
-        return self._loop.run(self._async.render(camera, **wishes))
+    def render(self, camera: CameraSpec | Mapping[str, Any], **options: Any) -> bytes:
+        """Render an image from `camera`. `options` are output, format, background and quality of RenderRequest."""
+        return self._loop.run(self._async.render(camera, **options))
 
-    def orbit(self, path: AnyPath, **wishes: Any) -> Path:
-        """Write a video (MP4) that circles the scene to `path`; `wishes` are the fields of OrbitRequest."""
-        return self._loop.run(self._async.orbit(path, **wishes))
+    def orbit(self, path: AnyPath, **options: Any) -> Path:
+        """Render a video (MP4) that circles the scene, and write it to `path`. `options` are those of OrbitRequest."""
+        return self._loop.run(self._async.orbit(path, **options))

@@ -1,4 +1,4 @@
-"""One connection to a server: the API key, what is tried again, and how an answer becomes an error."""
+"""The HTTP connection to a server: API key, retries, and the conversion of responses into errors."""
 
 import asyncio
 import os
@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import httpx
 from pydantic import BaseModel, ValidationError
 
-from splatmill.errors import ConnectionFailed, refused
+from splatmill.errors import ConnectionFailed, error_for
 from splatmill.schema.info import DEFAULT_PORT
 from splatmill.schema.problems import PROBLEM_MEDIA_TYPE, Problem, code_for_status
 
@@ -18,25 +18,25 @@ DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
 SERVER_VARIABLE = "SPLATMILL_SERVER"
 API_KEY_VARIABLE = "SPLATMILL_API_KEY"
 
-# Reading waits for a render or a Redis that is coming back; connecting to a server that is there is quick.
+# A read may have to wait for a render or for Redis to restart; connecting to a running server is quick.
 TIMEOUT = httpx.Timeout(60.0, connect=10.0)
 RETRIES = 4
-FIRST_PAUSE = 0.25  # seconds; doubled each time, with jitter so that many clients do not return at once
-LONGEST_PAUSE = 8.0
-PASSING = frozenset({429, 502, 503, 504})
+FIRST_PAUSE = 0.25  # seconds; doubled after each retry, with jitter so that clients do not retry in step
+LONGEST_PAUSE = 8.0  # seconds
+TRANSIENT = frozenset({429, 502, 503, 504})
 REPEATABLE = frozenset({"GET", "HEAD", "PUT", "DELETE"})
 
 M = TypeVar("M", bound=BaseModel)
 
 Body = Callable[[], AsyncIterable[bytes]]
-"""Opens the body from its beginning, so that it can be sent again."""
+"""Returns a new iterator over the request body, so that the body can be sent again."""
 
 
 class Connection:
-    """Sends requests to one server.
+    """Sends requests to one server, and retries those that failed.
 
-    A request is sent again after a lost connection or a passing refusal (429, 502, 503, 504) only where repeating
-    it cannot do anything twice; one that never reached the server is always sent again.
+    A request is retried after a lost connection or a transient refusal (429, 502, 503, 504) if it is idempotent. A
+    request that never reached the server is retried in any case.
     """
 
     def __init__(
@@ -60,12 +60,12 @@ class Connection:
             headers=headers,
             timeout=timeout,
             transport=transport,
-            # A proxy set for the outside world must not stand between this machine and itself.
+            # Requests to this machine must not go through a proxy that is set for other hosts.
             trust_env=url.host not in ("127.0.0.1", "localhost", "::1"),
         )
 
     async def close(self) -> None:
-        """Close the connections; the object cannot be used afterwards."""
+        """Close the connections. The object cannot be used afterwards."""
         await self.http.aclose()
 
     async def request(
@@ -80,10 +80,10 @@ class Connection:
         repeatable: bool | None = None,
         timeout: httpx.Timeout | None = None,
     ) -> httpx.Response:
-        """The answer, read whole.
+        """Send a request and return the response with its whole body.
 
-        `repeatable` says of a POST that sending it twice does no more than sending it once.
-        Raises ConnectionFailed, or the `Refused` that the problem calls for.
+        `repeatable` says whether the request is idempotent; left out, the method decides. Raises ConnectionFailed, or
+        the subclass of `Refused` for the problem.
         """
         extra: dict[str, Any] = {} if timeout is None else {"timeout": timeout}
         may_repeat = method in REPEATABLE if repeatable is None else repeatable
@@ -105,13 +105,13 @@ class Connection:
                 never_sent = isinstance(error, httpx.ConnectError | httpx.ConnectTimeout | httpx.PoolTimeout)
                 if last or not (may_repeat or never_sent):
                     raise self.lost(error) from error
-                await asyncio.sleep(pause(tries))
+                await asyncio.sleep(backoff(tries))
                 continue
             if response.is_success or response.status_code == 304:
                 return response
-            if last or not may_repeat or response.status_code not in PASSING:
-                raise refused(read_problem(response))
-            await asyncio.sleep(max(pause(tries), retry_after(response)))
+            if last or not may_repeat or response.status_code not in TRANSIENT:
+                raise error_for(read_problem(response))
+            await asyncio.sleep(max(backoff(tries), retry_after(response)))
 
     @asynccontextmanager
     async def stream(
@@ -123,19 +123,19 @@ class Connection:
         headers: Mapping[str, str] | None = None,
         timeout: httpx.Timeout | None = None,
     ) -> AsyncIterator[httpx.Response]:
-        """One try at an answer that is read piece by piece; httpx's transport errors come through.
+        """Send a request once and yield the response, whose body is read in pieces.
 
-        Raises the `Refused` that a problem calls for.
+        Raises httpx.TransportError, or the subclass of `Refused` for the problem.
         """
         extra: dict[str, Any] = {} if timeout is None else {"timeout": timeout}
         async with self.http.stream(method, path, json=json, headers=headers, **extra) as response:
             if not response.is_success:
                 await response.aread()
-                raise refused(read_problem(response))
+                raise error_for(read_problem(response))
             yield response
 
     def lost(self, error: httpx.TransportError) -> ConnectionFailed:
-        """The error for a connection that failed."""
+        """Return the error for a failed connection."""
         reason = str(error) or type(error).__name__
         if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
             return ConnectionFailed(
@@ -143,39 +143,41 @@ class Connection:
                 "Start one with `splatmill up`, or check the address.",
             )
         return ConnectionFailed(
-            f"The connection to {self.server} was lost ({reason}).", "What was sent is kept; try again."
+            f"The connection to {self.server} was lost ({reason}).",
+            "The server keeps the files that it has received; try again.",
         )
 
 
 def read_answer(kind: type[M], response: httpx.Response) -> M:
-    """The answer as `kind`; ConnectionFailed for one that no Splatmill server would give."""
+    """Parse the body of a response as `kind`. Raises ConnectionFailed for a body that is not one."""
     try:
         return kind.model_validate_json(response.content)
     except ValidationError as error:
         raise ConnectionFailed(
-            f"{response.request.url} answered {response.status_code}, but not as a Splatmill server would.",
-            "Check the address, and that the versions of server and client go together.",
+            f"{response.request.url} answered {response.status_code} with a body that is not a "
+            f"{kind.__name__}.",
+            "Check that the address is that of a Splatmill server, and that its version fits this client.",
         ) from error
 
 
-def pause(tries: int) -> float:
-    """Seconds to wait after the n-th try."""
+def backoff(tries: int) -> float:
+    """Return the seconds to wait after the n-th attempt: exponential backoff with jitter."""
     return min(FIRST_PAUSE * 2.0 ** (tries - 1), LONGEST_PAUSE) * random.uniform(0.5, 1.0)
 
 
 def retry_after(response: httpx.Response) -> float:
-    """Seconds the server asks to wait, at most 30; 0 where it asks for none or for a date."""
+    """Return the seconds of the header Retry-After, at most 30; 0 without it, or where it holds a date."""
     text = response.headers.get("Retry-After", "")
     return min(float(text), 30.0) if text.isascii() and text.isdigit() else 0.0
 
 
 def read_problem(response: httpx.Response) -> Problem:
-    """The problem in an answer, or one made from the bare status (a proxy's page, say)."""
+    """Return the problem of a response; for one without a problem document (from a proxy, say), one from its status."""
     if response.headers.get("Content-Type", "").startswith(PROBLEM_MEDIA_TYPE):
         try:
             return Problem.model_validate_json(response.content)
         except ValidationError:
-            pass  # claimed to be one of ours and is not: treated like any other page
+            pass  # the Content-Type is wrong: the body is no problem document
     status = response.status_code if 400 <= response.status_code <= 599 else 500
     made = Problem.of(
         code_for_status(status),
@@ -191,12 +193,13 @@ def _checked(server: str) -> httpx.URL:
     try:
         url = httpx.URL(server)
     except httpx.InvalidURL as error:
-        raise ValueError(f"{server!r} is no address of a server: {error}.") from error
+        raise ValueError(f"{server!r} is not the address of a server: {error}.") from error
     if url.scheme not in ("http", "https") or not url.host:
-        raise ValueError(f"{server!r} is no address of a server; write it like {DEFAULT_SERVER}.")
+        raise ValueError(f"{server!r} is not the address of a server; write it like {DEFAULT_SERVER}.")
     if url.userinfo or url.query:
-        # Addresses end up in logs and histories; a key must not.
+        # Addresses appear in logs and shell histories, where a key must not appear.
         raise ValueError(
-            f"The address of a server holds no key and no query; pass api_key or set {API_KEY_VARIABLE}."
+            f"The address of the server contains credentials or a query; pass api_key or set "
+            f"{API_KEY_VARIABLE}."
         )
     return url

@@ -8,18 +8,18 @@ from pathlib import Path
 
 import httpx
 
-from splatmill.connection import Connection, pause
+from splatmill.connection import Connection, backoff
 from splatmill.errors import DownloadFailed, InvalidRequest, Unavailable
 from splatmill.files import move_into_place
 from splatmill.schema.captures import SHA256_HEADER
 
 AnyPath = str | os.PathLike[str]
 OnBytes = Callable[[int, int | None], None]
-"""Called with the bytes that are there and the size of the whole, where it is known."""
+"""Called with the number of bytes received so far, and the size of the file where it is known."""
 
 
 def target_of(path: AnyPath, name: str) -> Path:
-    """Where `name` is written: `path` itself, or inside it where it is a folder (or ends in a separator)."""
+    """Return the path to write to: `path`, or `path`/`name` if `path` is a folder or ends in a separator."""
     target = Path(path).expanduser()
     if target.is_dir() or os.fspath(path).endswith(("/", os.sep)):
         target = target / name
@@ -34,12 +34,13 @@ async def download(
     sha256: str | None = None,
     on_bytes: OnBytes | None = None,
 ) -> Path:
-    """Write the file at `address` to `target`.
+    """Download the file at `address` to `target`, and return `target`.
 
-    Bytes collect in `target.part` with the file's ETag beside it; a later call goes on there if the ETag still
-    fits. `target` appears only when the size and, where the server or the caller names one, the SHA-256 agree.
+    The bytes are collected in `target.part`, beside the ETag of the file; a later call resumes there if the ETag is
+    unchanged. `target` is replaced once the size agrees, and the SHA-256 if the server or the caller gives one.
 
-    Raises DownloadFailed when they do not, ConnectionFailed or `Refused`, OSError when the disk refuses.
+    Raises DownloadFailed when the SHA-256 differs, ConnectionFailed, a subclass of `Refused`, or OSError when the file
+    cannot be written.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     part = _Part(target)
@@ -52,12 +53,12 @@ async def download(
             break
         except (httpx.TransportError, Unavailable) as error:
             if part.size > before:
-                tries = 1  # it moves: only tries without a byte count
+                tries = 1  # count only attempts that received nothing
             if tries > connection.retries:
                 raise connection.lost(error) if isinstance(error, httpx.TransportError) else error from error
-            await asyncio.sleep(pause(tries))
+            await asyncio.sleep(backoff(tries))
         except InvalidRequest as error:
-            # All bytes were there already and only the renaming was missing, or the file changed: begin anew.
+            # Either all bytes had arrived and only the rename was missing, or the file has changed: start again.
             if error.problem.status != 416 or not before:
                 raise
             part.discard()
@@ -67,15 +68,15 @@ async def download(
         if seen != expected:
             part.discard()
             raise DownloadFailed(
-                f"{target.name} arrived with SHA-256 {seen[:12]}... instead of {expected[:12]}...",
+                f"The SHA-256 of the downloaded {target.name} is {seen[:12]}..., not {expected[:12]}...",
                 "The partial file was removed; download it again.",
             )
-    part.finish()
+    part.move_into_place()
     return target
 
 
 class _Part:
-    """The unfinished file and the ETag of what it is a part of."""
+    """The partial file of a download, and the ETag of the file it is a part of."""
 
     def __init__(self, target: Path) -> None:
         self.target = target
@@ -84,7 +85,7 @@ class _Part:
 
     @property
     def size(self) -> int:
-        """Bytes that can be gone on after; 0 without an ETag, since nothing would prove them to fit."""
+        """Number of bytes after which the download can resume; 0 without an ETag, which would prove that they fit."""
         return self.path.stat().st_size if self.path.exists() and self.etag is not None else 0
 
     @property
@@ -93,7 +94,7 @@ class _Part:
 
     def begin(self, etag: str | None) -> None:
         self.discard()
-        # A weak ETag does not promise the same bytes.
+        # Files with equal weak ETags may differ in their bytes.
         if etag and not etag.startswith("W/"):
             self.etag_path.write_text(etag)
         self.path.touch()
@@ -106,13 +107,13 @@ class _Part:
         self.path.unlink(missing_ok=True)
         self.etag_path.unlink(missing_ok=True)
 
-    def finish(self) -> None:
+    def move_into_place(self) -> None:
         move_into_place(self.path, self.target, sync=True)
         self.etag_path.unlink(missing_ok=True)
 
 
 async def _fetch(connection: Connection, address: str, part: _Part, on_bytes: OnBytes | None) -> str | None:
-    """One try: append what is missing, and return the announced SHA-256."""
+    """Send one request, append the missing bytes, and return the SHA-256 that the server announces."""
     headers = {"Accept-Encoding": "identity"}
     if part.size and part.etag:
         headers |= {"Range": f"bytes={part.size}-", "If-Range": part.etag}
@@ -124,7 +125,7 @@ async def _fetch(connection: Connection, address: str, part: _Part, on_bytes: On
             f"bytes {start}-"
         ):
             part.discard()
-            raise httpx.RemoteProtocolError("the server answered with another range than the one asked for")
+            raise httpx.RemoteProtocolError("the server sent another range than the requested one")
         length = response.headers.get("Content-Length")
         total = start + int(length) if length is not None else None
         with part.path.open("ab") as sink:

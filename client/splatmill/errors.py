@@ -1,18 +1,18 @@
-"""Every error the SDK raises.
+"""The errors that the SDK raises.
 
 SplatmillError
-├── ConnectionFailed          no answer, or the connection was lost for good
-├── Refused                   the server answered with a problem (`.problem`)
-│   ├── InvalidRequest        something about the request or the upload has to change
-│   ├── Unauthorized          the API key is missing, wrong, or may not do that
-│   ├── NotFound              no such capture, job, model or file
-│   ├── Conflict              the thing is in the wrong state, or the name is taken
-│   ├── Unavailable           a part of the service is down or full; later may be better
-│   └── ServerError           the service made a mistake
+├── ConnectionFailed          the server does not answer, or the connection was lost
+├── Refused                   the server refused the request (`.problem` says why)
+│   ├── InvalidRequest        the request or the uploaded file is not valid
+│   ├── Unauthorized          the API key is missing or wrong, or does not permit the request
+│   ├── NotFound              there is no such capture, job, model or file
+│   ├── Conflict              the job or model is in the wrong state, or the name is taken
+│   ├── Unavailable           a part of the service is down or full; try again later
+│   └── ServerError           the service failed to handle the request
 ├── JobFailed                 the job ended without a model (`.problem` says why)
 ├── JobCancelled              the job was cancelled
-├── NothingToUpload           the path holds nothing that could be trained
-├── DownloadFailed            the bytes that arrived are not the file
+├── NothingToUpload           the path holds no photos, video or zip archive
+├── DownloadFailed            the downloaded bytes are not those of the file
 └── ServiceFailed             the embedded service could not be started
 """
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class SplatmillError(Exception):
-    """The base of all errors of the SDK: a sentence, and advice where there is some."""
+    """The base class of all errors of the SDK. `message` says what happened, `advice` what to do, if anything."""
 
     def __init__(self, message: str, advice: str | None = None) -> None:
         super().__init__(message)
@@ -37,11 +37,11 @@ class SplatmillError(Exception):
 
 
 class ConnectionFailed(SplatmillError):
-    """No answer, or the connection was lost for good."""
+    """The server does not answer, or the connection was lost and could not be restored."""
 
 
 class Refused(SplatmillError):
-    """The server answered with a problem."""
+    """The server refused the request. `problem` is its answer."""
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem.detail, problem.advice)
@@ -49,16 +49,16 @@ class Refused(SplatmillError):
 
     @property
     def code(self) -> str:
-        """The problem's stable code."""
+        """The stable code of the problem."""
         return self.problem.code
 
 
 class InvalidRequest(Refused):
-    """Something about the request or the upload has to change."""
+    """The request or the uploaded file is not valid, and has to be changed."""
 
 
 class Unauthorized(Refused):
-    """The API key is missing, wrong, or may not do that."""
+    """The API key is missing or wrong, or does not permit the request."""
 
 
 class NotFound(Refused):
@@ -66,19 +66,19 @@ class NotFound(Refused):
 
 
 class Conflict(Refused):
-    """The thing is in the wrong state, or the name is taken."""
+    """The job or model is in the wrong state for the request, or the name is taken."""
 
 
 class Unavailable(Refused):
-    """A part of the service is down or full; later may be better."""
+    """A part of the service is down or full. Try again later."""
 
 
 class ServerError(Refused):
-    """The service made a mistake."""
+    """The service failed to handle the request."""
 
 
 class JobFailed(SplatmillError):
-    """The job ended without a model."""
+    """The job ended without a model. `problem` is the reason."""
 
     def __init__(self, job_id: str, problem: Problem) -> None:
         super().__init__(problem.detail, problem.advice)
@@ -87,7 +87,7 @@ class JobFailed(SplatmillError):
 
     @property
     def code(self) -> str:
-        """The problem's stable code."""
+        """The stable code of the problem."""
         return self.problem.code
 
 
@@ -100,11 +100,11 @@ class JobCancelled(SplatmillError):
 
 
 class NothingToUpload(SplatmillError):
-    """The path holds nothing that could be trained."""
+    """The path holds no photos, video or zip archive, or a file that cannot be read or uploaded."""
 
 
 class DownloadFailed(SplatmillError):
-    """The bytes that arrived are not the file."""
+    """The downloaded bytes are not those of the file."""
 
 
 class ServiceFailed(SplatmillError):
@@ -123,20 +123,20 @@ _BY_STATUS: dict[int, type[Refused]] = {
 }
 
 
-def refused(problem: Problem) -> Refused:
-    """The error for a problem. The status decides: it is fixed for each code by the schema's table."""
+def error_for(problem: Problem) -> Refused:
+    """Return the error for a problem. Its class follows from the HTTP status, which is fixed for each code."""
     kind = _BY_STATUS.get(problem.status) or (InvalidRequest if problem.status < 500 else ServerError)
     return kind(problem)
 
 
-def invalid(error: "ValidationError", code: str = "invalid_request") -> InvalidRequest:
-    """The error for values that the schema refuses before anything is sent: one clause per value."""
+def invalid_request(error: "ValidationError", code: str = "invalid_request") -> InvalidRequest:
+    """Return the error for values that the schema rejects before anything is sent, with one clause per value."""
     clauses = []
     for entry in error.errors(include_url=False):
         place = ".".join(str(part) for part in entry["loc"])
         message = entry["msg"].removeprefix("Value error, ")
         if entry["type"] == "extra_forbidden":
-            clauses.append(f"there is no setting {place!r}")
+            clauses.append(f"there is no option {place!r}")
         else:
             seen = f" (got {entry['input']!r})" if isinstance(entry["input"], str | int | float) else ""
             clauses.append(f"{place}: {message}{seen}" if place else message)

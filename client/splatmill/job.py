@@ -1,10 +1,10 @@
-"""A job on the server: its events, its end, and the wishes one can have about it."""
+"""A job on the server: its state, its events and its results."""
 
 import asyncio
 import time
 from collections.abc import AsyncIterator
 
-from splatmill.connection import Connection, pause, read_answer
+from splatmill.connection import Connection, backoff, read_answer
 from splatmill.errors import Conflict, ConnectionFailed, JobCancelled, JobFailed, Unavailable
 from splatmill.model import AsyncModelHandle, find_model
 from splatmill.schema import (
@@ -18,12 +18,16 @@ from splatmill.schema import (
     ProgressEvent,
     Report,
 )
-from splatmill.sse import PATIENCE, follow
+from splatmill.sse import GIVE_UP_SECONDS, follow_events
 from splatmill.uploads import OnProgress
 
 
 class AsyncJobHandle:
-    """A job on the server. `job` is what was last heard of it."""
+    """A job on the server.
+
+    job: its record, as of the last request.
+    refused: names of the photos that the server refused in the upload, each with the reason.
+    """
 
     def __init__(self, connection: Connection, job: Job) -> None:
         self.connection = connection
@@ -32,56 +36,56 @@ class AsyncJobHandle:
 
     @property
     def id(self) -> str:
-        """The job's id, and its model's."""
+        """The id of the job and of its model."""
         return self.job.id
 
     @property
     def state(self) -> JobState:
-        """The state when last heard of."""
+        """The state as of the last request."""
         return self.job.state
 
     async def refresh(self) -> Job:
-        """Ask for the job's present state."""
+        """Request the current record of the job."""
         response = await self.connection.request("GET", f"/v1/jobs/{self.id}")
         self.job = read_answer(Job, response)
         return self.job
 
     async def events(self, after: str | None = None) -> AsyncIterator[EventRecord]:
-        """What happens, as it happens, until the job's end; lost connections are taken up again.
+        """Yield the events of the job until it ends. A lost connection is restored without losing events.
 
-        `after` is the id of an event to go on after; without it the stream begins at the job's beginning.
+        `after` is the id of the last event already seen; without it, the events begin at the start of the job.
         """
-        silent = 0
+        empty = 0  # streams in a row that ended without an event
         while True:
-            silent += 1
-            async for record in follow(self.connection, f"/v1/jobs/{self.id}/events", after=after):
-                after, silent = record.id, 0
+            empty += 1
+            async for record in follow_events(self.connection, f"/v1/jobs/{self.id}/events", after=after):
+                after, empty = record.id, 0
                 yield record
             if (await self._refresh_patiently()).state.final:
                 return
-            if silent:  # a server that ends its streams at once must not be asked in a tight circle
-                await asyncio.sleep(pause(silent))
+            if empty:  # do not poll a server that ends its streams at once
+                await asyncio.sleep(backoff(empty))
 
     async def _refresh_patiently(self) -> Job:
-        """The job's present state, waiting out a service of which a part is down."""
-        end = time.monotonic() + PATIENCE
+        """Request the current record, and wait while a part of the service is down."""
+        end = time.monotonic() + GIVE_UP_SECONDS
         while True:
             try:
                 return await self.refresh()
             except (Unavailable, ConnectionFailed):
                 if time.monotonic() > end:
                     raise
-                await asyncio.sleep(pause(self.connection.retries + 1))
+                await asyncio.sleep(backoff(self.connection.retries + 1))
 
     async def wait(self, on_progress: OnProgress | None = None) -> AsyncModelHandle:
-        """The model, once the job is done; raises JobFailed or JobCancelled when it ends without one."""
+        """Wait for the job to end and return its model. Raises JobFailed or JobCancelled when it ends without one."""
         async for record in self.events():
             if on_progress is not None and isinstance(record.event, ProgressEvent):
                 on_progress(Progress.model_validate(record.event.model_dump(exclude={"type"})))
         return await self.result()
 
     async def result(self) -> AsyncModelHandle:
-        """The model of a job that has ended; raises JobFailed, JobCancelled, or Conflict while it runs."""
+        """Return the model of a job that has ended. Raises JobFailed, JobCancelled, or Conflict while it runs."""
         job = await self.refresh()
         if job.state is JobState.succeeded:
             return await find_model(self.connection, job.model or job.id)
@@ -89,41 +93,41 @@ class AsyncJobHandle:
             raise JobCancelled(job.id)
         if job.state is JobState.failed:
             problem = job.problem or Problem.of(
-                "internal_error", f"The job {job.id} failed without a reason."
+                "internal_error", f"The job {job.id} failed, and the server gave no reason."
             )
             raise JobFailed(job.id, problem)
-        detail = f"The job {job.id} is {job.state.value}; its model is not there yet."
+        detail = f"The job {job.id} is {job.state.value}; its model is not finished."
         raise Conflict(Problem.of("model_not_ready", detail))
 
     async def cancel(self) -> Job:
-        """Ask for the job's end; it is reported as cancelled once its process is gone."""
+        """Request the cancellation of the job. Its state becomes cancelled once its process has ended."""
         return await self._post("cancel")
 
     async def restart(self) -> Job:
-        """Run a job that has ended once more, going on from its last checkpoint where there is one."""
+        """Run a job that has ended again, from its last checkpoint if there is one."""
         return await self._post("restart")
 
     async def delete(self) -> None:
-        """Remove the job, its model and its files."""
+        """Delete the job, its model and its files."""
         await self.connection.request("DELETE", f"/v1/jobs/{self.id}")
 
     async def report(self) -> Report:
-        """Error against run time, and what led to it."""
+        """Return the report: error against run time, the plan, and where it ran."""
         response = await self.connection.request("GET", f"/v1/jobs/{self.id}/report")
         return read_answer(Report, response)
 
     async def logs(self) -> list[LogLine]:
-        """The job's log, oldest line first."""
+        """Return the log of the job, oldest line first."""
         response = await self.connection.request("GET", f"/v1/jobs/{self.id}/logs")
         return read_answer(LogPage, response).lines
 
     async def preview(self) -> bytes:
-        """The newest preview picture (JPEG)."""
+        """Return the newest preview image (JPEG)."""
         response = await self.connection.request("GET", f"/v1/jobs/{self.id}/preview")
         return response.content
 
-    async def _post(self, wish: str) -> Job:
-        # Wishing twice is wishing once.
-        response = await self.connection.request("POST", f"/v1/jobs/{self.id}/{wish}", repeatable=True)
+    async def _post(self, action: str) -> Job:
+        # The server treats a repeated cancel or restart as one.
+        response = await self.connection.request("POST", f"/v1/jobs/{self.id}/{action}", repeatable=True)
         self.job = read_answer(Job, response)
         return self.job

@@ -1,4 +1,4 @@
-"""An event loop on a thread of its own, so that the synchronous client is the asynchronous one, waited for."""
+"""An event loop on its own thread, on which the synchronous client runs the asynchronous one."""
 
 import asyncio
 import threading
@@ -15,7 +15,7 @@ _DONE: Final = object()
 
 
 class BackgroundLoop:
-    """Runs coroutines on its thread. The thread is a daemon: a program that forgets to close still ends."""
+    """An event loop on a thread. The thread is a daemon, so a program that does not call `close` still ends."""
 
     def __init__(self) -> None:
         self._loop = asyncio.new_event_loop()
@@ -27,7 +27,7 @@ class BackgroundLoop:
         self._loop.run_forever()
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
-        """The result of `work`; an interruption here (Ctrl-C) cancels it there."""
+        """Run `work` on the loop and return its result. An exception in the waiting thread (Ctrl-C) cancels `work`."""
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result()
@@ -40,7 +40,7 @@ class BackgroundLoop:
         work: Callable[[Callable[[Progress], None]], Coroutine[Any, Any, T]],
         on_progress: Callable[[Progress], None] | None,
     ) -> T:
-        """The result of `work(report)`; what it reports is handed to `on_progress` on the caller's own thread."""
+        """Run `work(report)` and return its result. `on_progress` is called on the caller's thread with each report."""
         if on_progress is None:
             return self.run(work(lambda _: None))
         reports: SimpleQueue[Any] = SimpleQueue()
@@ -55,7 +55,7 @@ class BackgroundLoop:
             raise
 
     def iterate(self, items: AsyncIterator[T]) -> Iterator[T]:
-        """The items of an asynchronous generator; it is closed when the iteration is left."""
+        """Yield the items of an asynchronous generator, which is closed when the iteration ends early."""
 
         advancing: asyncio.Task[Any] | None = None
 
@@ -64,8 +64,8 @@ class BackgroundLoop:
             advancing = asyncio.current_task()
             return await anext(items, _DONE)
 
-        async def leave() -> None:
-            # An interruption may have struck while the next item was awaited; a generator that runs cannot close.
+        async def close_items() -> None:
+            # An exception may have arrived while the next item was awaited; a running generator cannot be closed.
             if advancing is not None and not advancing.done():
                 advancing.cancel()
                 await asyncio.wait({advancing})
@@ -75,9 +75,9 @@ class BackgroundLoop:
 
         try:
             while (item := self.run(advance())) is not _DONE:
-                yield item  # type: ignore[misc]  # anext's default widens the type; _DONE was ruled out
+                yield item  # type: ignore[misc]  # the default of anext widens the type; _DONE is excluded here
         finally:
-            self.run(leave())
+            self.run(close_items())
 
     @property
     def closed(self) -> bool:
@@ -85,7 +85,7 @@ class BackgroundLoop:
         return self._loop.is_closed()
 
     def close(self) -> None:
-        """End what still runs, and the thread."""
+        """Cancel the running coroutines and end the thread."""
         self.run(_cancel_others())
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()

@@ -1,4 +1,4 @@
-"""A finished model on the server: its files, its cameras, and pictures of it."""
+"""A finished model on the server: its files, its cameras, and images rendered from it."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,13 +9,13 @@ from pydantic import ValidationError
 
 from splatmill.connection import Connection, read_answer
 from splatmill.downloads import AnyPath, OnBytes, download, target_of
-from splatmill.errors import invalid
+from splatmill.errors import invalid_request
 from splatmill.files import atomic_write
 from splatmill.schema import CameraSpec, Model, ModelCamera, ModelCameras, OrbitRequest, RenderRequest
 
-# A little longer than the server waits for its renderer, so that its sentence arrives instead of ours.
+# Longer than the server waits for its renderer, so that the server's problem arrives before this timeout.
 RENDER_TIMEOUT = httpx.Timeout(30.0, read=150.0)
-# Hundreds of frames on a machine without a GPU take minutes, and the answer begins when the video is whole.
+# Without a GPU, hundreds of frames take minutes, and the response begins when the video is complete.
 ORBIT_TIMEOUT = httpx.Timeout(30.0, read=900.0)
 
 
@@ -28,13 +28,17 @@ class AsyncModelHandle:
 
     @property
     def id(self) -> str:
-        """The model's id."""
+        """The id of the model."""
         return self.model.id
 
     async def download(
         self, path: AnyPath, *, file: str = "model.ply", on_bytes: OnBytes | None = None
     ) -> Path:
-        """Write one of the model's files to `path` (a file, or a folder that exists), whole or not at all."""
+        """Download a file of the model to `path`, a file or an existing folder, and return the path written.
+
+        A partial download is resumed. `on_bytes` is called with the bytes received and the size, where it is known.
+        Raises DownloadFailed, ConnectionFailed, a subclass of `Refused`, or OSError.
+        """
         digest = next((entry.sha256 for entry in self.model.files if entry.name == file), None)
         return await download(
             self.connection,
@@ -45,16 +49,20 @@ class AsyncModelHandle:
         )
 
     async def cameras(self) -> list[ModelCamera]:
-        """The cameras of the capture in the model's world, held-out ones marked `test`."""
+        """Return the cameras of the capture in the coordinates of the model; `split` marks the held-out ones."""
         response = await self.connection.request("GET", f"/v1/models/{self.id}/cameras")
         return read_answer(ModelCameras, response).cameras
 
-    async def render(self, camera: CameraSpec | Mapping[str, Any], **wishes: Any) -> bytes:
-        """The picture from `camera`; `wishes` are `output`, `format`, `background` and `quality` of RenderRequest."""
+    async def render(self, camera: CameraSpec | Mapping[str, Any], **options: Any) -> bytes:
+        """Render an image from `camera`, and return the bytes of the file.
+
+        `options` are output, format, background and quality of `RenderRequest`. Raises InvalidRequest for a camera or
+        options that are not valid.
+        """
         try:
-            request = RenderRequest.model_validate({"camera": camera} | wishes)
+            request = RenderRequest.model_validate({"camera": camera} | options)
         except ValidationError as error:
-            raise invalid(error, "camera_invalid") from error
+            raise invalid_request(error, "camera_invalid") from error
         response = await self.connection.request(
             "POST",
             f"/v1/models/{self.id}/render",
@@ -64,12 +72,15 @@ class AsyncModelHandle:
         )
         return response.content
 
-    async def orbit(self, path: AnyPath, **wishes: Any) -> Path:
-        """Write a video (MP4) that circles the scene to `path`; `wishes` are the fields of OrbitRequest."""
+    async def orbit(self, path: AnyPath, **options: Any) -> Path:
+        """Render a video (MP4) that circles the scene, write it to `path`, and return the path written.
+
+        `options` are the fields of `OrbitRequest`. Raises InvalidRequest for options that are not valid.
+        """
         try:
-            request = OrbitRequest.model_validate(wishes)
+            request = OrbitRequest.model_validate(options)
         except ValidationError as error:
-            raise invalid(error) from error
+            raise invalid_request(error) from error
         response = await self.connection.request(
             "POST",
             f"/v1/models/{self.id}/orbit",
@@ -83,6 +94,6 @@ class AsyncModelHandle:
 
 
 async def find_model(connection: Connection, model_id: str) -> AsyncModelHandle:
-    """A finished model by its id; raises NotFound, or Conflict while its job runs."""
+    """Return the finished model with this id. Raises NotFound, or Conflict while its job runs."""
     response = await connection.request("GET", f"/v1/models/{model_id}")
     return AsyncModelHandle(connection, read_answer(Model, response))

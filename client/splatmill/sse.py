@@ -1,6 +1,6 @@
-"""Server-sent events, and following a job's events across lost connections.
+"""Parsing of server-sent events, and a stream of a job's events that survives lost connections.
 
-Lines are split on bytes: JSON may hold U+2028 or U+0085, which text splitting takes for ends of lines.
+Lines are split as bytes: JSON may contain U+2028 or U+0085, at which str.splitlines would break a line.
 """
 
 import asyncio
@@ -11,25 +11,27 @@ from dataclasses import dataclass
 import httpx
 from pydantic import ValidationError
 
-from splatmill.connection import Connection, pause
+from splatmill.connection import Connection, backoff
 from splatmill.errors import Unavailable
 from splatmill.schema.events import EventRecord
 
-PATIENCE = 300.0  # seconds without a word before a job is given up on: replacing a server may take that long
-# The server sends a comment every few seconds; silence for this long is a dead connection.
-SILENCE = httpx.Timeout(30.0, connect=10.0, read=45.0)
+GIVE_UP_SECONDS = 300.0
+"""Time without any data after which the connection counts as lost for good; replacing a server may take this long."""
+
+# The server sends a comment every few seconds, so a read that waits this long has a dead connection.
+STREAM_TIMEOUT = httpx.Timeout(30.0, connect=10.0, read=45.0)
 
 
 @dataclass(frozen=True)
 class Message:
-    """One dispatched message of an event stream."""
+    """One message of an event stream: its `id`, if it has one, and its `data`."""
 
     id: str | None
     data: str
 
 
 async def read_messages(chunks: AsyncIterable[bytes]) -> AsyncIterator[Message]:
-    """The messages of a `text/event-stream` body (WHATWG HTML, section 9.2); comments and `retry` are passed over."""
+    """Yield the messages of a `text/event-stream` body (WHATWG HTML, section 9.2); comments and `retry` are ignored."""
     last_id: str | None = None
     data: list[str] = []
     async for line in _lines(chunks):
@@ -47,11 +49,11 @@ async def read_messages(chunks: AsyncIterable[bytes]) -> AsyncIterator[Message]:
 
 
 async def _lines(chunks: AsyncIterable[bytes]) -> AsyncIterator[bytes]:
-    """Lines without their ends (LF, CRLF or CR); an unfinished last line is dropped, as the standard asks."""
+    """Yield lines without their ends (LF, CRLF or CR). An unfinished last line is dropped, as the standard requires."""
     rest = b""
     async for chunk in chunks:
         rest += chunk
-        # A CR at the very end may be the first half of a CRLF: keep it until more is known.
+        # A CR at the end may be the first half of a CRLF, so it is kept for the next chunk.
         held = b"\r" if rest.endswith(b"\r") else b""
         text = rest[: len(rest) - len(held)].replace(b"\r\n", b"\n").replace(b"\r", b"\n")
         *lines, rest = text.split(b"\n")
@@ -60,14 +62,16 @@ async def _lines(chunks: AsyncIterable[bytes]) -> AsyncIterator[bytes]:
             yield line
 
 
-async def follow(
-    connection: Connection, path: str, *, after: str | None = None, patience: float = PATIENCE
+async def follow_events(
+    connection: Connection, path: str, *, after: str | None = None, give_up: float = GIVE_UP_SECONDS
 ) -> AsyncIterator[EventRecord]:
-    """The events at `path` until the server ends the stream, going on after the last one when the connection breaks.
+    """Yield the events at `path` until the server ends the stream; after a lost connection, resume after the last one.
 
-    `after` is the id to go on after. An event of a kind this version does not know is passed over. Raises
-    ConnectionFailed when nothing was heard for `patience` seconds over all tries, and `Refused` for a refusal that
-    waiting does not mend. The caller decides whether an ended stream means an ended job.
+    `after` is the id of the last event already seen. Events of a type that this version does not know are skipped. The
+    end of the stream does not imply the end of the job.
+
+    Raises ConnectionFailed or Unavailable when no data arrived for `give_up` seconds over all attempts, and other
+    subclasses of `Refused` at once.
     """
     heard, tries = time.monotonic(), 0
     while True:
@@ -76,7 +80,7 @@ async def follow(
             headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
             if after is not None:
                 headers["Last-Event-ID"] = after
-            async with connection.stream("GET", path, headers=headers, timeout=SILENCE) as response:
+            async with connection.stream("GET", path, headers=headers, timeout=STREAM_TIMEOUT) as response:
                 heard, tries = time.monotonic(), 0
                 async for message in read_messages(response.aiter_bytes()):
                     heard = time.monotonic()
@@ -88,9 +92,9 @@ async def follow(
                     yield record
             return
         except httpx.TransportError as error:
-            if time.monotonic() - heard > patience:
+            if time.monotonic() - heard > give_up:
                 raise connection.lost(error) from error
         except Unavailable:
-            if time.monotonic() - heard > patience:
+            if time.monotonic() - heard > give_up:
                 raise
-        await asyncio.sleep(pause(tries))
+        await asyncio.sleep(backoff(tries))

@@ -1,4 +1,4 @@
-"""Uploading a capture's files: from disk, several at a time, each with its SHA-256."""
+"""Uploads of the files of a capture: several at a time, each with its SHA-256."""
 
 import asyncio
 import hashlib
@@ -10,16 +10,16 @@ from urllib.parse import quote
 
 from splatmill.connection import Connection, read_answer
 from splatmill.errors import InvalidRequest, NothingToUpload
-from splatmill.layout import LocalFile
+from splatmill.local_capture import LocalFile
 from splatmill.schema.captures import SHA256_HEADER, CaptureFile, Role
 from splatmill.schema.events import Progress
 from splatmill.schema.problems import Problem
 
-CHUNK = 256 * 1024
-AT_A_TIME = 4
+CHUNK = 256 * 1024  # bytes
+CONCURRENT = 4
 
-# One photo with these flaws is left out and reported; the others still make a scene.
-FLAWS_OF_ONE_PHOTO = frozenset(
+# A photo that is refused with one of these codes is left out and reported; the others are still uploaded.
+BAD_PHOTO_CODES = frozenset(
     {"not_an_image", "image_truncated", "image_too_small", "image_too_large", "file_empty"}
 )
 
@@ -28,7 +28,11 @@ OnProgress = Callable[[Progress], None]
 
 @dataclass(frozen=True)
 class Uploaded:
-    """What is stored now, and which photos the server would not take, with its reasons."""
+    """The result of an upload.
+
+    files: the files that the capture now holds of those that were sent.
+    refused: names of the photos that the server refused, each with the reason.
+    """
 
     files: tuple[CaptureFile, ...]
     refused: tuple[tuple[str, Problem], ...]
@@ -39,17 +43,18 @@ async def upload(
     capture_id: str,
     files: Sequence[LocalFile],
     on_progress: OnProgress | None = None,
-    at_a_time: int = AT_A_TIME,
+    concurrent: int = CONCURRENT,
 ) -> Uploaded:
-    """Send `files` into a capture; a file that is already there with the same bytes is not stored twice.
+    """Upload `files` to a capture, `concurrent` at a time. A file that is already stored is not stored twice.
 
-    Raises the first `Refused` that is not about one photo alone, and also that one when no photo is left.
+    Raises ConnectionFailed, NothingToUpload for a file that cannot be read, and a subclass of `Refused`, unless it
+    concerns one photo and others are left.
     """
     total = sum(file.size for file in files)
     stored: list[CaptureFile] = []
     flawed: list[tuple[str, InvalidRequest]] = []
     done = 0
-    # Poses and masks first: a refusal of theirs concerns the whole capture and should come before the photos.
+    # Poses and masks go first: if one is refused, the upload fails before the photos are sent.
     queue = iter(sorted(files, key=lambda file: file.role is Role.images))
 
     async def work() -> None:
@@ -58,7 +63,7 @@ async def upload(
             try:
                 stored.append(await _send(connection, capture_id, file))
             except InvalidRequest as error:
-                if file.role is not Role.images or error.code not in FLAWS_OF_ONE_PHOTO:
+                if file.role is not Role.images or error.code not in BAD_PHOTO_CODES:
                     raise
                 flawed.append((file.name, error))
             done += file.size
@@ -67,7 +72,7 @@ async def upload(
 
     try:
         async with asyncio.TaskGroup() as group:
-            for _ in range(at_a_time):
+            for _ in range(concurrent):
                 group.create_task(work())
     except BaseExceptionGroup as errors:
         raise errors.exceptions[0] from None
@@ -78,7 +83,7 @@ async def upload(
 
 async def _send(connection: Connection, capture_id: str, file: LocalFile) -> CaptureFile:
     digest, size = await asyncio.to_thread(_digest, file.path)
-    # What a machine calls a .ply or .bin differs; of poses the service reads the bytes alone.
+    # The media types of .ply and .bin differ between systems, and the server does not need those of poses.
     known = mimetypes.guess_type(file.name)[0] if file.role is not Role.poses else None
     media_type = known or "application/octet-stream"
     response = await connection.request(

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 from splatmill.cli.app import COMMANDS, app
 from splatmill.cli.exits import Exit
-from splatmill.cli.follow import ONE_WISH
+from splatmill.cli.follow import ONE_SIGNAL_SECONDS
 from splatmill.client import Client
 from splatmill.schema import (
     JobState,
@@ -135,7 +135,7 @@ def test_the_options_of_train_are_those_of_the_schema():
         (["--time-budget", "soon"], Exit.usage, "'soon' is not a duration"),
         (["--max-memory", "1MB"], Exit.usage, "greater than or equal to 200000000"),
         (["--stepps", "3"], Exit.usage, "No such option"),
-        (["--detach"], Exit.usage, "Without --server"),
+        (["--detach"], Exit.usage, "--detach needs --server"),
         (["--server", "nonsense"], Exit.usage, "address of a server"),
         (["--server", "http://127.0.0.1:9"], Exit.unreachable, "splatmill up"),
     ],
@@ -151,7 +151,7 @@ def test_wrong_arguments_of_train(photos: Path, tmp_path: Path, monkeypatch, arg
 def test_a_path_with_nothing_to_train(tmp_path: Path):
     done = invoke("train", tmp_path)
     assert done.exit_code == Exit.refused
-    assert "holds no photos" in done.stderr
+    assert "contains no photos" in done.stderr
 
 
 def test_train_on_a_server(service, photos: Path, tmp_path: Path):
@@ -166,7 +166,7 @@ def test_train_on_a_server(service, photos: Path, tmp_path: Path):
     assert {path.name for path in out.iterdir()} >= {"model.ply", "report.json", "report.png", "report.html"}
     for line in (
         "3 photos, 3.0 kB",
-        "passed over: notes.txt",
+        "ignored: notes.txt",
         "recovering the cameras",
         "warning: 2 photos were left out",
         "plan: image size: 480 - The photos resolve no more.",
@@ -228,7 +228,7 @@ def test_an_interruption_cancels_the_job(service, photos: Path, tmp_path: Path, 
     stdout, stderr = process.communicate(timeout=60)
     assert process.returncode == Exit.cancelled, stderr
     assert "Cancelling the job" in stdout
-    assert "is cancelled." in stdout
+    assert "was cancelled." in stdout
     assert "Traceback" not in stderr
     with Client(service.url) as client:
         assert [job.state for job in client.jobs()] == [JobState.cancelled]
@@ -346,15 +346,15 @@ def test_a_second_interruption_does_not_wait(peer, reply, photos: Path, tmp_path
     process = spawn("train", photos, "-o", tmp_path / "out", "--server", peer.url)
     eventually(lambda: any(seen.path.endswith("/events") for seen in peer.seen))
     process.send_signal(signal.SIGINT)
-    process.send_signal(signal.SIGTERM)  # what timeout(1) does: one wish, sent twice
+    process.send_signal(signal.SIGTERM)  # timeout(1) signals the process and its group
     eventually(lambda: any(seen.path.endswith("/cancel") for seen in peer.seen))
     assert process.poll() is None
-    time.sleep(2 * ONE_WISH)
+    time.sleep(2 * ONE_SIGNAL_SECONDS)
     process.send_signal(signal.SIGINT)
     stdout, stderr = process.communicate(timeout=30)
     assert process.returncode == Exit.cancelled
     assert "Cancelling the job j1" in stdout
-    assert stderr == "Not waiting for the cancellation.\n"
+    assert stderr == "The job is being cancelled; this command does not wait for its end.\n"
 
 
 def test_an_interruption_before_the_job_began(peer, reply, photos: Path, tmp_path: Path):

@@ -103,7 +103,7 @@ def test_another_kind_of_server_is_told_as_such(peer, reply):
     peer.answer = lambda _: reply(body=b"<html>hello</html>")
     with Client(peer.url) as client:
         for ask in (client.info, client.ready, client.options, lambda: list(client.jobs())):
-            with pytest.raises(ConnectionFailed, match="not as a Splatmill server would"):
+            with pytest.raises(ConnectionFailed, match="with a body that is not a"):
                 ask()
 
 
@@ -143,7 +143,7 @@ def test_the_key_travels_in_a_header_only(peer, reply, monkeypatch):
 )
 def test_addresses_that_are_refused(address, monkeypatch):
     monkeypatch.setenv("SPLATMILL_SERVER", "nonsense")
-    with pytest.raises(ValueError, match="address of a server"):
+    with pytest.raises(ValueError, match=r"address of (a|the) server"):
         Client(address)
 
 

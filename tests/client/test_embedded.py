@@ -60,10 +60,10 @@ def test_what_a_killed_call_left_is_cleared(tmp_path: Path):
         assert not (data / "storage" / "old").exists()
 
 
-def test_a_start_that_fails_is_told_with_its_last_words(tmp_path: Path, monkeypatch):
+def test_a_start_that_fails_shows_the_end_of_its_log(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("splatmill.cli.embedded.SUPERVISOR", "splatmill_server.no_such_module")
     with (
-        pytest.raises(ServiceFailed, match="ended at its start with code 1") as failed,
+        pytest.raises(ServiceFailed, match="ended while it started, with exit code 1") as failed,
         embedded_service(tmp_path / "d"),
     ):
         pass

@@ -14,7 +14,7 @@ from splatmill.schema import PROBLEMS, CameraSpec, Problem
 @pytest.mark.parametrize("code", sorted(PROBLEMS))
 def test_every_problem_has_its_error(code: str):
     status = PROBLEMS[code].status
-    error = errors.refused(Problem.of(code, "It was so.", advice="Do that."))
+    error = errors.error_for(Problem.of(code, "It was so.", advice="Do that."))
     expected = {
         401: errors.Unauthorized,
         403: errors.Unauthorized,
@@ -51,7 +51,7 @@ def test_several_wrong_options_are_told_at_once():
         train_options({"steps": 0, "holdout": "many", "colour": 1})
     text = str(refused.value)
     assert "steps: Input should be greater than or equal to 1 (got 0)" in text
-    assert "there is no setting 'colour'" in text
+    assert "there is no option 'colour'" in text
     assert refused.value.code == "unknown_option"
 
 
@@ -60,5 +60,5 @@ def test_a_rule_of_ours_is_told_without_pydantic_words():
         CameraSpec.model_validate(
             {"camera_to_world": [[1, 0, 0, 0]] * 4, "width": 8, "height": 8, "fov_y_deg": 40}
         )
-    text = str(errors.invalid(wrong.value))
+    text = str(errors.invalid_request(wrong.value))
     assert text == "The last row of camera_to_world is [1.0, 0.0, 0.0, 0.0]; it must be [0, 0, 0, 1]."

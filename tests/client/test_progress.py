@@ -17,7 +17,7 @@ def test_many_steps_are_few_lines_and_the_last_is_never_lost(capsys: pytest.Capt
     with cli.PlainDisplay() as display:
         for n in range(1, 1001):
             display.progress(step(n))
-        display.say("writing the model")
+        display.print("writing the model")
         for n in range(5):
             display.progress(step(n, "files"))
     lines = capsys.readouterr().out.splitlines()
@@ -28,7 +28,7 @@ def test_many_steps_are_few_lines_and_the_last_is_never_lost(capsys: pytest.Capt
 
 
 def test_a_stage_is_told_at_once_and_again_after_a_while(capsys, monkeypatch):
-    monkeypatch.setattr(cli, "PLAIN_EVERY", 0.0)
+    monkeypatch.setattr(cli, "PLAIN_INTERVAL", 0.0)
     with cli.PlainDisplay() as display:
         for n in range(4):
             display.progress(step(n))

@@ -121,14 +121,14 @@ def test_a_job_that_is_gone_ends_the_following(peer, reply):
 
 def test_patience_has_an_end(peer, reply, monkeypatch):
     from splatmill.connection import Connection
-    from splatmill.sse import follow
+    from splatmill.sse import follow_events
 
     peer.answer = lambda _: reply(dropped=True)
 
     async def run() -> None:
         connection = Connection(peer.url)
         try:
-            async for _ in follow(connection, "/v1/jobs/j1/events", patience=0.05):
+            async for _ in follow_events(connection, "/v1/jobs/j1/events", give_up=0.05):
                 pass
         finally:
             await connection.close()

@@ -2,7 +2,7 @@
 
 
 def main() -> None:
-    """Run the command line with the process's arguments and exit with its code."""
+    """Run the command line on the arguments of the process, and exit with its status."""
     from splatmill.cli.app import app
 
     app()

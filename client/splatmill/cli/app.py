@@ -1,4 +1,4 @@
-"""The commands by name. Each lives in a module of its own, which is imported when its command is run or listed."""
+"""The group of all commands. The module of a command is imported when the command is run or its help is shown."""
 
 from importlib import import_module
 from typing import Annotated, Any
@@ -9,7 +9,7 @@ from typer.core import TyperGroup
 
 from splatmill import __version__
 
-# Command, and the module and function that are it.
+# The module and function of each command.
 COMMANDS = {
     "train": ("splatmill.cli.train", "train"),
     "up": ("splatmill.cli.service", "up"),
@@ -25,12 +25,12 @@ COMMANDS = {
     "bench": ("splatmill.cli.service", "bench"),
 }
 
-# What these take is read by the program they start.
-PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+# The arguments of these commands are parsed by the programs that they start.
+PASS_ARGUMENTS_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 
 class Commands(TyperGroup):
-    """The group that loads its commands, and tells their errors as sentences."""
+    """A group that imports its commands on demand and prints their errors as sentences."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(COMMANDS)
@@ -40,7 +40,7 @@ class Commands(TyperGroup):
             return None
         module, function = COMMANDS[cmd_name]
         single = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-        settings = PASSED_ON if cmd_name in ("up", "doctor", "bench") else None
+        settings = PASS_ARGUMENTS_ON if cmd_name in ("up", "doctor", "bench") else None
         single.command(cmd_name, context_settings=settings)(getattr(import_module(module), function))
         return typer.main.get_command(single)
 
@@ -51,10 +51,10 @@ class Commands(TyperGroup):
             return super().invoke(ctx)
         except (SplatmillError, OSError) as error:
             if isinstance(error, BrokenPipeError):
-                raise  # `splatmill jobs | head`: the runner ends quietly
-            from splatmill.cli.exits import tell
+                raise  # in `splatmill jobs | head`, typer ends the process quietly
+            from splatmill.cli.exits import print_error
 
-            raise typer.Exit(tell(error)) from error
+            raise typer.Exit(print_error(error)) from error
         except KeyboardInterrupt:
             typer.echo("Stopped.", err=True)
             raise typer.Exit(130) from None

@@ -1,4 +1,4 @@
-"""The whole service as a child process, for the time of one call."""
+"""The embedded service: the whole service as a child process, for the duration of one command."""
 
 import importlib.util
 import json
@@ -17,34 +17,34 @@ from pathlib import Path
 from splatmill.errors import ServiceFailed
 
 SUPERVISOR = "splatmill_server.up"
-START_WITHIN = 90.0  # seconds; a first start on a cold disk reads a few hundred megabytes of libraries
-END_WITHIN = 20.0  # seconds; a worker that is told to end writes its checkpoint first
+START_SECONDS = 90.0  # a first start may read several hundred megabytes of libraries from disk
+STOP_SECONDS = 20.0  # a worker that is stopped first writes a checkpoint
 
 ALL_PARTS = "pip install splatmill splatmill-server[embedded] splatmill-worker"
 
 
 @dataclass(frozen=True)
 class Service:
-    """Where the service answers, and the key it asks for, if any."""
+    """The address of the service, and its API key if it requires one."""
 
     url: str
     api_key: str | None
 
 
 def require(part: str, needed_for: str) -> None:
-    """ServiceFailed with the command that installs it, where a part is not installed."""
+    """Raise ServiceFailed, with the command that installs it, if the package `part` is not installed."""
     if importlib.util.find_spec(part) is None:
         raise ServiceFailed(
-            f"{needed_for} needs the part {part.replace('_', '-')}, which is not installed.",
-            f"Install all parts ({ALL_PARTS}), or name a server with --server.",
+            f"{needed_for} needs the package {part.replace('_', '-')}, which is not installed.",
+            f"Install all packages ({ALL_PARTS}), or give the address of a server with --server.",
         )
 
 
 @contextmanager
 def embedded_service(data: Path) -> Iterator[Service]:
-    """Run the service with its files in `data`, an empty folder of its own, which is removed afterwards.
+    """Run the service while the context is open. Its files are in the folder `data`, which is removed afterwards.
 
-    Raises ServiceFailed, with what the service said, when it does not come up.
+    Raises ServiceFailed, with the end of the service's log, if it does not start.
     """
     for part in ("splatmill_server", "splatmill_worker"):
         require(part, "Training on this machine")
@@ -57,18 +57,21 @@ def embedded_service(data: Path) -> Iterator[Service]:
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 env=_environment(),
-                # Ctrl-C is for this process, which cancels the job first and ends the service after it.
+                # Ctrl-C must reach this process only, which cancels the job before it stops the service.
                 start_new_session=True,
             )
         try:
             yield _wait_ready(process, log)
         finally:
-            _end(process)
+            _stop(process)
 
 
 def _environment() -> dict[str, str]:
-    """This process's environment without what points at another service: its Redis would hand this call's job to
-    strangers, and theirs to this machine. The key keeps other users of this machine out."""
+    """Return the environment for the service: without the addresses of another one, and with a random API key.
+
+    With the Redis of another service, its workers could take the job of this command, and this machine its jobs. The
+    key keeps other users of this machine out.
+    """
     foreign = ("REDIS_URL", "SPLATMILL_STORAGE", "SPLATMILL_DATA", "SPLATMILL_RENDERER_URL", "SPLATMILL_UDS")
     kept = {name: value for name, value in os.environ.items() if name not in foreign}
     return kept | {"SPLATMILL_API_KEY": secrets.token_urlsafe(24)}
@@ -76,8 +79,8 @@ def _environment() -> dict[str, str]:
 
 @contextmanager
 def _owned(data: Path) -> Iterator[None]:
-    """Hold `data` alone; what an earlier call left behind when it was killed is removed."""
-    import fcntl  # not on Windows, where only `--server` works
+    """Hold a lock on `data` and start with it empty: an earlier command that was killed may have left files."""
+    import fcntl  # missing on Windows, where only --server works
 
     data.parent.mkdir(parents=True, exist_ok=True)
     lock_path = data.with_name(data.name + ".lock")
@@ -87,7 +90,7 @@ def _owned(data: Path) -> Iterator[None]:
         except OSError as error:
             raise ServiceFailed(
                 f"Another `splatmill train` is writing to {data.parent}.",
-                "Choose another folder with -o, or wait.",
+                "Choose another folder with -o, or wait until it has ended.",
             ) from error
         shutil.rmtree(data, ignore_errors=True)
         data.mkdir()
@@ -100,34 +103,36 @@ def _owned(data: Path) -> Iterator[None]:
 
 def _wait_ready(process: subprocess.Popen[bytes], log: Path) -> Service:
     assert process.stdout is not None
-    deadline = time.monotonic() + START_WITHIN
+    deadline = time.monotonic() + START_SECONDS
     line = b""
     while not line.endswith(b"\n"):
         left = deadline - time.monotonic()
         if left <= 0:
             raise ServiceFailed(
-                f"The service did not come up within {START_WITHIN:.0f} seconds.{_last_words(log)}"
+                f"The service did not start within {START_SECONDS:.0f} seconds.{_log_end(log)}"
             )
         if select.select([process.stdout], [], [], left)[0]:
             more = os.read(process.stdout.fileno(), 65536)
             if not more:
                 code = process.wait()
-                raise ServiceFailed(f"The service ended at its start with code {code}.{_last_words(log)}")
+                raise ServiceFailed(
+                    f"The service ended while it started, with exit code {code}.{_log_end(log)}"
+                )
             line += more
     try:
         ready = json.loads(line.splitlines()[0])
         return Service(ready["url"], ready.get("api_key"))
     except (ValueError, KeyError) as error:
-        raise ServiceFailed(f"The service said {line[:200]!r} instead of where it answers.") from error
+        raise ServiceFailed(f"The service printed {line[:200]!r} instead of its address.") from error
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Closing its input tells the service to end; what does not end in time is ended."""
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    """Stop the service by closing its standard input; terminate it if it does not end in time."""
     assert process.stdin is not None
     assert process.stdout is not None
     process.stdin.close()
     try:
-        process.wait(END_WITHIN)
+        process.wait(STOP_SECONDS)
     except subprocess.TimeoutExpired:
         process.terminate()
         try:
@@ -138,6 +143,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.stdout.close()
 
 
-def _last_words(log: Path) -> str:
+def _log_end(log: Path) -> str:
     lines = log.read_text(errors="replace").strip().splitlines()[-8:]
-    return "\nIts last words:\n  " + "\n  ".join(lines) if lines else ""
+    return "\nThe end of its log:\n  " + "\n  ".join(lines) if lines else ""

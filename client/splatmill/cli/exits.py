@@ -1,4 +1,4 @@
-"""What the command line's exit codes mean, and how an error is told."""
+"""The exit codes of the command line, and how errors are printed."""
 
 import sys
 from collections.abc import Iterator
@@ -8,16 +8,16 @@ from splatmill import errors
 
 
 class Exit(IntEnum):
-    """The exit codes, one per kind of ending that a script may want to tell apart."""
+    """The exit codes: one for each outcome that a script may need to distinguish."""
 
     done = 0
-    error = 1  # the service made a mistake, or the disk refused
+    error = 1  # the service failed, or a file could not be written
     usage = 2  # a wrong argument or option
     job_failed = 3
-    unreachable = 4  # no server, or a part of it is down
-    refused = 5  # the photos or the request cannot be used
+    unreachable = 4  # the server or a part of it does not answer
+    refused = 5  # the photos or the request are not valid
     unauthorized = 6
-    not_found = 7  # no such job or model, or not in the right state
+    not_found = 7  # no such job or model, or it is in the wrong state
     no_service = 8  # the embedded service could not be started
     cancelled = 130  # by Ctrl-C, SIGTERM or another client
 
@@ -35,20 +35,20 @@ _CODES: tuple[tuple[type[Exception], Exit], ...] = (
     (errors.ServiceFailed, Exit.no_service),
 )
 
-MOST_ENTRIES = 10
+MOST_ENTRIES = 10  # of a list among the facts of a problem
 
 USAGE_CODES = frozenset({"unknown_option", "option_out_of_range"})
 
 
 def code_of(error: Exception) -> Exit:
-    """The exit code for an error."""
+    """Return the exit code for an error."""
     if isinstance(error, errors.Refused) and error.code in USAGE_CODES:
         return Exit.usage
     return next((code for kind, code in _CODES if isinstance(error, kind)), Exit.error)
 
 
-def tell(error: Exception) -> Exit:
-    """Print an error's sentence, its facts where a job failed, and its advice; return the exit code."""
+def print_error(error: Exception) -> Exit:
+    """Print the message of an error, the facts of a failed job, and the advice; return the exit code."""
     if isinstance(error, errors.SplatmillError):
         message, advice = error.message, error.advice
     elif isinstance(error, OSError):
@@ -67,7 +67,7 @@ def tell(error: Exception) -> Exit:
 
 
 def _shown(name: str, value: object) -> Iterator[str]:
-    """A fact in lines: a list of files has one each, and an end."""
+    """Yield the lines that show a fact: one for each entry of a list, up to a limit."""
     if isinstance(value, list) and value:
         yield f"{name}:"
         yield from (f"  {entry}" for entry in value[:MOST_ENTRIES])

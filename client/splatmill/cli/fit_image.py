@@ -1,4 +1,4 @@
-"""`splatmill fit-image`: one picture as Gaussians in a plane, on this machine."""
+"""`splatmill fit-image`: fits one picture with Gaussians in a plane, on this machine."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -7,7 +7,7 @@ import typer
 
 from splatmill.cli.embedded import require
 from splatmill.cli.schema_options import with_options_of
-from splatmill.cli.service import become
+from splatmill.cli.service import exec_module
 from splatmill.schema.fit_image import FitImageOptions
 
 
@@ -15,27 +15,27 @@ def _fit_image(
     photo: Annotated[
         Path,
         typer.Argument(
-            metavar="PHOTO", help="The picture: JPEG, PNG, WebP, TIFF or HEIC.", show_default=False
+            metavar="PHOTO", help="Picture to fit: JPEG, PNG, WebP, TIFF or HEIC.", show_default=False
         ),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for the results.")] = Path(
-        "fit"
-    ),
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for the results; created if missing.")
+    ] = Path("fit"),
     **options: Any,
 ) -> None:
-    """Fit one picture by Gaussians; leaves model.ply, picture.png and the curve of its error in DIR."""
+    """Fit one picture with Gaussians; write model.ply, picture.png and the error over time to DIR."""
     from pydantic import ValidationError
 
-    from splatmill.errors import invalid
+    from splatmill.errors import invalid_request
 
     try:
         checked = FitImageOptions.model_validate(
             {name: value for name, value in options.items() if value is not None}
         )
     except ValidationError as error:
-        raise invalid(error, "option_out_of_range") from error
+        raise invalid_request(error, "option_out_of_range") from error
     require("splatmill_worker", "Fitting a picture")
-    become(
+    exec_module(
         "splatmill_worker",
         "fit-image",
         "--out",

@@ -1,7 +1,7 @@
-"""Following a job to its end, with Ctrl-C as one of the things that can arrive.
+"""Shows the events of a job until it ends, and cancels the job on Ctrl-C.
 
-A signal that raised KeyboardInterrupt would strike between any two steps, also where a job has just been created or
-a stream is half open. Here it is an item in the same queue as the events, and is dealt with where items are.
+A KeyboardInterrupt could be raised between any two steps, for example when a job has just been created or while a
+stream is opened. Therefore a signal is put into the same queue as the events, and handled where these are handled.
 """
 
 import signal
@@ -18,32 +18,33 @@ from splatmill.client import JobHandle, ModelHandle
 from splatmill.errors import Conflict
 from splatmill.schema import EventRecord
 
-# timeout(1) and some supervisors send one wish to end twice, to the process and to its group.
-ONE_WISH = 0.5  # seconds
+ONE_SIGNAL_SECONDS = 0.5
+"""Two signals within this time count as one: timeout(1) signals both the process and its group."""
 
 
 @dataclass(frozen=True)
 class Interruption:
-    """Ctrl-C, or a polite end from outside (`kill`, a container that is stopped), at a monotonic time in seconds."""
+    """SIGINT (Ctrl-C) or SIGTERM (`kill`, a container that is stopped). `at` is the monotonic time in seconds."""
 
     at: float
 
 
-class Ended:
-    """The job's events are over."""
+class EventsEnded:
+    """The job has ended, and no more events follow."""
 
 
-Item = EventRecord | Interruption | Ended | Exception
+Item = EventRecord | Interruption | EventsEnded | Exception
 
 
-class LeftBehind(Exception):
-    """Interrupted twice: nobody waits for the cancellation any more."""
+class StoppedWaiting(Exception):
+    """A second signal arrived: the command does not wait until the job is cancelled."""
 
 
-def follow(start: Callable[[], JobHandle], *, verbose: bool) -> ModelHandle:
-    """Start a job and show it until its end; the first interruption cancels it, a second one stops waiting.
+def follow_job(start: Callable[[], JobHandle], *, verbose: bool) -> ModelHandle:
+    """Start a job, show its events until it ends, and return its model.
 
-    Raises JobFailed, JobCancelled, LeftBehind, or what the SDK raises.
+    The first signal (SIGINT or SIGTERM) cancels the job. Raises JobFailed, JobCancelled, StoppedWaiting after a second
+    signal, and the errors of the SDK.
     """
     inbox: SimpleQueue[Item] = SimpleQueue()
     with _signals_into(inbox):
@@ -60,16 +61,16 @@ def _until_ended(job: JobHandle, inbox: SimpleQueue[Item], display: Display, ver
         item = inbox.get()
         if isinstance(item, EventRecord):
             show(item, display, verbose=verbose)
-        elif isinstance(item, Ended):
+        elif isinstance(item, EventsEnded):
             return
         elif isinstance(item, Exception):
             raise item
         elif cancelling is not None:
-            if item.at - cancelling.at > ONE_WISH:
-                raise LeftBehind
+            if item.at - cancelling.at > ONE_SIGNAL_SECONDS:
+                raise StoppedWaiting
         else:
             cancelling = item
-            display.say(f"Cancelling the job {job.id} ...")
+            display.print(f"Cancelling the job {job.id} ...")
             _in_background(lambda: _cancel(job, inbox))
 
 
@@ -77,7 +78,7 @@ def _listen(job: JobHandle, inbox: SimpleQueue[Item]) -> None:
     try:
         for record in job.events():
             inbox.put(record)
-        inbox.put(Ended())
+        inbox.put(EventsEnded())
     except Exception as error:
         inbox.put(error)
 
@@ -86,7 +87,7 @@ def _cancel(job: JobHandle, inbox: SimpleQueue[Item]) -> None:
     try:
         job.cancel()
     except Conflict:
-        pass  # it ended meanwhile, and its events say how
+        pass  # the job has ended meanwhile; its events say how
     except Exception as error:
         inbox.put(error)
 
@@ -98,9 +99,8 @@ def _in_background(work: Callable[[], None]) -> None:
 @contextmanager
 def _signals_into(inbox: SimpleQueue[Item]) -> Iterator[None]:
     def arrived(number: int, frame: FrameType | None) -> None:
-        inbox.put(
-            Interruption(time.monotonic())
-        )  # SimpleQueue.put may be called at any point, also inside itself
+        # SimpleQueue.put is reentrant, so a signal handler may call it at any point.
+        inbox.put(Interruption(time.monotonic()))
 
     before = {number: signal.signal(number, arrived) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -1,24 +1,24 @@
-"""`splatmill jobs`, `status`, `cancel` and `options`: what the server knows."""
+"""`splatmill jobs`, `status`, `cancel` and `options`."""
 
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from splatmill.cli.servers import Server, connect
+from splatmill.cli.servers import Server, open_client
 
 if TYPE_CHECKING:
     from splatmill.schema import Job
 
-JobId = Annotated[str, typer.Argument(metavar="JOB", help="The job's id.", show_default=False)]
+JobId = Annotated[str, typer.Argument(metavar="JOB", help="Id of the job.", show_default=False)]
 
 
 def jobs(
     server: Server = None,
-    limit: Annotated[int, typer.Option("-n", "--limit", min=1, help="Show at most this many.")] = 20,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per job.")] = False,
+    limit: Annotated[int, typer.Option("-n", "--limit", min=1, help="Largest number of jobs to list.")] = 20,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line and job.")] = False,
 ) -> None:
     """List the jobs, newest first."""
-    with connect(server) as client:
+    with open_client(server) as client:
         found = list(client.jobs(limit=limit))
     if as_json:
         for job in found:
@@ -40,10 +40,10 @@ def jobs(
 def status(
     job_id: JobId,
     server: Server = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the job as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the record of the job as JSON.")] = False,
 ) -> None:
-    """Show a job: its state, progress, plan and problem."""
-    with connect(server) as client:
+    """Show the state, progress, plan and problem of a job."""
+    with open_client(server) as client:
         job = client.job(job_id).job
     if as_json:
         typer.echo(job.model_dump_json(indent=2, exclude_none=True))
@@ -51,7 +51,7 @@ def status(
     from splatmill.cli.plan import plan_lines
 
     typer.echo(f"job       {job.id}" + (f" ({job.name})" if job.name else ""))
-    typer.echo(f"state     {job.state.value}" + (" (cancel requested)" if _dying(job) else ""))
+    typer.echo(f"state     {job.state.value}" + (" (cancel requested)" if _cancelling(job) else ""))
     typer.echo(f"attempt   {job.attempt}")
     typer.echo(f"created   {job.created_at.astimezone():%Y-%m-%d %H:%M:%S}")
     if job.started_at and job.finished_at:
@@ -68,7 +68,7 @@ def status(
 
 def cancel(job_id: JobId, server: Server = None) -> None:
     """Cancel a job, and wait until it has ended."""
-    with connect(server) as client:
+    with open_client(server) as client:
         handle = client.job(job_id)
         handle.cancel()
         for _ in handle.events():
@@ -78,7 +78,7 @@ def cancel(job_id: JobId, server: Server = None) -> None:
 
 
 def options() -> None:
-    """List every training option with its default, range and help."""
+    """List the training options with their defaults, ranges and help."""
     from rich.console import Console
     from rich.table import Table
 
@@ -86,12 +86,12 @@ def options() -> None:
 
     table = Table("option", "default", "range", "help", box=None, pad_edge=False)
     for option in describe_options():
-        default = "decided" if option.default is None else str(option.default)
+        default = "automatic" if option.default is None else str(option.default)
         table.add_row(option.flag, default, option.range_text.replace("|", " "), option.help)
     Console().print(table)
 
 
-def _dying(job: "Job") -> bool:
+def _cancelling(job: "Job") -> bool:
     return job.cancel_requested and not job.state.final
 
 

@@ -1,45 +1,47 @@
-"""`splatmill download`, `render` and `orbit`: what a finished model gives."""
+"""`splatmill download`, `render` and `orbit`: the files of a model, and images and videos of it."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from splatmill.cli.servers import Server, connect
+from splatmill.cli.servers import Server, open_client
 
 if TYPE_CHECKING:
     from splatmill.client import ModelHandle
     from splatmill.schema import CameraSpec
 
 ModelId = Annotated[
-    str, typer.Argument(metavar="MODEL", help="The model's id, that of its job.", show_default=False)
+    str,
+    typer.Argument(metavar="MODEL", help="Id of the model, which is that of its job.", show_default=False),
 ]
 
 FILES = ("model.ply", "report.json", "report.png", "report.html", "cameras.json")
-"""What `train` and `download` leave in the output folder."""
+"""The files that `train` and `download` write to the output folder."""
 
-SOMETIMES = ("preview.jpg", "progress.mp4")
-"""What comes along where there is one."""
+OPTIONAL_FILES = ("preview.jpg", "progress.mp4")
+"""Files that are also written if the model has them."""
 
 
 def download_files(model: "ModelHandle", folder: Path) -> list[Path]:
-    """Write the model's files into `folder`."""
+    """Download the files of the model to `folder`, and return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     stored = {entry.name for entry in model.model.files}
     wanted = [name for name in FILES if name in stored or not stored]
-    wanted += [name for name in SOMETIMES if name in stored]
+    wanted += [name for name in OPTIONAL_FILES if name in stored]
     return [model.download(folder / name, file=name) for name in wanted]
 
 
 def write_novel_view(model: "ModelHandle", path: Path) -> Path:
-    """Render from half-way between two cameras in the middle of the capture; returns the picture's path."""
+    """Write an image to `path`, rendered half-way between two adjacent cameras of the capture; return `path`."""
     from splatmill.files import atomic_write
     from splatmill.schema import CameraSpec
 
     cameras = [entry.camera for entry in model.cameras()]
     if len(cameras) < 2:
         raise typer.BadParameter(
-            "The model has fewer than two cameras to stand between.", param_hint="--novel-view"
+            "The model has fewer than two cameras, so there is no view between two.",
+            param_hint="--novel-view",
         )
     middle = len(cameras) // 2
     atomic_write(path, model.render(CameraSpec.between(cameras[middle - 1], cameras[middle])))
@@ -48,11 +50,13 @@ def write_novel_view(model: "ModelHandle", path: Path) -> Path:
 
 def download(
     model_id: ModelId,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write to.")] = Path("splat"),
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder for the files; created if missing.")
+    ] = Path("splat"),
     server: Server = None,
 ) -> None:
-    """Fetch a finished model with its report."""
-    with connect(server) as client:
+    """Download a finished model with its report."""
+    with open_client(server) as client:
         for path in download_files(client.model(model_id), out):
             typer.echo(path)
 
@@ -60,24 +64,40 @@ def download(
 def render(
     model_id: ModelId,
     out: Annotated[
-        Path, typer.Option("-o", "--out", help="Picture to write; its ending says the format.")
+        Path, typer.Option("-o", "--out", help="Image to write: .png, .jpg, .webp, or .npy (float32).")
     ] = Path("view.png"),
     view: Annotated[
         str | None,
-        typer.Option(help="A photo's name: render from its camera. Left out: the first held-out photo."),
+        typer.Option(
+            help="Name of the photo from whose camera to render. Left out, the first held-out photo."
+        ),
     ] = None,
     camera: Annotated[
         Path | None,
-        typer.Option(exists=True, dir_okay=False, help="A JSON file with a camera as the API takes it."),
+        typer.Option(
+            exists=True,
+            dir_okay=False,
+            help="JSON file with a camera as in the API (`CameraSpec`), in place of --view.",
+        ),
     ] = None,
-    width: Annotated[int | None, typer.Option(min=1, max=8192, help="Pixels; the height follows.")] = None,
-    output: Annotated[Literal["color", "depth", "alpha"], typer.Option(help="What to render.")] = "color",
+    width: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=8192,
+            help="Width in pixels; the aspect ratio stays. Left out, the width of the camera.",
+        ),
+    ] = None,
+    output: Annotated[
+        Literal["color", "depth", "alpha"],
+        typer.Option(help="What to render: colour, depth along the viewing axis, or opacity."),
+    ] = "color",
     background: Annotated[
-        Literal["black", "white", "transparent"], typer.Option(help="What shows where the model is not.")
+        Literal["black", "white", "transparent"], typer.Option(help="Colour behind the model.")
     ] = "black",
     server: Server = None,
 ) -> None:
-    """Render a picture of a model."""
+    """Render an image of a model."""
     from splatmill.files import atomic_write
     from splatmill.schema import Format
 
@@ -92,7 +112,7 @@ def render(
         raise typer.BadParameter(f"{out} must end in one of {', '.join(suffixes)}.", param_hint="--out")
     if camera is not None and view is not None:
         raise typer.BadParameter("Give --view or --camera, not both.", param_hint="--view")
-    with connect(server) as client:
+    with open_client(server) as client:
         model = client.model(model_id)
         chosen = _read_camera(camera) if camera is not None else _camera_of_view(model, view)
         if width is not None:
@@ -106,15 +126,15 @@ def render(
 
 def orbit(
     model_id: ModelId,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Video to write.")] = Path("orbit.mp4"),
-    seconds: Annotated[float, typer.Option(min=0.5, max=60, help="Length of the video.")] = 6.0,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Video to write (MP4).")] = Path("orbit.mp4"),
+    seconds: Annotated[float, typer.Option(min=0.5, max=60, help="Length of the video in seconds.")] = 6.0,
     fps: Annotated[int, typer.Option(min=1, max=60, help="Frames per second.")] = 24,
-    width: Annotated[int, typer.Option(min=16, max=3840, help="Pixels, an even number.")] = 640,
-    height: Annotated[int, typer.Option(min=16, max=2160, help="Pixels, an even number.")] = 480,
+    width: Annotated[int, typer.Option(min=16, max=3840, help="Width in pixels; must be even.")] = 640,
+    height: Annotated[int, typer.Option(min=16, max=2160, help="Height in pixels; must be even.")] = 480,
     server: Server = None,
 ) -> None:
     """Render a video that circles the scene."""
-    with connect(server) as client:
+    with open_client(server) as client:
         model = client.model(model_id)
         typer.echo(model.orbit(out, seconds=seconds, fps=fps, width=width, height=height))
 
@@ -125,24 +145,23 @@ def _camera_of_view(model: "ModelHandle", name: str | None) -> "CameraSpec":
         found = [entry for entry in cameras if entry.name == name]
         if not found:
             raise typer.BadParameter(
-                f"The model has no camera called {name!r}; it has {', '.join(c.name for c in cameras[:8])}, ...",
+                f"The model has no camera named {name!r}; it has "
+                f"{', '.join(c.name for c in cameras[:8])}, ...",
                 param_hint="--view",
             )
         return found[0].camera
     if not cameras:
-        raise typer.BadParameter(
-            "The model came without cameras; give one with --camera.", param_hint="--view"
-        )
+        raise typer.BadParameter("The model has no cameras; give one with --camera.", param_hint="--view")
     return next((entry for entry in cameras if entry.split == "test"), cameras[0]).camera
 
 
 def _read_camera(path: Path) -> "CameraSpec":
     from pydantic import ValidationError
 
-    from splatmill.errors import invalid
+    from splatmill.errors import invalid_request
     from splatmill.schema import CameraSpec
 
     try:
         return CameraSpec.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        raise invalid(error, "camera_invalid") from error
+        raise invalid_request(error, "camera_invalid") from error

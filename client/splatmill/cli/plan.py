@@ -1,20 +1,20 @@
-"""The plan in lines: what was decided, and the fact that decided it."""
+"""The lines that show a plan: each decision, with the fact that decided it."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-_ABOUT = ("reasons", "left_out", "forced")
+_NOT_DECISIONS = ("reasons", "left_out", "forced")
 
 
 def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
-    """One line per decision with its reason, then one per thing that was left out.
+    """Yield one line per decision with its reason, then one per part that was left out.
 
-    `plan` is a plan as jobs and reports carry it: values by name, and beside them `reasons` and `left_out`, each a
-    sentence by name.
+    `plan` is the plan of a job or a report: values by name, and `reasons` and `left_out`, which map names to
+    sentences.
     """
     reasons: Mapping[str, str] = plan.get("reasons") or {}
     for name, value in plan.items():
-        if name in _ABOUT or (isinstance(value, Mapping) and name not in reasons):
+        if name in _NOT_DECISIONS or (isinstance(value, Mapping) and name not in reasons):
             continue
         shown = "" if isinstance(value, Mapping) else f": {_value(value)}"
         reason = f" - {reasons[name]}" if name in reasons else ""

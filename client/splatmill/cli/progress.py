@@ -1,4 +1,4 @@
-"""Progress of a job for people: a live bar on a terminal, plain lines elsewhere."""
+"""Display of the progress of a job: a progress bar on a terminal, plain lines elsewhere."""
 
 import sys
 import time
@@ -19,7 +19,7 @@ from splatmill.schema.quantities import format_bytes, format_duration
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-PLAIN_EVERY = 5.0  # seconds between lines of one stage, so that a log stays readable
+PLAIN_INTERVAL = 5.0  # seconds between two lines about one stage, so that a log stays readable
 
 STATES = {
     JobState.queued: "waiting for a worker",
@@ -31,7 +31,7 @@ STATES = {
 
 
 def measurements(progress: Progress) -> str:
-    """Loss, PSNR, Gaussians and ETA, those that there are."""
+    """Return loss, PSNR, number of Gaussians and ETA as text, as far as they are known."""
     parts = []
     if progress.loss is not None:
         parts.append(f"loss {progress.loss:.4f}")
@@ -45,13 +45,13 @@ def measurements(progress: Progress) -> str:
 
 
 def count_text(progress: Progress) -> str:
-    """`120/3000`, as bytes while uploading."""
+    """Return done and total as text: `120/3000`, or `1.5 MB/20.0 MB` for an upload."""
     show = format_bytes if progress.stage == "uploading" else str
     return show(progress.done) if progress.total is None else f"{show(progress.done)}/{show(progress.total)}"
 
 
 def progress_text(progress: Progress) -> str:
-    """One line of progress."""
+    """Return progress as one line of text."""
     parts = [
         progress.stage,
         count_text(progress) if progress.done or progress.total else "",
@@ -61,7 +61,7 @@ def progress_text(progress: Progress) -> str:
 
 
 class Display(Protocol):
-    """Where progress goes."""
+    """What shows the progress and the messages of a job."""
 
     def __enter__(self) -> Self: ...
 
@@ -70,49 +70,49 @@ class Display(Protocol):
     ) -> None: ...
 
     def progress(self, progress: Progress) -> None:
-        """Show how far things are."""
+        """Show the progress of a stage."""
 
-    def say(self, line: str) -> None:
-        """Print a line that stays."""
+    def print(self, line: str) -> None:
+        """Print a line that stays on the screen."""
 
 
 class PlainDisplay:
-    """Lines on standard output, at most one every few seconds per stage."""
+    """Prints lines to standard output, at most one every few seconds about one stage."""
 
     def __init__(self) -> None:
         self._stage = ""
         self._next = 0.0
-        self._unsaid: Progress | None = None
+        self._held_back: Progress | None = None
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._last_word()
+        self._flush()
 
     def progress(self, progress: Progress) -> None:
         now = time.monotonic()
         if progress.stage != self._stage:
-            self._last_word()
+            self._flush()
         elif now < self._next:
-            self._unsaid = progress
+            self._held_back = progress
             return
-        self._stage, self._next, self._unsaid = progress.stage, now + PLAIN_EVERY, None
+        self._stage, self._next, self._held_back = progress.stage, now + PLAIN_INTERVAL, None
         print(progress_text(progress), flush=True)
 
-    def say(self, line: str) -> None:
-        self._last_word()
+    def print(self, line: str) -> None:
+        self._flush()
         print(line, flush=True)
 
-    def _last_word(self) -> None:
-        """A stage's last numbers are worth a line, however soon they came after the one before."""
-        if self._unsaid is not None:
-            print(progress_text(self._unsaid), flush=True)
-            self._unsaid = None
+    def _flush(self) -> None:
+        """Print the last progress of a stage if it was held back for coming too soon after the line before."""
+        if self._held_back is not None:
+            print(progress_text(self._held_back), flush=True)
+            self._held_back = None
 
 
 class LiveDisplay:
-    """One moving line on a terminal."""
+    """Shows a progress bar on a terminal."""
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -148,17 +148,17 @@ class LiveDisplay:
             self._task = self._bar.add_task(progress.stage, total=progress.total, **fields)
         self._bar.update(self._task, completed=progress.done, total=progress.total, **fields)
 
-    def say(self, line: str) -> None:
+    def print(self, line: str) -> None:
         self._bar.console.print(line, markup=False)
 
 
 def make_display() -> Display:
-    """A live one where standard output is a terminal."""
+    """Return a progress bar if standard output is a terminal, else plain lines."""
     return LiveDisplay() if sys.stdout.isatty() else PlainDisplay()
 
 
 def show(record: EventRecord, display: Display, *, verbose: bool = False) -> None:
-    """Show one event of a job."""
+    """Show an event of a job; log lines below a warning and the plan only if `verbose`."""
     event = record.event
     if isinstance(event, ProgressEvent):
         display.progress(event)
@@ -166,12 +166,12 @@ def show(record: EventRecord, display: Display, *, verbose: bool = False) -> Non
         again = (
             f" (attempt {record.attempt})" if record.attempt > 1 and event.state is JobState.preparing else ""
         )
-        display.say(STATES[event.state] + again)
-    # An error ends the job, whose problem is told at the end.
+        display.print(STATES[event.state] + again)
+    # An error ends the job, and its problem is printed then.
     elif isinstance(event, LogEvent) and (verbose or event.level == "warning"):
-        display.say(f"{event.level}: {event.message}")
+        display.print(f"{event.level}: {event.message}")
     elif isinstance(event, PlanEvent) and verbose:
         from splatmill.cli.plan import plan_lines
 
         for line in plan_lines(event.plan):
-            display.say(f"plan: {line}")
+            display.print(f"plan: {line}")

@@ -1,4 +1,4 @@
-"""Options of the command line made from the schema: same names, ranges and help."""
+"""Options of the command line, generated from the schema: same names, ranges and help."""
 
 import inspect
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from splatmill.schema.base import Request
 from splatmill.schema.options import OptionHelp, TrainOptions, describe_options
 
 PANELS = {
-    "budget": "How long, how good",
+    "budget": "Length and size of the training",
     "photos": "Photos",
     "cameras": "Recovering the cameras",
     "engine": "Engine",
@@ -27,21 +27,20 @@ _TYPES: dict[str, Any] = {
 
 
 def with_training_options(function: Callable[..., None]) -> Callable[..., None]:
-    """Replace the `**options` of a command by one option per training setting."""
+    """Replace the `**options` of a command by one command-line option per training option."""
     return with_options_of(TrainOptions, function)
 
 
 def with_options_of(model: type[Request], function: Callable[..., None]) -> Callable[..., None]:
-    """Replace the `**options` of a command by one option per field of `model`.
+    """Replace the `**options` of a command by one command-line option per field of `model`.
 
-    All are None where they are not given, so that only what a person said is sent and the server's own defaults
-    hold for the rest.
+    An option that is not given is None, so that it is not sent and the default of the server applies.
     """
     signature = inspect.signature(function, eval_str=True)
     fixed = [p for p in signature.parameters.values() if p.kind is not inspect.Parameter.VAR_KEYWORD]
     made = [_parameter(option) for option in describe_options(model)]
-    # typer reads the signature; there is no other place where it takes parameters that are not written out.
-    function.__signature__ = signature.replace(parameters=[*fixed, *made])  # type: ignore[attr-defined]
+    # typer reads the parameters from the signature, and has no other interface for parameters made at run time.
+    function.__signature__ = signature.replace(parameters=[*fixed, *made])  # type: ignore[attr-defined]  # functions have no declared __signature__
     return function
 
 
@@ -52,8 +51,8 @@ def _parameter(option: OptionHelp) -> inspect.Parameter:
         settings |= {"min": option.minimum, "max": option.maximum}
     if option.type in ("duration", "bytes"):
         settings["metavar"] = option.type.upper()
-    decided = option.default is None or option.default is False
-    default = "" if decided else f" (default: {option.default})"
+    unsaid = option.default is None or option.default is False
+    default = "" if unsaid else f" (default: {option.default})"
     return inspect.Parameter(
         option.name,
         inspect.Parameter.KEYWORD_ONLY,

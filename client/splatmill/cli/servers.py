@@ -1,4 +1,4 @@
-"""Which server a command talks to, said the same way by all of them."""
+"""The option --server, and the client it stands for."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,13 +13,14 @@ Server = Annotated[
         "--server",
         metavar="URL",
         envvar="SPLATMILL_SERVER",
-        help="Address of the server. The API key is read from SPLATMILL_API_KEY.",
+        help="Address of the server. Left out, the server on this machine. The API key is read from "
+        "SPLATMILL_API_KEY.",
     ),
 ]
 
 
-def connect(server: str | None) -> "Client":
-    """A client of `server`, or of the one on this machine."""
+def open_client(server: str | None) -> "Client":
+    """Return a client of `server`, or of the server on this machine."""
     from splatmill.client import Client
     from splatmill.connection import DEFAULT_SERVER
 

@@ -1,4 +1,4 @@
-"""`splatmill train`: photos to splats in one command, on a server or on this machine."""
+"""`splatmill train`: trains a model from photos, on a server or on this machine."""
 
 import signal
 from collections.abc import Iterator
@@ -11,14 +11,14 @@ import typer
 
 from splatmill.cli.embedded import embedded_service
 from splatmill.cli.exits import Exit
-from splatmill.cli.follow import LeftBehind, follow
+from splatmill.cli.follow import StoppedWaiting, follow_job
 from splatmill.cli.models import download_files, write_novel_view
 from splatmill.cli.progress import make_display
 from splatmill.cli.schema_options import with_training_options
-from splatmill.cli.servers import connect
+from splatmill.cli.servers import open_client
 from splatmill.client import Client, ModelHandle
 from splatmill.errors import JobCancelled
-from splatmill.layout import Found, find_files
+from splatmill.local_capture import Found, find_files
 from splatmill.schema import Capture, Role, TrainOptions, format_bytes
 
 
@@ -27,44 +27,56 @@ def train(
     path: Annotated[
         Path,
         typer.Argument(
-            metavar="PATH", help="Photos, a zip, a video or a posed data set.", show_default=False
+            metavar="PATH",
+            help="Folder of photos, zip archive, video, or posed data set.",
+            show_default=False,
         ),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for the results.")] = Path(
-        "splat"
-    ),
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for the results; created if missing.")
+    ] = Path("splat"),
     server: Annotated[
         str | None,
         typer.Option(
             metavar="URL",
             envvar="SPLATMILL_SERVER",
-            help="Train there instead of on this machine. The API key is read from SPLATMILL_API_KEY.",
+            help="Address of a server to train on. Left out, this machine trains. The API key is read from "
+            "SPLATMILL_API_KEY.",
         ),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="A name for the job.", show_default=False)] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the job. Left out, that of PATH.", show_default=False)
+    ] = None,
     detach: Annotated[
-        bool, typer.Option("--detach", help="With --server: start the job, print its id, and leave it.")
+        bool,
+        typer.Option("--detach", help="Start the job on --server, print its id, and do not wait for it."),
     ] = False,
     orbit: Annotated[
-        bool, typer.Option("--orbit", help="Also leave a video that circles the scene.")
+        bool, typer.Option("--orbit", help="Also write orbit.mp4, a video that circles the scene.")
     ] = False,
     novel_view: Annotated[
-        bool, typer.Option("--novel-view", help="Also leave a picture from where no photo was taken.")
+        bool,
+        typer.Option(
+            "--novel-view", help="Also write novel_view.png, an image from half-way between two cameras."
+        ),
     ] = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Show the plan and all log lines.")
     ] = False,
     **options: Any,
 ) -> None:
-    """Train Gaussian splats from photos; leaves model.ply and its report in DIR."""
-    from splatmill.aio import train_options, with_start_file
+    """Train Gaussian splats from photos; write model.ply and its report to DIR."""
+    from splatmill.aio import train_options, with_start_model
 
     given = {key: value for key, value in options.items() if value is not None and value != []}
-    given, start = with_start_file(given, path)
+    given, start = with_start_model(given, path)
     checked = train_options(given)
     found = find_files(path)
     if detach and server is None:
-        raise typer.BadParameter("Without --server the job ends with this call.", param_hint="--detach")
+        raise typer.BadParameter(
+            "--detach needs --server: without a server, the job ends with this command.",
+            param_hint="--detach",
+        )
     out.mkdir(parents=True, exist_ok=True)
     _announce(found)
     with _sigterm_as_interrupt(), _client(server, out) as client:
@@ -88,13 +100,13 @@ def _announce(found: Found) -> None:
     typer.echo(f"{photos} photos{extra}, {format_bytes(found.bytes)}")
     if found.ignored:
         shown = ", ".join(found.ignored[:5]) + (", ..." if len(found.ignored) > 5 else "")
-        typer.echo(f"passed over: {shown}")
+        typer.echo(f"ignored: {shown}")
 
 
 @contextmanager
 def _client(server: str | None, out: Path) -> Iterator[Client]:
     if server is not None:
-        with connect(server) as client:
+        with open_client(server) as client:
             yield client
         return
     with (
@@ -114,11 +126,11 @@ def _upload(client: Client, path: Path, name: str, start: Path | None) -> Captur
 
 def _follow(client: Client, capture: Capture, name: str, options: TrainOptions, verbose: bool) -> ModelHandle:
     try:
-        return follow(lambda: client.submit(capture.id, options, name=name), verbose=verbose)
+        return follow_job(lambda: client.submit(capture.id, options, name=name), verbose=verbose)
     except JobCancelled as cancelled:
-        typer.echo(f"The job {cancelled.job_id} is cancelled.")
-    except LeftBehind:
-        typer.echo("Not waiting for the cancellation.", err=True)
+        typer.echo(f"The job {cancelled.job_id} was cancelled.")
+    except StoppedWaiting:
+        typer.echo("The job is being cancelled; this command does not wait for its end.", err=True)
     raise typer.Exit(Exit.cancelled)
 
 
@@ -129,12 +141,15 @@ def _summary(model: ModelHandle, written: list[Path]) -> None:
     typer.echo(f"{record.gaussians:,} Gaussians, {format_bytes(record.bytes)}{quality}")
     for path in written:
         typer.echo(f"  {path}")
-    typer.echo("Drop model.ply on https://superspl.at/editor, or open it in any viewer for Gaussian splats.")
+    typer.echo(
+        "To view it, drop model.ply on https://superspl.at/editor, or open it in any viewer for "
+        "Gaussian splats."
+    )
 
 
 @contextmanager
 def _sigterm_as_interrupt() -> Iterator[None]:
-    """A polite end (`kill`, a stopped container) is taken like Ctrl-C: what was started is ended."""
+    """Handle SIGTERM (`kill`, a container that is stopped) like Ctrl-C, so that the embedded service is stopped."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt

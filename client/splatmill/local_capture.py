@@ -1,4 +1,4 @@
-"""What a path given by a person contains: photos, masks, poses, a video or an archive."""
+"""The files of a capture at a local path: photos, masks, poses, a video or a zip archive."""
 
 import os
 from dataclasses import dataclass
@@ -10,13 +10,19 @@ from splatmill.schema.photos import ARCHIVE_SUFFIXES, MASK_FOLDERS, PHOTO_SUFFIX
 
 MODEL_SUFFIXES = frozenset({".bin", ".txt"})
 MODEL_STEMS = frozenset({"cameras", "images", "points3D", "rigs", "frames"})
-# Where tools put a COLMAP model; the first folder that has one wins.
+# Where tools put a COLMAP model; the first folder that holds one is used.
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
 
 
 @dataclass(frozen=True)
 class LocalFile:
-    """A file to upload: what it is for, its name in the capture, and where it lies."""
+    """A file to upload.
+
+    role: its purpose in the capture.
+    name: its name in the capture.
+    path: where it is on this machine.
+    size: in bytes.
+    """
 
     role: Role
     name: str
@@ -26,35 +32,35 @@ class LocalFile:
 
 @dataclass(frozen=True)
 class Found:
-    """What a path contains. `ignored` are relative names of files that are no part of a capture."""
+    """The files of a capture, and the relative names of the files that were ignored."""
 
     files: tuple[LocalFile, ...]
     ignored: tuple[str, ...] = ()
 
     def count(self, role: Role) -> int:
-        """How many files have this role."""
+        """Return the number of files with this role."""
         return sum(file.role is role for file in self.files)
 
     @property
     def bytes(self) -> int:
-        """Size of all files together."""
+        """The total size of the files in bytes."""
         return sum(file.size for file in self.files)
 
 
 def find_files(path: str | os.PathLike[str]) -> Found:
-    """The files of the capture at `path`: a photo, a video, a zip, a folder of photos, or a posed data set.
+    """Find the files of the capture at `path`: a photo, a video, a zip archive, a folder of photos or a posed data set.
 
-    In a folder, photos are those under `images/` with names relative to it, or, without such a folder, all photos
-    with names relative to the folder itself (so that `train/r_0.png` keeps the name a `transforms_train.json`
-    calls it by). Masks are those under `masks/`; poses are `transforms*.json` and a COLMAP model. Hidden files and
-    folders are passed over. A video or zip in a folder counts only where there are no photos.
+    In a folder, the photos are those under `images/`, named relative to it. Without `images/`, they are all photos in
+    the folder, named relative to the folder, so that `train/r_0.png` keeps its name in `transforms_train.json`. Masks
+    lie under `masks/` or `mask/`; poses are `transforms*.json` and a COLMAP model. Hidden files and folders are
+    ignored. Videos and zip archives are used only where there are no photos.
 
-    Raises NothingToUpload where the path does not exist, cannot be read, or holds nothing of that kind, and where
-    a file's name is not accepted by the service.
+    Raises NothingToUpload where the path does not exist, cannot be read or holds none of these, and where the service
+    does not accept the name of a file.
     """
     root = Path(path).expanduser()
     if not root.exists():
-        raise NothingToUpload(f"{root} does not exist.", "Give a folder of photos, a zip or a video.")
+        raise NothingToUpload(f"{root} does not exist.", "Give a folder of photos, a zip archive or a video.")
     if root.is_file():
         return _single(root)
     try:
@@ -86,19 +92,21 @@ def find_files(path: str | os.PathLike[str]) -> Found:
         if not whole:
             kinds = ", ".join(sorted(suffix.removeprefix(".") for suffix in PHOTO_SUFFIXES))
             raise NothingToUpload(
-                f"{root} holds no photos, no video and no zip.", f"Photos are {kinds} files."
+                f"{root} contains no photos, no video and no zip archive.",
+                f"Photos are {kinds} files.",
             )
     return Found(tuple(files), tuple(ignored))
 
 
-def start_file(path: Path) -> LocalFile:
-    """A model to start from as a file of the capture: it lies beside the poses whose world it is in.
+def start_model(path: Path) -> LocalFile:
+    """Return a model to start from as a file of the capture; its role is poses, whose coordinates it shares.
 
-    Raises NothingToUpload where it is no file, or its name is not accepted.
+    Raises NothingToUpload where there is no such file, or where the service does not accept its name.
     """
     if not path.is_file():
         raise NothingToUpload(
-            f"The model {path} to start from does not exist.", "Give a .ply file, or a model's id."
+            f"The model {path} to start from does not exist.",
+            "Give the path of a .ply file, or the id of a model.",
         )
     return _local(Role.poses, path.name, path)
 
@@ -106,21 +114,21 @@ def start_file(path: Path) -> LocalFile:
 def _single(path: Path) -> Found:
     if _suffix(path.name) not in PHOTO_SUFFIXES + VIDEO_SUFFIXES + ARCHIVE_SUFFIXES:
         raise NothingToUpload(
-            f"{path.name} is neither a photo, nor a video, nor a zip.",
-            "Give a folder of photos, a zip or a video.",
+            f"{path.name} is neither a photo, nor a video, nor a zip archive.",
+            "Give a folder of photos, a zip archive or a video.",
         )
     return Found((_local(Role.images, path.name, path),))
 
 
 def _walk(root: Path) -> list[str]:
-    """Relative names of all files under `root`, sorted, hidden ones left out."""
+    """Return the relative names of all files under `root` except hidden ones, sorted."""
 
     def fail(error: OSError) -> None:
         raise error
 
     names: list[str] = []
     visited: set[tuple[int, int]] = set()
-    # Links are followed, since data sets share their photos by links; a folder met again ends a circle.
+    # Links are followed, because data sets share photos through them; a folder seen before ends a cycle.
     for folder, subfolders, files in os.walk(root, onerror=fail, followlinks=True):
         here = os.stat(folder)
         if (here.st_dev, here.st_ino) in visited:
@@ -134,7 +142,7 @@ def _walk(root: Path) -> list[str]:
 
 
 def _poses(names: list[str]) -> dict[str, str]:
-    """Local name of each pose file, and the name it gets in the capture."""
+    """Return the local name of each pose file, with its name in the capture."""
     found = {
         name: name
         for name in names
@@ -147,7 +155,7 @@ def _poses(names: list[str]) -> dict[str, str]:
             model = [
                 name for name in inside if Path(name).stem in MODEL_STEMS and _suffix(name) in MODEL_SUFFIXES
             ]
-            # One place for the worker to look, wherever the tool had put it.
+            # In a capture, a COLMAP model always lies in the same folder.
             return found | {name: f"sparse/0/{name.removeprefix(prefix)}" for name in model}
     return found
 

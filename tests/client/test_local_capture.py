@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from splatmill.errors import NothingToUpload
-from splatmill.layout import find_files
+from splatmill.local_capture import find_files
 from splatmill.schema import Role
 from tests.support.paths import DATA
 
