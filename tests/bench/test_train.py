@@ -291,7 +291,7 @@ def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: P
 
     def idle(config: str, plan: Row) -> bool:
         measured = default | {"plan": plan, "code": rows.code_version()}
-        return bool(rows.idle(rows.Run(scene, config, budget, default["seed"]), [measured]))
+        return bool(rows.idle(rows.BenchRun(scene, config, budget, default["seed"]), [measured]))
 
     assert "densify" not in default["plan"]
     assert idle("no-densification", default["plan"])

@@ -13,12 +13,14 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import _gsplat
 import numpy as np
 import torch
 from _rows import Row, write
+from torch import Tensor
 
 from splatmill.schema import TrainOptions
 from splatmill_worker.images import load_views
@@ -73,13 +75,13 @@ def median_ms(work: Callable[[], object], repeats: int = REPEATS) -> float:
     torch.cuda.synchronize()
     taken = []
     for _ in range(repeats):
-        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))  # type: ignore[no-untyped-call]  # torch's own gap
         start.record()
         work()
         end.record()
         end.synchronize()
         taken.append(start.elapsed_time(end))
-    return statistics.median(taken)
+    return float(statistics.median(taken))
 
 
 def seconds_to(curve: Sequence[Row], psnr: float) -> float | None:
@@ -140,6 +142,11 @@ def equal(counts: Sequence[int]) -> list[Row]:
     return rows
 
 
+def _drawn(trainer: _gsplat.GsplatTrainer, degree: int, target: Target, _: Tensor) -> Tensor:
+    """What gsplat's model shows from a camera, at an SH degree; it knows no background but black."""
+    return trainer.render(target, degree)[0].clamp(0, 1)
+
+
 def curves(capture: Path, size: int, steps: int, seed: int) -> list[Row]:
     """Held-out error against training seconds on one capture; evaluation is off the clock for both."""
     found = posed.find(capture)
@@ -186,7 +193,7 @@ def curves(capture: Path, size: int, steps: int, seed: int) -> list[Row]:
             seconds += time.perf_counter() - started
             with torch.no_grad():
                 score = evaluate(
-                    lambda target, _, at=number: trainer.render(target, _gsplat.degree_at(at))[0].clamp(0, 1),
+                    partial(_drawn, trainer, _gsplat.degree_at(number)),
                     held_out,
                     torch.zeros(3),
                 )

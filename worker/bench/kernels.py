@@ -14,12 +14,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 
 import _plot
 import numpy as np
 import torch
 from _rows import HERE, Row, build, footer, read, write
 from _scenes import Scene, cloud, fox
+from matplotlib.lines import Line2D
 
 from splatmill_worker.kernels import cpu, ops
 from splatmill_worker.kernels.cpu import isa
@@ -176,7 +178,21 @@ def draw_and_differentiate(
     """The ops one by one, on one view: the image and the gradients of a fixed weighting of it."""
     v = scene.views[0]
     leaves = [x.to(dtype).requires_grad_() for x in scene.groups]
-    p = ops.project(*leaves, v.viewmat.to(dtype), v.K.to(dtype), v.width, v.height, degree=3, backend=backend)
+    means, log_scales, quats, logit_opacities, sh = leaves
+    viewmat, K = v.viewmat.to(dtype), v.K.to(dtype)
+    p = ops.project(
+        means,
+        log_scales,
+        quats,
+        logit_opacities,
+        sh,
+        viewmat,
+        K,
+        v.width,
+        v.height,
+        degree=3,
+        backend=backend,
+    )
     color, _, _ = ops.composite(
         p, ops.bin(p, v.width, v.height, backend=backend), v.width, v.height, backend=backend
     )
@@ -247,7 +263,7 @@ def precision_rows(scene: Scene, rounds: int) -> list[Row]:
                 add(
                     f"cpu {name} fused",
                     threads,
-                    median_seconds(lambda step=step: fused(scene, step), rounds),
+                    median_seconds(partial(fused, scene, step), rounds),
                     kept,
                 )
     torch.set_num_threads(before)
@@ -285,7 +301,7 @@ def precision_figure(rows: list[Row]) -> None:
         panel.set_yscale("log")
         panel.set_xlabel("milliseconds: render and differentiate one view")
         panel.set_title(title, fontsize=10)
-    line = _plot.plt.Line2D
+    line = Line2D
     handles = [
         line([], [], ls="", marker="o", color=_plot.COLORS[b], label=b)
         for b in dict.fromkeys(r["backend"].removesuffix(" fused") for r in mine)
@@ -536,9 +552,9 @@ def main(argv: list[str]) -> int:
         for name in isa.supported()[:2]:
             rows.append(render_row(scene, name, 2, options.rounds))
     rows.append(memory_row("step"))
-    for scene in (small, cloud(2_000, 128, 128), cloud(20_000, 256, 256)):
-        if scene is not None:
-            rows += precision_rows(scene, options.rounds)
+    for drawn in (small, cloud(2_000, 128, 128), cloud(20_000, 256, 256)):
+        if drawn is not None:
+            rows += precision_rows(drawn, options.rounds)
     write("kernels", rows)
     rows = read("kernels")
     precision_figure(rows)

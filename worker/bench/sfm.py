@@ -365,7 +365,12 @@ def scenes_figure(rows: list[dict[str, Any]], path: Path) -> None:
             continue
         color = colors[row["scene"]]
         face = "none" if row["busy"] else color
-        style = {"edgecolors": color, "facecolors": face, "marker": markers[row["setting"]], "s": 48}
+        style: dict[str, Any] = {
+            "edgecolors": color,
+            "facecolors": face,
+            "marker": markers[row["setting"]],
+            "s": 48,
+        }
         label = f"{row['scene']}, {row['setting']}"
         if "psnr" in row:
             left.scatter(row["seconds"], row["psnr"], label=label, **style)

@@ -13,6 +13,7 @@ import importlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import _plot
 import numpy as np
@@ -126,25 +127,27 @@ def with_norm(norm: float, seed: int) -> Scene:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Drawn:
     color: Tensor
     gradients: list[Tensor]
 
 
-def draw(scene: Scene, backend: ops.Backend, dtype: torch.dtype) -> Outcome:
+def draw(scene: Scene, backend: ops.Backend, dtype: torch.dtype) -> Drawn:
     """The image, and the gradients of a fixed weighting of it."""
     leaves = [getattr(scene, k).to(dtype).requires_grad_() for k in GROUPS]
+    means, log_scales, quats, logit_opacities, sh = leaves
+    viewmat, K = scene.viewmat.to(dtype), scene.K.to(dtype)
     p = ops.project(
-        *leaves, scene.viewmat.to(dtype), scene.K.to(dtype), SIDE, SIDE, degree=3, backend=backend
+        means, log_scales, quats, logit_opacities, sh, viewmat, K, SIDE, SIDE, degree=3, backend=backend
     )
     color, _, _ = ops.composite(p, ops.bin(p, SIDE, SIDE, backend=backend), SIDE, SIDE, backend=backend)
     g = torch.Generator().manual_seed(1)
     weights = torch.rand(SIDE, SIDE, 3, generator=g).to(dtype) + 0.5
     gradients = torch.autograd.grad((color * weights).sum(), leaves)
-    return Outcome(color.detach().double(), [x.double() for x in gradients])
+    return Drawn(color.detach().double(), [x.double() for x in gradients])
 
 
-def errors(got: Outcome, want: Outcome) -> dict[str, float]:
+def errors(got: Drawn, want: Drawn) -> dict[str, float]:
     """Mean absolute error of the image over its brightest value; error of the gradients, the worst group's, over its norm."""
     scale = float(want.color.abs().max()) or 1.0
     image = float((got.color - want.color).abs().mean()) / scale
@@ -180,7 +183,8 @@ def determinants(ratio: float) -> Formulas:
 
     def exact(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         minors = np.cross(x, y)
-        return (minors**2).sum(1) + 0.3 * ((x**2).sum(1) + (y**2).sum(1)) + 0.09
+        value: np.ndarray = (minors**2).sum(1) + 0.3 * ((x**2).sum(1) + (y**2).sum(1)) + 0.09
+        return value
 
     want = exact(m0.astype(np.float64), m1.astype(np.float64))
     blur = np.float32(0.3)
@@ -331,13 +335,13 @@ DECISION = 3e-6
 """Relative width around the 1/255 cut in which float32 may take a pixel that float64 skips: twenty-five roundings."""
 
 
-def decided(scene: Scene, got: Outcome, error: float) -> dict[str, float]:
+def decided(scene: Scene, got: Drawn, error: float) -> dict[str, float]:
     """Errors of `got` against the nearest definition whose 1/255 cut lies within DECISION of the true one.
 
     Where that error is small and the plain one is large, no digits were lost: a pixel stands on the cut, where the image and its
     gradient jump.
     """
-    definition = importlib.import_module("splatmill_worker.kernels.reference.composite")
+    definition: Any = importlib.import_module("splatmill_worker.kernels.reference.composite")
     cut, best = definition.ALPHA_MIN, {"gradient": error}
     try:
         for share in (-1.0, -0.33, -0.1, 0.1, 0.33, 1.0):

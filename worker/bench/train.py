@@ -21,10 +21,11 @@ import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from _rows import HERE, Row, append, lines
 from _train import budgets, child, configurations, estimate, figure, scenes, tables
-from _train.rows import Run, code_version, failed, idle, missing, runs_of
+from _train.rows import BenchRun, code_version, failed, idle, missing, runs_of
 from _train.scenes import Scene
 
 from splatmill.schema.quantities import format_duration
@@ -66,7 +67,7 @@ class Peer:
 class Wanted:
     """What a call asks for; `absent` has a sentence for each scene whose data is not there."""
 
-    runs: list[Run]
+    runs: list[BenchRun]
     peers: list[Peer]
     absent: list[str]
 
@@ -229,7 +230,7 @@ def _parser() -> argparse.ArgumentParser:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    several = {"nargs": "+", "metavar": "NAME"}
+    several: dict[str, Any] = {"nargs": "+", "metavar": "NAME"}
     parser.add_argument(
         "--scenes",
         **several,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from _rows import Row
 
-from _train.rows import Run
+from _train.rows import BenchRun
 from _train.scenes import Scene
 
 LAST_WORDS = 2000
@@ -26,7 +26,7 @@ def prepared(scene: Scene, work: Path) -> Row:
     return _ask({"do": "prepare", **_of(scene, work), "options": scene.options})
 
 
-def measured(run: Run, work: Path) -> Row:
+def measured(run: BenchRun, work: Path) -> Row:
     """The row of a run, a failure by name included. Raises Fault."""
     return _ask(
         {

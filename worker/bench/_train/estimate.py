@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from _rows import Row
 
-from _train.rows import Run, failed
+from _train.rows import BenchRun, failed
 
 START = 4.0
 """Seconds that a process needs to load torch and COLMAP."""
@@ -18,12 +18,12 @@ AROUND = 12.0
 PER_STEP = 0.012
 
 
-def seconds_left(runs: Iterable[Run], rows: list[Row]) -> float:
+def seconds_left(runs: Iterable[BenchRun], rows: list[Row]) -> float:
     """Wall seconds for all of `runs`."""
     return sum(expected(run, rows) for run in runs)
 
 
-def expected(run: Run, rows: list[Row]) -> float:
+def expected(run: BenchRun, rows: list[Row]) -> float:
     """Wall seconds of one run: what its like took, by the median, else a guess from its budget."""
     like = (run.scene.name, run.budget.name)
     known = [row for row in rows if row["kind"] == "run" and not failed(row)]

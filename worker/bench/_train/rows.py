@@ -24,8 +24,8 @@ QUIET = 0.1
 
 _WORKER = Path(splatmill_worker.__file__).parent
 _COMPUTES = [
-    *(_WORKER / name for name in ("images", "kernels", "sfm", "splat")),
-    *(_WORKER / f"{name}.py" for name in ("capture", "colmap", "pipeline", "scene", "synthetic", "textures")),
+    *(_WORKER / name for name in ("images", "kernels", "sfm", "splat", "synthetic")),
+    *(_WORKER / f"{name}.py" for name in ("capture", "colmap", "pipeline", "scene")),
     Path(splatmill.schema.__file__).parent / "options.py",
 ]
 
@@ -35,6 +35,8 @@ def code_version() -> str:
     """A digest of the sources that a result depends on: the same code, the same row, whatever the commit is called."""
     digest = hashlib.sha256()
     for place in _COMPUTES:
+        if not place.exists():
+            raise FileNotFoundError(f"{place} is gone; name in _COMPUTES what a result depends on now.")
         files = [place] if place.is_file() else sorted(place.rglob("*"))
         for path in files:
             if path.suffix in {".py", ".cpp", ".hpp", ".h"}:
@@ -57,7 +59,7 @@ class _Textless(ast.NodeTransformer):
 
 
 @dataclass(frozen=True)
-class Run:
+class BenchRun:
     """One run to do: a scene trained by one configuration within one budget from one seed."""
 
     scene: Scene
@@ -92,12 +94,12 @@ def key(row: Row) -> str:
 
 def runs_of(
     scenes: Iterable[Scene], configs: Iterable[str], budgets: Iterable[Budget], seeds: Iterable[int]
-) -> list[Run]:
+) -> list[BenchRun]:
     """Every combination that means something: the default first, and seeds outermost, so that those done are whole."""
     scenes, budgets = list(scenes), list(budgets)
     configs = sorted(configs, key=lambda name: name != DEFAULT)
     return [
-        Run(scene, config, budget, seed)
+        BenchRun(scene, config, budget, seed)
         for seed in seeds
         for budget in budgets
         for scene in scenes
@@ -106,13 +108,13 @@ def runs_of(
     ]
 
 
-def missing(runs: list[Run], rows: list[Row]) -> list[Run]:
+def missing(runs: list[BenchRun], rows: list[Row]) -> list[BenchRun]:
     """Those of `runs` that have no row of today's code."""
     there = {key(row) for row in rows}
     return [run for run in runs if key(run.identity() | {"code": code_version()}) not in there]
 
 
-def idle(run: Run, rows: list[Row]) -> bool:
+def idle(run: BenchRun, rows: list[Row]) -> bool:
     """Whether the default of the same scene, budget, seed and code does already what the switch would do."""
     defaults, _ = _sides(rows)
     default = defaults.get((run.scene.name, run.budget.name, run.seed, code_version()))

@@ -100,7 +100,8 @@ def measure(job: Row) -> Row:
         "warnings": report["warnings"],
         "curve": report["curve"],
     }  # fmt: skip
-    return row | rounded(values)
+    measured: Row = rounded(values)
+    return row | measured
 
 
 def judge(job: Row) -> Row:
@@ -126,7 +127,7 @@ def judge(job: Row) -> Row:
     views = [TrainingView.of(photo, frame) for photo in load_views(test, options.image_size)]
     with torch.no_grad():
         score = evaluate(draw, views, judged_over(views))
-    return rounded(
+    judged: Row = rounded(
         {
             "kind": "peer",
             "scene": job["scene"],
@@ -142,6 +143,7 @@ def judge(job: Row) -> Row:
             **origin(),
         }
     )
+    return judged
 
 
 JOBS: dict[str, Callable[[Row], Row]] = {"prepare": prepare, "measure": measure, "judge": judge}
