@@ -33,7 +33,7 @@ from splatmill_worker.splat.evaluate import evaluate
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.decide import decide
 from splatmill_worker.splat.plan.facts import measure
-from splatmill_worker.splat.plan.probe import STILL, probe
+from splatmill_worker.splat.plan.probe import ZERO_RATES, probe
 from splatmill_worker.splat.render import render
 from splatmill_worker.splat.start.points import from_points
 from splatmill_worker.splat.train.loop import train
@@ -112,7 +112,7 @@ def equal(counts: Sequence[int]) -> list[Row]:
         late = 3 * _gsplat.DEGREE_EVERY  # all of SH is in use
 
         def our_step(engine: object = ours, seen: Target = target) -> None:
-            engine.train_photo(seen.viewmat, seen.K, seen.rgb, degree=3, rates=STILL, step=1)  # type: ignore[attr-defined]
+            engine.train_photo(seen.viewmat, seen.K, seen.rgb, degree=3, rates=ZERO_RATES, step=1)  # type: ignore[attr-defined]
 
         def our_view(scene: Gaussians = here, seen: Target = target) -> None:
             with torch.no_grad():

@@ -30,11 +30,10 @@ from splatmill_worker.splat.report.export import Frame, export
 from splatmill_worker.splat.report.progress_film import ProgressFilm
 from splatmill_worker.splat.report.report import write_report
 from splatmill_worker.splat.report.stages import Stages
-from splatmill_worker.splat.start.completion import completed
-from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS, in_frusta
-from splatmill_worker.splat.start.given_model import Start, judge, strongest
-from splatmill_worker.splat.start.given_model import read as read_start
+from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS, sample_frusta
+from splatmill_worker.splat.start.given_model import GivenModel, assess, read_given_model
 from splatmill_worker.splat.start.points import ENOUGH_POINTS, from_points
+from splatmill_worker.splat.start.seeding import add_seeds, most_opaque
 from splatmill_worker.splat.train import checkpoint
 from splatmill_worker.splat.train.loop import Hooks, Trained, train
 from splatmill_worker.splat.views import TrainingView
@@ -88,7 +87,7 @@ def run(
             plan = _plan(task, facts, revise)
         emit(PlanEvent(plan=plan.as_dict()))
         photos = _photos_as_planned(cameras, probed, plan, facts, stages)
-        engine = open_engine(_completed(first, cameras, photos, plan), plan.kernels)
+        engine = open_engine(_seeded(first, cameras, photos, plan), plan.kernels)
         training = _trained(task, engine, photos, plan)
     except Cancelled:
         return Outcome("cancelled", workdir / "out")
@@ -190,12 +189,12 @@ def _photos_as_planned(cameras: Cameras, loaded: Photos, plan: Plan, facts: Fact
     return _photos(cameras, plan.image_size, stages)
 
 
-def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaussians, Start | None]:
+def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaussians, GivenModel | None]:
     """The Gaussians to start with, and what is known of the model they are, where one was given."""
     path = start_file(task.capture, task.workdir, task.options)
     if path is not None:
-        given = read_start(path, cameras.normalization)
-        start = judge(given, photos.training)
+        given = read_given_model(path, cameras.normalization)
+        start = assess(given, photos.training)
         if start.doubtful:
             task.emit(LogEvent(level="warning", message=_doubt(start)))
         return given, start
@@ -203,17 +202,19 @@ def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaus
     if len(world.points) >= ENOUGH_POINTS:
         return from_points(torch.from_numpy(world.points), torch.from_numpy(world.colors)), None
     targets = [view.full for view in photos.training]
-    return from_points(*in_frusta(targets, RANDOM_GAUSSIANS, task.options.seed)), None
+    return from_points(*sample_frusta(targets, RANDOM_GAUSSIANS, task.options.seed)), None
 
 
-def _doubt(start: Start) -> str:
+def _doubt(start: GivenModel) -> str:
     return (
         f"The model given shows the training photos at {start.psnr:.1f} dB, hardly better than one colour per photo "
         f"({start.one_color:.1f} dB). If it is of another scene, train without it."
     )
 
 
-def _facts(task: Task, cameras: Cameras, photos: Photos, gaussians: Gaussians, start: Start | None) -> Facts:
+def _facts(
+    task: Task, cameras: Cameras, photos: Photos, gaussians: Gaussians, start: GivenModel | None
+) -> Facts:
     """What can be measured before training: the scene, and how fast this machine trains it."""
     speed = probe(open_engine(gaussians, task.kernels), photos.training)
     facts = replace(measure(cameras.world, photos.training, len(photos.held_out), speed), start=start)
@@ -239,12 +240,12 @@ def _plan(task: Task, facts: Facts, revise: Revise) -> Plan:
     return plan
 
 
-def _completed(first: Gaussians, cameras: Cameras, photos: Photos, plan: Plan) -> Gaussians:
+def _seeded(first: Gaussians, cameras: Cameras, photos: Photos, plan: Plan) -> Gaussians:
     """The first Gaussians within the plan's limit, with what the plan adds to those made from points."""
-    gaussians = strongest(first, plan.max_gaussians)
+    gaussians = most_opaque(first, plan.max_gaussians)
     if plan.initial != "points":
         return gaussians
-    return completed(
+    return add_seeds(
         gaussians,
         cameras.world,
         photos.training,

@@ -136,7 +136,7 @@ def test_points_become_balls_as_wide_as_their_neighbours_are_far() -> None:
 
 def test_without_points_gaussians_start_inside_the_visual_hull() -> None:
     targets = [view.full for view in still_life.training_views(alpha=True)]
-    points, colors = frusta.in_frusta(targets, 800, 0)
+    points, colors = frusta.sample_frusta(targets, 800, 0)
     assert points.shape == (800, 3)
     assert colors.dtype == torch.uint8
     outside = 0

@@ -35,7 +35,6 @@ FACTS = Facts(
     exposure_spread=0.02,
     view_angle=30.0,
     distance_ratio=1.9,
-    depth_ratio=2.6,
     reprojection=0.9,
     memory_available=16 * 10**9,
     speed=Speed(per_pixel=2.6e-8, per_gaussian=9e-8),

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from splatmill_worker.scene import Camera
-from splatmill_worker.splat.start import completion, far_shell, gaps, sky
+from splatmill_worker.splat.start import far_shell, gaps, seeding, sky
 from splatmill_worker.splat.start.cells import Cells, cells_of, located, projected
 from splatmill_worker.splat.start.points import from_points
 from splatmill_worker.splat.views import Target, TrainingView
@@ -58,7 +58,7 @@ def test_gaps_are_filled_at_the_inverse_depth_of_their_neighbours() -> None:
     points = np.array([[-0.5, 0.3, 2.0], [0.0, 0.3, 2.0], [0.5, 0.3, 2.0]])
     grid = Cells.of(street(), points)
     assert gaps.gap_share([grid]) == pytest.approx(1.0 - 27 / (16 * 48))
-    places, colors = gaps.filled([grid])
+    places, colors = gaps.gap_points([grid])
     assert len(places) == 16 * 48 - 27
     assert places[:, 2] == pytest.approx(2.0)
     assert (colors == BRICK).all()
@@ -67,17 +67,17 @@ def test_gaps_are_filled_at_the_inverse_depth_of_their_neighbours() -> None:
 def test_a_second_photo_of_the_same_place_adds_only_what_it_alone_shows() -> None:
     points = np.array([[-0.5, 0.3, 2.0], [0.0, 0.3, 2.0], [0.5, 0.3, 2.0]])
     first, second = Cells.of(street(0.0), points), Cells.of(street(0.5), points)
-    alone, both = len(gaps.filled([first])[0]), len(gaps.filled([first, second])[0])
+    alone, both = len(gaps.gap_points([first])[0]), len(gaps.gap_points([first, second])[0])
     new = both - alone
     assert 0.2 * alone < new < 0.5 * alone  # half a unit at depth 2 is 10 of 48 columns
-    assert len(gaps.filled([first, first])[0]) == alone
+    assert len(gaps.gap_points([first, first])[0]) == alone
 
 
 def test_masked_cells_are_no_gaps() -> None:
     mask = torch.ones(64, 96, dtype=torch.bool)
     mask[:, :48] = False
     points = np.array([[0.2, 0.3, 2.0], [0.3, 0.3, 2.0], [0.5, 0.3, 2.0]])
-    places, _ = gaps.filled([Cells.of(street(mask=mask), points)])
+    places, _ = gaps.gap_points([Cells.of(street(mask=mask), points)])
     assert len(places)
     assert float(places[:, 0].min()) > 0.0
 
@@ -104,7 +104,7 @@ def test_the_shell_is_far_and_wherever_photos_look() -> None:
     points = np.array([[-0.5, 0.3, 2.0], [0.0, 0.3, 2.0], [0.5, 0.3, 4.0]])
     grids = [Cells.of(street(x), points) for x in (-0.2, 0.0, 0.2)]
     assert sky.sky_share(grids) == pytest.approx(0.5)
-    places, colors = far_shell.far_shell(grids, points)
+    places, colors = far_shell.shell_points(grids, points)
     distance = np.linalg.norm(places, axis=1)
     assert distance.min() > 0.99 * far_shell.DISTANCE * 3.0
     assert distance.max() / distance.min() < 1.01
@@ -126,7 +126,7 @@ def test_what_a_photo_shows_outweighs_what_another_continues() -> None:
     beside = replace(first.full.camera, cx=0.0)
     grey = first.full._replace(camera=beside, rgb=torch.full_like(first.full.rgb, 200))
     grids = [Cells.of(first, points), Cells.of(TrainingView("beside", {1: grey}), points)]
-    places, colors = far_shell.far_shell(grids, points)
+    places, colors = far_shell.shell_points(grids, points)
     cells, _ = located(grids[0].camera, places)
     lower = cells[:, 1] > 18
     left = lower & (cells[:, 0] > 19) & (cells[:, 0] < 20.5)
@@ -142,28 +142,24 @@ def test_masked_cells_leave_no_colour_on_the_shell() -> None:
     mask[:, :48] = False
     points = np.array([[0.2, 0.3, 2.0], [0.3, 0.3, 2.0], [0.5, 0.3, 2.0]])
     grid = Cells.of(street(mask=mask), points)
-    cells, _ = located(grid.camera, far_shell.far_shell([grid], points)[0])
+    cells, _ = located(grid.camera, far_shell.shell_points([grid], points)[0])
     assert cells[:, 0].min() > 23
     masked = Cells.of(street(mask=torch.zeros(64, 96, dtype=torch.bool)), points)
-    places, colors = far_shell.far_shell([masked], points)
+    places, colors = far_shell.shell_points([masked], points)
     assert places.shape == colors.shape == (0, 3)
 
 
 def test_what_is_added_keeps_to_the_limit_and_to_what_the_plan_says() -> None:
     world, views = sparse_scene()
     first = from_points(torch.from_numpy(world.points), torch.from_numpy(world.colors))
-    nothing = completion.completed(
+    nothing = seeding.add_seeds(
         first, world, views, fill_gaps=False, add_far_shell=False, max_gaussians=10**6
     )
     assert nothing is first
-    wanted = len(gaps.filled(cells_of(world, views))[0])
-    whole = completion.completed(
-        first, world, views, fill_gaps=True, add_far_shell=False, max_gaussians=10**6
-    )
+    wanted = len(gaps.gap_points(cells_of(world, views))[0])
+    whole = seeding.add_seeds(first, world, views, fill_gaps=True, add_far_shell=False, max_gaussians=10**6)
     assert whole.count == first.count + wanted
     assert bool(whole.finite().all())
     most = first.count + 10
-    limited = completion.completed(
-        first, world, views, fill_gaps=True, add_far_shell=True, max_gaussians=most
-    )
+    limited = seeding.add_seeds(first, world, views, fill_gaps=True, add_far_shell=True, max_gaussians=most)
     assert limited.count == most

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from splatmill_worker.splat.motion import motion
-from splatmill_worker.splat.plan.probe import STILL
+from splatmill_worker.splat.plan.probe import ZERO_RATES
 from splatmill_worker.splat.train.loop import Trained, train
 from splatmill_worker.splat.train.poses import Poses, gauge, moved, typical_depth
 from splatmill_worker.splat.views import TrainingView
@@ -135,7 +135,7 @@ def test_the_reference_gives_the_same_gradient_as_the_fused_step() -> None:
     gradients = []
     for engine in engines:
         engine.keep_pose_gradient = True
-        engine.train_photo(target.viewmat, target.K, target.rgb, degree=0, rates=STILL, step=1)
+        engine.train_photo(target.viewmat, target.K, target.rgb, degree=0, rates=ZERO_RATES, step=1)
         assert engine.pose_gradient is not None
         gradients.append(engine.pose_gradient)
     assert torch.allclose(*gradients, rtol=1e-3, atol=1e-6)

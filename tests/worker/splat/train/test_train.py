@@ -273,7 +273,7 @@ def test_a_scene_that_no_camera_sees_is_empty_by_name() -> None:
 def test_transparent_photos_train_over_random_backgrounds() -> None:
     views = still_life.training_views(alpha=True)
     targets = [view.full for view in views]
-    points, colors = frusta.in_frusta(targets, 2500, 0)
+    points, colors = frusta.sample_frusta(targets, 2500, 0)
     engine = open_engine(from_points(points, colors), "cpu")
     trained = train(engine, views[1:], views[:1], plan(400, background="random", densify=False), extent=1.1)
     assert trained.held_out is not None

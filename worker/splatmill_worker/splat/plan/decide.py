@@ -16,7 +16,7 @@ from splatmill_worker.splat.plan.rates import PAPER_STEPS, Annealing, boost_of
 from splatmill_worker.splat.plan.reasons import Reasons
 from splatmill_worker.splat.plan.schedule import Schedule
 from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS
-from splatmill_worker.splat.start.given_model import Start
+from splatmill_worker.splat.start.given_model import GivenModel
 from splatmill_worker.splat.start.points import ENOUGH_POINTS
 
 PRESET_STEPS = {Preset.draft: 1000, Preset.balanced: 3000, Preset.quality: 10_000}
@@ -25,7 +25,7 @@ PRESET_SIZE: dict[Kernels, dict[Preset, int]] = {
     "cpu": {Preset.draft: 480, Preset.balanced: 640, Preset.quality: 960},
     "gpu": {Preset.draft: 640, Preset.balanced: 1280, Preset.quality: 1920},
 }
-SETTLED = 1550.0
+GAUSSIANS_PER_ROOT_STEP = 1550.0
 """Gaussians per root of a step. More cost their time without showing more: on fox and lego, 600 steps gain 0.5 and
 1.2 dB from 48,000 in place of 24,000, and 1500 steps nothing from 100,000 in place of 60,000."""
 
@@ -184,9 +184,9 @@ def _budget(
     return Budget(steps), steps
 
 
-def _settled(steps: int) -> int:
+def _trainable(steps: int) -> int:
     """How many Gaussians `steps` steps are worth."""
-    return round(SETTLED * math.sqrt(steps))
+    return round(GAUSSIANS_PER_ROOT_STEP * math.sqrt(steps))
 
 
 def _affordable_steps(seconds: float, speed: Speed, pixels: float, start: int, most: int) -> int:
@@ -196,7 +196,7 @@ def _affordable_steps(seconds: float, speed: Speed, pixels: float, start: int, m
     """
 
     def fits(steps: int) -> bool:
-        gaussians = min(most, max(start, _settled(steps)))
+        gaussians = min(most, max(start, _trainable(steps)))
         return 0.8 * steps * speed.step(pixels, gaussians) <= seconds
 
     few, many = 10, 10**7
@@ -216,7 +216,7 @@ def _max_gaussians(
     why: Reasons,
 ) -> int:
     resolved, held, _ = limits
-    settled = _settled(steps)
+    settled = _trainable(steps)
     most = max(min(settled, resolved, held), min(start, held))
     if options.max_gaussians is not None:
         most = min(options.max_gaussians, max(most, min(resolved, held)))
@@ -253,7 +253,7 @@ def _resolution(steps: int, image_size: int, why: Reasons) -> tuple[tuple[int, i
     return ((0, 4), (first, 2), (second, 1))
 
 
-def _continued(schedule: Schedule, start: Start, why: Reasons) -> Schedule:
+def _continued(schedule: Schedule, start: GivenModel, why: Reasons) -> Schedule:
     """The course of a scene that was trained before: what its beginning is for is done.
 
     The rates start as ever. On the fox, 300 steps on a model of 700 ended at 29.7 dB so, and at 29.5, 29.3 and 28.8 dB

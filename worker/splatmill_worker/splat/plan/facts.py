@@ -15,9 +15,9 @@ import torch
 from splatmill_worker.images.lens import distortion
 from splatmill_worker.scene import Scene
 from splatmill_worker.splat.start.cells import cells_of
-from splatmill_worker.splat.start.far_shell import far_shell
-from splatmill_worker.splat.start.gaps import filled, gap_share
-from splatmill_worker.splat.start.given_model import Start
+from splatmill_worker.splat.start.far_shell import shell_points
+from splatmill_worker.splat.start.gaps import gap_points, gap_share
+from splatmill_worker.splat.start.given_model import GivenModel
 from splatmill_worker.splat.start.points import ENOUGH_POINTS
 from splatmill_worker.splat.start.sky import sky_share
 from splatmill_worker.splat.views import TrainingView
@@ -25,8 +25,8 @@ from splatmill_worker.splat.views import TrainingView
 Float = npt.NDArray[np.float64]
 MAX_POINTS = 4000  # enough for a median, and a fraction of a second
 DARK = 4.0  # grey levels: below, ratios are noise
-SAME = 0.02  # log brightness: sightings nearer to their mean than this agree
-ROUNDS = 30
+RESIDUAL_FLOOR = 0.02  # log brightness: sightings nearer to their mean than this agree
+ITERATIONS = 30
 
 
 @dataclass(frozen=True)
@@ -43,20 +43,37 @@ class Speed:
 
 @dataclass(frozen=True)
 class Facts:
-    """Figures of one scene at the size of the loaded photos. None: it cannot be measured here.
+    """What is measured of a scene and of this machine before the plan is made. None: it cannot be measured here.
 
-    exposure_spread: robust standard deviation between photos of the log brightness of the same points.
-    halving_loss: median RMS difference, in grey levels of 255, between a photo and its half-size copy enlarged.
-    view_angle: median over points of the largest angle between two views of it, in degrees. distance_ratio:
-    90th percentile over points of largest over smallest pixel footprint. depth_ratio: 95th over 5th percentile
-    of depths. reprojection: median error of the points in pixels of this size. Neither it nor view_angle counts what
-    stereo added: that is looked for under few angles and in steps of its own. lens_residual: the farthest that
-    distortion moves a pixel of this size. tint_spread: as exposure_spread, of the log ratios of red and blue to
-    green. sightings: median number of points that a photo shows. sky_share, gap_share: shares of the photos that look
-    like sky, and that (sky apart) have no point near; gap_points, shell_points: what would fill the gaps, and stand
-    behind all. shell_distance: of the nearest of those from the origin of the frame.
-    extent: distance of the farthest tenth of the points over the radius of the cameras.
-    start: the model to start from, if one was given.
+    Pixels are those of the training photos as they were loaded. Counts are of training photos unless the field says
+    otherwise.
+
+    views: number of training photos.
+    held_out: number of held-out photos.
+    width, height: median size of a photo, pixels.
+    native_longest: longest side of the largest photo before it was loaded, pixels.
+    points: number of points of the reconstruction, those of stereo included.
+    source: where the cameras come from: "sfm", "colmap", "transforms" or "blender".
+    transparent: number of photos with transparent pixels.
+    masked: number of photos with a mask.
+    distorted: number of photos, held-out ones included, whose lens distortion was removed.
+    halving_loss: median RMS difference between a photo and its half-size copy enlarged again, grey levels of 255.
+    exposure_spread: robust standard deviation of the photos' exposures, natural logarithm.
+    view_angle: median over points of the largest angle between two views of the point, degrees; without stereo points.
+    distance_ratio: largest over smallest footprint of a pixel on the same point, 90th percentile over points.
+    reprojection: median reprojection error, pixels; without stereo points.
+    memory_available: free memory of the machine, or of the GPU for the gpu kernels, bytes.
+    speed: training time of this machine; None where it was not probed.
+    start: the model that training starts from; None without one.
+    tint_spread: as exposure_spread, of red over green or blue over green, whichever spreads more.
+    lens_residual: largest displacement of a pixel by lens distortion, pixels.
+    sightings: median number of points that a photo shows.
+    sky_share: share of the photos' area that looks like sky and shows no point, 0 to 1.
+    gap_share: share of the photos' area, sky excluded, with no point in or beside it, 0 to 1.
+    gap_points: number of Gaussians that would fill the gaps.
+    shell_points: number of Gaussians of the far shell.
+    shell_distance: distance from the origin to the nearest Gaussian of the far shell, in units of the world.
+    extent: radius around the cameras that holds nine points in ten, over the radius of the cameras.
     """
 
     views: int
@@ -73,11 +90,10 @@ class Facts:
     exposure_spread: float | None
     view_angle: float | None
     distance_ratio: float | None
-    depth_ratio: float | None
     reprojection: float | None
     memory_available: int
     speed: Speed | None = None
-    start: Start | None = None
+    start: GivenModel | None = None
     tint_spread: float | None = None
     lens_residual: float | None = None
     sightings: float | None = None
@@ -102,7 +118,7 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
     """Facts of `scene` (in any frame) whose training photos are `views`, in the same frame."""
     sizes = np.array([[view.full.camera.width, view.full.camera.height] for view in views])
     width, height = (int(value) for value in np.median(sizes, axis=0))
-    seen = _Sightings.of(scene, views)
+    seen = _Observations.of(scene, views)
     return Facts(
         views=len(views),
         held_out=held_out,
@@ -119,7 +135,6 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
         tint_spread=None if seen is None else tint_spread(seen),
         view_angle=None if seen is None else seen.view_angle(_own_points(scene)),
         distance_ratio=None if seen is None else seen.distance_ratio(),
-        depth_ratio=None if seen is None else seen.depth_ratio(),
         reprojection=_reprojection(scene, max(width, height)),
         lens_residual=_lens_residual(scene, max(width, height)),
         memory_available=int(psutil.virtual_memory().available),
@@ -144,12 +159,12 @@ def _coverage(scene: Scene, views: Sequence[TrainingView]) -> dict[str, Any]:
     if len(scene.points) < ENOUGH_POINTS or any(view.full.alpha is not None for view in views):
         return {}
     cells = cells_of(scene, views)
-    shell, _ = far_shell(cells, scene.points)
+    shell, _ = shell_points(cells, scene.points)
     return {
         "sightings": float(np.median([len(grid.points) for grid in cells])),
         "sky_share": sky_share(cells),
         "gap_share": gap_share(cells),
-        "gap_points": len(filled(cells)[0]),
+        "gap_points": len(gap_points(cells)[0]),
         "shell_points": len(shell),
         "shell_distance": float(np.linalg.norm(shell, axis=1).min()) if len(shell) else None,
         "extent": _extent(scene, views),
@@ -186,19 +201,19 @@ def _lens_residual(scene: Scene, longest: int) -> float | None:
     return max(moves, default=None)
 
 
-def exposure_spread(seen: _Sightings) -> float | None:
+def exposure_spread(seen: _Observations) -> float | None:
     """Spread between the photos of their log exposures; None with too few sightings."""
     return _spread(seen, np.log(np.maximum(seen.color.mean(axis=1), DARK)))
 
 
-def tint_spread(seen: _Sightings) -> float | None:
+def tint_spread(seen: _Observations) -> float | None:
     """Spread between the photos of their white balance: the larger one of red and of blue over green, in logs."""
     red, green, blue = np.log(np.maximum(seen.color.astype(np.float64), DARK)).T
     spreads = [_spread(seen, red - green), _spread(seen, blue - green)]
     return max((spread for spread in spreads if spread is not None), default=None)
 
 
-def _spread(seen: _Sightings, log: Float) -> float | None:
+def _spread(seen: _Observations, log: Float) -> float | None:
     """Spread between the photos of the part that is theirs in `log` (one value per sighting).
 
     Each value is a point's own plus its photo's. Both are solved for by alternating means whose weights fall with
@@ -206,12 +221,12 @@ def _spread(seen: _Sightings, log: Float) -> float | None:
     """
     share = np.zeros(seen.photos)
     weight = np.ones(len(log))
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         point = _group_mean(log - share[seen.photo], weight, seen.point, seen.points)
         share = _group_mean(log - point[seen.point], weight, seen.photo, seen.photos)
         share -= np.median(share)
         left = log - point[seen.point] - share[seen.photo]
-        weight = 1.0 / np.maximum(np.abs(left), SAME)
+        weight = 1.0 / np.maximum(np.abs(left), RESIDUAL_FLOOR)
     enough = np.bincount(seen.photo, minlength=seen.photos) >= 10
     if enough.sum() < 3:
         return None
@@ -219,7 +234,7 @@ def _spread(seen: _Sightings, log: Float) -> float | None:
 
 
 @dataclass(frozen=True)
-class _Sightings:
+class _Observations:
     """Which photo shows which point, one row each: indices, colour 0..255, distance over focal length."""
 
     points: int
@@ -227,12 +242,11 @@ class _Sightings:
     point: npt.NDArray[np.int64]
     photo: npt.NDArray[np.int64]
     color: npt.NDArray[np.uint8]
-    depth: Float
     footprint: Float
     direction: Float
 
     @staticmethod
-    def of(scene: Scene, views: Sequence[TrainingView]) -> _Sightings | None:
+    def of(scene: Scene, views: Sequence[TrainingView]) -> _Observations | None:
         """None without tracks (which photo sees which point), or with too few of them."""
         if scene.point_views is None or len(scene.points) < 20:
             return None
@@ -255,13 +269,11 @@ class _Sightings:
             on = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
             away = scene.points[rows[on]] - camera.center
             direction = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-            columns.append(
-                (rows[on], np.full(on.sum(), i), rgb[v[on], u[on]], z[on], z[on] / camera.fx, direction)
-            )
+            columns.append((rows[on], np.full(on.sum(), i), rgb[v[on], u[on]], z[on] / camera.fx, direction))
         joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
         if len(joined[0]) < 40:
             return None
-        return _Sightings(len(scene.points), len(views), *joined)
+        return _Observations(len(scene.points), len(views), *joined)
 
     def view_angle(self, first: int) -> float | None:
         """Median over the `first` points of the largest angle between two of its views, in degrees; None without."""
@@ -274,11 +286,6 @@ class _Sightings:
         """90th percentile over points of the largest over the smallest footprint of a pixel on it."""
         ratios = [rows.max() / rows.min() for rows in _by_point(self.point, self.footprint)]
         return float(np.percentile(ratios, 90))
-
-    def depth_ratio(self) -> float:
-        """95th over 5th percentile of all depths."""
-        low, high = np.percentile(self.depth, [5, 95])
-        return float(high / max(low, 1e-12))
 
 
 def _by_point(point: npt.NDArray[np.int64], values: Float) -> list[Float]:

@@ -12,7 +12,7 @@ from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.plan.facts import Speed
 from splatmill_worker.splat.views import Target, TrainingView
 
-STILL = Rates(means=0.0, log_scales=0.0, quats=0.0, logit_opacities=0.0, sh_dc=0.0, sh_rest=0.0)
+ZERO_RATES = Rates(means=0.0, log_scales=0.0, quats=0.0, logit_opacities=0.0, sh_dc=0.0, sh_rest=0.0)
 REPEATS = 3
 SMALL = 4
 
@@ -40,7 +40,7 @@ def _seconds(engine: Engine, target: Target) -> float:
     for step in range(1, REPEATS + 2):
         started = time.perf_counter()
         engine.train_photo(
-            target.viewmat, target.K, target.rgb, degree=0, rates=STILL, step=step, mask=target.mask
+            target.viewmat, target.K, target.rgb, degree=0, rates=ZERO_RATES, step=step, mask=target.mask
         )
         if torch.cuda.is_available():
             torch.cuda.synchronize()  # a GPU's step is only enqueued

@@ -24,7 +24,7 @@ GUESSED = 0.05
 """Weight of a colour from beyond a border; 1 is that of a colour which a photo shows."""
 
 
-def far_shell(cells: Sequence[Cells], points: Float) -> tuple[Float, Pixels]:
+def shell_points(cells: Sequence[Cells], points: Float) -> tuple[Float, Pixels]:
     """Points [k, 3] and colours uint8 [k, 3] on a sphere around the cameras, wherever photos look.
 
     `points` [n, 3] of the reconstruction set the sphere's radius. There is one for each patch, with the mean of the

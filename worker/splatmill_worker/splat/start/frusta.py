@@ -23,11 +23,11 @@ RANDOM_GAUSSIANS = 20_000
 CANDIDATES = 4
 """Points tried for each one kept."""
 
-JUDGES = 32
+HULL_VIEWS = 32
 """Photos that are asked about every candidate; more do not change a hull's shape visibly."""
 
 
-def in_frusta(targets: Sequence[Target], count: int, seed: int) -> tuple[Tensor, Tensor]:
+def sample_frusta(targets: Sequence[Target], count: int, seed: int) -> tuple[Tensor, Tensor]:
     """Random points [count, 3] and colours uint8 [count, 3] where cameras look, for scenes without points.
 
     Candidates are drawn along the rays of random pixels, between 0.2 and 1.8 times the distance of what the
@@ -36,24 +36,24 @@ def in_frusta(targets: Sequence[Target], count: int, seed: int) -> tuple[Tensor,
     candidates that no camera sees through is filled anew. Colours are the means of what the cameras show.
     """
     random = np.random.default_rng(seed)
-    some = targets[:: max(1, len(targets) // JUDGES)]
+    some = targets[:: max(1, len(targets) // HULL_VIEWS)]
     cameras = [target.camera for target in targets]
     centers = np.array([camera.center for camera in cameras])
     axes = np.array([camera.viewmat[2, :3] for camera in cameras])
     _, distance = looked_at(centers, axes)
     points = _along_rays(cameras, distance, CANDIDATES * count, random)
-    rank, color = _judged(some, points)
+    rank, color = _occupancy(some, points)
     solid = points[rank > 0.5 * rank.max()]
     if any(target.alpha is not None for target in targets) and len(solid) >= ENOUGH_POINTS:
         low, high = solid.min(axis=0), solid.max(axis=0)
         margin = 0.1 * (high - low)
         points = random.uniform(low - margin, high + margin, (CANDIDATES * count, 3))
-        rank, color = _judged(some, points)
+        rank, color = _occupancy(some, points)
     order = np.argsort(-rank - random.uniform(0.0, 0.5, len(rank)), kind="stable")[:count]
     return torch.from_numpy(points[order]).float(), torch.from_numpy(color[order])
 
 
-def _judged(targets: Sequence[Target], points: Float) -> tuple[Float, Pixels]:
+def _occupancy(targets: Sequence[Target], points: Float) -> tuple[Float, Pixels]:
     """How many photos show something at each point, minus those that see through it, and the mean colour there."""
     seen, missed = np.zeros(len(points)), np.zeros(len(points))
     color = np.zeros((len(points), 3))

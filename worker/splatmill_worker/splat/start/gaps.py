@@ -22,7 +22,7 @@ def gap_share(cells: Sequence[Cells]) -> float:
     return sum(int(_gaps(grid).sum()) for grid in cells) / max(1, ground)
 
 
-def filled(cells: Sequence[Cells]) -> tuple[Float, Pixels]:
+def gap_points(cells: Sequence[Cells]) -> tuple[Float, Pixels]:
     """Points [k, 3] and colours [k, 3] behind the cells that have neither sky nor a point.
 
     Each is put at the mean inverse depth of the nearest points in its photo. Photo after photo: where the new points

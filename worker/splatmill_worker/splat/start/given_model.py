@@ -18,19 +18,19 @@ from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.render import render
 from splatmill_worker.splat.views import TrainingView
 
-JUDGES = 8
+ASSESSED_VIEWS = 8
 """Training views that a model is judged on."""
 
-DOUBTFUL = 3.0
+DOUBTFUL_MARGIN = 3.0
 """dB over one colour per photo: a model in the right world shows its photos far better, unless it is hardly trained."""
 
-TELLS_APART = 1.0
+OWN_PHOTO_MARGIN = 1.0
 """dB by which a view of a doubtful model must be nearer to its own photo than to another one. On the still
 life bare points of the right world are by 1.3 to 2.9, and the same points moved, turned or scaled by 1.0 at most."""
 
 
 @dataclass(frozen=True)
-class Start:
+class GivenModel:
     """What is known of the model given: its size, SH degree, and how it shows training photos before any step.
 
     psnr, one_color, another in dB: medians over some training views of the model's rendering, of each photo's mean
@@ -46,15 +46,15 @@ class Start:
     @property
     def doubtful(self) -> bool:
         """Whether the model says so little about these photos that its world may be another."""
-        return not self.psnr > self.one_color + DOUBTFUL
+        return not self.psnr > self.one_color + DOUBTFUL_MARGIN
 
     @property
-    def elsewhere(self) -> bool:
+    def misaligned(self) -> bool:
         """Whether what the model shows has nothing to do with where the cameras stand."""
-        return self.doubtful and self.another is not None and not self.psnr > self.another + TELLS_APART
+        return self.doubtful and self.another is not None and not self.psnr > self.another + OWN_PHOTO_MARGIN
 
 
-def read(path: Path, frame: Normalization) -> Gaussians:
+def read_given_model(path: Path, frame: Normalization) -> Gaussians:
     """The Gaussians of `path` in the training world. Raises StartUnusable where there are none.
 
     A model that this program wrote far from its origin says by how much it was moved; that is undone.
@@ -72,9 +72,9 @@ def read(path: Path, frame: Normalization) -> Gaussians:
     return gaussians.moved(frame.scale, torch.from_numpy(shift))
 
 
-def judge(gaussians: Gaussians, views: Sequence[TrainingView]) -> Start:
+def assess(gaussians: Gaussians, views: Sequence[TrainingView]) -> GivenModel:
     """How `gaussians` show some of `views`. Raises StartUnusable where they show something else."""
-    some = views[:: max(1, len(views) // JUDGES)]
+    some = views[:: max(1, len(views) // ASSESSED_VIEWS)]
     backdrop = judged_over(views)
     shown: list[float] = []
     plain: list[float] = []
@@ -89,28 +89,20 @@ def judge(gaussians: Gaussians, views: Sequence[TrainingView]) -> Start:
             plain.append(compare(view.name, _one_color(photo, target.mask), photo, target.mask).psnr)
             if beyond.rgb.shape == target.rgb.shape and len(some) > 1:
                 other.append(compare(view.name, color, beyond.over(backdrop), beyond.mask).psnr)
-    start = Start(
+    start = GivenModel(
         gaussians.count,
         gaussians.degree,
         float(np.median(shown)),
         float(np.median(plain)),
         float(np.median(other)) if other else None,
     )
-    if start.elsewhere:
+    if start.misaligned:
         raise StartUnusable(
             f"The model's views are as near to other photos ({start.another:.1f} dB) as to their own "
             f"({start.psnr:.1f} dB; one colour per photo: {start.one_color:.1f} dB): it is not in the world of these "
             "cameras."
         )
     return start
-
-
-def strongest(gaussians: Gaussians, most: int) -> Gaussians:
-    """At most `most` Gaussians, the most opaque ones, in their order."""
-    if gaussians.count <= most:
-        return gaussians
-    order = torch.argsort(gaussians.logit_opacities, descending=True, stable=True)
-    return gaussians.select(torch.sort(order[:most]).values)
 
 
 def _one_color(photo: Tensor, mask: Tensor | None) -> Tensor:

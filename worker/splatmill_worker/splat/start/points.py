@@ -26,10 +26,10 @@ def from_points(points: Tensor, colors: Tensor, *, backend: ops.Backend | None =
     width = ops.knn(points, backend=backend)
     positive = width[width > 0]
     floor = float(torch.quantile(positive, 0.001)) if len(positive) else 1e-3
-    return round_ones(points, width.clamp_min(floor), colors)
+    return isotropic(points, width.clamp_min(floor), colors)
 
 
-def round_ones(points: Tensor, width: Tensor, colors: Tensor) -> Gaussians:
+def isotropic(points: Tensor, width: Tensor, colors: Tensor) -> Gaussians:
     """Isotropic Gaussians at `points` [M, 3] with standard deviations `width` [M] and flat colours uint8 [M, 3]."""
     n = points.shape[0]
     quats = torch.zeros(n, 4)

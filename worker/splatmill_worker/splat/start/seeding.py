@@ -21,7 +21,7 @@ Float = npt.NDArray[np.float64]
 Pixels = npt.NDArray[np.uint8]
 
 
-def completed(
+def add_seeds(
     gaussians: Gaussians,
     scene: Scene,
     views: Sequence[TrainingView],
@@ -40,9 +40,9 @@ def completed(
     cells = cells_of(scene, views)
     found: list[tuple[Float, Pixels, float]] = []
     if add_far_shell:
-        found.append((*far_shell.far_shell(cells, scene.points), far_shell.OPACITY))
+        found.append((*far_shell.shell_points(cells, scene.points), far_shell.OPACITY))
     if fill_gaps:
-        found.append((*gaps.filled(cells), INITIAL_OPACITY))
+        found.append((*gaps.gap_points(cells), INITIAL_OPACITY))
     parts = [gaussians]
     room = max(0, max_gaussians - gaussians.count)
     for points, colors, opacity in found:
@@ -53,6 +53,14 @@ def completed(
             more = from_points(torch.from_numpy(points), torch.from_numpy(colors), backend=backend)
             parts.append(replace(more, logit_opacities=torch.full((more.count,), logit(opacity))))
     return concatenate(*parts)
+
+
+def most_opaque(gaussians: Gaussians, limit: int) -> Gaussians:
+    """The `limit` most opaque of `gaussians`, in their order; all of them where there are no more."""
+    if gaussians.count <= limit:
+        return gaussians
+    order = torch.argsort(gaussians.logit_opacities, descending=True, stable=True)
+    return gaussians.select(torch.sort(order[:limit]).values)
 
 
 def _at_most(room: int, points: Float, colors: Pixels) -> tuple[Float, Pixels]:
