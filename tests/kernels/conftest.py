@@ -1,8 +1,5 @@
 """Without a GPU, Triton's kernels run in its interpreter, which has to be asked for before Triton is first imported."""
 
-import os
+from tests.support.kernels.interpreter import ask_for_it
 
-import torch
-
-if not torch.cuda.is_available():
-    os.environ.setdefault("TRITON_INTERPRET", "1")
+ask_for_it()

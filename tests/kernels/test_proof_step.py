@@ -158,7 +158,8 @@ def test_threads_do_not_show(build: str) -> None:
                     step.exp_avg,
                     step.exp_avg_sq,
                     step.plain_sum,
-                    step.abs_sum,
+                    step.visible_count,
+                    step.max_extent,
                     torch.tensor(result.loss),
                 ]
             )

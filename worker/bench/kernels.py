@@ -27,7 +27,7 @@ from splatmill_worker.kernels import cpu, ops
 from splatmill_worker.kernels.cpu import isa
 from splatmill_worker.kernels.cpu.loss import photo_stats
 from splatmill_worker.kernels.cpu.step import Step
-from splatmill_worker.kernels.records import Rates, Scores
+from splatmill_worker.kernels.records import Rates
 
 STILL = Rates(
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -78,16 +78,10 @@ def _timed(call: Callable[[], object]) -> float:
 # ---- the speed table
 
 
-def step_row(
-    scene: Scene, build_name: str, threads: int, rounds: int, scores: Scores | None = "plain"
-) -> Row:
-    """One whole training step over every view: project, bin, forward, loss, backward, sums + projection backward + Adam.
-
-    `scores` are the densification scores that it adds up: training reads the plain ones.
-    """
+def step_row(scene: Scene, build_name: str, threads: int, rounds: int) -> Row:
+    """One whole training step over every view: project, bin, forward, loss, backward, sums + projection backward + Adam."""
     with build(build_name):
         step = Step(*scene.groups, threads=threads)
-        step.keep_scores = scores
         stats = [photo_stats(v.photo) for v in scene.views]
         walls: list[float] = []
         phases: list[tuple[float, ...]] = []
@@ -112,7 +106,7 @@ def step_row(
         "bench": "kernels", "table": "step", "scene": scene.name, "gaussians": scene.count, "width": view.width,
         "height": view.height, "backend": f"cpu {build_name}", "threads": threads, "ms": 1e3 * statistics.median(walls),
         "ms_by_pass": {k: 1e3 * s for k, s in zip(names, middle, strict=True)},
-        "pairs": statistics.mean(pairs), "scores": scores,
+        "pairs": statistics.mean(pairs),
         "blocks": {k: statistics.mean(b[i] for b in blocks) for i, k in enumerate(MULTIPLIES)},
         "forward_pairs_per_s": statistics.mean(pairs) / middle[2],
         "backward_pairs_per_s": statistics.mean(pairs) / middle[3],
@@ -407,11 +401,9 @@ def table(rows: list[Row]) -> str:
     for r in by["step"] + by["render"]:
         passes = ", ".join(f"{k} {v:.2f}" for k, v in r.get("ms_by_pass", {}).items())
         what = "training step" if r["table"] == "step" else "render"
-        if r.get("scores") == "absolute":
-            what += " with absolute scores"
         goal = (
             REACH.get((r["table"], r["scene"]), "")
-            if r["threads"] == 2 and r["backend"].endswith("avx512") and r.get("scores") != "absolute"
+            if r["threads"] == 2 and r["backend"].endswith("avx512")
             else ""
         )
         lines.append(
@@ -425,14 +417,11 @@ def table(rows: list[Row]) -> str:
     for r in by["step"]:
         goal = (
             "85 M/s / 50 M/s, then 100 / 60"
-            if "100k" in r["scene"]
-            and r["backend"].endswith("avx512")
-            and r["threads"] == 2
-            and r["scores"] == "plain"
+            if "100k" in r["scene"] and r["backend"].endswith("avx512") and r["threads"] == 2
             else ""
         )
         lines.append(
-            f"| {r['scene']}, {r['width']}x{r['height']}, {r['backend']}, {r['threads']} threads, {r['scores']} scores | {r['pairs'] / 1e3:.0f} k | "
+            f"| {r['scene']}, {r['width']}x{r['height']}, {r['backend']}, {r['threads']} threads | {r['pairs'] / 1e3:.0f} k | "
             f"{r['forward_pairs_per_s'] / 1e6:.0f} M/s | {r['backward_pairs_per_s'] / 1e6:.0f} M/s | {goal} |"
         )
     lines += ["", *ratios(by["step"])]
@@ -467,11 +456,7 @@ def ratios(steps: list[Row]) -> list[str]:
     """AVX2 against AVX-512, and one thread against two, on each scene."""
     found = []
     for scene in dict.fromkeys(r["scene"] for r in steps):
-        mine = {
-            (r["backend"], r["threads"]): r["ms"]
-            for r in steps
-            if r["scene"] == scene and r["scores"] == "plain"
-        }
+        mine = {(r["backend"], r["threads"]): r["ms"] for r in steps if r["scene"] == scene}
         if ("cpu avx512", 2) in mine and ("cpu avx2", 2) in mine:
             found.append(
                 f"- {scene}: AVX2 takes {mine['cpu avx2', 2] / mine['cpu avx512', 2]:.2f} times as long as AVX-512 (target 2.2, then 1.8)."
@@ -496,11 +481,7 @@ def shares(steps: list[Row], probes: list[Row]) -> list[str]:
     ]
     for r in steps:
         for p in probes:
-            if (
-                p["threads"] != r["threads"]
-                or r["backend"] != f"cpu {isa.supported()[0]}"
-                or r["scores"] != "plain"
-            ):
+            if p["threads"] != r["threads"] or r["backend"] != f"cpu {isa.supported()[0]}":
                 continue
             done = [
                 100 * 16e-9 * count * r["blocks"][name] / (r["ms_by_pass"][name] / 1e3) / p["gfma_per_s"]
@@ -546,7 +527,6 @@ def main(argv: list[str]) -> int:
                 rows.append(
                     step_row(scene, name, threads, max(1, options.rounds // 2) if name == best else 1)
                 )
-        rows.append(step_row(scene, best, 2, max(1, options.rounds // 2), "absolute"))
     for n in (100_000, 1_000_000):
         scene = cloud(n, 1920, 1080)
         for name in isa.supported()[:2]:

@@ -125,7 +125,7 @@ class _Fit:
         self.pixel = 1.0 / full.camera.fx
         first = max(1, round(FIRST_SHARE * most))
         self.engine = FusedStep(self._stacked(self._placed(_detail(full), first)))
-        self.engine.keep_scores = None
+        self.engine.keep_scores = False
         self.step = 0
         self.events = list(GROWN_AT)
         self.clock = Clock()

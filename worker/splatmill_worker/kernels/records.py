@@ -3,44 +3,68 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from torch import Tensor
 
-TILE = 16  # side of a tile in pixels; lists are made per tile, row by row
+TILE = 16
+"""Side of a tile in pixels. Every tile has its own list of Gaussians; tiles are numbered row by row."""
 
-ALPHA_MIN = 1.0 / 255.0  # below this a splat cannot change an 8-bit pixel, and is skipped
-ALPHA_MAX = 0.999  # keeps 1 - alpha away from 0, so that what lies behind still gets a gradient
-TRANSMITTANCE_MIN = 1e-4  # a splat that would bring the transmittance to this or below ends the pixel
-BLUR = 0.3  # added to both variances of a projected splat, pixels^2
-COMPENSATION_MIN = 2.5e-5  # floor of det / det' under antialiasing
+ALPHA_MIN = 1.0 / 255.0
+"""A splat with less alpha at a pixel is skipped there: it cannot change an 8-bit value."""
 
-Scores = Literal["plain", "absolute"]
-"""Which densification scores a step adds up: "absolute" all of them, "plain" all but the sum of absolute gradients. The
-GPU's adds up all of them whenever one is asked for: beside its other passes that costs next to nothing."""
+ALPHA_MAX = 0.999
+"""Largest alpha of a splat at a pixel. It keeps 1 - alpha away from 0, so that splats behind still get a gradient."""
+
+TRANSMITTANCE_MIN = 1e-4
+"""A splat that would bring a pixel's transmittance to this or below is not blended, and ends the pixel."""
+
+BLUR = 0.3
+"""Added to both variances of a projected Gaussian, pixels^2."""
+
+COMPENSATION_MIN = 2.5e-5
+"""Smallest ratio of determinants, without and with `BLUR`, whose root scales the opacity under antialiasing."""
+
+GROUPS = {"means": 3, "log_scales": 3, "quats": 4, "logit_opacities": 1, "sh": 48}
+"""The parameter groups of a Gaussian and the values in each; sh by coefficient, then channel."""
+
+PARAMETERS = sum(GROUPS.values())
+"""Values of a Gaussian: 59. Where groups are joined, as in moments, they follow in the order of `GROUPS`."""
 
 
 class Projected(NamedTuple):
-    """One row per Gaussian. A culled one has extents 0 and every other field exactly 0."""
+    """Gaussians in the image plane of one camera, one row each. A culled one has exactly 0 in every field.
 
-    means2d: Tensor  # [N,2] pixels; the centre of pixel (0, 0) is (0.5, 0.5)
-    conics: Tensor  # [N,3] upper triangle a, b, c of the inverse 2-D covariance, 1/pixels^2
-    opacities: Tensor  # [N] after the sigmoid (and the antialiasing compensation)
-    colors: Tensor  # [N,3] spherical harmonics seen from the camera, clamped at 0 below
-    depths: Tensor  # [N] camera z
-    extents: Tensor  # [N,2] half sides in pixels of the box around the exact 1/255 ellipse; no gradient
+    means2d: [N, 2] pixels; the centre of pixel (0, 0) is (0.5, 0.5).
+    conics: [N, 3] upper triangle a, b, c of the inverse 2-D covariance, 1/pixels^2.
+    opacities: [N] after the sigmoid and, under antialiasing, the compensation.
+    colors: [N, 3] spherical harmonics in the direction from the camera, clamped at 0 from below.
+    depths: [N] camera z.
+    extents: [N, 2] half sides in pixels of the box around the ellipse where alpha is 1/255; without gradient.
+    """
+
+    means2d: Tensor
+    conics: Tensor
+    opacities: Tensor
+    colors: Tensor
+    depths: Tensor
+    extents: Tensor
 
 
 class Bins(NamedTuple):
-    """For every tile, row-major, the Gaussians whose 1/255 ellipse reaches one of its pixel centres."""
+    """For every tile, the Gaussians whose 1/255 ellipse reaches one of its pixel centres.
 
-    offsets: Tensor  # int64 [tiles + 1]
-    ids: Tensor  # int32 [pairs], front to back inside a tile, ties by index
+    offsets: int64 [tiles + 1]; tile t has the entries offsets[t] to offsets[t + 1] of ids.
+    ids: int32 [pairs], front to back within a tile; Gaussians of equal depth by index.
+    """
+
+    offsets: Tensor
+    ids: Tensor
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rates (betas 0.9 and 0.999, eps 1e-15), in world units for the means."""
+    """Adam's learning rate of each parameter group; those of the means are in world units."""
 
     means: float
     log_scales: float
@@ -50,7 +74,7 @@ class Rates:
     sh_rest: float
 
     def rows(self) -> list[float]:
-        """One rate for each of the 59 rows of a block."""
+        """Return the rate of each of a Gaussian's 59 parameters."""
         return [
             *[self.means] * 3,
             *[self.log_scales] * 3,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import checks
-from splatmill_worker.kernels.records import TILE, Rates, Scores
+from splatmill_worker.kernels.records import TILE, Rates
 
 from . import blocks, engine
 from .loss import PhotoStats, photo_stats
@@ -54,9 +54,7 @@ class Step:
         self.threads = threads or engine.default_threads()
         if self.threads < 1:
             raise ValueError(f"threads: expected at least 1, got {threads}")
-        self.keep_scores: Scores | None = (
-            "absolute"  # asks a tenth to a quarter more of the backward pass; "plain" is free
-        )
+        self.keep_scores = True
         self._frame = engine.Frame()
         self._image = torch.zeros(0)
         self._gradient = torch.zeros(0)
@@ -124,11 +122,6 @@ class Step:
     def plain_sum(self) -> Tensor:
         """Sum over views of |dL/d mean2d|."""
         return self._scores[0, : self.count]
-
-    @property
-    def abs_sum(self) -> Tensor:
-        """Sum over views of |(sum over pixels |dL/dx|, sum over pixels |dL/dy|)| (AbsGS, Ye et al. 2024)."""
-        return self._scores[1, : self.count]
 
     @property
     def visible_count(self) -> Tensor:
@@ -297,7 +290,7 @@ class Step:
             rates.rows(),
             step,
             self._scores if self.keep_scores else None,
-            self.keep_scores == "absolute",
+            False,
             self.threads,
             self.pose_gradient,
         )

@@ -1,12 +1,11 @@
-"""Adam for the Gaussians that were seen, with the steps that a Gaussian missed made up when it is seen
-again.
-"""
+"""Adam for the visible Gaussians; one that becomes visible again first makes up for the steps it missed."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -14,21 +13,30 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from ..records import GROUPS
 from ..reference.adam import BETA1, BETA2, EPS, MEMORY
 from . import device
-from .constant import constant
+from .argument import Bytes, Float, Floats, Int, Ints
+from .constant import LARGEST, constant
 
 B1, B2, EPSILON = constant(BETA1), constant(BETA2), constant(EPS)
 LOG2_B1, LOG2_B2 = constant(math.log2(BETA1)), constant(math.log2(BETA2))
 RATIO = constant(BETA1 / math.sqrt(BETA2))
 LONGEST = constant(MEMORY)
 BLOCK = 256
+"""Gaussians per program."""
+
+# Where the groups end among the 59 planes; the SH coefficients of degree 0 have a rate of their own.
+_ENDS = list(accumulate(GROUPS.values()))
+MEANS, SCALES, QUATS, OPACITY = (constant(end) for end in _ENDS[:4])
+DC = constant(_ENDS[3] + 3)
 
 
 @lru_cache(maxsize=4)
 def correction(room: int, where: torch.device) -> Tensor:
-    """sqrt(1 - beta2^s) / (1 - beta1^s) for s = 0 .. room - 1 (0 at 0), from float64: 1 - 0.999 has few
-    digits in float32.
+    """Return sqrt(1 - beta2^s) / (1 - beta1^s) for s = 0 .. room - 1 (0 at 0) as float32.
+
+    Computed in float64, because 1 - 0.999 has few significant digits in float32.
     """
     s = torch.arange(1, room, dtype=torch.float64)
     values = torch.sqrt(1 - BETA2**s) / (1 - BETA1**s)
@@ -36,12 +44,14 @@ def correction(room: int, where: torch.device) -> Tensor:
 
 
 @triton.jit
-def drift_kernel(last_step, seen, table, travel, decay1, decay2, count, step, BLOCK: tl.constexpr):
-    """Per Gaussian what the steps it missed before `step` amount to: travel in units of rate * m / sqrt(v),
-    and both decays.
+def drift_kernel(
+    last_step: Ints, seen: Bytes, table: Floats, travel: Floats, decay1: Floats, decay2: Floats, count: Int, step: Int,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Write what the steps that each Gaussian missed before `step` amount to, and mark every seen one as current.
 
-    Marks every seen one as current. travel is `reference.adam.drift`: the sum over missed steps s = last + j
-    of (beta1 / sqrt(beta2))^j * correction(s).
+    travel is `reference.adam.drift` in units of rate * m / sqrt(v): the sum over the missed steps s = last + j of
+    (beta1 / sqrt(beta2))^j * correction(s). decay1 and decay2 are the factors on the two moments.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
@@ -65,12 +75,11 @@ def drift_kernel(last_step, seen, table, travel, decay1, decay2, count, step, BL
 
 @triton.jit
 def adam_kernel(
-    params, grads, exp_avg, exp_avg_sq, seen, travel, decay1, decay2, refused, count, rate, size, root,
+    params: Floats, grads: Floats, exp_avg: Floats, exp_avg_sq: Floats, seen: Bytes, travel: Floats, decay1: Floats,
+    decay2: Floats, refused: Ints, count: Int, rate: Float, size: Float, root: Float,
     CHANNELS: tl.constexpr, VISIBLE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One step on [N, CHANNELS] rows. An entry whose gradient or its square is not finite stays as it was
-    and is counted.
-    """
+    """One step on rows [N, CHANNELS]. An entry whose gradient, or its square, is not finite stays and is counted."""
     e = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     shown = e < count * CHANNELS
     i = e // CHANNELS
@@ -97,7 +106,7 @@ def adam_kernel(
 @triton.jit
 def advance(p, g, m, v, rate, size, root):
     """Adam's arithmetic: size = 1 / (1 - beta1^step), root = 1 / sqrt(1 - beta2^step)."""
-    good = g * g <= 3.4028234e38
+    good = g * g <= LARGEST
     g = tl.where(good, g, 0.0)
     m_new = B1 * m + (1.0 - B1) * g
     v_new = B2 * v + (1.0 - B2) * g * g
@@ -107,13 +116,12 @@ def advance(p, g, m, v, rate, size, root):
 
 @triton.jit
 def planes_kernel(
-    params, grads, exp_avg, exp_avg_sq, seen, travel, decay1, decay2, refused, count, stride, channels,
-    means_rate, scales_rate, quats_rate, opacity_rate, dc_rate, rest_rate, size, root,
+    params: Floats, grads: Floats, exp_avg: Floats, exp_avg_sq: Floats, seen: Bytes, travel: Floats, decay1: Floats,
+    decay2: Floats, refused: Ints, count: Int, stride: Int, channels: Int, means_rate: Float, scales_rate: Float,
+    quats_rate: Float, opacity_rate: Float, dc_rate: Float, rest_rate: Float, size: Float, root: Float,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One step on planes [59, stride] of a whole scene: 3 means, 3 log-scales, 4 quaternions, 1 opacity, 3
-    + 45 SH.
-    """
+    """One step on the first `channels` of a scene's planes [59, stride], for the Gaussians seen."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     shown = here & (tl.load(seen + i, mask=here, other=0) != 0)
@@ -122,9 +130,9 @@ def planes_kernel(
     keep2 = tl.load(decay2 + i, mask=shown, other=1.0)
     number = tl.zeros([BLOCK], tl.int32)
     for channel in tl.range(0, channels):
-        rate = tl.where(channel < 3, means_rate, tl.where(channel < 6, scales_rate, quats_rate))
-        late = tl.where(channel < 11, opacity_rate, tl.where(channel < 14, dc_rate, rest_rate))
-        rate = tl.where(channel < 10, rate, late)
+        rate = tl.where(channel < MEANS, means_rate, tl.where(channel < SCALES, scales_rate, quats_rate))
+        late = tl.where(channel < OPACITY, opacity_rate, tl.where(channel < DC, dc_rate, rest_rate))
+        rate = tl.where(channel < QUATS, rate, late)
         place = channel * stride + i
         p = tl.load(params + place, mask=shown, other=0.0)
         g = tl.load(grads + place, mask=shown, other=0.0)
@@ -142,7 +150,10 @@ def planes_kernel(
 
 
 class CatchUp:
-    """Travel and decays [N] of one step's visible rows, made once and used by every group."""
+    """What the visible Gaussians of one step missed, as `drift_kernel` computes it, for use by every group.
+
+    Marks the rows of seen (uint8 [N]) as current in last_step (int32 [N]).
+    """
 
     def __init__(self, seen: Tensor, last_step: Tensor, step: int) -> None:
         count = seen.shape[0]
@@ -160,9 +171,7 @@ def apply(
     param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, step: int, refused: Tensor,
     missed: CatchUp | None,
 ) -> None:  # fmt: skip
-    """One step of one contiguous group [N, ...] in place; refused (int32 [1]) counts entries that were
-    left.
-    """
+    """One step of one contiguous group [N, ...] in place; adds the entries that were refused to refused, int32 [1]."""
     count = param.shape[0]
     entries = param.numel()
     if not entries:
@@ -179,9 +188,7 @@ def apply_planes(
     params: Tensor, grads: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rates: Sequence[float],
     channels: int, step: int, refused: Tensor, missed: CatchUp,
 ) -> None:  # fmt: skip
-    """One step in place of the first `channels` of planes [59, N]; rates of means, log-scales, quats,
-    opacity, SH DC and rest.
-    """
+    """One step in place on the first `channels` of planes [59, N]; six rates, in the order of `Rates`."""
     count = params.shape[1]
     size, root = 1 / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step)
     if count:
@@ -203,8 +210,9 @@ def adam_(
     visible: Tensor | None = None,
     last_step: Tensor | None = None,
 ) -> int:
-    """One Adam step in place as `reference.adam_` defines it; returns how many entries were refused, which
-    waits once.
+    """One Adam step in place, as `reference.adam_` defines it; returns how many entries were refused.
+
+    Waits for the device, to read that number.
     """
     device.require(params[0])
     refused = torch.zeros(1, dtype=torch.int32, device=params[0].device)

@@ -1,6 +1,4 @@
-"""Tile lists: visible splats only, sorted by depth once, written in that order, then sorted by tile
-without losing it.
-"""
+"""Tile lists: visible splats are sorted by depth once, written in that order, and their pairs sorted stably by tile."""
 
 from __future__ import annotations
 
@@ -13,18 +11,26 @@ from torch import Tensor
 
 from ..records import ALPHA_MIN, TILE, Bins, Projected
 from . import device, record
+from .argument import Floats, Int, Ints, Longs, Shorts
 from .constant import constant
+from .record import CONIC_A, CONIC_B, CONIC_C, EXTENT_X, EXTENT_Y, MEAN_X, MEAN_Y, OPACITY, STRIDE
 
-STRIDE = constant(record.WIDTH)
+SIDE = constant(float(TILE))
+SPAN = constant(TILE - 1.0)  # from the first pixel centre of a tile to its last
 CUT = constant(ALPHA_MIN)
-BLOCK = 8  # splats per program
-LANES = 32  # candidate tiles that a splat tests at a time: one warp each
+BLOCK = 8
+"""Splats per program."""
+
+LANES = 32
+"""Candidate tiles that a program tests at a time for each of its splats."""
 
 
 @dataclass(frozen=True)
 class Room:
-    """How many visible splats and tile pairs the buffers hold; from the view's last visit, so that nothing
-    waits for the device.
+    """Sizes of the list buffers. Taken from a view's last visit, they let a step run without waiting for the device.
+
+    visible: splats.
+    pairs: (tile, Gaussian) pairs.
     """
 
     visible: int
@@ -33,29 +39,26 @@ class Room:
 
 @triton.jit
 def tile_range(center, extent, tiles):
-    """First tile and the one after the last whose pixel centres 16 i + 0.5 .. 16 i + 15.5 meet center -+
-    extent.
-    """
+    """The first tile whose pixel centres 16 i + 0.5 .. 16 i + 15.5 meet center -+ extent, and how many tiles do."""
     limit = tiles * 1.0
-    # Bounded before it turns into an integer: what a float that does not fit becomes is undefined.
-    first = tl.minimum(tl.maximum(tl.floor((center - extent - 0.5) / 16.0), 0.0), limit)
-    last = tl.minimum(tl.maximum(tl.floor((center + extent - 0.5) / 16.0) + 1.0, 0.0), limit)
+    # Bounded while still floats: converting a float that does not fit into an integer is undefined.
+    first = tl.minimum(tl.maximum(tl.floor((center - extent - 0.5) / SIDE), 0.0), limit)
+    last = tl.minimum(tl.maximum(tl.floor((center + extent - 0.5) / SIDE) + 1.0, 0.0), limit)
     return first.to(tl.int32), tl.maximum(last - first, 0.0).to(tl.int32)
 
 
 @triton.jit
 def form(a, b, c, x, y):
+    """The quadratic form d^T C d of the conic (a, b, c) at d = (x, y)."""
     return a * x * x + 2.0 * b * x * y + c * y * y
 
 
 @triton.jit
 def least(a, b, c, mx, my, column, row):
-    """The smallest d^T C d over the rectangle of a tile's pixel centres; on an edge, unless the centre is
-    inside.
-    """
-    x0 = column.to(tl.float32) * 16.0 + 0.5 - mx
-    y0 = row.to(tl.float32) * 16.0 + 0.5 - my
-    x1, y1 = x0 + 15.0, y0 + 15.0
+    """The smallest d^T C d over the rectangle of a tile's pixel centres: 0 with the mean inside, else on an edge."""
+    x0 = column.to(tl.float32) * SIDE + 0.5 - mx
+    y0 = row.to(tl.float32) * SIDE + 0.5 - my
+    x1, y1 = x0 + SPAN, y0 + SPAN
     value = form(a, b, c, x0, tl.minimum(tl.maximum(-b * x0 / c, y0), y1))
     value = tl.minimum(value, form(a, b, c, x1, tl.minimum(tl.maximum(-b * x1 / c, y0), y1)))
     value = tl.minimum(value, form(a, b, c, tl.minimum(tl.maximum(-b * y0 / a, x0), x1), y0))
@@ -66,22 +69,24 @@ def least(a, b, c, mx, my, column, row):
 
 @triton.jit
 def pairs_kernel(
-    records, order, counts, ends, keys, ids, visible, columns, rows, room,
+    records: Floats, order: Ints, counts: Longs, ends: Longs, keys: Shorts, ids: Ints, visible: Longs, columns: Int,
+    rows: Int, room: Int,
     WRITE: tl.constexpr, BLOCK: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """One pass for counting and for writing, so that the two cannot disagree on what is a pair.
+    """Count the pairs of each splat or, with WRITE, write them: one kernel, so that both find the same pairs.
 
-    Writing past `room` is left out: the lists then lack their farthest splats, and `ends` says how many there
-    should be.
+    Pairs beyond `room` are not written. They are those of the farthest splats; the last of `ends` tells how many pairs
+    there are. `keys` are tile numbers, of 32 bits in images with too many tiles for 16.
     """
     slot = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = slot < tl.load(visible)
     splat = tl.load(order + slot, mask=here, other=0)
     source = records + splat.to(tl.int64) * STRIDE
-    mx, my = tl.load(source), tl.load(source + 1)
-    a, b, c = tl.load(source + 2), tl.load(source + 3), tl.load(source + 4)
-    level = 2.0 * tl.log(tl.load(source + 5) / CUT)
-    ex, ey = tl.load(source + 10, mask=here, other=0.0), tl.load(source + 11, mask=here, other=0.0)
+    mx, my = tl.load(source + MEAN_X), tl.load(source + MEAN_Y)
+    a, b, c = tl.load(source + CONIC_A), tl.load(source + CONIC_B), tl.load(source + CONIC_C)
+    level = 2.0 * tl.log(tl.load(source + OPACITY) / CUT)
+    ex = tl.load(source + EXTENT_X, mask=here, other=0.0)
+    ey = tl.load(source + EXTENT_Y, mask=here, other=0.0)
     left, across = tile_range(mx, ex, columns)
     top, down = tile_range(my, ey, rows)
     area = tl.where(here, across * down, 0)
@@ -112,35 +117,39 @@ def pairs_kernel(
 
 @dataclass(frozen=True)
 class Lists:
-    """Bins of one view and, on the device, how many visible splats and pairs it really has (int64 [2])."""
+    """The tile lists of one view.
+
+    bins: as `Bins`, except that with a `Room` its ids have `room.pairs` entries, of which offsets[-1] are in use.
+    used: int64 [2] on the device, how many visible splats and pairs the view has, whether they fit or not.
+    """
 
     bins: Bins
     used: Tensor
 
 
 def lists(records: Tensor, width: int, height: int, room: Room | None) -> Lists:
-    """Tile lists of records [N, 12]. With `room` nothing waits for the device; without it the exact sizes are
-    read back.
+    """Return the tile lists of records [N, 12].
 
-    `ids` then has `room.pairs` entries of which offsets[-1] are in use. What does not fit is left out,
-    farthest first; the caller compares `used` with the room at leisure and gives the view more on its next
-    visit.
+    With `room` nothing waits for the device, and pairs that do not fit are left out, farthest first; the caller reads
+    `used` later and gives the view more room on its next visit. Without `room` the exact sizes are read back. Raises
+    ValueError for 2^31 pairs or more.
     """
     dev = records.device
     columns, rows = -(-width // TILE), -(-height // TILE)
     tiles = columns * rows
-    shown = records[:, 10] > 0
+    shown = record.visible(records)
     rank = torch.cumsum(shown, 0)
     visible = rank[-1:] if records.shape[0] else torch.zeros(1, dtype=torch.int64, device=dev)
     most = int(visible) if room is None else min(room.visible, records.shape[0])
-    # Compaction without a data-dependent shape: the hidden and those past the room are sent to a spare last
-    # slot.
+    # Compaction without a data-dependent shape: hidden splats and those past the room go to a spare last slot.
     slot = torch.where(shown & (rank <= most), rank - 1, most)
     packed = torch.zeros(most + 1, dtype=torch.int64, device=dev)
     packed.scatter_(0, slot, torch.arange(records.shape[0], device=dev))
     packed = packed[:most]
     held = visible.clamp(max=most)
-    depths = torch.where(torch.arange(most, device=dev) < held, records[packed, 9], torch.inf)
+    depths = torch.where(
+        torch.arange(most, device=dev) < held, record.fields(records).depths[packed], torch.inf
+    )
     order = packed[torch.sort(depths, stable=True).indices].to(torch.int32)
 
     counts = torch.zeros(most, dtype=torch.int64, device=dev)
@@ -159,7 +168,7 @@ def lists(records: Tensor, width: int, height: int, room: Room | None) -> Lists:
     limit = int(total) if room is None else room.pairs
     if limit >= 2**31:
         raise ValueError(
-            f"{limit} tile-Gaussian pairs in one view; the lists hold 2 billion. Use fewer or smaller Gaussians."
+            f"One view has {limit} tile-Gaussian pairs; the lists hold 2147483647. Use fewer or smaller Gaussians."
         )
     # A 16-bit key halves the passes of the radix sort; tiles + 1 of them fit up to 2600 x 3200 pixels.
     key_type = torch.int16 if tiles < 2**15 - 1 else torch.int32
@@ -172,8 +181,9 @@ def lists(records: Tensor, width: int, height: int, room: Room | None) -> Lists:
 
 
 def bin(projected: Projected, width: int, height: int) -> Bins:
-    """List for every tile the Gaussians that reach it, front to back, as `reference.bin` defines it; reads
-    its size back once.
+    """List for every tile the Gaussians that reach it, front to back, as `reference.bin` defines it.
+
+    Waits for the device, to read the number of pairs.
     """
     device.require(projected.means2d)
     with torch.no_grad():

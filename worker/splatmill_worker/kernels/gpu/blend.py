@@ -1,8 +1,8 @@
-"""Device functions shared by the compositing passes: one splat against the 256 pixels of a tile.
+"""Device functions that both compositing passes share: one splat over the 256 pixels of a tile, and checkpoints.
 
-A program walks a tile's list with a pixel's state in registers, several pixels to a thread, so that what is
-the same for all pixels (ten numbers of a splat, read by all threads at one address) and the sums over pixels
-are paid once for many of them.
+One program walks the list of a tile and holds the state of its pixels in registers, several pixels to a thread. The
+loads that all pixels share (ten numbers of a splat, read by all threads at one address) and the sums over pixels are
+then paid once for many pixels.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import triton
 import triton.language as tl
 
 from ..records import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
-from . import record
+from .blended import PLANES
 from .constant import constant
 
 PIXELS = constant(TILE * TILE)
 SIDE = constant(TILE)
-STRIDE = constant(record.WIDTH)
+CHECKPOINT = constant(PLANES * TILE * TILE)  # floats
 LEAST = constant(ALPHA_MIN)
 MOST = constant(ALPHA_MAX)
 STOP = constant(TRANSMITTANCE_MIN)
@@ -25,19 +25,17 @@ LOG2E = constant(1.4426950408889634)
 
 @triton.jit
 def alpha_of(dx, dy, a, b, c, opacity):
-    """min(0.999, o exp(-d^T C d / 2)) at offsets d [256]; where it is below 1/255 the caller skips it, and
-    NaN is below.
-    """
+    """min(0.999, o exp(-d^T C d / 2)) at offsets d [256]. The caller skips what is below 1/255, and NaN with it."""
     power = dx * ((-0.5 * LOG2E * a) * dx + (-LOG2E * b) * dy) + ((-0.5 * LOG2E * c) * dy) * dy
     return tl.minimum(opacity * tl.exp2(power), MOST)
 
 
 @triton.jit
 def advance(through, alpha):
-    """Weight of a splat, the transmittance after it, and whether it is blended.
+    """Weight of a splat, the transmittance after it, and whether it is blended, per pixel.
 
-    A pixel that is done has a negative transmittance: no product with 1 - alpha passes the stop again, and
-    its size is what is left for the background.
+    A finished pixel has a negative transmittance. No product with 1 - alpha exceeds `STOP` again, so nothing more is
+    blended, and the absolute value is the transmittance that the background gets.
     """
     weight = alpha * through
     after = through - weight
@@ -52,6 +50,33 @@ def advance(through, alpha):
 
 @triton.jit
 def tile_pixels(tile, columns):
-    """Column and row of a tile's 256 pixels."""
+    """Column and row of the 256 pixels of a tile."""
     p = tl.arange(0, PIXELS)
     return (tile % columns) * SIDE + p % SIDE, (tile // columns) * SIDE + p // SIDE
+
+
+@triton.jit
+def checkpoint_of(checkpoints, segment):
+    """Where the checkpoint of a segment has its first plane, for each of the 256 pixels."""
+    return checkpoints + segment.to(tl.int64) * CHECKPOINT + tl.arange(0, PIXELS)
+
+
+@triton.jit
+def store_checkpoint(place, red, green, blue, through, deep, DEPTH: tl.constexpr):
+    """Write the state of a tile's pixels before a segment, one plane per value; the depth plane only with DEPTH."""
+    tl.store(place, red)
+    tl.store(place + PIXELS, green)
+    tl.store(place + 2 * PIXELS, blue)
+    tl.store(place + 3 * PIXELS, through)
+    if DEPTH:
+        tl.store(place + 4 * PIXELS, deep)
+
+
+@triton.jit
+def load_checkpoint(place, DEPTH: tl.constexpr):
+    """Red, green, blue, transmittance and depth (0 without DEPTH) as `store_checkpoint` left them."""
+    through = tl.load(place + 3 * PIXELS)
+    deep = tl.zeros_like(through)
+    if DEPTH:
+        deep = tl.load(place + 4 * PIXELS)
+    return tl.load(place), tl.load(place + PIXELS), tl.load(place + 2 * PIXELS), through, deep

@@ -1,8 +1,7 @@
-"""Compile every kernel for a GPU that need not be there, and read registers, spills and shared memory from
-the binary.
+"""Compile every kernel for a GPU that need not be present, and read registers, spills and shared memory off the binary.
 
-`python -m splatmill_worker.kernels.gpu.compiled 80 90` prints one JSON line per kernel, setting and
-architecture; with --first only of the setting that is used where nothing was measured.
+`python -m splatmill_worker.kernels.gpu.compiled 80 90` prints one JSON line per kernel, launch setting and architecture
+(80 is sm_80). With --first it compiles each kernel only in the setting used where nothing was measured.
 """
 
 from __future__ import annotations
@@ -22,48 +21,46 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from . import adam, bin, composite, composite_backward, knn, loss, project, project_backward, step
+from .argument import declared
 from .blended import SEGMENT
-
-FLOATS = "*fp32"
-TYPES = {
-    "offsets": "*i64", "ids": "*i32", "first_segment": "*i32", "segment_tile": "*i32", "photo": "*u8", "mask": "*u8",
-    "order": "*i32", "counts": "*i64", "ends": "*i64", "keys": "*i16", "visible": "*i64", "room": "i32", "seen": "*u8",
-    "last_step": "*i32", "refused": "*i32", "count": "i32", "stride": "i32", "width": "i32", "height": "i32",
-    "columns": "i32", "rows": "i32", "step": "i32", "near": "fp32", "weight": "fp32", "rate": "fp32", "size": "fp32",
-    "root": "fp32", "nearest": "fp32", "channels": "i32", "half_width": "fp32", "half_height": "fp32",
-    "per_image": "fp32", "means_rate": "fp32", "scales_rate": "fp32", "quats_rate": "fp32", "opacity_rate": "fp32",
-    "dc_rate": "fp32", "rest_rate": "fp32",
-}  # fmt: skip
-"""Type of every argument that is not a float32 array, by the name it has in all kernels."""
-
-SCALARS = {"i32", "i64", "fp32"}
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One kernel with the constants that the product launches it with; the autotuner's settings come on
-    top.
+    """One kernel with constants that a render or a training step launches it with.
+
+    kernel: the function under `triton.jit`, autotuned or not.
+    constants: by argument name, those of the launch; None for arrays that it leaves out.
+    settings: launch settings of a kernel that is not autotuned; None takes those of the autotuner.
     """
 
     kernel: Any
     constants: dict[str, Any]
-    settings: tuple[triton.Config, ...] | None = None  # of kernels that are not autotuned
+    settings: tuple[triton.Config, ...] | None = None
 
 
 @dataclass(frozen=True)
 class Compiled:
-    """What the assembler said of one kernel."""
+    """What the assembler reports of one compiled kernel.
+
+    kernel: its name.
+    setting: its constants and launch setting, for a reader.
+    architecture: 80 for sm_80.
+    registers: per thread.
+    spilled: bytes of stack per thread.
+    shared: bytes of shared memory per program.
+    """
 
     kernel: str
     setting: str
     architecture: int
     registers: int
-    spilled: int  # bytes of stack per thread
-    shared: int  # bytes per program
+    spilled: int
+    shared: int
 
 
 def variants() -> Iterator[Variant]:
-    """Every kernel as a training step and a rendering launch it."""
+    """Yield every kernel with the constants of the training step, of rendering and of the separate ops."""
     flat = {"COEFFICIENTS": 16, "USED": 16, "ANTIALIAS": False}
     for planar in (True, False):
         yield Variant(project.project_kernel, {**flat, "PLANAR": planar})
@@ -82,25 +79,13 @@ def variants() -> Iterator[Variant]:
     yield Variant(bin.pairs_kernel, {**lists, "WRITE": True}, settings=warps)
     walk = {"SEGMENT": SEGMENT, "BACKGROUND": True}
     nothing = {"depth": None, "checkpoints": None, "first_segment": None, "segment_tile": None}
-    yield Variant(composite.composite_kernel, {**walk, **nothing, "DEPTH": False, "CHECKPOINTS": False})
-    yield Variant(composite.composite_kernel, {**walk, "DEPTH": False, "CHECKPOINTS": True, "depth": None})
-    back = {"SEGMENT": SEGMENT}
+    yield Variant(composite.composite_kernel, {**walk, **nothing, "WITH_DEPTH": False, "CHECKPOINTS": False})
     yield Variant(
-        composite_backward.composite_backward_kernel,
-        {
-            **back,
-            "ALPHA": False,
-            "DEPTH": False,
-            "SCORES": True,
-            "d_alpha": None,
-            "d_depth": None,
-            "depth": None,
-        },
+        composite.composite_kernel, {**walk, "WITH_DEPTH": False, "CHECKPOINTS": True, "depth": None}
     )
-    yield Variant(
-        composite_backward.composite_backward_kernel,
-        {**back, "ALPHA": True, "DEPTH": True, "SCORES": False},
-    )
+    color_alone = {"WITH_ALPHA": False, "WITH_DEPTH": False, "d_alpha": None, "d_depth": None, "depth": None}
+    for back in (color_alone, {"WITH_ALPHA": True, "WITH_DEPTH": True}):
+        yield Variant(composite_backward.composite_backward_kernel, {**back, "SEGMENT": SEGMENT})
     bare, photo = {"MASK": False, "mask": None}, {"mean": None, "variance": None}
     yield Variant(loss.across_kernel, {**bare, "STATS": True})
     yield Variant(loss.across_kernel, {"MASK": True, "STATS": False})
@@ -116,16 +101,19 @@ def variants() -> Iterator[Variant]:
 
 
 def compile_variant(variant: Variant, setting: triton.Config, architecture: int) -> Compiled:
-    """Compile one kernel down to the binary of `architecture` (80 is sm_80), aligned pointers assumed as
-    at a launch.
+    """Compile one kernel for `architecture`, with arrays aligned to 16 bytes, as torch allocates them.
+
+    Raises KeyError for an argument without a declared type (`argument`).
     """
     function = variant.kernel.fn if hasattr(variant.kernel, "configs") else variant.kernel
     constants = {**variant.constants, **setting.kwargs}
     signature, attributes = {}, {}
     for position, name in enumerate(function.arg_names):
-        kind = TYPES.get(name, FLOATS)
-        signature[name] = "constexpr" if name in constants else kind
-        if name not in constants and kind not in SCALARS:
+        if name in constants:
+            signature[name] = "constexpr"
+            continue
+        signature[name] = declared(function, name)
+        if signature[name].startswith("*"):
             attributes[(position,)] = [["tt.divisibility", 16]]
     made = triton.compile(
         ASTSource(function, signature, constants, attributes),
@@ -140,7 +128,7 @@ def compile_variant(variant: Variant, setting: triton.Config, architecture: int)
 
 
 def resources(binary: bytes) -> tuple[int, int]:
-    """Registers and stack bytes per thread, as cuobjdump reads them from a binary."""
+    """Return the registers and the bytes of stack per thread that cuobjdump reads from a binary."""
     with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
         file.write(binary)
         file.flush()
@@ -150,18 +138,18 @@ def resources(binary: bytes) -> tuple[int, int]:
         ).stdout
     found = re.search(r"REG:(\d+) STACK:(\d+)", told)
     if found is None:
-        raise RuntimeError(f"cuobjdump -res-usage said nothing of registers: {told!r}")
+        raise RuntimeError(f"The output of cuobjdump -res-usage names no registers: {told!r}")
     return int(found[1]), int(found[2])
 
 
 def settings(variant: Variant) -> tuple[triton.Config, ...]:
-    """What the autotuner would choose from."""
+    """Return the launch settings of a variant, the one used where nothing was measured first."""
     return variant.settings or tuple(variant.kernel.configs)
 
 
 def main(arguments: list[str]) -> None:
     if os.environ.get("TRITON_INTERPRET") == "1":
-        raise SystemExit("TRITON_INTERPRET=1 replaces the compiler; unset it to compile.")
+        raise SystemExit("TRITON_INTERPRET=1 puts the interpreter in the place of the compiler; unset it.")
     first = "--first" in arguments
     for architecture in [int(x) for x in arguments if x.isdigit()] or [80, 90]:
         for variant in variants():

@@ -1,6 +1,4 @@
-"""Front-to-back alpha compositing, one program per tile; leaves the checkpoints that the backward pass
-starts from.
-"""
+"""Front-to-back alpha compositing, one program per tile, which leaves the checkpoints for the backward pass."""
 
 from __future__ import annotations
 
@@ -14,18 +12,32 @@ from torch.autograd.function import once_differentiable
 
 from ..records import TILE, Bins, Projected
 from . import device, record
-from .blend import PIXELS, STOP, STRIDE, advance, alpha_of, tile_pixels
-from .blended import SEGMENT, Blended
+from .argument import Floats, Int, Ints, Longs
+from .blend import PIXELS, STOP, advance, alpha_of, checkpoint_of, store_checkpoint, tile_pixels
+from .blended import PLANES, SEGMENT, Blended
 from .composite_backward import blend_backward
+from .record import (
+    BLUE,
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
+    DEPTH,
+    GREEN,
+    MEAN_X,
+    MEAN_Y,
+    OPACITY,
+    RED,
+    STRIDE,
+)
 from .tuning import COMPOSITE, autotune
 
 
-@autotune(COMPOSITE, key=["DEPTH", "CHECKPOINTS"])
+@autotune(COMPOSITE, key=["WITH_DEPTH", "CHECKPOINTS"])
 @triton.jit
 def composite_kernel(
-    records, offsets, ids, background, color, transmittance, depth, checkpoints, first_segment, segment_tile,
-    width, height, columns,
-    BACKGROUND: tl.constexpr, DEPTH: tl.constexpr, CHECKPOINTS: tl.constexpr, SEGMENT: tl.constexpr,
+    records: Floats, offsets: Longs, ids: Ints, background: Floats, color: Floats, transmittance: Floats,
+    depth: Floats, checkpoints: Floats, first_segment: Ints, segment_tile: Ints, width: Int, height: Int, columns: Int,
+    BACKGROUND: tl.constexpr, WITH_DEPTH: tl.constexpr, CHECKPOINTS: tl.constexpr, SEGMENT: tl.constexpr,
     BATCH: tl.constexpr,
 ):  # fmt: skip
     tile = tl.program_id(0)
@@ -35,7 +47,6 @@ def composite_kernel(
     inside = (column < width) & (row < height)
     start = tl.load(offsets + tile)
     count = (tl.load(offsets + tile + 1) - start).to(tl.int32)
-    pixel = tl.arange(0, PIXELS)
 
     through = tl.where(inside, 1.0, 0.0)
     red = tl.zeros([PIXELS], tl.float32)
@@ -47,27 +58,23 @@ def composite_kernel(
             if done % SEGMENT == 0:
                 segment = tl.load(first_segment + tile) + done // SEGMENT
                 tl.store(segment_tile + segment, tile)
-                place = checkpoints + segment.to(tl.int64) * (5 * PIXELS) + pixel
-                tl.store(place, red)
-                tl.store(place + PIXELS, green)
-                tl.store(place + 2 * PIXELS, blue)
-                tl.store(place + 3 * PIXELS, through)
-                if DEPTH:
-                    tl.store(place + 4 * PIXELS, deep)
+                place = checkpoint_of(checkpoints, segment)
+                store_checkpoint(place, red, green, blue, through, deep, WITH_DEPTH)
         for j in tl.static_range(BATCH):
             listed = done + j < count
             splat = tl.load(ids + start + done + j, mask=listed, other=0)
             source = records + splat.to(tl.int64) * STRIDE
             alpha = alpha_of(
-                x - tl.load(source), y - tl.load(source + 1), tl.load(source + 2), tl.load(source + 3),
-                tl.load(source + 4), tl.load(source + 5, mask=listed, other=0.0),
+                x - tl.load(source + MEAN_X), y - tl.load(source + MEAN_Y),
+                tl.load(source + CONIC_A), tl.load(source + CONIC_B), tl.load(source + CONIC_C),
+                tl.load(source + OPACITY, mask=listed, other=0.0),
             )  # fmt: skip
             weight, through, _ = advance(through, alpha)
-            red += weight * tl.load(source + 6)
-            green += weight * tl.load(source + 7)
-            blue += weight * tl.load(source + 8)
-            if DEPTH:
-                deep += weight * tl.load(source + 9)
+            red += weight * tl.load(source + RED)
+            green += weight * tl.load(source + GREEN)
+            blue += weight * tl.load(source + BLUE)
+            if WITH_DEPTH:
+                deep += weight * tl.load(source + DEPTH)
         most = tl.max(through, 0)
         done += BATCH
 
@@ -81,7 +88,7 @@ def composite_kernel(
     tl.store(color + out * 3 + 1, green, mask=inside)
     tl.store(color + out * 3 + 2, blue, mask=inside)
     tl.store(transmittance + out, left_over, mask=inside)
-    if DEPTH:
+    if WITH_DEPTH:
         tl.store(depth + out, deep, mask=inside)
 
 
@@ -95,8 +102,9 @@ def blend(
     depth: bool,
     checkpoints: bool,
 ) -> Blended:
-    """Composite records [N, 12]. The buffers are sized by the room in `bins.ids`, so that nothing waits
-    for the device.
+    """Composite records [N, 12] into an image, with the depth image and the checkpoints only when asked for.
+
+    The number of checkpoints follows from the room in `bins.ids`, so that nothing waits for the device.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
     tiles = columns * rows
@@ -112,11 +120,11 @@ def blend(
         first[1:] = torch.cumsum(torch.div(lengths + (SEGMENT - 1), SEGMENT, rounding_mode="floor"), 0)
         segments = bins.ids.shape[0] // SEGMENT + tiles  # each tile's last segment may be short
         owner = torch.full((segments,), -1, **index)
-        saved = torch.empty(segments, 5, 256, **like)
+        saved = torch.empty(segments, PLANES, TILE * TILE, **like)
     composite_kernel[(tiles,)](
         records, bins.offsets, bins.ids, background, color, transmittance, deep, saved, first, owner,
         width, height, columns,
-        BACKGROUND=background is not None, DEPTH=depth, CHECKPOINTS=checkpoints, SEGMENT=SEGMENT,
+        BACKGROUND=background is not None, WITH_DEPTH=depth, CHECKPOINTS=checkpoints, SEGMENT=SEGMENT,
     )  # fmt: skip
     return Blended(color, transmittance, deep, saved, first, owner)
 
@@ -146,16 +154,14 @@ class _Composite(torch.autograd.Function):
         d_background = None
         if background is not None and ctx.needs_input_grad[6]:
             d_background = (ctx.made.transmittance[..., None] * d_color).sum((0, 1))
-        g = gradient
-        return g[:, 0:2], g[:, 2:5], g[:, 5], g[:, 6:9], g[:, 9], None, d_background, None, None, None
+        by_field = record.fields(gradient)
+        return *by_field[:5], None, d_background, None, None, None
 
 
 def composite(
     projected: Projected, bins: Bins, width: int, height: int, *, background: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Blend the lists into color [H,W,3], alpha [H,W] and depth [H,W] = sum w_i z_i, as
-    `reference.composite` defines it.
-    """
+    """Blend the lists into color [H,W,3], alpha [H,W] and depth [H,W], as `reference.composite` defines it."""
     device.require(projected.means2d)
     background = None if background is None else background.to(projected.means2d).contiguous()
     color, alpha, depth = _Composite.apply(*projected, background, bins, width, height)

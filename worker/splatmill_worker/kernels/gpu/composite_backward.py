@@ -1,6 +1,4 @@
-"""The gradient of compositing, front to back: one program per segment of a tile's list, started from its
-checkpoint.
-"""
+"""The gradient of compositing, front to back: one program per segment of a tile's list, starting at its checkpoint."""
 
 from __future__ import annotations
 
@@ -10,13 +8,26 @@ import triton.language as tl
 from torch import Tensor
 
 from ..records import TILE, Bins
-from .blend import MOST, PIXELS, STOP, STRIDE, advance, alpha_of, tile_pixels
+from .argument import Floats, Int, Ints, Longs
+from .blend import MOST, PIXELS, STOP, advance, alpha_of, checkpoint_of, load_checkpoint, tile_pixels
 from .blended import SEGMENT, Blended
-from .constant import constant
-from .record import GRADIENT_WIDTH
+from .record import (
+    BLUE,
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
+    DEPTH,
+    DIFFERENTIABLE,
+    GRADIENT_STRIDE,
+    GRADIENT_WIDTH,
+    GREEN,
+    MEAN_X,
+    MEAN_Y,
+    OPACITY,
+    RED,
+    STRIDE,
+)
 from .tuning import COMPOSITE_BACKWARD, autotune
-
-GRADIENT_STRIDE = constant(GRADIENT_WIDTH)
 
 
 @triton.jit
@@ -25,12 +36,13 @@ def pick(k, which: tl.constexpr, value, others):
     return tl.where(k == which, value, others)
 
 
-@autotune(COMPOSITE_BACKWARD, key=["DEPTH", "SCORES"], reset=["gradient"])
+@autotune(COMPOSITE_BACKWARD, key=["WITH_DEPTH"], reset=["gradient"])
 @triton.jit
 def composite_backward_kernel(
-    records, offsets, ids, color, transmittance, depth, checkpoints, first_segment, segment_tile,
-    d_color, d_alpha, d_depth, gradient, width, height, columns,
-    ALPHA: tl.constexpr, DEPTH: tl.constexpr, SCORES: tl.constexpr, SEGMENT: tl.constexpr, BATCH: tl.constexpr,
+    records: Floats, offsets: Longs, ids: Ints, color: Floats, transmittance: Floats, depth: Floats,
+    checkpoints: Floats, first_segment: Ints, segment_tile: Ints, d_color: Floats, d_alpha: Floats, d_depth: Floats,
+    gradient: Floats, width: Int, height: Int, columns: Int,
+    WITH_ALPHA: tl.constexpr, WITH_DEPTH: tl.constexpr, SEGMENT: tl.constexpr, BATCH: tl.constexpr,
 ):  # fmt: skip
     segment = tl.program_id(0)
     tile = tl.load(segment_tile + segment)
@@ -40,33 +52,29 @@ def composite_backward_kernel(
     x = column.to(tl.float32) + 0.5
     y = row.to(tl.float32) + 0.5
     inside = (column < width) & (row < height)
-    pixel = tl.arange(0, PIXELS)
     out = row * width + column
     g_red = tl.load(d_color + out * 3, mask=inside, other=0.0)
     g_green = tl.load(d_color + out * 3 + 1, mask=inside, other=0.0)
     g_blue = tl.load(d_color + out * 3 + 2, mask=inside, other=0.0)
 
-    # All that follows a splat enters its alpha's gradient through one number per pixel: sum over j > i of w_j
-    # (c_j . g), plus the transmittance left times (background . g - d_alpha). `behind` starts as the whole
-    # and loses what was passed.
+    # What lies behind splat i enters the gradient of its alpha as one number per pixel: the sum over j > i of
+    # w_j (c_j . g), plus the transmittance left times (background . g - d_alpha). `behind` starts as the sum over all
+    # splats; the terms of the splats passed are subtracted.
     behind = tl.load(color + out * 3, mask=inside, other=0.0) * g_red
     behind += tl.load(color + out * 3 + 1, mask=inside, other=0.0) * g_green
     behind += tl.load(color + out * 3 + 2, mask=inside, other=0.0) * g_blue
-    if ALPHA:
+    if WITH_ALPHA:
         left_over = tl.load(transmittance + out, mask=inside, other=0.0)
         behind -= left_over * tl.load(d_alpha + out, mask=inside, other=0.0)
     g_depth = tl.zeros([PIXELS], tl.float32)
-    if DEPTH:
+    if WITH_DEPTH:
         g_depth = tl.load(d_depth + out, mask=inside, other=0.0)
         behind += tl.load(depth + out, mask=inside, other=0.0) * g_depth
 
-    place = checkpoints + segment.to(tl.int64) * (5 * PIXELS) + pixel
-    through = tl.load(place + 3 * PIXELS)
-    behind -= (
-        tl.load(place) * g_red + tl.load(place + PIXELS) * g_green + tl.load(place + 2 * PIXELS) * g_blue
-    )
-    if DEPTH:
-        behind -= tl.load(place + 4 * PIXELS) * g_depth
+    red, green, blue, through, deep = load_checkpoint(checkpoint_of(checkpoints, segment), WITH_DEPTH)
+    behind -= red * g_red + green * g_green + blue * g_blue
+    if WITH_DEPTH:
+        behind -= deep * g_depth
 
     start = tl.load(offsets + tile)
     count = (tl.load(offsets + tile + 1) - start).to(tl.int32)
@@ -79,16 +87,17 @@ def composite_backward_kernel(
             listed = done + j < end
             splat = tl.load(ids + start + done + j, mask=listed, other=0)
             source = records + splat.to(tl.int64) * STRIDE
-            dx = x - tl.load(source)
-            dy = y - tl.load(source + 1)
-            a, b, c = tl.load(source + 2), tl.load(source + 3), tl.load(source + 4)
-            opacity = tl.load(source + 5, mask=listed, other=0.0)
+            dx = x - tl.load(source + MEAN_X)
+            dy = y - tl.load(source + MEAN_Y)
+            a, b, c = tl.load(source + CONIC_A), tl.load(source + CONIC_B), tl.load(source + CONIC_C)
+            opacity = tl.load(source + OPACITY, mask=listed, other=0.0)
             alpha = alpha_of(dx, dy, a, b, c, opacity)
             before = through
             weight, through, kept = advance(before, alpha)
-            shine = tl.load(source + 6) * g_red + tl.load(source + 7) * g_green + tl.load(source + 8) * g_blue
-            if DEPTH:
-                shine += tl.load(source + 9) * g_depth
+            shine = tl.load(source + RED) * g_red + tl.load(source + GREEN) * g_green
+            shine += tl.load(source + BLUE) * g_blue
+            if WITH_DEPTH:
+                shine += tl.load(source + DEPTH) * g_depth
             behind -= weight * shine
             d_alpha_here = before * shine - behind / (1.0 - alpha)
             # Where alpha is clamped, no gradient flows to opacity, conic or mean.
@@ -97,22 +106,19 @@ def composite_backward_kernel(
             sum_x, sum_y = tl.sum(pull_x, axis=0), tl.sum(pull_y, axis=0)
 
             # One record of sums, and so one coalesced atomic per tile and splat.
-            sums = pick(k, 0, a * sum_x + b * sum_y, tl.zeros([GRADIENT_STRIDE], tl.float32))
-            sums = pick(k, 1, b * sum_x + c * sum_y, sums)
-            sums = pick(k, 2, -0.5 * tl.sum(pull_x * dx, axis=0), sums)
-            sums = pick(k, 3, -tl.sum(pull_x * dy, axis=0), sums)
-            sums = pick(k, 4, -0.5 * tl.sum(pull_y * dy, axis=0), sums)
-            sums = pick(k, 5, tl.sum(pull, axis=0) / tl.maximum(opacity, 1e-30), sums)
-            sums = pick(k, 6, tl.sum(weight * g_red, axis=0), sums)
-            sums = pick(k, 7, tl.sum(weight * g_green, axis=0), sums)
-            sums = pick(k, 8, tl.sum(weight * g_blue, axis=0), sums)
-            if DEPTH:
-                sums = pick(k, 9, tl.sum(weight * g_depth, axis=0), sums)
-            if SCORES:
-                sums = pick(k, 10, tl.sum(tl.abs(a * pull_x + b * pull_y), axis=0), sums)
-                sums = pick(k, 11, tl.sum(tl.abs(b * pull_x + c * pull_y), axis=0), sums)
+            sums = pick(k, MEAN_X, a * sum_x + b * sum_y, tl.zeros([GRADIENT_STRIDE], tl.float32))
+            sums = pick(k, MEAN_Y, b * sum_x + c * sum_y, sums)
+            sums = pick(k, CONIC_A, -0.5 * tl.sum(pull_x * dx, axis=0), sums)
+            sums = pick(k, CONIC_B, -tl.sum(pull_x * dy, axis=0), sums)
+            sums = pick(k, CONIC_C, -0.5 * tl.sum(pull_y * dy, axis=0), sums)
+            sums = pick(k, OPACITY, tl.sum(pull, axis=0) / tl.maximum(opacity, 1e-30), sums)
+            sums = pick(k, RED, tl.sum(weight * g_red, axis=0), sums)
+            sums = pick(k, GREEN, tl.sum(weight * g_green, axis=0), sums)
+            sums = pick(k, BLUE, tl.sum(weight * g_blue, axis=0), sums)
+            if WITH_DEPTH:
+                sums = pick(k, DEPTH, tl.sum(weight * g_depth, axis=0), sums)
             target = gradient + splat.to(tl.int64) * GRADIENT_STRIDE + k
-            tl.atomic_add(target, sums, mask=listed & (k < 12), sem="relaxed")
+            tl.atomic_add(target, sums, mask=listed & (k < DIFFERENTIABLE), sem="relaxed")
         most = tl.max(through, 0)
         done += BATCH
 
@@ -127,12 +133,16 @@ def blend_backward(
     *,
     d_alpha: Tensor | None = None,
     d_depth: Tensor | None = None,
-    scores: bool = False,
 ) -> Tensor:
-    """Gradient records [N, 16] (see `record`) of one view; with `scores` the densification sums are filled too."""
+    """Return the gradient records [N, 16] (see `record`) of one view.
+
+    d_color [H,W,3], d_alpha [H,W] and d_depth [H,W] are the loss's gradients to the image; None counts as 0. Raises
+    ValueError for an image that was composited without checkpoints.
+    """
     if made.checkpoints is None or made.segment_tile is None:
         raise ValueError(
-            "the view was composited without checkpoints; composite it again with them to differentiate it"
+            "The image was composited without checkpoints and cannot be differentiated; "
+            "composite it with checkpoints=True."
         )
     gradient = torch.zeros(records.shape[0], GRADIENT_WIDTH, device=records.device, dtype=torch.float32)
     composite_backward_kernel[(made.segment_tile.shape[0],)](
@@ -141,7 +151,6 @@ def blend_backward(
         None if d_alpha is None else d_alpha.contiguous(),
         None if d_depth is None else d_depth.contiguous(), gradient,
         width, height, -(-width // TILE),
-        ALPHA=d_alpha is not None, DEPTH=d_depth is not None,
-        SCORES=scores, SEGMENT=SEGMENT,
+        WITH_ALPHA=d_alpha is not None, WITH_DEPTH=d_depth is not None, SEGMENT=SEGMENT,
     )  # fmt: skip
     return gradient

@@ -1,4 +1,4 @@
-"""Numbers that kernels read from their module."""
+"""Constants that kernels read from their module."""
 
 from __future__ import annotations
 
@@ -10,8 +10,13 @@ from .device import interpreting
 
 
 def constant(value: float) -> Any:
-    """`value` as the compile-time constant that a kernel may read from its module.
+    """Return `value` as the compile-time constant that a kernel may read from its module.
 
-    Under the interpreter the bare number: there a constexpr to the left of an array swallows the array.
+    Under the interpreter the result is the bare number, because an operator with a constexpr on its left and an array
+    on its right gives a constexpr there, not an array.
     """
     return value if interpreting() else tl.constexpr(value)
+
+
+LARGEST = constant(3.4028234e38)
+"""The largest finite float32."""

@@ -1,4 +1,4 @@
-"""What GPU there is, whether these kernels can use it, and what fits into its memory."""
+"""Which GPU there is, whether these kernels can use it, and what fits into its memory."""
 
 from __future__ import annotations
 
@@ -13,31 +13,27 @@ OLDEST = (8, 0)
 """Oldest compute capability that Triton compiles for without gaps (Ampere; RTX 30 and later)."""
 
 STEP_BYTES = 1300
-"""Device bytes per Gaussian of a training step: parameters and two moments 3 * 59 * 4 = 708, gradients
-236, records 112, scores and lists 60, and room for the sort's double buffers. `memory_needed` adds the
-copy that densification makes.
-"""
+"""Device bytes per Gaussian of a training step, estimated: parameters and two moments 3 * 59 * 4 = 708, gradients
+236, records 112, scores and lists 60, and the buffers of the sort. `memory_needed` adds densification's copy."""
 
 PAIR_BYTES = 60
-"""Device bytes per tile-Gaussian pair: key, id, their sorted copies and the sort's 64-bit index and
-buffers (36), and a share of the checkpoints of 5 floats for 256 pixels every 256 pairs (20).
-"""
+"""Device bytes per (tile, Gaussian) pair, estimated: 36 for key, id, their sorted copies, the 64-bit index and the
+buffers of the sort, and 24 for checkpoints. A list of full segments has 40 bytes of checkpoints for each pair; the
+margin of `largest_budget` covers the difference."""
 
 PIXEL_BYTES = 120
-"""Device bytes per pixel of a step: image, transmittance, gradients, and nine planes of the loss in
-float32.
-"""
-
+"""Device bytes per pixel of a training step, estimated: image, transmittance, gradients, and nine float32 planes of
+the loss."""
 
 _found_usable: set[int] = set()
 
 
 class GpuUnavailable(RuntimeError):
-    """The GPU engine was asked for and cannot run here; the message says why and what to do."""
+    """The GPU backend was asked for and cannot run here; the message says why and what to do."""
 
 
 class GpuMemoryShort(MemoryError):
-    """Device memory ran out in mid-training; the scene is as it was before the call that failed."""
+    """Device memory ran out during training; the scene is as it was before the call that failed."""
 
     def __init__(self, where: torch.device, params: Tensor | None) -> None:
         free, total = torch.cuda.mem_get_info(where)
@@ -45,13 +41,19 @@ class GpuMemoryShort(MemoryError):
         super().__init__(
             f"The GPU ran out of memory with {held} Gaussians in training: {free / 2**30:.1f} of "
             f"{total / 2**30:.1f} GiB are free. "
-            "Go on with fewer Gaussians or smaller photos, or close what else uses the GPU."
+            "Use fewer Gaussians or smaller photos, or close other programs that use the GPU."
         )
 
 
 @dataclass(frozen=True)
 class DeviceFacts:
-    """One GPU that the kernels run on: its name, compute capability, and memory in bytes as seen now."""
+    """One GPU that the kernels can run on.
+
+    name: as its driver gives it.
+    capability: compute capability, major and minor.
+    total_bytes: its memory.
+    free_bytes: what was free of it at the time of asking.
+    """
 
     name: str
     capability: tuple[int, int]
@@ -60,14 +62,12 @@ class DeviceFacts:
 
 
 def interpreting() -> bool:
-    """Whether Triton's interpreter was asked for, which runs the kernels on CPU tensors, slowly, for
-    proof.
-    """
+    """Whether Triton's interpreter was asked for, which runs the kernels on CPU tensors: slowly, to test them."""
     return os.environ.get("TRITON_INTERPRET", "0") == "1"
 
 
 def absence(device: int = 0) -> str | None:
-    """Why GPU number `device` cannot be used, as a sentence for a person; None when it can."""
+    """Return why GPU number `device` cannot be used, as a sentence for a person; None when it can."""
     if importlib.util.find_spec("triton") is None:
         return "Triton is not installed; it comes with torch's CUDA and ROCm builds (pip install torch)."
     if not torch.cuda.is_available():
@@ -87,9 +87,7 @@ def absence(device: int = 0) -> str | None:
 
 
 def describe(device: int = 0) -> DeviceFacts | None:
-    """Facts about GPU number `device`, or None where `absence` says why it cannot be used. Reads memory,
-    allocates none.
-    """
+    """Return the facts of GPU number `device`; None when it cannot be used, for the reason that `absence` gives."""
     if absence(device) is not None:
         return None
     free, total = torch.cuda.mem_get_info(device)
@@ -99,29 +97,24 @@ def describe(device: int = 0) -> DeviceFacts | None:
 
 
 def memory_needed(gaussians: int, pixels: int, photo_bytes: int, *, pairs_per_gaussian: float = 8.0) -> int:
-    """Device bytes that training needs at its peak, which is densification: old and new parameters exist at
-    once.
+    """Estimate the device bytes that training needs at its peak: in densification, old and new parameters coexist.
 
-    gaussians: how many at most; pixels: of the largest view; photo_bytes: of all resident uint8 photos. Pairs
-    per Gaussian default to what ordinary scenes show at a million Gaussians and 1080p; a step that meets more
-    grows its lists.
+    gaussians: the most that there will be. pixels: of the largest view. photo_bytes: of all photos, which stay on the
+    device as uint8. pairs_per_gaussian: by default that of ordinary scenes with a million Gaussians at 1080p; where a
+    step has more, its lists grow.
     """
     per_gaussian = STEP_BYTES + 708 + pairs_per_gaussian * PAIR_BYTES
     return int(gaussians * per_gaussian + pixels * PIXEL_BYTES + photo_bytes)
 
 
 def largest_budget(free_bytes: int, pixels: int, photo_bytes: int, *, margin: float = 0.85) -> int:
-    """The largest number of Gaussians that fits in `margin` of the free memory; 0 when not even the photos
-    do.
-    """
+    """Return the largest number of Gaussians that fits into `margin` of the free memory; 0 when the photos do not."""
     room = free_bytes * margin - memory_needed(0, pixels, photo_bytes)
     return max(0, int(room / memory_needed(1, 0, 0)))
 
 
 def require(tensor: Tensor) -> None:
-    """Raise GpuUnavailable unless kernels can run on `tensor`: on a usable GPU, or on the CPU under the
-    interpreter.
-    """
+    """Raise GpuUnavailable unless kernels can run on `tensor`: on a usable GPU, or on the CPU under the interpreter."""
     if interpreting() and not tensor.is_cuda:
         return
     if not tensor.is_cuda:
@@ -135,7 +128,7 @@ def require(tensor: Tensor) -> None:
             raise GpuUnavailable(f'{reason} Use backend "cpu" on this machine.')
         _found_usable.add(index)
     if index != torch.cuda.current_device():
-        # Triton launches on the current device, whatever its arguments' device is.
+        # Triton launches on the current device, whatever the device of its arguments is.
         raise GpuUnavailable(
             f"The tensors are on {tensor.device}, but the current GPU is number {torch.cuda.current_device()}; "
             f"call torch.cuda.set_device({index}) first."

@@ -1,6 +1,4 @@
-"""Real spherical harmonics to degree 3 and their slopes, for a block of unit directions; signs and order
-as in splat files.
-"""
+"""Real spherical harmonics to degree 3 and their slopes at unit directions; signs and order as in splat files."""
 
 from __future__ import annotations
 
@@ -23,7 +21,7 @@ E3 = constant(1.445305721320277)
 
 @triton.jit
 def at(pointer, i, channel, stride, CHANNELS: tl.constexpr, PLANAR: tl.constexpr):
-    """Where element (i, channel) lies: planes of `stride` Gaussians, or rows of CHANNELS."""
+    """Where channel number `channel` of Gaussian i lies: in planes of `stride` Gaussians, or in rows of CHANNELS."""
     if PLANAR:
         return pointer + channel * stride + i
     return pointer + i * CHANNELS + channel
@@ -31,7 +29,7 @@ def at(pointer, i, channel, stride, CHANNELS: tl.constexpr, PLANAR: tl.constexpr
 
 @triton.jit
 def basis(x, y, z, k: tl.constexpr):
-    """Harmonic number k (0..15, degree by degree) at directions (x, y, z)."""
+    """Harmonic number k (0 to 15, degree by degree) at directions (x, y, z)."""
     if k == 0:
         return tl.zeros_like(x) + A0
     if k == 1:
@@ -67,7 +65,7 @@ def basis(x, y, z, k: tl.constexpr):
 
 @triton.jit
 def slope(x, y, z, k: tl.constexpr):
-    """The gradient of harmonic number k by x, y and z, each coordinate on its own."""
+    """The derivatives of harmonic number k by x, y and z, taken as independent."""
     none = tl.zeros_like(x)
     if k == 0:
         return none, none, none
@@ -104,9 +102,7 @@ def slope(x, y, z, k: tl.constexpr):
 
 @triton.jit
 def shade(sh, i, here, stride, x, y, z, COEFFICIENTS: tl.constexpr, USED: tl.constexpr, PLANAR: tl.constexpr):
-    """Colour before the clamp, and the sum of |coefficient| that says whether every one that is read is
-    finite.
-    """
+    """Colour before the clamp at 0, and the sum of |coefficient|, which is finite when every coefficient read is."""
     red = tl.zeros_like(x) + 0.5
     green = tl.zeros_like(x) + 0.5
     blue = tl.zeros_like(x) + 0.5

@@ -1,6 +1,4 @@
-"""Mean distance to the three nearest other points, every pair tried: N^2 of nothing but arithmetic suits a
-GPU well.
-"""
+"""Mean distance to the three nearest other points, by trying every pair: N^2 plain arithmetic suits a GPU."""
 
 from __future__ import annotations
 
@@ -11,14 +9,23 @@ from torch import Tensor
 
 from ..reference.knn import NEIGHBORS, check_points
 from . import device
+from .argument import Float, Floats, Int
 from .constant import constant
 
-ROWS, OTHERS = 64, 64
+ROWS = 64
+"""Points per program."""
+
+OTHERS = 64
+"""Points that they are compared with at a time."""
+
 FAR = constant(float("inf"))
 
 
 @triton.jit
-def knn_kernel(points, result, count, nearest, ROWS: tl.constexpr, OTHERS: tl.constexpr):
+def knn_kernel(
+    points: Floats, result: Floats, count: Int, nearest: Float, ROWS: tl.constexpr, OTHERS: tl.constexpr
+):
+    """Write the mean distance of each point to its `nearest` (1 to 3) nearest others."""
     i = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
     here = i < count
     x = tl.load(points + i * 3, mask=here, other=0.0)
@@ -36,8 +43,7 @@ def knn_kernel(points, result, count, nearest, ROWS: tl.constexpr, OTHERS: tl.co
         squared = dx * dx + dy * dy + dz * dz
         squared = tl.where(there[None, :] & (i[:, None] != j[None, :]), squared, FAR)
         for _ in tl.static_range(3):
-            # Take one smallest entry out of the block, even where several are equal, and sort it into the
-            # three.
+            # Take exactly one smallest entry out of the block, also where several are equal, and sort it in.
             small = tl.min(squared, axis=1)
             which = tl.min(tl.where(squared == small[:, None], tl.arange(0, OTHERS)[None, :], OTHERS), axis=1)
             squared = tl.where(tl.arange(0, OTHERS)[None, :] == which[:, None], FAR, squared)

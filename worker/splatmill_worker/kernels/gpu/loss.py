@@ -1,9 +1,8 @@
-"""L1 plus D-SSIM from the 8-bit photo, value and gradient in four kernels: the window across, then down, and
-both again.
+"""L1 plus D-SSIM against an 8-bit photo, value and gradient in four kernels.
 
-The 11-tap window is separable, and its eleven shifted reads fall into the first-level cache; what goes to
-memory between the kernels is three planes per channel. Everything is float32: the variance is a difference of
-nearly equal windows, and SSIM divides by it plus 9e-4.
+The window of SSIM is separable: two kernels apply it to the moments, across and then down, and two to the derivatives.
+Its eleven shifted reads hit the first-level cache; between the kernels, three planes per channel go through memory.
+Everything is float32, since a variance is a difference of nearly equal moments and SSIM divides by it plus 9e-4.
 """
 
 from __future__ import annotations
@@ -19,18 +18,23 @@ from torch.autograd.function import once_differentiable
 
 from ..reference.loss import C1, C2, SIGMA, WINDOW, PhotoStats
 from . import device
+from .argument import Bytes, Float, Floats, Int
 from .constant import constant
 from .tuning import LOSS, SMALLEST_LOSS_BLOCK, autotune
 
 REACH = constant(WINDOW // 2)
 TAPS = constant(WINDOW)
 S1, S2 = constant(C1), constant(C2)
+# First of the three planes, one per channel, of each windowed moment: of x, x^2, x y, y and y^2 (rendered x, photo y).
+# The derivatives of SSIM by the first three, its slopes, have the same places.
+X, XX, XY, Y, YY = (constant(3 * number) for number in range(5))
 
 
 @triton.jit
 def load_pair(color, photo, mask, place, channel, inside, MASK: tl.constexpr):
-    """Rendered and seen values of one channel, both 0 where not `inside` and not under the mask, and where
-    they are used.
+    """Rendered and photographed values of one channel, and where they are used: `inside`, and under the mask if any.
+
+    Both are 0 elsewhere.
     """
     used = inside
     if MASK:
@@ -43,12 +47,10 @@ def load_pair(color, photo, mask, place, channel, inside, MASK: tl.constexpr):
 @autotune(LOSS, key=["MASK", "STATS"])
 @triton.jit
 def across_kernel(
-    color, photo, mask, taps, planes, width, height,
+    color: Floats, photo: Bytes, mask: Bytes, taps: Floats, planes: Floats, width: Int, height: Int,
     MASK: tl.constexpr, STATS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """x, x^2, xy, and without the photo's own part also y, y^2, windowed along rows: planes [3 or 5, 3, H,
-    W].
-    """
+    """The moments windowed along rows, planes [3 or 5, 3, H, W]; those of y alone only without kept STATS."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     channel = tl.program_id(1)
     plane = width * height
@@ -68,17 +70,17 @@ def across_kernel(
             y1 += tap * y
             yy += tap * y * y
     out = planes + channel * plane + p
-    tl.store(out, x1, mask=here)
-    tl.store(out + 3 * plane, xx, mask=here)
-    tl.store(out + 6 * plane, xy, mask=here)
+    tl.store(out + X * plane, x1, mask=here)
+    tl.store(out + XX * plane, xx, mask=here)
+    tl.store(out + XY * plane, xy, mask=here)
     if not STATS:
-        tl.store(out + 9 * plane, y1, mask=here)
-        tl.store(out + 12 * plane, yy, mask=here)
+        tl.store(out + Y * plane, y1, mask=here)
+        tl.store(out + YY * plane, yy, mask=here)
 
 
 @triton.jit
 def down(planes, taps, p, row, here, width, height):
-    """One plane windowed along columns."""
+    """The window along columns of one plane, at pixels p."""
     total = tl.zeros_like(p).to(tl.float32)
     for k in tl.static_range(TAPS):
         shift = k - REACH
@@ -90,11 +92,13 @@ def down(planes, taps, p, row, here, width, height):
 @autotune(LOSS, key=["MASK", "STATS"])
 @triton.jit
 def value_kernel(
-    color, photo, mask, mean, variance, taps, planes, slopes, sums, width, height,
+    color: Floats, photo: Bytes, mask: Bytes, mean: Floats, variance: Floats, taps: Floats, planes: Floats,
+    slopes: Floats, sums: Floats, width: Int, height: Int,
     MASK: tl.constexpr, STATS: tl.constexpr, SLOPES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Sums of |x - y| and of SSIM per program, and SSIM's derivatives by the windowed x, x^2 and xy
-    (slopes [3, 3, H, W]).
+    """Per program the sums of |x - y| and of SSIM; with SLOPES also SSIM's derivatives by the windowed x, x^2 and x y.
+
+    slopes [3, 3, H, W]; sums [programs * 3, 2].
     """
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     channel = tl.program_id(1)
@@ -102,15 +106,15 @@ def value_kernel(
     here = p < plane
     row = p // width
     source = planes + channel * plane
-    mu1 = down(source, taps, p, row, here, width, height)
-    var1 = down(source + 3 * plane, taps, p, row, here, width, height) - mu1 * mu1
-    both = down(source + 6 * plane, taps, p, row, here, width, height)
+    mu1 = down(source + X * plane, taps, p, row, here, width, height)
+    var1 = down(source + XX * plane, taps, p, row, here, width, height) - mu1 * mu1
+    both = down(source + XY * plane, taps, p, row, here, width, height)
     if STATS:
         mu2 = tl.load(mean + p * 3 + channel, mask=here, other=0.0)
         var2 = tl.load(variance + p * 3 + channel, mask=here, other=0.0)
     else:
-        mu2 = down(source + 9 * plane, taps, p, row, here, width, height)
-        var2 = down(source + 12 * plane, taps, p, row, here, width, height) - mu2 * mu2
+        mu2 = down(source + Y * plane, taps, p, row, here, width, height)
+        var2 = down(source + YY * plane, taps, p, row, here, width, height) - mu2 * mu2
     x, y, used = load_pair(color, photo, mask, p, channel, here, MASK)
     a1, a2 = 2.0 * mu1 * mu2 + S1, 2.0 * (both - mu1 * mu2) + S2
     b1, b2 = mu1 * mu1 + mu2 * mu2 + S1, var1 + var2 + S2
@@ -121,9 +125,9 @@ def value_kernel(
         by_mean = 2.0 * mu2 * a2 / (b1 * b2) - 2.0 * mu1 * ssim / b1
         by_mean = by_mean - mu2 * by_covariance - 2.0 * mu1 * by_variance
         out = slopes + channel * plane + p
-        tl.store(out, tl.where(used, by_mean, 0.0), mask=here)
-        tl.store(out + 3 * plane, tl.where(used, by_variance, 0.0), mask=here)
-        tl.store(out + 6 * plane, tl.where(used, by_covariance, 0.0), mask=here)
+        tl.store(out + X * plane, tl.where(used, by_mean, 0.0), mask=here)
+        tl.store(out + XX * plane, tl.where(used, by_variance, 0.0), mask=here)
+        tl.store(out + XY * plane, tl.where(used, by_covariance, 0.0), mask=here)
     place = sums + 2 * (tl.program_id(0) * 3 + channel)
     tl.store(place, tl.sum(tl.where(used, tl.abs(x - y), 0.0), axis=0))
     tl.store(place + 1, tl.sum(tl.where(used, ssim, 0.0), axis=0))
@@ -131,8 +135,8 @@ def value_kernel(
 
 @autotune(LOSS, key=[])
 @triton.jit
-def down_kernel(planes, taps, windowed, width, height, BLOCK: tl.constexpr):
-    """Planes windowed along columns, one per second index of the grid."""
+def down_kernel(planes: Floats, taps: Floats, windowed: Floats, width: Int, height: Int, BLOCK: tl.constexpr):
+    """The window along columns of as many planes as the second side of the grid is long."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     plane = width * height
     here = p < plane
@@ -145,11 +149,13 @@ def down_kernel(planes, taps, windowed, width, height, BLOCK: tl.constexpr):
 @autotune(LOSS, key=["MASK"])
 @triton.jit
 def gradient_kernel(
-    color, photo, mask, taps, planes, used_pixels, d_color, width, height, weight,
+    color: Floats, photo: Bytes, mask: Bytes, taps: Floats, planes: Floats, used_pixels: Floats, d_color: Floats,
+    width: Int, height: Int, weight: Float,
     MASK: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The slopes windowed along rows and put on the pixels, plus the sign of L1; 0 where a pixel is not
-    used.
+    """The gradient to the image: the slopes, windowed along rows as well, and the sign of L1; 0 at unused pixels.
+
+    planes holds the slopes windowed along columns; used_pixels [] their number.
     """
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     channel = tl.program_id(1)
@@ -163,9 +169,9 @@ def gradient_kernel(
         tap = tl.load(taps + k)
         inside = here & (column + shift >= 0) & (column + shift < width)
         source = planes + channel * plane + p + shift
-        by_mean += tap * tl.load(source, mask=inside, other=0.0)
-        by_variance += tap * tl.load(source + 3 * plane, mask=inside, other=0.0)
-        by_covariance += tap * tl.load(source + 6 * plane, mask=inside, other=0.0)
+        by_mean += tap * tl.load(source + X * plane, mask=inside, other=0.0)
+        by_variance += tap * tl.load(source + XX * plane, mask=inside, other=0.0)
+        by_covariance += tap * tl.load(source + XY * plane, mask=inside, other=0.0)
     x, y, used = load_pair(color, photo, mask, p, channel, here, MASK)
     share = 1.0 / (3.0 * tl.maximum(tl.load(used_pixels), 1.0))
     slope = by_mean + 2.0 * x * by_variance + y * by_covariance
@@ -176,7 +182,7 @@ def gradient_kernel(
 
 @lru_cache(maxsize=4)
 def window_taps(where: torch.device) -> Tensor:
-    """The eleven taps, made once per device: a copy from the host in every step would wait for it."""
+    """Return the taps [11] of the window, kept per device: a copy from the host at every step would wait."""
     x = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
     taps = torch.exp(-x * x / (2 * SIGMA * SIGMA))
     return (taps / taps.sum()).to(where, torch.float32)
@@ -191,14 +197,16 @@ def loss_and_gradient(
     stats: PhotoStats | None,
     gradient: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """The loss, its L1 and its SSIM as 0-d tensors on the device, and d loss / d color [H, W, 3] or None.
-    Waits for nothing.
+    """Return the loss, its L1 and its SSIM as 0-d tensors, and the gradient to color [H, W, 3] (None unless asked).
+
+    Arguments as in `reference.loss`. Nothing waits for the device. Raises ValueError for an image too large for 32-bit
+    offsets.
     """
     height, width = color.shape[:2]
     pixels = height * width
     if pixels * 15 >= 2**31:
         raise ValueError(
-            f"an image of {width}x{height}: offsets into its planes are 32-bit; use fewer than 143 megapixels"
+            f"The image is {width}x{height}; offsets into its planes have 32 bits, enough for 143 megapixels."
         )
     like: dict[str, Any] = {"device": color.device, "dtype": torch.float32}
     if mask is not None:
@@ -222,7 +230,7 @@ def loss_and_gradient(
         MASK=masked, STATS=stats is not None, SLOPES=gradient,
     )  # fmt: skip
     off, similar = sums.sum(0) / (3 * count.clamp_min(1))
-    # With no used pixel both sums are 0, and so is the loss.
+    # Without a used pixel both sums are 0, and the loss is 0.
     value = (1 - dssim_weight) * off + dssim_weight * ((count > 0).float() - similar)
     if slopes is None:
         return value, off, similar, None
@@ -266,9 +274,7 @@ def loss(
     mask: Tensor | None = None,
     stats: PhotoStats | None = None,
 ) -> Tensor:
-    """(1 - w) mean |color - photo/255| + w (1 - mean SSIM), as `reference.loss` defines it, differentiable
-    by color.
-    """
+    """(1 - w) mean |color - photo/255| + w (1 - mean SSIM), differentiable in color, as `reference.loss` defines it."""
     device.require(color)
     value: Tensor = _Loss.apply(color, photo, dssim_weight, mask, stats)
     return value
@@ -276,9 +282,7 @@ def loss(
 
 @torch.no_grad()
 def photo_stats(photo: Tensor, *, mask: Tensor | None = None) -> PhotoStats:
-    """Windowed mean and variance of a photo (uint8 [H,W,3]) under a mask, each [H,W,3]; 24 bytes a pixel
-    when kept.
-    """
+    """Return the windowed mean and variance of a photo (uint8 [H,W,3]) under a mask, each [H,W,3]: 24 bytes a pixel."""
     device.require(photo)
     height, width = photo.shape[:2]
     mask = None if mask is None else mask.to(torch.uint8).contiguous()

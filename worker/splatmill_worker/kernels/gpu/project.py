@@ -1,6 +1,4 @@
-"""Gaussians to the image plane in one kernel: activations, covariance factor, exact extents, SH colour,
-culling.
-"""
+"""Gaussians to the image plane in one kernel: activations, covariance factor, exact extents, SH colour, culling."""
 
 from __future__ import annotations
 
@@ -14,10 +12,12 @@ from torch.autograd.function import once_differentiable
 
 from ..records import ALPHA_MIN, Projected
 from . import device, record
+from .argument import Float, Floats, Int
 from .constant import constant
 from .harmonics import shade
 from .project_backward import project_backward
 from .projection import (
+    COMPENSATION_MIN,
     covariance,
     finite,
     load3,
@@ -28,19 +28,34 @@ from .projection import (
     slope_row,
     through,
 )
+from .record import (
+    BLUE,
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
+    DEPTH,
+    EXTENT_X,
+    EXTENT_Y,
+    GREEN,
+    MEAN_X,
+    MEAN_Y,
+    OPACITY,
+    RED,
+    STRIDE,
+)
 from .tuning import PROJECT, autotune
 
-STRIDE = constant(record.WIDTH)
 CUT = constant(ALPHA_MIN)
-COMPENSATION_MIN = constant(2.5e-5)
 
 
 @autotune(PROJECT, key=["USED", "PLANAR"])
 @triton.jit
 def project_kernel(
-    means, log_scales, quats, logit_opacities, sh, viewmat, K, records, count, stride, width, height, near,
+    means: Floats, log_scales: Floats, quats: Floats, logit_opacities: Floats, sh: Floats, viewmat: Floats, K: Floats,
+    records: Floats, count: Int, stride: Int, width: Int, height: Int, near: Float,
     COEFFICIENTS: tl.constexpr, USED: tl.constexpr, PLANAR: tl.constexpr, ANTIALIAS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
+    """Write the record of each Gaussian: all of it, or zeros where it is culled."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     w00, w01, w02, w10, w11, w12, w20, w21, w22, t0, t1, t2, fx, fy, cx, cy = load_camera(viewmat, K)
@@ -89,18 +104,18 @@ def project_kernel(
     keep = keep & (ex > 0.0) & (ey > 0.0)
     keep = keep & (mx + ex > 0.0) & (mx - ex < width) & (my + ey > 0.0) & (my - ey < height)
     out = records + i.to(tl.int64) * STRIDE
-    tl.store(out, tl.where(keep, mx, 0.0), mask=here)
-    tl.store(out + 1, tl.where(keep, my, 0.0), mask=here)
-    tl.store(out + 2, tl.where(keep, c / det, 0.0), mask=here)
-    tl.store(out + 3, tl.where(keep, -b / det, 0.0), mask=here)
-    tl.store(out + 4, tl.where(keep, a / det, 0.0), mask=here)
-    tl.store(out + 5, tl.where(keep, opacity, 0.0), mask=here)
-    tl.store(out + 6, tl.where(keep, tl.maximum(red, 0.0), 0.0), mask=here)
-    tl.store(out + 7, tl.where(keep, tl.maximum(green, 0.0), 0.0), mask=here)
-    tl.store(out + 8, tl.where(keep, tl.maximum(blue, 0.0), 0.0), mask=here)
-    tl.store(out + 9, tl.where(keep, z, 0.0), mask=here)
-    tl.store(out + 10, tl.where(keep, ex, 0.0), mask=here)
-    tl.store(out + 11, tl.where(keep, ey, 0.0), mask=here)
+    tl.store(out + MEAN_X, tl.where(keep, mx, 0.0), mask=here)
+    tl.store(out + MEAN_Y, tl.where(keep, my, 0.0), mask=here)
+    tl.store(out + CONIC_A, tl.where(keep, c / det, 0.0), mask=here)
+    tl.store(out + CONIC_B, tl.where(keep, -b / det, 0.0), mask=here)
+    tl.store(out + CONIC_C, tl.where(keep, a / det, 0.0), mask=here)
+    tl.store(out + OPACITY, tl.where(keep, opacity, 0.0), mask=here)
+    tl.store(out + RED, tl.where(keep, tl.maximum(red, 0.0), 0.0), mask=here)
+    tl.store(out + GREEN, tl.where(keep, tl.maximum(green, 0.0), 0.0), mask=here)
+    tl.store(out + BLUE, tl.where(keep, tl.maximum(blue, 0.0), 0.0), mask=here)
+    tl.store(out + DEPTH, tl.where(keep, z, 0.0), mask=here)
+    tl.store(out + EXTENT_X, tl.where(keep, ex, 0.0), mask=here)
+    tl.store(out + EXTENT_Y, tl.where(keep, ey, 0.0), mask=here)
 
 
 def project_records(
@@ -115,13 +130,15 @@ def project_records(
     antialias: bool,
     planar: int | None = None,
 ) -> Tensor:
-    """Records [N, 12] of the five parameter groups; `planar` is the plane stride when channels lie in
-    planes, else rows do.
+    """Return the records [N, 12] of the five parameter groups.
+
+    With `planar` the groups lie in planes of that stride, [channels, stride]; without, in rows [N, channels]. Raises
+    ValueError for more Gaussians than 32-bit offsets reach.
     """
     count = groups[3].shape[0]
     if count * 64 >= 2**31:
         raise ValueError(
-            f"{count} Gaussians: offsets into the parameters are 32-bit; use fewer than 33 million"
+            f"{count} Gaussians were given; offsets into the parameters have 32 bits, enough for 33 million."
         )
     records = torch.empty(count, record.WIDTH, device=viewmat.device, dtype=torch.float32)
     coefficients = 16 if planar is not None else groups[4].shape[1]
@@ -157,7 +174,9 @@ class _Project(torch.autograd.Function):
         *groups, viewmat, K, records = ctx.saved_tensors
         width, height = ctx.size
         gradient = torch.zeros(records.shape[0], record.GRADIENT_WIDTH, device=records.device)
-        for place, given in zip(record.fields(gradient)[:5], d_fields[:5], strict=True):
+        for place, given in zip(
+            record.fields(gradient)[:5], d_fields[:5], strict=True
+        ):  # all but the extents
             if given is not None:
                 place.copy_(given)
         grads, d_viewmat = project_backward(
@@ -182,7 +201,7 @@ def project(
     near: float = 0.01,
     antialias: bool = False,
 ) -> Projected:
-    """Project Gaussians into one camera as `reference.project` defines it; float32 tensors on the GPU.
+    """Project Gaussians into one camera, as `reference.project` defines it; float32 tensors on the GPU.
 
     The fields are views of one array of records. Gradients reach the five groups and viewmat.
     """

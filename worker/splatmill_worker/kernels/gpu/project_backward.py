@@ -7,11 +7,11 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from . import record
-from .constant import constant
+from .argument import Floats, Int
 from .harmonics import at, basis, shade, slope
 from .projection import (
     BLUR,
+    COMPENSATION_MIN,
     covariance,
     load3,
     load4,
@@ -21,15 +21,27 @@ from .projection import (
     slope_row,
     through,
 )
+from .record import (
+    BLUE,
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
+    DEPTH,
+    EXTENT_X,
+    GRADIENT_STRIDE,
+    GREEN,
+    MEAN_X,
+    MEAN_Y,
+    OPACITY,
+    RED,
+    STRIDE,
+)
 from .tuning import PROJECT_BACKWARD, autotune
-
-STRIDE = constant(record.WIDTH)
-GRADIENT_STRIDE = constant(record.GRADIENT_WIDTH)
-COMPENSATION_MIN = constant(2.5e-5)
 
 
 @triton.jit
 def store3(pointer, i, here, stride, x, y, z, PLANAR: tl.constexpr):
+    """Write three channels of a block."""
     tl.store(at(pointer, i, 0, stride, 3, PLANAR), x, mask=here)
     tl.store(at(pointer, i, 1, stride, 3, PLANAR), y, mask=here)
     tl.store(at(pointer, i, 2, stride, 3, PLANAR), z, mask=here)
@@ -37,7 +49,7 @@ def store3(pointer, i, here, stride, x, y, z, PLANAR: tl.constexpr):
 
 @triton.jit
 def add_row(pointer, x, y, z, t):
-    """Add one row of the camera's gradient, summed over the block."""
+    """Add the block's sums to one row of the gradient of the viewmat."""
     tl.atomic_add(pointer, tl.sum(x, axis=0))
     tl.atomic_add(pointer + 1, tl.sum(y, axis=0))
     tl.atomic_add(pointer + 2, tl.sum(z, axis=0))
@@ -47,21 +59,23 @@ def add_row(pointer, x, y, z, t):
 @autotune(PROJECT_BACKWARD, key=["USED", "PLANAR"])
 @triton.jit
 def color_backward_kernel(
-    means, sh, viewmat, K, records, gradient, d_means, d_sh, count, stride,
+    means: Floats, sh: Floats, viewmat: Floats, K: Floats, records: Floats, gradient: Floats, d_means: Floats,
+    d_sh: Floats, count: Int, stride: Int,
     COEFFICIENTS: tl.constexpr, USED: tl.constexpr, PLANAR: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """From colour to the SH coefficients, and by the direction to the mean: that part alone is left in
-    d_means.
+    """From the colour to the SH coefficients and, through the direction, to the mean.
+
+    d_means then holds that part alone; `shape_backward_kernel` adds the rest.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
-    seen = here & (tl.load(records + i.to(tl.int64) * STRIDE + 10, mask=here, other=0.0) > 0.0)
+    seen = here & (tl.load(records + i.to(tl.int64) * STRIDE + EXTENT_X, mask=here, other=0.0) > 0.0)
     w00, w01, w02, w10, w11, w12, w20, w21, w22, t0, t1, t2, _, _, _, _ = load_camera(viewmat, K)
     m0, m1, m2 = load3(means, i, seen, stride, PLANAR)
     grow = gradient + i.to(tl.int64) * GRADIENT_STRIDE
-    g_red = tl.load(grow + 6, mask=seen, other=0.0)
-    g_green = tl.load(grow + 7, mask=seen, other=0.0)
-    g_blue = tl.load(grow + 8, mask=seen, other=0.0)
+    g_red = tl.load(grow + RED, mask=seen, other=0.0)
+    g_green = tl.load(grow + GREEN, mask=seen, other=0.0)
+    g_blue = tl.load(grow + BLUE, mask=seen, other=0.0)
     d0 = m0 + w00 * t0 + w10 * t1 + w20 * t2
     d1 = m1 + w01 * t0 + w11 * t1 + w21 * t2
     d2 = m2 + w02 * t0 + w12 * t1 + w22 * t2
@@ -99,17 +113,16 @@ def color_backward_kernel(
 @autotune(PROJECT_BACKWARD, key=["PLANAR", "VIEWMAT"], reset=["d_viewmat"])
 @triton.jit
 def shape_backward_kernel(
-    means, log_scales, quats, logit_opacities, viewmat, K, records, gradient,
-    d_means, d_log_scales, d_quats, d_logits, d_viewmat, count, stride, width, height,
+    means: Floats, log_scales: Floats, quats: Floats, logit_opacities: Floats, viewmat: Floats, K: Floats,
+    records: Floats, gradient: Floats, d_means: Floats, d_log_scales: Floats, d_quats: Floats, d_logits: Floats,
+    d_viewmat: Floats, count: Int, stride: Int, width: Int, height: Int,
     PLANAR: tl.constexpr, ANTIALIAS: tl.constexpr, VIEWMAT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """From mean, conic, opacity and depth on the image to the mean, shape and opacity in the world, and to
-    the camera.
-    """
+    """From the 2-D mean, conic, opacity and depth to mean, scales, quaternion, logit and, with VIEWMAT, the camera."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     row = records + i.to(tl.int64) * STRIDE
-    seen = here & (tl.load(row + 10, mask=here, other=0.0) > 0.0)
+    seen = here & (tl.load(row + EXTENT_X, mask=here, other=0.0) > 0.0)
     w00, w01, w02, w10, w11, w12, w20, w21, w22, t0, t1, t2, fx, fy, cx, cy = load_camera(viewmat, K)
     # Culled Gaussians are not read: what they hold (NaN, say) cannot come back as a gradient.
     m0, m1, m2 = load3(means, i, seen, stride, PLANAR)
@@ -117,13 +130,13 @@ def shape_backward_kernel(
     qw, qx, qy, qz = load4(quats, i, seen, stride, PLANAR)
     logit = tl.load(logit_opacities + i, mask=seen, other=0.0)
     grow = gradient + i.to(tl.int64) * GRADIENT_STRIDE
-    g_mx = tl.load(grow, mask=seen, other=0.0)
-    g_my = tl.load(grow + 1, mask=seen, other=0.0)
-    g_a = tl.load(grow + 2, mask=seen, other=0.0)
-    g_b = tl.load(grow + 3, mask=seen, other=0.0)
-    g_c = tl.load(grow + 4, mask=seen, other=0.0)
-    g_o = tl.load(grow + 5, mask=seen, other=0.0)
-    g_z = tl.load(grow + 9, mask=seen, other=0.0)
+    g_mx = tl.load(grow + MEAN_X, mask=seen, other=0.0)
+    g_my = tl.load(grow + MEAN_Y, mask=seen, other=0.0)
+    g_a = tl.load(grow + CONIC_A, mask=seen, other=0.0)
+    g_b = tl.load(grow + CONIC_B, mask=seen, other=0.0)
+    g_c = tl.load(grow + CONIC_C, mask=seen, other=0.0)
+    g_o = tl.load(grow + OPACITY, mask=seen, other=0.0)
+    g_z = tl.load(grow + DEPTH, mask=seen, other=0.0)
 
     # The forward pass again: cheaper than keeping it. A row that is not seen gets z = 1 and stays finite.
     z = tl.where(seen, w20 * m0 + w21 * m1 + w22 * m2 + t2, 1.0)
@@ -150,8 +163,8 @@ def shape_backward_kernel(
         d_logit = d_logit * tl.sqrt_rn(tl.maximum(sharp / det, COMPENSATION_MIN))
     tl.store(d_logits + i, d_logit, mask=here)
 
-    # Conic c/det, -b/det, a/det by the rows p, q of M. The determinant's part goes through the minors n = p x
-    # q as the forward pass does: -X dX X is the same, but cancels for needles.
+    # The conic c/det, -b/det, a/det by the rows p, q of M. The determinant's part goes through the minors
+    # n = p x q, as in the forward pass: -X dX X is the same, but its terms cancel for needles.
     d_det = -(g_a * (c / det) - g_b * (b / det) + g_c * (a / det)) / det
     d_tr0, d_tr1, d_b = g_c / det + BLUR * d_det, g_a / det + BLUR * d_det, -g_b / det
     n0, n1, n2 = p1 * q2 - p2 * q1, p2 * q0 - p0 * q2, p0 * q1 - p1 * q0
@@ -166,7 +179,7 @@ def shape_backward_kernel(
     )
     dp0, dp1, dp2, dq0, dq1, dq2 = dp0 * s0, dp1 * s1, dp2 * s2, dq0 * s0, dq1 * s1, dq2 * s2
 
-    # Rotation, through the unit quaternion, to the one of any norm.
+    # The rotation, through the unit quaternion, to the quaternion of any norm.
     e00, e01, e02 = a0 * dp0 + b0 * dq0, a0 * dp1 + b0 * dq1, a0 * dp2 + b0 * dq2
     e10, e11, e12 = a1 * dp0 + b1 * dq0, a1 * dp1 + b1 * dq1, a1 * dp2 + b1 * dq2
     e20, e21, e22 = a2 * dp0 + b2 * dq0, a2 * dp1 + b2 * dq1, a2 * dp2 + b2 * dq2
@@ -180,7 +193,7 @@ def shape_backward_kernel(
     tl.store(at(d_quats, i, 2, stride, 4, PLANAR), (hy - ny * along) / norm, mask=here)
     tl.store(at(d_quats, i, 3, stride, 4, PLANAR), (hz - nz * along) / norm, mask=here)
 
-    # Rows of J W: focal / z (W_row - limited W_2), and the mean on the image.
+    # The rows of J W, focal / z (W_row - limited W_2), and the 2-D mean.
     ga0 = r00 * dp0 + r01 * dp1 + r02 * dp2
     ga1 = r10 * dp0 + r11 * dp1 + r12 * dp2
     ga2 = r20 * dp0 + r21 * dp1 + r22 * dp2
@@ -195,7 +208,7 @@ def shape_backward_kernel(
     dz = g_z - (ga0 * a0 + ga1 * a1 + ga2 * a2 + gb0 * b0 + gb1 * b1 + gb2 * b2 + u * du + v * dv) / z
     dx, dy = du / z, dv / z
 
-    # The colour's part, by the direction m + W^T t, was left in d_means by the other kernel.
+    # color_backward_kernel left the part through the direction m + W^T t in d_means.
     n0, n1, n2 = load3(d_means, i, seen, stride, PLANAR)
     store3(
         d_means, i, here, stride,
@@ -204,7 +217,7 @@ def shape_backward_kernel(
     )  # fmt: skip
 
     if VIEWMAT:
-        # Of p = W m + t, of J W, and of the direction m + W^T t.
+        # Through p = W m + t, J W, and the direction m + W^T t.
         add_row(
             d_viewmat,
             dx * m0 + ku * ga0 + t0 * n0, dx * m1 + ku * ga1 + t0 * n1, dx * m2 + ku * ga2 + t0 * n2,
@@ -238,10 +251,10 @@ def project_backward(
     planar: int | None = None,
     into: tuple[Tensor, ...] | None = None,
 ) -> tuple[tuple[Tensor, ...], Tensor | None]:
-    """Gradients of the five groups, shaped and laid out like them (written to `into` if given), and of
-    viewmat [4,4] or None.
+    """Return the gradients of the five groups, shaped and laid out like them, and of viewmat [4,4] or None.
 
-    gradient [N, 16] as `composite_backward` fills it. Culled rows get exactly zero.
+    records and `planar` as in `project_records`; gradient [N, 16] as `composite_backward` fills it; the gradients of
+    the groups are written to `into` where given. Culled rows get exactly zero.
     """
     count = records.shape[0]
     used, room = (degree + 1) ** 2, 16 if planar is not None else groups[4].shape[1]

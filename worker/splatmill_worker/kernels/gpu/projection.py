@@ -1,22 +1,21 @@
-"""Device functions that both projection passes share: one block of Gaussians from world to the image
-plane.
-"""
+"""Device functions that both projection passes share: a block of Gaussians from the world to the image plane."""
 
 from __future__ import annotations
 
 import triton
 import triton.language as tl
 
-from .constant import constant
+from .. import records
+from .constant import LARGEST, constant
 from .harmonics import at
 
-BLUR = constant(0.3)
-LARGEST = constant(3.4028234e38)
+BLUR = constant(records.BLUR)
+COMPENSATION_MIN = constant(records.COMPENSATION_MIN)
 
 
 @triton.jit
 def finite(x):
-    """True where x is a number; written so that NaN and infinity fail."""
+    """Whether x is neither infinite nor NaN, which fails the comparison."""
     return tl.abs(x) <= LARGEST
 
 
@@ -43,9 +42,7 @@ def load4(pointer, i, here, stride, PLANAR: tl.constexpr):
 
 @triton.jit
 def load_camera(viewmat, K):
-    """Rows of the rotation, the translation, and fx, fy, cx, cy; read on the device, so that no launch
-    waits for them.
-    """
+    """Rows of the rotation, the translation, and fx, fy, cx, cy. Read by each program, so that no launch waits."""
     return (
         tl.load(viewmat), tl.load(viewmat + 1), tl.load(viewmat + 2),
         tl.load(viewmat + 4), tl.load(viewmat + 5), tl.load(viewmat + 6),
@@ -57,8 +54,9 @@ def load_camera(viewmat, K):
 
 @triton.jit
 def normalised(w, x, y, z):
-    """Unit quaternion and the norm it had. Scaled by the largest part first: the square of 1e-30 is 0 in
-    float32.
+    """The unit quaternion, and the norm that (w, x, y, z) had.
+
+    Divided by the largest component first, because the square of 1e-30 is 0 in float32.
     """
     largest = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
     w, x, y, z = w / largest, x / largest, y / largest, z / largest
@@ -78,23 +76,22 @@ def rotation(w, x, y, z):
 
 @triton.jit
 def slope_row(focal, z, limited, w0, w1, w2, w20, w21, w22):
-    """One row of J W: focal / z (W_row - limited W_2), with x/z or y/z held within 15 % outside the image."""
+    """One row of J W: focal / z (W_row - limited W_2), with x/z or y/z limited to 15 % outside the image."""
     k = focal / z
     return k * (w0 - limited * w20), k * (w1 - limited * w21), k * (w2 - limited * w22)
 
 
 @triton.jit
 def through(r0, r1, r2, r00, r01, r02, r10, r11, r12, r20, r21, r22):
-    """Row vector times R."""
+    """The row vector (r0, r1, r2) times the matrix R."""
     return r0 * r00 + r1 * r10 + r2 * r20, r0 * r01 + r1 * r11 + r2 * r21, r0 * r02 + r1 * r12 + r2 * r22
 
 
 @triton.jit
 def covariance(p0, p1, p2, q0, q1, q2):
-    """a, b, c of M M^T + 0.3 I from the rows of the factor M, det M M^T by Cauchy-Binet, and the whole
-    determinant.
+    """a, b, c of M M^T + 0.3 I from the rows of the factor M, det M M^T by Cauchy-Binet, and det (M M^T + 0.3 I).
 
-    a c - b b in float32 loses every digit for needles; the sum of squared minors of the factor loses none.
+    In float32, a c - b b loses every digit for needles; the sum of squared minors of the factor loses none.
     """
     tr0 = p0 * p0 + p1 * p1 + p2 * p2
     tr1 = q0 * q0 + q1 * q1 + q2 * q2

@@ -1,4 +1,4 @@
-"""Numbers of past steps, fetched while later ones run, so that no step waits for the device."""
+"""Numbers that steps measured, fetched while later steps run, so that no step waits for the device."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ import torch
 from torch import Tensor
 
 AHEAD = 8
-"""Steps that the host may be ahead of the device; more would only make what it reads older."""
+"""Steps that the host may be ahead of the device. More would only make the numbers it reads older."""
 
 
 class Numbers(NamedTuple):
-    """What one step measured. `key` says of which parameters and view: a generation, and the view's own
-    key.
+    """What one step measured.
+
+    key: the generation of the parameters (see `Step.replace`), and the key of the view.
+    loss, l1, ssim: of the photo.
+    visible, pairs: Gaussians and (tile, Gaussian) pairs of the view.
+    refused: gradient values that were not finite.
     """
 
     key: tuple[int, tuple[int, int, int]]
@@ -27,9 +31,9 @@ class Numbers(NamedTuple):
 
 
 class Readback:
-    """A queue of small copies to pinned memory, each with the event that says it has arrived.
+    """A queue of small copies to pinned memory, each with the event that marks its arrival.
 
-    steady: numbers come exactly `AHEAD` steps late, so that processes that compare notes read the same ones.
+    steady: numbers are handed out exactly `AHEAD` steps late, so that several processes read the same ones.
     """
 
     def __init__(self, *, steady: bool = False) -> None:
@@ -40,10 +44,9 @@ class Readback:
         self._latest: Numbers | None = None
 
     def post(self, key: tuple[int, tuple[int, int, int]], values: Tensor) -> list[Numbers]:
-        """Send values [6] (loss, L1, SSIM, visible, pairs, refused; float64) on their way; returns all that
-        has arrived since.
+        """Start the copy of values [6] float64, the fields of `Numbers` after the key; returns what has arrived since.
 
-        Waits only when nothing has ever arrived, or the host is `AHEAD` steps in front.
+        Waits only when nothing has ever arrived, or when the host is `AHEAD` steps in front.
         """
         if values.is_cuda:
             here = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
@@ -69,7 +72,7 @@ class Readback:
 
     @property
     def latest(self) -> Numbers:
-        """Of the most recent step that has been heard from."""
+        """The numbers of the most recent step that has arrived."""
         if self._latest is None:
-            raise RuntimeError("no step has been posted yet")
+            raise RuntimeError("No step has been posted yet.")
         return self._latest

@@ -1,12 +1,11 @@
-"""One scene under optimisation on the GPU: parameters in planes, and a training step that never waits for
-the device.
-"""
+"""The training step on the GPU: a scene's parameters in planes, and a step that does not wait for the device."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import NamedTuple, Protocol
 
 import torch
@@ -15,9 +14,10 @@ import triton.language as tl
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from splatmill_worker.kernels.records import Rates, Scores
+from splatmill_worker.kernels.records import GROUPS, PARAMETERS, Rates
 
-from . import adam, device
+from . import adam, device, record
+from .argument import Float, Floats, Int
 from .bin import Lists, Room, lists
 from .blended import Blended
 from .composite import blend
@@ -26,57 +26,77 @@ from .loss import loss_and_gradient
 from .project import project_records
 from .project_backward import project_backward
 from .readback import Readback
+from .record import EXTENT_X, EXTENT_Y, GRADIENT_STRIDE, MEAN_X, MEAN_Y, STRIDE
 
-ViewKey = tuple[int, int, int]  # address of the camera's matrix, width, height
-CHANNELS = 59
-PARTS = {"means": (0, 3), "log_scales": (3, 6), "quats": (6, 10), "logit_opacities": (10, 11), "sh": (11, 59)}
-SLACK, SPARE = 1.25, 4096
-"""Room for a view's lists over what its last visit used: views change little from visit to visit,
-parameters move slowly.
-"""
+ViewKey = tuple[int, int, int]
+"""What a view is recognised by: address of its viewmat, width and height in pixels."""
+
+PLANES = {
+    name: slice(end - GROUPS[name], end)
+    for name, end in zip(GROUPS, accumulate(GROUPS.values()), strict=True)
+}
+"""The planes of each parameter group among the 59."""
+
+PLAIN_SUM, VISIBLE_COUNT, MAX_EXTENT = range(3)
+"""Rows of the densification scores [3, N]."""
+
+SLACK = 1.25
+"""Room for a view's lists, over what its last visit used: the parameters move slowly from visit to visit."""
+
+SPARE = 4096
+"""Splats, and pairs, of room on top of that."""
 
 
 class Together(Protocol):
-    """Several processes that train one scene; each call changes a tensor in place, to the same bits in all
-    of them.
-    """
+    """Several processes that train one scene; every call leaves the same bits in all of them."""
 
-    def average_(self, values: Tensor) -> None: ...
-    def add_(self, values: Tensor) -> None: ...
-    def largest_(self, values: Tensor) -> None: ...
+    def average_(self, values: Tensor) -> None:
+        """Replace values by their mean over the processes."""
+
+    def add_(self, values: Tensor) -> None:
+        """Replace values by their sum over the processes."""
+
+    def largest_(self, values: Tensor) -> None:
+        """Replace values by their maximum over the processes."""
 
 
 class StepResult(NamedTuple):
-    """Of the latest step whose numbers have arrived, up to `readback.AHEAD` steps ago: waiting for them
-    would idle the GPU.
+    """What the latest step measured of which the host has heard, up to `readback.AHEAD` steps ago.
+
+    Waiting for the step just enqueued would leave the GPU idle.
+
+    loss: (1 - w) l1 + w (1 - ssim).
+    l1, ssim: means over the pixels used.
+    visible: Gaussians that are not culled.
+    pairs: (tile, Gaussian) pairs.
+    refused: gradient values that were not finite and were left out of the update.
     """
 
-    loss: float  # (1 - w) l1 + w (1 - ssim)
+    loss: float
     l1: float
     ssim: float
     visible: int
     pairs: int
-    refused: int  # gradient values that were not finite, and were left out of the update
+    refused: int
 
 
 @triton.jit
-def scores_kernel(gradient, records, scores, count, half_width, half_height, per_image, BLOCK: tl.constexpr):
-    """Add one view to scores [4, N]: plain and absolute gradient of the mean in NDC units, visits, largest extent."""
+def scores_kernel(
+    gradient: Floats, records: Floats, scores: Floats, count: Int, half_width: Float, half_height: Float,
+    per_image: Float, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Add one view to scores [3, N]: the norm of the mean's gradient in NDC units, the visit, the largest extent."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
-    source = records + i.to(tl.int64) * 12
-    extent_x = tl.load(source + 10, mask=here, other=0.0)
-    extent_y = tl.load(source + 11, mask=here, other=0.0)
+    source = records + i.to(tl.int64) * STRIDE
+    extent_x = tl.load(source + EXTENT_X, mask=here, other=0.0)
+    extent_y = tl.load(source + EXTENT_Y, mask=here, other=0.0)
     seen = here & (extent_x > 0.0)
-    row = gradient + i.to(tl.int64) * 16
-    x = tl.load(row, mask=seen, other=0.0) * half_width
-    y = tl.load(row + 1, mask=seen, other=0.0) * half_height
-    ax = tl.load(row + 10, mask=seen, other=0.0) * half_width
-    ay = tl.load(row + 11, mask=seen, other=0.0) * half_height
+    row = gradient + i.to(tl.int64) * GRADIENT_STRIDE
+    x = tl.load(row + MEAN_X, mask=seen, other=0.0) * half_width
+    y = tl.load(row + MEAN_Y, mask=seen, other=0.0) * half_height
     place = scores + i
     tl.store(place, tl.load(place, mask=seen) + tl.sqrt_rn(x * x + y * y), mask=seen)
-    place += count
-    tl.store(place, tl.load(place, mask=seen) + tl.sqrt_rn(ax * ax + ay * ay), mask=seen)
     place += count
     tl.store(place, tl.load(place, mask=seen) + 1.0, mask=seen)
     place += count
@@ -86,7 +106,7 @@ def scores_kernel(gradient, records, scores, count, half_width, half_height, per
 
 @dataclass
 class _View:
-    """The last forward pass: what its backward pass needs."""
+    """What the backward pass needs of the last forward pass."""
 
     key: ViewKey
     viewmat: Tensor
@@ -103,14 +123,21 @@ class _View:
 class Step:
     """Parameters, Adam moments and densification scores of one scene, and the training step over them.
 
-    The interface of `kernels.cpu.step.Step`. Tensors that come from the host (photos, cameras) are copied
-    once and kept as long as the caller keeps them; the first visit of a view reads its list sizes back, later
-    ones use room from the visit before. Adam moves the Gaussians that a view shows; the others are brought up
-    to date when they are seen again, or read.
+    Its methods are those of `kernels.cpu.step.Step`, without photo statistics and gradients to the camera. Photos,
+    masks and cameras on the host are copied to the device once, and the copy is kept as long as the caller keeps the
+    tensor. The first visit of a view reads the sizes of its lists back; later visits use room for what the visit before
+    needed. Adam moves the Gaussians that are visible; the others make up for the steps missed when they are visible
+    again, or read.
 
-    together: the processes whose views a step is averaged over; see `splat.engine.parallel`. Raises GpuUnavailable
-    where these kernels cannot run, and GpuMemoryShort when memory runs out, with the scene as it was before
-    the call.
+    keep_scores: whether steps add to the densification scores.
+    overflowed: steps whose lists had more pairs than room; the farthest pairs were left out.
+    refused: gradient values that were not finite and were left out, over all steps heard of.
+
+    The scores are views [N] that add up over steps until `replace` or `clear_scores`: `plain_sum`, `visible_count` and
+    `max_extent`, in the units of `kernels.cpu.step.Step`.
+
+    Raises GpuUnavailable where these kernels cannot run, and GpuMemoryShort when memory runs out, with the scene as it
+    was before the call.
     """
 
     def __init__(
@@ -124,28 +151,29 @@ class Step:
         where: torch.device | str | None = None,
         together: Together | None = None,
     ) -> None:
-        self.keep_scores: Scores | None = "absolute"
+        """Take means [N,3], log_scales [N,3], quats [N,4], logit_opacities [N] and sh [N, up to 16, 3].
+
+        where: the device; None is the current GPU, or the CPU under the interpreter. together: the processes over whose
+        views a step is averaged.
+        """
+        self.keep_scores = True
         if where is None:
             where = "cpu" if device.interpreting() else "cuda"
         self.device = torch.device(where)
         if self.device.type != "cpu" and (reason := device.absence(self.device.index or 0)) is not None:
             raise device.GpuUnavailable(reason)
         if self.device.type == "cuda" and self.device.index is None:
-            self.device = torch.device(
-                "cuda", torch.cuda.current_device()
-            )  # as the tensors' own device reads
+            # With its number, as in the device of its tensors.
+            self.device = torch.device("cuda", torch.cuda.current_device())
         self._together = together
         self._rooms: dict[ViewKey, Room] = {}
         self._resident: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
         self._readback = Readback(steady=together is not None)
         self._steps = 0
-        self._generation = (
-            0  # of the parameters; what arrives late from before a `replace` says nothing of room
-        )
+        # Counts `replace`: list sizes that arrive from before the last one say nothing of the room needed now.
+        self._generation = 0
         self.overflowed = 0
-        """Steps whose lists did not fit into their room: their farthest pairs were left out."""
         self.refused = 0
-        """Gradient values that were not finite and were left out, over all steps."""
         self.replace(
             {
                 "means": means,
@@ -165,51 +193,51 @@ class Step:
 
     @property
     def plain_sum(self) -> Tensor:
-        return self._scores[0]
-
-    @property
-    def abs_sum(self) -> Tensor:
-        return self._scores[1]
+        return self._scores[PLAIN_SUM]
 
     @property
     def visible_count(self) -> Tensor:
-        return self._scores[2]
+        return self._scores[VISIBLE_COUNT]
 
     @property
     def max_extent(self) -> Tensor:
-        return self._scores[3]
+        return self._scores[MAX_EXTENT]
 
     def clear_scores(self) -> None:
-        """Start the scores anew."""
+        """Set the scores to 0."""
         self._scores.zero_()
 
     def parameters(self) -> dict[str, Tensor]:
-        """Copies [N, ...] of the five groups, brought up to date; sh [N, 16, 3]."""
+        """Return copies [N, ...] of the five groups after all steps, the missed ones included; sh [N, 16, 3]."""
         self._catch_up()
         shapes = {"logit_opacities": (self.count,), "sh": (self.count, 16, 3)}
         return {
-            name: self._params[a:b].t().reshape(shapes.get(name, (self.count, b - a))).clone()
-            for name, (a, b) in PARTS.items()
+            name: self._params[planes].t().reshape(shapes.get(name, (self.count, GROUPS[name]))).clone()
+            for name, planes in PLANES.items()
         }
 
     def moments(self) -> tuple[Tensor, Tensor]:
-        """Adam's first and second moments [N, 59] each, in the order of `parameters`, brought up to date."""
+        """Return Adam's first and second moments, [N, 59] each, after all steps; columns in the order of `GROUPS`."""
         self._catch_up()
         return self._exp_avg.t().contiguous(), self._exp_avg_sq.t().contiguous()
 
     def replace(
         self, parameters: dict[str, Tensor], exp_avg: Tensor | None, exp_avg_sq: Tensor | None
     ) -> None:
-        """Take over other parameters, and moments [N, 59] (None: zero); scores start again at zero."""
+        """Take other parameters, with moments [N, 59] or zeros, and set the scores to 0.
+
+        parameters [N, ...] by group; sh with fewer than 16 coefficients is padded with zeros. Raises ValueError for
+        groups that are too wide.
+        """
         with self._sparing():
-            rows = [parameters[name].detach().reshape(parameters["means"].shape[0], -1) for name in PARTS]
-            if rows[-1].shape[1] < 48:
-                rows[-1] = torch.nn.functional.pad(rows[-1], (0, 48 - rows[-1].shape[1]))
+            rows = [parameters[name].detach().reshape(parameters["means"].shape[0], -1) for name in GROUPS]
+            if rows[-1].shape[1] < GROUPS["sh"]:
+                rows[-1] = torch.nn.functional.pad(rows[-1], (0, GROUPS["sh"] - rows[-1].shape[1]))
             params = torch.cat(rows, 1).to(self.device, torch.float32).t().contiguous()
             count = params.shape[1]
-            if params.shape[0] != CHANNELS:
+            if params.shape[0] != PARAMETERS:
                 raise ValueError(
-                    f"parameters: {params.shape[0]} values per Gaussian where {CHANNELS} are needed"
+                    f"parameters: expected {PARAMETERS} values for each Gaussian, got {params.shape[0]}"
                 )
             moments = [
                 torch.zeros_like(params)
@@ -217,7 +245,7 @@ class Step:
                 else given.to(self.device, torch.float32).t().contiguous()
                 for given in (exp_avg, exp_avg_sq)
             ]
-            scores = torch.zeros(4, count, device=self.device)
+            scores = torch.zeros(3, count, device=self.device)
             gradient = torch.empty_like(params)
             last = torch.full((count,), self._steps, dtype=torch.int32, device=self.device)
         grown = count / max(1, self.count) if hasattr(self, "_params") else 1.0
@@ -242,8 +270,9 @@ class Step:
         antialias: bool = False,
         near: float = 0.01,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Colour [H, W, 3], alpha [H, W] and depth [H, W] on the device; `backward_update` takes it from
-        here.
+        """Render color [H,W,3], alpha [H,W] and depth [H,W] = sum of weight times z, on the device.
+
+        viewmat [4,4] world to camera, K [3,3] pixels. `backward_update` differentiates the last call.
         """
         with self._sparing():
             self._view = self._shown(
@@ -262,9 +291,15 @@ class Step:
         rates: Rates,
         step: int,
     ) -> None:
-        """Gradient of the last `forward` and one Adam step (number `step`, from 1)."""
+        """Differentiate the last `forward` and move the visible Gaussians by Adam's step number `step`, from 1.
+
+        d_color [H,W,3], d_alpha [H,W] and d_depth [H,W] are the loss's gradients to what `forward` gave. Raises
+        RuntimeError without a `forward` since the last update.
+        """
         if self._view is None:
-            raise RuntimeError("backward_update needs a forward pass before it.")
+            raise RuntimeError(
+                "There is nothing to differentiate; backward_update needs a forward pass before it."
+            )
         view, self._view = self._view, None
         with self._sparing():
             given = [None if d is None else d.to(self.device) for d in (d_color, d_alpha, d_depth)]
@@ -289,7 +324,11 @@ class Step:
         antialias: bool = False,
         near: float = 0.01,
     ) -> StepResult:
-        """Forward, loss against photo uint8 [H, W, 3], backward and Adam, enqueued as a whole."""
+        """One step on one photo, enqueued as a whole: render, L1 + D-SSIM, gradients, scores, Adam.
+
+        photo uint8 [H,W,3]; mask [H,W], nonzero where a pixel is used; step counts from 1. The numbers returned are
+        those of an earlier step; see `StepResult`.
+        """
         height, width = photo.shape[:2]
         with self._sparing():
             view = self._shown(viewmat, K, width, height, degree, background, antialias, near, depth=False)
@@ -336,20 +375,20 @@ class Step:
         d_alpha: Tensor | None,
         d_depth: Tensor | None,
     ) -> Tensor:
-        """Fill the gradient planes and add to the scores; which Gaussians have a gradient, uint8 [N]."""
+        """Fill the gradient planes, add to the scores, and return which Gaussians have a gradient, uint8 [N]."""
         size = (view.width, view.height)
         image = view.image
         gradient = blend_backward(
             view.records, view.lists.bins, image, *size, d_color,
-            d_alpha=d_alpha, d_depth=d_depth, scores=self.keep_scores is not None,
+            d_alpha=d_alpha, d_depth=d_depth,
         )  # fmt: skip
         project_backward(
             self._groups(self._params), view.viewmat, view.K, *size, view.records, gradient,
             degree=view.degree, antialias=view.antialias, planar=self.count, into=self._groups(self._gradient),
         )  # fmt: skip
-        if self.keep_scores is not None:
+        if self.keep_scores:
             self._score(view, gradient)
-        return (view.records[:, 10] > 0).to(torch.uint8)
+        return record.visible(view.records).to(torch.uint8)
 
     def _score(self, view: _View, gradient: Tensor) -> None:
         """Add a view's gradient records [N, 16] to the scores, of all processes where there are several."""
@@ -360,15 +399,15 @@ class Step:
                 2.0 / max(view.width, view.height), BLOCK=256,
             )  # fmt: skip
         if self._together is not None:
-            extent = scores[3].clone()
+            extent = scores[MAX_EXTENT].clone()
             self._together.largest_(extent)
-            scores[3] = 0.0
+            scores[MAX_EXTENT] = 0.0
             self._together.add_(scores)
             self._scores += scores
-            torch.maximum(self._scores[3], extent, out=self._scores[3])
+            torch.maximum(self.max_extent, extent, out=self.max_extent)
 
     def _move(self, seen: Tensor, degree: int, rates: Rates, step: int, refused: Tensor) -> None:
-        channels = 11 + 3 * (degree + 1) ** 2
+        channels = PLANES["sh"].start + 3 * (degree + 1) ** 2
         if self._together is not None:
             # A Gaussian that any process saw moves in all of them.
             self._together.average_(self._gradient[:channels])
@@ -391,14 +430,14 @@ class Step:
         )
 
     def _catch_up(self) -> None:
-        """What dense Adam with zero gradients would have left of those that recent views did not show."""
+        """Bring every Gaussian to where dense Adam would have it, with zero gradients while it was not visible."""
         if self._rates is None or not self.count:
             return
         everyone = torch.ones(self.count, dtype=torch.uint8, device=self.device)
         missed = adam.CatchUp(everyone, self._last, self._steps + 1)
         self._last.fill_(self._steps)
         rates = torch.tensor(self._rates, device=self.device).repeat_interleave(
-            torch.tensor([3, 3, 4, 1, 3, 45], device=self.device)
+            torch.tensor([*list(GROUPS.values())[:-1], 3, GROUPS["sh"] - 3], device=self.device)
         )
         drift = torch.where(self._exp_avg_sq > 0, self._exp_avg / self._exp_avg_sq.sqrt(), 0.0)
         self._params -= rates[:, None] * missed.travel * drift
@@ -406,7 +445,7 @@ class Step:
         self._exp_avg_sq *= missed.decay2
 
     def _listen(self, key: ViewKey, losses: Tensor, used: Tensor, refused: Tensor) -> None:
-        """Send a step's numbers to the host, and give views room by what has arrived."""
+        """Send a step's numbers to the host, and set the room of the views whose numbers have arrived."""
         values = torch.cat([losses.double(), used.double(), refused.double()])
         for numbers in self._readback.post((self._generation, key), values):
             self.refused += numbers.refused
@@ -419,7 +458,7 @@ class Step:
             self._rooms[key] = _room(numbers.visible, numbers.pairs)
 
     def _here(self, tensor: Tensor) -> Tensor:
-        """The tensor on this device; a copy is made once and kept while the caller keeps the original."""
+        """Return the tensor on this device. A copy is made once, and kept while the caller keeps the original."""
         if tensor.device == self.device:
             return tensor.contiguous()
         held = self._resident.get(tensor)
@@ -430,22 +469,18 @@ class Step:
         return held
 
     def _sent(self, tensor: Tensor) -> Tensor:
-        """A copy on this device. From pinned memory, because a copy from any other waits for all that is
-        enqueued.
-        """
+        """Return a copy on this device, from pinned memory: from any other, the copy waits for all that is enqueued."""
         if tensor.device.type == "cpu" and self.device.type == "cuda":
             return tensor.contiguous().pin_memory().to(self.device, non_blocking=True)
         return tensor.to(self.device).contiguous()
 
     def _groups(self, planes: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        a, b, c, d, e = (planes[first:last] for first, last in PARTS.values())
-        return a, b, c, d[0], e
+        means, log_scales, quats, logit_opacities, sh = (planes[group] for group in PLANES.values())
+        return means, log_scales, quats, logit_opacities[0], sh
 
     @contextmanager
     def _sparing(self) -> Iterator[None]:
-        """Turn the allocator's failure into one that says what to do; nothing is changed before all is
-        allocated.
-        """
+        """Turn a failed allocation into GpuMemoryShort; code inside changes the scene only after it has allocated."""
         try:
             yield
         except torch.OutOfMemoryError as error:

@@ -1,6 +1,4 @@
-"""Launch settings: what the autotuner may choose from, measured once per kernel and card and kept in
-Triton's cache on disk.
-"""
+"""Launch settings that the autotuner chooses from. It measures once per kernel and GPU and keeps the result on disk."""
 
 from __future__ import annotations
 
@@ -11,7 +9,7 @@ import triton
 
 from .device import interpreting
 
-# Passes that memory bounds gain nothing from a choice; the walks through the lists do.
+# One setting for the passes that are bound by memory; several for those that walk the lists.
 PROJECT = [triton.Config({"BLOCK": 128}, num_warps=4)]
 PROJECT_BACKWARD = [triton.Config({"BLOCK": 64}, num_warps=2)]
 LOSS = [triton.Config({"BLOCK": 256}, num_warps=4)]
@@ -32,11 +30,11 @@ def autotune(
     *,
     reset: Sequence[str] = (),
 ) -> Callable[[Any], Any]:
-    """Triton's autotuner with its results on disk; `reset` names accumulators (or None) to zero between
-    trials.
+    """Return Triton's autotuner with results on disk; `key` names the constants that a result depends on.
 
-    Under the interpreter timing means nothing, and the first setting is taken. `reset` must not name an array
-    whose contents before the launch matter: the tuner zeroes it also before the launch that counts.
+    reset: arrays that the kernel adds to (they may be None), set to 0 before each trial and before the launch itself;
+    what such an array holds before the launch is lost. Under the interpreter the first setting is taken, since times
+    mean nothing there.
     """
 
     def before(arguments: Mapping[str, Any], reset_only: bool = False) -> None:

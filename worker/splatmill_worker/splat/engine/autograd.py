@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.kernels.records import Rates, Scores
+from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.motion import motion
@@ -24,7 +24,7 @@ class AutogradStep:
 
     def __init__(self, gaussians: Gaussians, *, backend: ops.Backend) -> None:
         self._backend = backend
-        self.keep_scores: Scores | None = "plain"  # autograd has them anyway
+        self.keep_scores = True
         self.keep_pose_gradient = False
         self.pose_gradient: Tensor | None = None
         self.replace(gaussians.padded(3).parameters(), None, None)

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
-from splatmill_worker.kernels.records import Rates, Scores
+from splatmill_worker.kernels.records import Rates
 
 
 class StepResult(NamedTuple):
@@ -29,7 +29,7 @@ class Engine(Protocol):
     camera exp(twist^) viewmat, as `kernels.cpu.step` defines it.
     """
 
-    keep_scores: Scores | None
+    keep_scores: bool
     keep_pose_gradient: bool
     pose_gradient: Tensor | None
 

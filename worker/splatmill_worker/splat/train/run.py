@@ -122,8 +122,7 @@ class Run:
         self.ever_saw |= result.visible > 0
         self.health.watch(self.step, result.loss, result.visible)
         # What nobody will read is not summed.
-        read = self.plan.densify and progress < schedule.densify_until
-        self.engine.keep_scores = "plain" if read else None
+        self.engine.keep_scores = self.plan.densify and progress < schedule.densify_until
         if self.plan.densify and schedule.densifies(self.step, progress):
             self._densify()
 
