@@ -1,1 +1,1 @@
-"""The Splatmill REST API: `create_app(settings)` makes it, `python -m splatmill_server` serves it."""
+"""The Splatmill REST API: `create_app(settings)` returns the app, `python -m splatmill_server` serves it."""

@@ -1,4 +1,4 @@
-"""`python -m splatmill_server`: serve the API as the environment says, or the options given here."""
+"""`python -m splatmill_server`: serves the API, configured by environment variables and command-line options."""
 
 import argparse
 import logging
@@ -21,25 +21,25 @@ from splatmill_server.settings import Settings
 log = structlog.get_logger()
 
 GRACE_SECONDS = 5
-"""How long requests under way may take to end after a signal to stop."""
+"""Seconds for which running requests may continue after a signal to stop."""
 
 
 class Server(uvicorn.Server):
-    """Tells the app at the first signal, so that event streams end instead of using up the grace."""
+    """A server that informs the app of the first signal, so that event streams end before the grace period does."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
         super().__init__(config)
         self._app = app
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        # uvicorn's own would raise the signal again after a clean end, and nothing after `run` would happen.
+        # uvicorn's own method raises the signal again after `run`, so the code after `run` would not be reached.
         self._app.state.service.closing.set()
         self.force_exit = self.should_exit and sig == signal.SIGINT
         self.should_exit = True
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve until a signal. Returns the exit status: 0, or 2 after a sentence about what has to be mended."""
+    """Serve until a signal arrives. Return the exit status: 0, 1 if the start failed, 2 for invalid settings."""
     given = vars(_options().parse_args(arguments))
     configure_logging()
     try:
@@ -65,8 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m splatmill_server",
-        description="Serve the Splatmill API.",
-        epilog="Everything else is set by environment variables: REDIS_URL and "
+        description="Serve the Splatmill REST API.",
+        epilog="All other settings are environment variables: REDIS_URL and "
         + ", ".join(f"SPLATMILL_{name.upper()}" for name in Settings.model_fields if name != "redis_url"),
     )
     for name in ("host", "port", "uds"):
@@ -75,7 +75,7 @@ def _options() -> argparse.ArgumentParser:
 
 
 def listen(settings: Settings) -> socket.socket:
-    """The socket to serve on. Raises OSError with a sentence when the address cannot be had."""
+    """Return the listening socket. Raises OSError, with a sentence, if the address is not available."""
     if settings.uds is not None:
         return _listen_unix(settings.uds)
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
@@ -86,8 +86,9 @@ def listen(settings: Settings) -> socket.socket:
     except OSError as error:
         listener.close()
         raise OSError(
-            f"The address {settings.host}:{settings.port} cannot be listened on: {error.strerror}. "
-            "Stop what uses it, or set SPLATMILL_PORT to another port (0 takes any free one)."
+            f"Cannot listen on {settings.host}:{settings.port}: {error.strerror}. "
+            "Stop the program that uses the port, or set SPLATMILL_PORT to another one (0 takes "
+            "any free port)."
         ) from error
     return listener
 
@@ -98,10 +99,10 @@ def _listen_unix(path: Path) -> socket.socket:
     try:
         probe.connect(str(path))
     except OSError:
-        path.unlink(missing_ok=True)  # Left over from a server that was killed; nobody answers there.
+        path.unlink(missing_ok=True)  # left by a server that was killed
     else:
         listener.close()
-        raise OSError(f"Another server answers on {path}; stop it, or set SPLATMILL_UDS to another path.")
+        raise OSError(f"Another server listens on {path}; stop it, or set SPLATMILL_UDS to another path.")
     finally:
         probe.close()
     try:
@@ -110,25 +111,28 @@ def _listen_unix(path: Path) -> socket.socket:
         path.chmod(0o600)
     except OSError as error:
         listener.close()
-        raise OSError(f"The socket {path} cannot be made: {error.strerror or error}.") from error
+        raise OSError(
+            f"The socket {path} cannot be created: {error.strerror or error}. Set SPLATMILL_UDS "
+            f"to another path."
+        ) from error
     return listener
 
 
 def configure_logging(level: int = logging.INFO) -> None:
-    """Lines for people on a terminal, JSON otherwise; uvicorn's own messages in the same form."""
+    """Log readable lines on a terminal and JSON otherwise, also for uvicorn's messages."""
     shared: list[structlog.types.Processor] = [
         structlog.contextvars.merge_contextvars,
         structlog.processors.add_log_level,
         structlog.processors.TimeStamper(fmt="iso", utc=True),
     ]
-    people = sys.stderr.isatty()
+    terminal = sys.stderr.isatty()
     renderer: structlog.types.Processor = (
-        # Plain traces: the rich ones print every local variable, keys included.
+        # Rich tracebacks would print all local variables, including keys.
         structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)
-        if people
+        if terminal
         else structlog.processors.JSONRenderer()
     )
-    errors = [] if people else [structlog.processors.format_exc_info]
+    errors = [] if terminal else [structlog.processors.format_exc_info]
     structlog.configure(
         processors=[*shared, *errors, renderer],
         wrapper_class=structlog.make_filtering_bound_logger(level),

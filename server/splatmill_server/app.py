@@ -1,4 +1,4 @@
-"""The ASGI app: `create_app(settings)`. Importing this module does nothing; making an app opens its storage."""
+"""`create_app`, which returns the ASGI app. Importing this module has no side effects."""
 
 import asyncio
 import contextlib
@@ -14,7 +14,7 @@ import splatmill
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import CreateJob, EventRecord, Problem
 from splatmill_server import problems
-from splatmill_server.edge import Edge
+from splatmill_server.middleware import RequestMiddleware
 from splatmill_server.routes import captures, job_outputs, jobs, models, status
 from splatmill_server.service import Service
 from splatmill_server.settings import Settings
@@ -24,15 +24,15 @@ log = structlog.get_logger()
 _DESCRIPTION = """Photos in, Gaussian splats out.
 
 Upload photos to a capture, start a job on it, follow its events, and download or render the model.
-Errors are problem documents (RFC 9457) with a stable `code`, the facts, and advice.
+Errors are problem documents (RFC 9457) with a stable `code`, the facts behind them, and advice.
 Cameras are 4x4 row-major camera-to-world matrices with OpenCV axes (x right, y down, z forward).
 """
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
-    """The app for these settings (default: from the environment).
+    """Return the app for `settings`; by default, for the settings in the environment.
 
-    Redis need not be there yet. Raises StorageError when the storage cannot be opened.
+    Redis need not run yet. Raises StorageError if storage cannot be opened.
     """
     settings = settings or Settings()
     service = Service.of(settings)
@@ -40,7 +40,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         reaper = asyncio.create_task(service.reaper.run())
-        sweep = asyncio.create_task(run_in_threadpool(_sweep, service))
+        clean_up = asyncio.create_task(run_in_threadpool(_clean_up, service))
         try:
             yield
         finally:
@@ -48,7 +48,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             reaper.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await reaper
-            await sweep
+            await clean_up
             await service.close()
 
     app = FastAPI(
@@ -57,7 +57,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         description=_DESCRIPTION,
         lifespan=lifespan,
         redoc_url=None,
-        middleware=[Middleware(Edge, settings=settings, metrics=service.metrics)],
+        middleware=[Middleware(RequestMiddleware, settings=settings, metrics=service.metrics)],
     )
     app.state.service = service
     problems.install(app)
@@ -67,16 +67,16 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     return app
 
 
-def _sweep(service: Service) -> None:
+def _clean_up(service: Service) -> None:
     try:
-        if gone := service.captures.sweep():
-            log.info("removed what broken uploads had left", files=gone)
+        if deleted := service.captures.delete_abandoned_uploads():
+            log.info("deleted abandoned uploads", files=deleted)
     except StorageError as error:
-        log.warning("could not look for broken uploads", error=str(error))
+        log.warning("could not look for abandoned uploads", error=str(error))
 
 
 def _describe(app: FastAPI, *, with_key: bool) -> None:
-    """Add to the OpenAPI document what FastAPI cannot see: models behind `$ref`s of ours, and the API key."""
+    """Add what FastAPI cannot infer to the OpenAPI document: models that only `$ref`s name, and the API key."""
 
     def openapi() -> dict[str, object]:
         if app.openapi_schema is None:
@@ -97,4 +97,4 @@ def _describe(app: FastAPI, *, with_key: bool) -> None:
             app.openapi_schema = document
         return app.openapi_schema
 
-    app.openapi = openapi  # type: ignore[method-assign]
+    app.openapi = openapi  # type: ignore[method-assign]  # FastAPI documents this assignment

@@ -1,4 +1,4 @@
-"""Captures: their record, their files, and the rule that a name belongs to the first bytes stored under it."""
+"""Captures: their records and files. The first bytes stored under a name keep it."""
 
 import asyncio
 import hashlib
@@ -17,27 +17,27 @@ from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError
 from splatmill_server.settings import Settings
 
-_READS_AT_ONCE = 32
+_CONCURRENT_READS = 32
 _COUNTED_CAPTURES = 1000
 _STALE_SECONDS = 24 * 3600
-"""Age after which an unfinished upload belongs to no request any more."""
+"""Age at which an unfinished upload counts as abandoned."""
 
 _CLAIM_SECONDS = 60
-"""How long a digest without a file counts as an upload that is just being put in place."""
+"""Seconds for which a digest without a file counts as an upload that is about to be renamed into place."""
 
 
 class Captures:
-    """Captures live in storage alone, so they outlast Redis."""
+    """All operations on captures. Captures exist in storage only, independently of Redis."""
 
     def __init__(self, storage: Storage, settings: Settings, metrics: Metrics) -> None:
         self.storage = storage
         self.settings = settings
         self.metrics = metrics
-        # Files per capture as this process last saw it: listing a folder for each of its uploads would be quadratic.
+        # Number of files per capture, as last seen: listing the folder at each upload would take quadratic time.
         self._counts: dict[str, int] = {}
 
     def create(self, name: str | None = None) -> Capture:
-        """A new, empty capture."""
+        """Create an empty capture."""
         capture = Capture(id=secrets.token_hex(8), name=name, created_at=datetime.now(UTC))
         self.storage.put(
             layout.capture_record(capture.id), capture.model_dump_json(exclude={"files"}).encode()
@@ -45,7 +45,7 @@ class Captures:
         return capture
 
     def record(self, capture_id: str) -> Capture:
-        """The record without the files. Raises a 404 problem."""
+        """Return the record without the files. Raises a 404 problem."""
         if layout.is_id(capture_id):
             try:
                 return Capture.model_validate_json(self.storage.get(layout.capture_record(capture_id)))
@@ -54,15 +54,15 @@ class Captures:
         raise ProblemError(
             "capture_not_found",
             f"There is no capture {capture_id[:80]!r}.",
-            advice="GET /v1/captures lists them; POST /v1/captures makes one.",
+            advice="List captures with GET /v1/captures, or create one with POST /v1/captures.",
         )
 
     async def read(self, capture_id: str) -> Capture:
-        """The record with every file and its digest."""
+        """Return the record with all files and their digests. Raises a 404 problem."""
         capture = await run_in_threadpool(self.record, capture_id)
         folder = layout.capture_files(capture_id)
         found = await run_in_threadpool(lambda: list(self.storage.entries(folder)))
-        gate = asyncio.Semaphore(_READS_AT_ONCE)
+        gate = asyncio.Semaphore(_CONCURRENT_READS)
 
         async def describe(entry: Entry) -> CaptureFile | None:
             role, _, name = entry.path[len(folder) + 1 :].partition("/")
@@ -74,13 +74,13 @@ class Captures:
         return capture.model_copy(update={"files": [file for file in files if file is not None]})
 
     def page(self, cursor: str | None, limit: int) -> CapturePage:
-        """Captures, newest first."""
+        """Return a page of captures, newest first. Raises a 422 problem for a cursor that is not valid."""
         records = []
         for capture_id in self.storage.children(layout.captures()):
             try:
                 records.append(self.record(capture_id))
             except ProblemError:
-                continue  # Being made or being deleted.
+                continue  # it is being created or deleted
         keyed = sorted(((int(c.created_at.timestamp() * 1000), c.id, c) for c in records), reverse=True)
         if cursor is not None:
             after = read_cursor(cursor)
@@ -90,48 +90,53 @@ class Captures:
         return CapturePage(captures=[capture for _, _, capture in page], cursor=following)
 
     def delete(self, capture_id: str) -> None:
-        """Remove a capture and all its files. The record goes first, so that no half capture is ever seen."""
+        """Delete a capture and its files. The record goes first, so that no incomplete capture is visible."""
         self.record(capture_id)
         self.storage.delete(layout.capture_record(capture_id))
         self.storage.delete_prefix(layout.capture(capture_id))
         self._counts.pop(capture_id, None)
 
-    def sweep(self) -> int:
-        """Remove what uploads left that were under way when a server was killed; how many files went."""
-        gone = 0
+    def delete_abandoned_uploads(self) -> int:
+        """Delete the files of uploads that a killed server left unfinished, and return their number."""
+        deleted = 0
         for capture_id in self.storage.children(layout.captures()):
             folder = layout.capture_incoming(capture_id)
-            gone += self.storage.delete_stale(folder, _STALE_SECONDS)
-        return gone
+            deleted += self.storage.delete_stale(folder, _STALE_SECONDS)
+        return deleted
 
     def check_trainable(self, capture_id: str) -> None:
-        """Refuse what cannot become a scene whatever the photos show. Raises 404 or 422 problems."""
+        """Raise a 404 or 422 problem for a capture that certainly cannot be trained: it has no photos, or only one."""
         self.record(capture_id)
         images = list(self.storage.entries(layout.capture_files(capture_id, Role.images)))
         if not images:
             raise ProblemError(
                 "no_images",
                 "The capture holds no images.",
-                advice="Upload photos, a video or a zip with PUT /v1/captures/{id}/images/{name} first.",
+                advice="Upload photos, a video or a zip archive with PUT "
+                "/v1/captures/{id}/images/{name} first.",
             )
         photos = all(entry.path.lower().endswith(PHOTO_SUFFIXES) for entry in images)
         poses = self.storage.entries(layout.capture_files(capture_id, Role.poses))
-        posed = any(not entry.path.lower().endswith(".ply") for entry in poses)  # a model to start from
+        posed = any(
+            not entry.path.lower().endswith(".ply") for entry in poses
+        )  # a .ply is a model to start from, not a pose
         if len(images) == 1 and photos and not posed:
             raise ProblemError(
                 "too_few_images",
-                "The capture holds one photo; depth cannot be recovered from a single view.",
-                advice="Take 20 or more photos from different places, each overlapping the next by two thirds.",
+                "The capture holds one photo; depth cannot be recovered from a single photo.",
+                advice="Take 20 or more photos from different positions, each overlapping the next by "
+                "two thirds.",
                 facts={"images": 1},
             )
 
-    def check_start(self, capture_id: str, name: str) -> None:
-        """Refuse a model to start from that is not among the capture's poses, with a 404 problem."""
+    def check_start_file(self, capture_id: str, name: str) -> None:
+        """Raise a 404 problem if a model to start from is not among the poses of the capture."""
         if not self.storage.exists(layout.capture_file(capture_id, Role.poses, name)):
             raise ProblemError(
                 "file_not_found",
-                f"The capture has no file {name[:80]!r} among its poses to start from.",
-                advice="Upload it with PUT /v1/captures/{id}/poses/{name} first, or name a stored model.",
+                f"The model to start from, {name[:80]!r}, is not among the poses of the capture.",
+                advice="Upload it with PUT /v1/captures/{id}/poses/{name} first, or give the id of a "
+                "stored model.",
             )
 
     async def store(
@@ -144,11 +149,11 @@ class Captures:
         announced_sha256: str | None = None,
         announced_size: int | None = None,
     ) -> tuple[CaptureFile, bool]:
-        """Store a file as it streams in; True when it is new, False when the same bytes were there already.
+        """Store a file while it arrives; return its record, and whether it is new.
 
-        Raises UnsafeName, and problems for other bytes under the name (409), a digest that does not fit (422), an
-        empty file (422), one too large (413), too many files (413) or no room (507). After any of them, and after
-        a connection that broke off, storage holds what it held before.
+        A file that is already stored with the same bytes is not stored again. Raises UnsafeName, and problems for
+        other bytes under the name (409), a digest that differs (422), an empty file (422), a file that is too large
+        (413), too many files (413) and full storage (507). After an error or a lost connection, storage is unchanged.
         """
         name = safe_name(name)
         await run_in_threadpool(self._check_room, capture_id, announced_size)
@@ -173,7 +178,7 @@ class Captures:
         if owner != file.sha256:
             raise ProblemError(
                 "name_taken",
-                f"The capture already holds other bytes under {role.value}/{name}; they stay as they were.",
+                f"The capture already holds {role.value}/{name} with other bytes, which were not replaced.",
                 advice="Upload this file under another name.",
                 facts={"stored_sha256": owner, "sent_sha256": file.sha256},
             )
@@ -183,10 +188,10 @@ class Captures:
         return file, new
 
     def _claim(self, capture_id: str, file: CaptureFile, incoming: str) -> bool:
-        """Make an upload the owner of its name; False when the name is owned already.
+        """Give an upload its name; return False if another upload has the name.
 
-        The digest is written first and only once, so that of two uploads at one moment exactly one wins. A digest
-        without its file is either about to get it, or was left by a server that died in between.
+        The digest is written first, with `put_new`, so that exactly one of two concurrent uploads gets the name. A
+        digest without its file belongs to an upload that is about to be renamed, or was left by a server that died.
         """
         path = layout.capture_digest(capture_id, file.role, file.name)
         target = layout.capture_file(capture_id, file.role, file.name)
@@ -203,13 +208,13 @@ class Captures:
                 self.storage.put(path, file.sha256.encode())
         self.storage.rename(incoming, target)
         if not self.storage.exists(layout.capture_record(capture_id)):
-            # The capture was deleted while the file came in; nothing may be left of it.
+            # The capture was deleted during the upload; delete this file too.
             self.storage.delete_prefix(layout.capture(capture_id))
             self.record(capture_id)
         return True
 
     def _taken(self, capture_id: str, role: Role, name: str) -> str | None:
-        """The digest of the file under a name, or None when the name is free."""
+        """Return the digest of the file with this name, or None if the name is free."""
         digest = self._digest(capture_id, role, name)
         return digest if digest and self.storage.exists(layout.capture_file(capture_id, role, name)) else None
 
@@ -229,7 +234,7 @@ class Captures:
         if self._counts[capture_id] >= limit:
             raise ProblemError(
                 "body_too_large",
-                f"The capture already holds {limit} files, which is the limit.",
+                f"The capture already holds {limit} files, and no more are accepted.",
                 facts={"limit": limit},
             )
         if announced_size is not None and announced_size > self.settings.max_file_bytes:
@@ -240,15 +245,15 @@ class Captures:
             if free < needed:
                 raise ProblemError(
                     "storage_full",
-                    f"The disk has {format_bytes(free)} left; this upload would need {format_bytes(needed)} "
-                    "with the reserve that is kept.",
-                    advice="Delete captures or jobs that are no longer needed, or give the storage more room.",
+                    f"The disk has {format_bytes(free)} left; this upload needs {format_bytes(needed)}, "
+                    "including the reserve that is kept free.",
+                    advice="Delete captures or jobs that are no longer needed, or extend the storage.",
                     facts={"free": free, "needed": needed},
                 )
 
 
 class _Counted:
-    """Passes chunks on while it counts and hashes them; ends with 413 once they are too many."""
+    """Passes chunks on, counts and hashes them, and raises a 413 problem above the limit."""
 
     def __init__(self, chunks: AsyncIterator[bytes], limit: int) -> None:
         self._chunks = chunks
@@ -258,7 +263,7 @@ class _Counted:
         self.digest = hashlib.sha256()
 
     async def begin(self) -> bool:
-        """Wait for the first bytes; False when there are none. Not every store takes an upload without parts."""
+        """Wait for the first bytes; return False if there are none. Some stores cannot store an empty upload."""
         async for chunk in self._chunks:
             if chunk:
                 self._first = chunk
@@ -270,7 +275,7 @@ class _Counted:
 
     async def __anext__(self) -> bytes:
         chunk, self._first = self._first, None
-        while not chunk:  # Starlette ends a body with an empty one, and storage takes no empty parts.
+        while not chunk:  # Starlette ends a body with an empty chunk, which storage does not accept.
             chunk = await anext(self._chunks)
         self.size += len(chunk)
         if self.size > self._limit:
@@ -282,8 +287,8 @@ class _Counted:
 def _too_large(size: int, limit: int) -> ProblemError:
     return ProblemError(
         "body_too_large",
-        f"The file has {format_bytes(size)} or more; at most {format_bytes(limit)} are taken.",
-        advice="Split a video, or raise SPLATMILL_MAX_FILE_BYTES.",
+        f"The file has {format_bytes(size)} or more; at most {format_bytes(limit)} are accepted.",
+        advice="Split the file, or raise the server's setting SPLATMILL_MAX_FILE_BYTES.",
         facts={"limit": limit},
     )
 
@@ -292,7 +297,7 @@ def _check_whole(body: _Counted, sha256: str | None, size: int | None) -> None:
     if size is not None and body.size != size:
         raise ProblemError(
             "body_cut_off",
-            f"{body.size} of {size} bytes arrived; nothing was stored.",
+            f"Only {body.size} of {size} bytes arrived; nothing was stored.",
             advice="Send the file again.",
             facts={"received": body.size, "announced": size},
         )
@@ -301,12 +306,12 @@ def _check_whole(body: _Counted, sha256: str | None, size: int | None) -> None:
     if sha256 is not None and body.digest.hexdigest() != sha256.strip().lower():
         raise ProblemError(
             "digest_mismatch",
-            "The bytes that arrived do not have the SHA-256 announced for them; nothing was stored.",
+            "The SHA-256 of the received bytes differs from the announced one; nothing was stored.",
             advice="Send the file again.",
             facts={"announced": sha256[:100], "received": body.digest.hexdigest()},
         )
 
 
-def names(files: Sequence[CaptureFile]) -> list[str]:
-    """What identifies a set of files: role, name and digest of each, sorted."""
+def fingerprints(files: Sequence[CaptureFile]) -> list[str]:
+    """Return role, name and digest of each file, sorted; equal for equal sets of files."""
     return sorted(f"{file.role.value}/{file.name} {file.sha256}" for file in files)

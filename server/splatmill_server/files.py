@@ -1,4 +1,4 @@
-"""Stored files over HTTP: ETag, If-None-Match, Range, HEAD (RFC 9110), streamed and never whole in memory."""
+"""Responses with stored files: ETag, If-None-Match, Range and HEAD (RFC 9110). Files are streamed."""
 
 from collections.abc import AsyncIterator
 from datetime import UTC
@@ -21,10 +21,10 @@ async def file_response(
     *,
     download_name: str | None = None,
 ) -> Response:
-    """The file at `path`, or the part of it that was asked for.
+    """Return a response with the file at `path`, or with the requested range of it.
 
-    `download_name` makes browsers save it under that name. Raises a 404 problem when there is no such file, and a
-    416 problem for a range that lies outside of it.
+    With `download_name`, browsers save the file under that name. Raises a 404 problem if there is no such file, and a
+    416 problem for a range outside of it.
     """
     entry = await run_in_threadpool(storage.head, path)
     if entry is None:
@@ -33,14 +33,14 @@ async def file_response(
     headers = {
         "ETag": etag,
         "Accept-Ranges": "bytes",
-        "Cache-Control": "private, no-cache",  # Always asked for again, answered with 304 when unchanged.
+        "Cache-Control": "private, no-cache",  # revalidated on each use; 304 if unchanged
         "Last-Modified": format_datetime(entry.modified.astimezone(UTC), usegmt=True),
         "Content-Type": media_type,
     }
     if download_name is not None:
         headers["Content-Disposition"] = f"attachment; filename*=UTF-8''{quote(download_name)}"
     if media_type.startswith("text/html"):
-        # A report is a page of ours with a stranger's file names in it: it gets no rights on this origin.
+        # A report contains file names chosen by users, so its page gets no access to this origin.
         headers["Content-Security-Policy"] = "sandbox allow-scripts"
     if _matches(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
@@ -71,8 +71,8 @@ def _matches(header: str | None, etag: str) -> bool:
 
 
 def _range(header: str | None, entry: Entry, headers: dict[str, str]) -> tuple[int, int] | None:
-    """The bytes [start, end) of a single range; None for none, for several, and for one that makes no sense, which
-    RFC 9110 lets a server ignore."""
+    """Return the bytes [start, end) of a single range. Return None without a range, and for several ranges or a
+    malformed one, which a server may ignore (RFC 9110)."""
     unit, _, spec = (header or "").partition("=")
     first, dash, last = spec.strip().partition("-")
     digits = all(not part or (part.isascii() and part.isdigit() and len(part) < 20) for part in (first, last))
@@ -88,7 +88,7 @@ def _range(header: str | None, entry: Entry, headers: dict[str, str]) -> tuple[i
     if start >= size or start >= end:
         raise ProblemError(
             "range_not_satisfiable",
-            f"The range {header!r} lies outside the file, which has {size} bytes.",
+            f"The range {header!r} is outside the file, which has {size} bytes.",
             facts={"size": size},
             headers={"Content-Range": f"bytes */{size}", "ETag": headers["ETag"]},
         )

@@ -1,4 +1,4 @@
-"""Passing a render request on to the renderer process, and its answer back, as a stream."""
+"""Forwards render requests to the renderer process, and streams its responses back."""
 
 from collections.abc import AsyncIterator
 
@@ -22,42 +22,42 @@ _OWN_PREFIX = "splatmill-"
 
 
 async def forward(
-    renderer: httpx.AsyncClient | None, request: Request, path: str, wish: BaseModel, seconds: float
+    renderer: httpx.AsyncClient | None, request: Request, path: str, body: BaseModel, seconds: float
 ) -> Response:
-    """The renderer's answer to `wish`, whatever its status: pictures, 304 and problem documents alike.
+    """Post `body` to the renderer and return its response, whatever its status.
 
-    Raises 503 when no renderer is there, 504 when it does not answer within `seconds`.
+    Raises a 503 problem if there is no renderer, and a 504 problem if it does not answer within `seconds`.
     """
     if renderer is None:
         raise ProblemError(
             "renderer_unavailable",
-            "This server has no renderer.",
-            advice="Start `python -m splatmill_worker renderer` and set SPLATMILL_RENDERER_URL; "
-            "models can still be downloaded.",
+            "This server has no renderer, so it cannot render images.",
+            advice="Start `python -m splatmill_worker renderer` and set SPLATMILL_RENDERER_URL. "
+            "Models can be downloaded without it.",
         )
     headers = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
     if (known := request.headers.get("if-none-match")) is not None:
         headers["If-None-Match"] = known
-    body = wish.model_dump_json(exclude_none=True)
+    content = body.model_dump_json(exclude_none=True)
     try:
         answer = await renderer.send(
             renderer.build_request(
-                "POST", path, content=body, headers=headers, timeout=httpx.Timeout(seconds, connect=5.0)
+                "POST", path, content=content, headers=headers, timeout=httpx.Timeout(seconds, connect=5.0)
             ),
             stream=True,
         )
     except httpx.TimeoutException as error:
         raise ProblemError(
             "render_timeout",
-            "The renderer took too long.",
-            advice="Ask for a smaller picture or a shorter video, or try again when less is going on.",
+            f"The renderer did not answer within {seconds:g} seconds.",
+            advice="Request a smaller image or a shorter video, or try again when the machine is less busy.",
         ) from error
     except httpx.TransportError as error:
         raise ProblemError(
             "renderer_unavailable",
             f"The renderer cannot be reached ({type(error).__name__}).",
-            advice="Try again in a few seconds; models can still be downloaded. "
-            "If it lasts, look at the log of `python -m splatmill_worker renderer`.",
+            advice="Try again in a few seconds. If the problem persists, read the log of "
+            "`python -m splatmill_worker renderer`. Models can be downloaded without it.",
             headers={"Retry-After": "5"},
         ) from error
     passed = {

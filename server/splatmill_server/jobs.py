@@ -1,7 +1,7 @@
-"""Job records: the only code that writes job rows.
+"""Job records. No other code writes job rows.
 
-Each change is one optimistic transaction on the row, and on the states stream where the change depends on it, so
-that several API processes and the workers never overwrite one another.
+Each change is one optimistic transaction on the row, and on the states stream if the change depends on it, so that
+API processes and workers never overwrite each other's changes.
 """
 
 import hashlib
@@ -23,11 +23,11 @@ from splatmill_server.problems import ProblemError
 
 IDEMPOTENCY_DAYS = 7
 _TIES = 16
-"""Jobs that may share one millisecond of creation without disturbing a page."""
+"""Number of jobs that may be created in one millisecond without being lost between two pages."""
 
 
 class Jobs:
-    """Every operation on jobs. Methods raise ProblemError, and redis.RedisError when Redis is away."""
+    """All operations on jobs. Methods raise ProblemError, and redis.RedisError if Redis cannot be reached."""
 
     def __init__(self, connection: redis.Redis, storage: Storage, metrics: Metrics) -> None:
         self.connection = connection
@@ -35,9 +35,10 @@ class Jobs:
         self.metrics = metrics
 
     def create(self, request: CreateJob, *, key: str | None = None, body: str = "") -> tuple[Job, bool]:
-        """A new job, or with a known `Idempotency-Key` the one it made; True when it is new.
+        """Create a job; return it, and whether it is new.
 
-        `body` is what identifies the request; the same key with another body is a 409 problem.
+        With an `Idempotency-Key` that was used before, return the job of that request. `body` identifies the request:
+        the same key with another body raises a 409 problem.
         """
         job_id = secrets.token_hex(8)
         if key is not None:
@@ -62,40 +63,42 @@ class Jobs:
                 pipe.zadd(keys.JOBS, {job_id: int(moment.timestamp() * 1000)})
                 pipe.sadd(keys.ACTIVE, job_id)
 
-        # Of two requests with one key at the same moment, one makes the job.
+        # Of two concurrent requests with the same key, only one inserts the job.
         self.connection.transaction(insert, keys.job(job_id))
         if known is not None:
-            return self._see(known), False
-        # A crash right here leaves a row without a place in the queue; the reaper enqueues it.
+            return self._job(known), False
+        # A crash here leaves a row that is not in the queue; the reaper enqueues it.
         queue.enqueue(self.connection, job_id, new.generation)
         self.metrics.created.inc()
-        return self._see(new), True
+        return self._job(new), True
 
-    def known(self, key: str) -> str | None:
-        """The job an `Idempotency-Key` was first used for, if any."""
+    def id_of_key(self, key: str) -> str | None:
+        """Return the id of the job that an `Idempotency-Key` was first used for, or None."""
         stored = cast(bytes | None, self.connection.get(keys.idempotency(_digest(key))))
         return cast(str, json.loads(stored)["job"]) if stored else None
 
     def row(self, job_id: str) -> JobRow:
-        """The row. Raises a 404 problem when Redis has none."""
+        """Return the row of a job. Raises a 404 problem if Redis has none."""
         found = row.read(self.connection, job_id) if layout.is_id(job_id) else None
         if found is None:
             raise ProblemError(
-                "job_not_found", f"There is no job {job_id[:80]!r}.", advice="GET /v1/jobs lists them."
+                "job_not_found",
+                f"There is no job {job_id[:80]!r}.",
+                advice="List the jobs with GET /v1/jobs.",
             )
         return found
 
     def get(self, job_id: str) -> Job:
-        """The job as a client sees it. A finished one is found in storage even when Redis has lost it."""
+        """Return the job as clients see it. A finished job is read from storage if Redis has lost it."""
         try:
-            return self._see(self.row(job_id))
+            return self._job(self.row(job_id))
         except ProblemError:
             if (stored := self.stored(job_id)) is not None:
                 return stored
             raise
 
     def stored(self, job_id: str) -> Job | None:
-        """The job in `job.json` beside its model, or None."""
+        """Return the job in the `job.json` of its model, or None."""
         if not layout.is_id(job_id):
             return None
         try:
@@ -104,7 +107,7 @@ class Jobs:
             return None
 
     def page(self, cursor: str | None, limit: int, state: JobState | None = None) -> JobPage:
-        """Jobs, newest first; with `state`, those in it."""
+        """Return a page of jobs, newest first; with `state`, only those in this state."""
         found: list[tuple[int, Job]] = []
         after = read_cursor(cursor) if cursor is not None else None
         while len(found) <= limit:
@@ -112,7 +115,7 @@ class Jobs:
             if not batch:
                 break
             after = batch[-1]
-            for (moment, _), job in zip(batch, self.see([job_id for _, job_id in batch]), strict=True):
+            for (moment, _), job in zip(batch, self.get_many([job_id for _, job_id in batch]), strict=True):
                 if job is not None and (state is None or job.state is state):
                     found.append((moment, job))
             if len(batch) <= limit:
@@ -121,8 +124,8 @@ class Jobs:
         following = write_cursor(page[-1][0], page[-1][1].id) if len(found) > limit else None
         return JobPage(jobs=[job for _, job in page], cursor=following)
 
-    def see(self, job_ids: Iterable[str]) -> list[Job | None]:
-        """Several jobs at once, None for those that are gone."""
+    def get_many(self, job_ids: Iterable[str]) -> list[Job | None]:
+        """Return several jobs, with None for those that were deleted."""
         wanted = list(job_ids)
         with self.connection.pipeline(transaction=False) as pipe:
             for job_id in wanted:
@@ -138,7 +141,7 @@ class Jobs:
         return jobs
 
     def active(self) -> list[JobRow]:
-        """The rows of all jobs that have not ended."""
+        """Return the rows of all unfinished jobs."""
         ids = sorted(entry.decode() for entry in cast(set[bytes], self.connection.smembers(keys.ACTIVE)))
         found = []
         for job_id in ids:
@@ -150,49 +153,49 @@ class Jobs:
         return found
 
     def _retire(self, job_id: str) -> None:
-        """Take an ended job off the reaper's list, unless it is restarted at this very moment."""
+        """Remove a job that has ended from the set of active ones, unless it was restarted meanwhile."""
 
-        def attempt(pipe: Any) -> None:
+        def remove(pipe: Any) -> None:
             known = row.read(self.connection, job_id)
             ended = known is None or fold(known, events.read_states(self.connection, job_id)).state.final
             pipe.multi()
             if ended:
                 pipe.srem(keys.ACTIVE, job_id)
 
-        self.connection.transaction(attempt, keys.job(job_id))
+        self.connection.transaction(remove, keys.job(job_id))
 
-    def uses(self, capture_id: str) -> str | None:
-        """The id of an unfinished job on a capture, if there is one."""
+    def unfinished_on(self, capture_id: str) -> str | None:
+        """Return the id of an unfinished job on a capture, or None."""
         return next((found.id for found in self.active() if found.capture == capture_id), None)
 
     def cancel(self, job_id: str) -> Job:
-        """Note the wish to cancel. The reaper then kills the process and gives the verdict."""
+        """Record the request to cancel a job. The reaper then kills its process and ends the job."""
 
-        def wish(found: JobRow, job: Job) -> dict[str, str] | None:
+        def request_cancel(found: JobRow, job: Job) -> dict[str, str] | None:
             if job.state is JobState.cancelled or found.cancel_requested_at is not None:
                 return None
             if job.state.final:
                 raise ProblemError(
                     "job_finished",
                     f"The job has already ended: it {_ended(job)}.",
-                    advice="Delete it with DELETE /v1/jobs/{id} if it is not needed.",
+                    advice="Delete it with DELETE /v1/jobs/{id} if it is no longer needed.",
                     facts={"state": job.state.value},
                 )
             return {"cancel_requested_at": row.now().isoformat()}
 
-        return self._change(job_id, wish)
+        return self._change(job_id, request_cancel)
 
     def restart(self, job_id: str) -> Job:
-        """Queue a job that has ended as a new generation; it goes on from its checkpoint where there is one."""
+        """Enqueue a job that has ended as a new generation, which resumes from its checkpoint if there is one."""
 
-        def anew(found: JobRow, job: Job) -> dict[str, str] | None:
+        def begin_generation(found: JobRow, job: Job) -> dict[str, str] | None:
             if job.state is JobState.queued and found.cancel_requested_at is None:
-                return None  # Wishing twice is wishing once.
+                return None  # a repeated restart has no further effect
             if not job.state.final:
                 raise ProblemError(
                     "job_running",
-                    f"The job has not ended; it is {job.state.value}.",
-                    advice="Cancel it first, or wait for its end.",
+                    f"The job has not ended; its state is {job.state.value}.",
+                    advice="Cancel it first, or wait until it has ended.",
                     facts={"state": job.state.value},
                 )
             if not self.storage.exists(layout.capture_record(found.capture)):
@@ -208,31 +211,31 @@ class Jobs:
                 "verdict": "",
             }
 
-        # On the list before it is changed: a crash in between leaves an ended job there, which is harmless.
+        # It is added to the active jobs first: a crash in between leaves an ended job there, which is harmless.
         self.connection.sadd(keys.ACTIVE, job_id)
-        job = self._change(job_id, anew)
+        job = self._change(job_id, begin_generation)
         queue.enqueue(self.connection, job_id, self.row(job_id).generation)
         return job
 
     def delete(self, job_id: str) -> None:
-        """Remove an ended job, its work files and its model."""
+        """Delete a job that has ended, its work files and its model. Raises 404 and 409 problems."""
         try:
             found = self.row(job_id)
         except ProblemError:
             if self.stored(job_id) is None:
                 raise
         else:
-            job = self._see(found)
+            job = self._job(found)
             if not job.state.final:
                 raise ProblemError(
                     "job_running",
-                    f"The job has not ended; it is {job.state.value}.",
+                    f"The job has not ended; its state is {job.state.value}.",
                     advice="Cancel it with POST /v1/jobs/{id}/cancel first.",
                     facts={"state": job.state.value},
                 )
             for generation in range(1, found.generation + 1):
                 queue.forget(self.connection, job_id, generation)
-        # The record of the model goes first: from then on nobody sees a model with files missing.
+        # The record goes first, so that no model with missing files is visible.
         self.storage.delete(layout.job_record(job_id))
         self.storage.delete_prefix(layout.model(job_id))
         self.storage.delete_prefix(layout.job(job_id))
@@ -242,8 +245,8 @@ class Jobs:
             pipe.srem(keys.ACTIVE, job_id)
             pipe.execute()
 
-    def end(self, expected: JobRow, state: str, problem: Problem | None = None) -> bool:
-        """Give the server's verdict on a generation, unless it has ended or changed meanwhile."""
+    def give_verdict(self, expected: JobRow, state: str, problem: Problem | None = None) -> bool:
+        """End a generation as `state`; return False if it has ended or was restarted meanwhile."""
         given = False
 
         def verdict(found: JobRow, job: Job) -> dict[str, str] | None:
@@ -259,33 +262,34 @@ class Jobs:
         self._change(expected.id, verdict)
         return given
 
-    def _see(self, found: JobRow) -> Job:
+    def _job(self, found: JobRow) -> Job:
         states = events.read_states(self.connection, found.id)
         return with_links(fold(found, states, events.last_progress(self.connection, found.id)))
 
     def _change(self, job_id: str, decide: Callable[[JobRow, Job], dict[str, str] | None]) -> Job:
-        """Apply what `decide` says of the row and the job; nothing when it says None. Empty values remove a field.
+        """Apply the changes that `decide` returns for the row and the job, and return the job.
 
-        Runs again when the row or the states changed while it decided.
+        `decide` returns new values of fields, where an empty value deletes the field, or None for no change. It is
+        called again if the row or the states changed meanwhile.
         """
 
-        def attempt(pipe: Any) -> None:
+        def apply(pipe: Any) -> None:
             found = self.row(job_id)
-            changes = decide(found, self._see(found))
+            changes = decide(found, self._job(found))
             pipe.multi()
             if changes is None:
                 return
             kept = {name: value for name, value in changes.items() if value}
-            gone = [name for name, value in changes.items() if not value]
+            deleted = [name for name, value in changes.items() if not value]
             pipe.hset(keys.job(job_id), mapping=kept)
-            if gone:
-                pipe.hdel(keys.job(job_id), *gone)
+            if deleted:
+                pipe.hdel(keys.job(job_id), *deleted)
 
-        self.connection.transaction(attempt, keys.job(job_id), keys.states(job_id))
-        return self._see(self.row(job_id))
+        self.connection.transaction(apply, keys.job(job_id), keys.states(job_id))
+        return self._job(self.row(job_id))
 
     def _ids(self, after: tuple[int, str] | None, count: int) -> list[tuple[int, str]]:
-        """Up to `count` (moment, id) of jobs older than `after`, newest first."""
+        """Return up to `count` pairs (time of creation in milliseconds, id) of jobs after `after`, newest first."""
         top = "+inf" if after is None else str(after[0])
         reply = self.connection.zrevrangebyscore(
             keys.JOBS, top, "-inf", start=0, num=count + _TIES, withscores=True
@@ -303,14 +307,14 @@ class Jobs:
             raise ProblemError(
                 "idempotency_conflict",
                 "This Idempotency-Key was already used for a request with another body.",
-                advice="Use a new key for a new request, and the same key only to repeat one.",
+                advice="Use a new key for a new request, and the same key only to repeat a request.",
                 facts={"job": known["job"]},
             )
         return cast(str, known["job"])
 
 
 def with_links(job: Job) -> Job:
-    """The job with the addresses of what belongs to it."""
+    """Return the job with the addresses of what belongs to it."""
     base = f"/v1/jobs/{job.id}"
     links = {"self": base, "events": f"{base}/events", "logs": f"{base}/logs", "preview": f"{base}/preview"}
     links["capture"] = f"/v1/captures/{job.capture}"
@@ -324,7 +328,7 @@ def with_links(job: Job) -> Job:
 
 
 def last_stage(job: Job) -> str | None:
-    """Where a job was when it was last heard of."""
+    """Return the stage of the job's last progress, or None."""
     return job.progress.stage if job.progress is not None else None
 
 

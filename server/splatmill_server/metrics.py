@@ -1,4 +1,4 @@
-"""Prometheus metrics of one API process. Each app has a registry of its own, so two apps do not collide."""
+"""Prometheus metrics of an API process. Each app has its own registry, so that two apps do not collide."""
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
@@ -7,33 +7,44 @@ MEDIA_TYPE = CONTENT_TYPE_LATEST
 
 
 class Metrics:
-    """Counters that the endpoints raise, and gauges that are read when they are scraped."""
+    """Counters that the endpoints increment, and gauges that are set when the metrics are scraped."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         self.requests = Counter(
             "splatmill_http_requests",
-            "Requests answered.",
+            "HTTP requests answered.",
             ["method", "route", "status"],
             registry=self.registry,
         )
         self.seconds = Histogram(
             "splatmill_http_request_seconds",
-            "Seconds until an answer was complete (event streams: until they ended).",
+            "Seconds until a response was complete (event streams: until they ended).",
             ["route"],
             registry=self.registry,
         )
-        self.uploaded = Counter("splatmill_uploaded_bytes", "Bytes of files stored.", registry=self.registry)
+        self.uploaded = Counter(
+            "splatmill_uploaded_bytes", "Bytes of uploaded files.", registry=self.registry
+        )
         self.created = Counter("splatmill_jobs_created", "Jobs created.", registry=self.registry)
         self.ended = Counter(
-            "splatmill_jobs_given_up", "Jobs this process ended itself.", ["code"], registry=self.registry
+            "splatmill_jobs_given_up",
+            "Jobs that this process ended because no worker did.",
+            ["code"],
+            registry=self.registry,
         )
-        self.requeued = Counter("splatmill_jobs_requeued", "Jobs the queue had lost.", registry=self.registry)
-        self.streams = Gauge("splatmill_event_streams", "Event streams open now.", registry=self.registry)
-        self.waiting = Gauge("splatmill_queue_length", "Jobs that wait.", ["queue"], registry=self.registry)
-        self.workers = Gauge("splatmill_workers", "Workers registered.", ["state"], registry=self.registry)
-        self.redis_up = Gauge("splatmill_redis_up", "1 when Redis answers.", registry=self.registry)
+        self.requeued = Counter(
+            "splatmill_jobs_requeued",
+            "Jobs enqueued again because the queue had lost them.",
+            registry=self.registry,
+        )
+        self.streams = Gauge("splatmill_event_streams", "Open event streams.", registry=self.registry)
+        self.waiting = Gauge(
+            "splatmill_queue_length", "Jobs that wait for a worker.", ["queue"], registry=self.registry
+        )
+        self.workers = Gauge("splatmill_workers", "Registered workers.", ["state"], registry=self.registry)
+        self.redis_up = Gauge("splatmill_redis_up", "1 if Redis answers, else 0.", registry=self.registry)
 
     def text(self) -> bytes:
-        """Everything in Prometheus's text format."""
+        """Return the metrics in the text format of Prometheus."""
         return generate_latest(self.registry)

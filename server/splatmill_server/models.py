@@ -1,4 +1,4 @@
-"""Finished models: read from storage alone, so that they are listed even when Redis has lost everything."""
+"""Finished models. They are read from storage only, so they stay available if Redis loses its data."""
 
 import re
 from typing import Any
@@ -16,18 +16,18 @@ _HEADER_BYTES = 8192
 _VERTICES = re.compile(rb"^element vertex (\d+)\s*$", re.MULTILINE)
 _REST = re.compile(rb"^property float f_rest_\d+\s*$", re.MULTILINE)
 _DEGREE = {0: 0, 9: 1, 24: 2, 45: 3}
-"""Spherical-harmonics degree by the number of `f_rest` properties: 3 colours x ((degree + 1)^2 - 1)."""
+"""Degree of the spherical harmonics by number of `f_rest` properties, which is 3 ((degree + 1)^2 - 1)."""
 
 
 class Models:
-    """A model exists when its `job.json` does: the worker writes that last."""
+    """All operations on models. A model exists if its `job.json` does, which the worker writes last."""
 
     def __init__(self, storage: Storage, jobs: Jobs) -> None:
         self.storage = storage
         self.jobs = jobs
 
     def check(self, model_id: str) -> None:
-        """Raise the problem that says why there is no such model: unknown (404), or not finished yet (409)."""
+        """Raise a problem if there is no such model (404) or if its job has not ended (409)."""
         if layout.is_id(model_id) and self.storage.exists(layout.job_record(model_id)):
             return
         job = None
@@ -39,22 +39,25 @@ class Models:
         if job is not None and not job.state.final:
             raise ProblemError(
                 "model_not_ready",
-                f"The model is not finished yet; its job is {job.state.value}.",
-                advice=f"Follow /v1/jobs/{job.id}/events, or ask again later.",
+                f"The model is not finished; the state of its job is {job.state.value}.",
+                advice=f"Follow its progress at /v1/jobs/{job.id}/events, and try again when the job has "
+                f"ended.",
                 facts={"job": job.id, "state": job.state.value},
             )
         if job is not None and job.state is not JobState.succeeded:
             raise ProblemError(
                 "model_not_found",
-                f"The job {job.id} ended as {job.state.value} and left no model.",
+                f"The job {job.id} ended as {job.state.value}, so it has no model.",
                 facts={"job": job.id, "state": job.state.value},
             )
         raise ProblemError(
-            "model_not_found", f"There is no model {model_id[:80]!r}.", advice="GET /v1/models lists them."
+            "model_not_found",
+            f"There is no model {model_id[:80]!r}.",
+            advice="List the models with GET /v1/models.",
         )
 
     def get(self, model_id: str) -> Model:
-        """One model with its files. Raises 404, 409, or 500 when what is stored cannot be read."""
+        """Return a model with its files. Raises 404 and 409 problems, and 500 if its files cannot be read."""
         self.check(model_id)
         files = {
             entry.path.rsplit("/", 1)[-1]: entry for entry in self.storage.entries(layout.model(model_id))
@@ -97,7 +100,7 @@ class Models:
         )
 
     def page(self, cursor: str | None, limit: int) -> ModelPage:
-        """Models, newest first by when they were stored."""
+        """Return a page of models, the most recently stored first."""
         records = [
             entry for entry in self.storage.entries(layout.models()) if entry.path.endswith("/job.json")
         ]
@@ -113,43 +116,43 @@ class Models:
             try:
                 models.append(self.get(model_id))
             except ProblemError:
-                continue  # Deleted meanwhile, or unreadable: one bad model must not hide the others.
+                continue  # deleted meanwhile or corrupt, which must not hide the other models
         return ModelPage(models=models, cursor=write_cursor(*page[-1]) if len(keyed) > limit else None)
 
     def file(self, model_id: str, name: str) -> Entry:
-        """The entry of a model's file. Raises 404 or 409 problems."""
+        """Return the entry of a file of a model. Raises 404 and 409 problems."""
         self.check(model_id)
         entry = self.storage.head(layout.model_file(model_id, name)) if name in layout.MODEL_FILES else None
         if entry is None:
             raise ProblemError(
                 "file_not_found",
                 f"The model {model_id} has no file {name[:80]!r}.",
-                advice=f"It may have: {', '.join(sorted(layout.MODEL_FILES))}.",
+                advice=f"The files of a model are: {', '.join(sorted(layout.MODEL_FILES))}.",
             )
         return entry
 
     def cameras(self, model_id: str) -> ModelCameras:
-        """The cameras of the capture in the model's world."""
+        """Return the cameras of the capture in the coordinates of the model."""
         self.file(model_id, "cameras.json")
         stored = self.storage.get(layout.model_file(model_id, "cameras.json"))
         try:
             return ModelCameras.model_validate_json(stored)
         except ValidationError as error:
             raise ProblemError(
-                "model_corrupt", f"cameras.json of {model_id} cannot be read: {error}."
+                "model_corrupt", f"The file cameras.json of the model {model_id} cannot be read: {error}."
             ) from error
 
     def _header(self, model_id: str, entry: Entry) -> tuple[int, int]:
-        """Number of Gaussians and SH degree, from the head of the .ply alone."""
+        """Return the number of Gaussians and the degree of the spherical harmonics, from the header of the .ply."""
         end = min(entry.size, _HEADER_BYTES)
         head, marker, _ = self.storage.get(entry.path, 0, end).partition(b"end_header")
         count = _VERTICES.search(head)
         if not marker or count is None:
-            raise ValueError(f"model.ply of {model_id} does not begin with the header of a .ply")
+            raise ValueError(f"model.ply of {model_id} has no valid .ply header")
         return int(count[1]), _DEGREE.get(len(_REST.findall(head)), 0)
 
     def _quality(self, model_id: str) -> tuple[Any, Any]:
-        """PSNR (dB) and SSIM of the last measured point of the curve, None where nothing was held out."""
+        """Return PSNR (dB) and SSIM of the last measurement; None if no photos were held out."""
         try:
             report = Report.model_validate_json(self.storage.get(layout.model_file(model_id, "report.json")))
         except (FileNotFoundError, ValidationError):

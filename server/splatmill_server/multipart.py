@@ -1,6 +1,6 @@
-"""Reading `multipart/form-data` as a stream: one part after the other, none of them whole in memory.
+"""A streaming parser of `multipart/form-data`: one part after the other, in pieces.
 
-Starlette's own form parser keeps an open file for each part, which a few hundred photos would exhaust.
+Starlette's form parser keeps a file open for each part, and a few hundred photos would exhaust the limit on these.
 """
 
 from collections.abc import AsyncIterator
@@ -20,20 +20,21 @@ Kind = Literal["headers", "data", "end"]
 
 @dataclass
 class Part:
-    """One part. `chunks` must be read to its end before the next part is asked for."""
+    """A part of a form. `chunks` must be exhausted before the next part is requested."""
 
     name: str
     filename: str | None
     chunks: AsyncIterator[bytes]
 
     async def text(self) -> str:
-        """The whole of a plain field. Raises a 413 problem when it is larger than a field should be."""
+        """Return the text of a field. Raises a 413 problem if it is too large, and a 400 problem if it is not UTF-8."""
         data = b""
         async for chunk in self.chunks:
             data += chunk
             if len(data) > _MAX_FIELD_BYTES:
                 raise ProblemError(
-                    "body_too_large", f"The field {self.name!r} is larger than a field may be."
+                    "body_too_large",
+                    f"The field {self.name!r} has more than {_MAX_FIELD_BYTES} bytes, the limit for a field.",
                 )
         try:
             return data.decode()
@@ -42,7 +43,7 @@ class Part:
 
 
 async def read_parts(request: Request) -> AsyncIterator[Part]:
-    """The parts of a form in order. Raises 400 problems for a body that is malformed or cut off."""
+    """Yield the parts of a form in order. Raises 400 problems for a body that is malformed or incomplete."""
     events = _Events(request)
     while (event := await events.next()) is not None:
         kind, payload = event
@@ -74,7 +75,7 @@ async def _chunks(events: "_Events") -> AsyncIterator[bytes]:
 
 
 class _Events:
-    """The parser's callbacks turned into a sequence that is pulled."""
+    """The events of the parser, which reports them through callbacks, as a sequence."""
 
     def __init__(self, request: Request) -> None:
         _, options = parse_options_header(request.headers.get("content-type", ""))
@@ -82,8 +83,8 @@ class _Events:
         if not boundary:
             raise ProblemError(
                 "malformed_body",
-                "The multipart body names no boundary in its Content-Type.",
-                advice="Let the HTTP library set the Content-Type of a form.",
+                "The Content-Type of the multipart body has no boundary.",
+                advice="Let the HTTP library set the Content-Type of the form.",
             )
         self._body = request.stream()
         self._found: list[tuple[Kind, bytes]] = []
@@ -104,7 +105,7 @@ class _Events:
         )
 
     async def next(self) -> tuple[Kind, bytes] | None:
-        """The next event, None at the end of the body."""
+        """Return the next event, or None at the end of the body."""
         while not self._found:
             chunk = await anext(self._body, None)
             if chunk is None:

@@ -1,4 +1,4 @@
-"""Cursors of lists: an opaque text that says after which entry the next page begins."""
+"""Cursors of lists: opaque texts that name the entry after which the next page begins."""
 
 import base64
 import binascii
@@ -10,12 +10,12 @@ DEFAULT_LIMIT = 50
 
 
 def write_cursor(moment: int, entry_id: str) -> str:
-    """The cursor after the entry with this time (milliseconds) and id."""
+    """Return the cursor for the page after the entry with this time in milliseconds and this id."""
     return base64.urlsafe_b64encode(f"{moment}/{entry_id}".encode()).decode().rstrip("=")
 
 
 def read_cursor(cursor: str) -> tuple[int, str]:
-    """Time and id in a cursor. Raises a 422 problem for a text that is none of ours."""
+    """Return the time and the id in a cursor. Raises a 422 problem for any other text."""
     try:
         padded = cursor.encode("ascii") + b"=" * (-len(cursor) % 4)
         moment, _, entry_id = (
@@ -27,6 +27,6 @@ def read_cursor(cursor: str) -> tuple[int, str]:
     except (ValueError, binascii.Error) as error:
         raise ProblemError(
             "cursor_invalid",
-            "The cursor is not one this service gave.",
-            advice="Use the 'cursor' of the previous page as it is, or leave it out to begin anew.",
+            "The cursor is not one that this service has issued.",
+            advice="Send the 'cursor' of the previous page unchanged, or leave it out for the first page.",
         ) from error

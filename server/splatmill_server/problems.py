@@ -1,4 +1,4 @@
-"""Every error leaves as an RFC 9457 problem document with a code from `splatmill.schema.PROBLEMS`."""
+"""Converts every error into a problem document (RFC 9457) with a code from `splatmill.schema.PROBLEMS`."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,9 +19,9 @@ log = structlog.get_logger()
 
 
 class ProblemError(HTTPException):
-    """Raised anywhere below an endpoint to answer with a problem.
+    """An error that becomes a problem document.
 
-    It is an HTTPException because FastAPI lets those pass through its own reading of a body, and no others.
+    It is an HTTPException because FastAPI passes on no other exceptions that are raised while it reads a body.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class ProblemError(HTTPException):
 
 
 class ProblemResponse(Response):
-    """A problem document; `instance` is the path it happened at."""
+    """A response with a problem document. `instance` is the path of the request."""
 
     media_type = PROBLEM_MEDIA_TYPE
 
@@ -48,7 +48,7 @@ class ProblemResponse(Response):
 
 
 def install(app: FastAPI) -> None:
-    """Register a handler for everything that can go wrong below an endpoint."""
+    """Register the handlers of all errors that endpoints raise."""
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:
@@ -58,13 +58,13 @@ def install(app: FastAPI) -> None:
         match error.status_code:
             case 404:
                 detail = f"There is nothing at {path}."
-                advice = "The addresses are listed at /docs and in /openapi.json."
+                advice = "Find the addresses at /docs or in /openapi.json."
             case 405:
                 allowed = (error.headers or {}).get("allow") or (error.headers or {}).get("Allow", "another")
-                detail = f"{request.method} is not possible at {path}."
+                detail = f"{path} does not accept the method {request.method}."
                 advice = f"Use {allowed}."
             case 400:
-                detail = "The body could not be read as what its Content-Type says."
+                detail = "The body does not have the format that its Content-Type names."
                 advice = "Send valid JSON in UTF-8."
             case _:
                 detail, advice = str(error.detail), ""
@@ -86,8 +86,9 @@ def install(app: FastAPI) -> None:
         log.warning("queue unavailable", error=str(error), path=request.url.path)
         problem = Problem.of(
             "queue_unavailable",
-            "The job queue (Redis) cannot be reached right now; nothing that is stored is lost.",
-            advice="Try again in a few seconds; if it lasts, check that Redis runs and REDIS_URL is right.",
+            "The job queue (Redis) cannot be reached; stored files are not affected.",
+            advice="Try again in a few seconds. If the problem persists, check that Redis runs, and "
+            "check REDIS_URL.",
         )
         return ProblemResponse(problem, request.url.path, {"Retry-After": "5"})
 
@@ -98,24 +99,24 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(ClientDisconnect)
     def on_disconnect(request: Request, _: ClientDisconnect) -> Response:
-        # Nobody reads this answer when the connection is gone; a proxy in front of us may.
+        # The client is gone, but a proxy in between may read this response.
         return ProblemResponse(body_cut_off(), request.url.path)
 
 
 def problem_of_storage(error: StorageError) -> Problem:
-    """Full, not writable, or not reachable: three things an operator mends differently."""
+    """Return the problem for an error of storage: full, not writable, or not available."""
     text = str(error)
     if isinstance(error, StorageFullError):
-        advice = "Delete captures or jobs that are no longer needed, or give the storage more room."
+        advice = "Delete captures or jobs that are no longer needed, or extend the storage."
         return Problem.of("storage_full", text, advice=advice)
     if "Permission denied" in text or "os error 13" in text or "os error 30" in text:
-        advice = "Let the user the server runs as write to the storage folder."
+        advice = "Give the user that the server runs as write access to the storage folder."
         return Problem.of("storage_unwritable", text, advice=advice)
     return Problem.of("storage_unavailable", text, advice="Check SPLATMILL_STORAGE and try again.")
 
 
 def body_cut_off(seen: int | None = None, announced: int | None = None) -> Problem:
-    """The connection ended before the body did. Nothing of it is kept."""
+    """Return the problem for a connection that ended before the body did."""
     facts = {} if seen is None else {"received": seen, "announced": announced}
     detail = "The body ended before its announced length; nothing was stored."
     return Problem.of("body_cut_off", detail, advice="Send the request again.", facts=facts)

@@ -1,8 +1,8 @@
-"""The reaper: what nobody else in the system would notice.
+"""The reaper, which repairs what workers and the queue cannot.
 
-A crashed worker's attempt is requeued, a job whose tries are used up becomes failed by name, a job the queue has lost
-(a Redis that came back without its last second) is enqueued again, and a wish to cancel is repeated until no process
-is left. Everything it does is safe to do twice, so each API process may run one.
+It requeues the attempts of crashed workers, fails jobs whose attempts are used up, enqueues jobs again that the queue
+has lost (Redis may restart without its last second of writes), and repeats the cancellation of a job until no process
+is left. Its actions are idempotent, so every API process may run one.
 """
 
 import asyncio
@@ -25,7 +25,7 @@ _ENDED = {"finished", "failed", "stopped"}
 
 
 class Reaper:
-    """Ticks every few seconds, and a few times per second while a job is being cancelled."""
+    """Checks all unfinished jobs every few seconds, and more often while a job is being cancelled."""
 
     def __init__(self, connection: redis.Redis, jobs: Jobs, metrics: Metrics, settings: Settings) -> None:
         self.connection = connection
@@ -34,15 +34,15 @@ class Reaper:
         self.interval = settings.reaper_interval
         self.stop_interval = settings.stop_interval
         self._wake = asyncio.Event()
-        # Jobs whose attempt had ended without a final state at the last tick: the state may still be on its way.
-        self._silent: set[tuple[str, int]] = set()
+        # Jobs whose attempt had ended without a final state at the last check: the state may still arrive.
+        self._unreported: set[tuple[str, int]] = set()
 
     def wake(self) -> None:
-        """A job is to be cancelled: do not wait for the next tick."""
+        """Check now, because a job is to be cancelled."""
         self._wake.set()
 
     async def run(self) -> None:
-        """Tick until cancelled. Redis being away is no reason to stop."""
+        """Check the jobs until this task is cancelled, also while Redis cannot be reached."""
         while True:
             cancelling = False
             try:
@@ -59,64 +59,65 @@ class Reaper:
             self._wake.clear()
 
     def tick(self) -> bool:
-        """Look at every unfinished job once; True while one is being cancelled."""
+        """Check every unfinished job once; return True while one is being cancelled."""
         queue.reclaim(self.connection)
         active = self.jobs.active()
         cancelling = [row for row in active if row.cancel_requested_at is not None]
         unfinished = [row for row in cancelling if not self.cancel(row)]
-        self._look(row for row in active if row.cancel_requested_at is None)
+        self._check(row for row in active if row.cancel_requested_at is None)
         return bool(unfinished)
 
     def cancel(self, row: JobRow) -> bool:
-        """Push a wish to cancel one step on; True once no process is left and the verdict is given."""
-        place = queue.place(self.connection, row.id, row.generation)
-        over = place.standing in _ENDED or place.standing == "absent"
+        """Take the next step of a cancellation; return True once no process is left and the job has ended."""
+        found = queue.status(self.connection, row.id, row.generation)
+        over = found.state in _ENDED or found.state == "absent"
         if not over:
             over = queue.withdraw(self.connection, row.id, row.generation)
         if over:
-            self.jobs.end(row, "cancelled")
+            self.jobs.give_verdict(row, "cancelled")
             log.info("job cancelled", job=row.id)
             return True
         queue.stop(self.connection, row.id, row.generation)
         return False
 
-    def _look(self, rows: Iterable[JobRow]) -> None:
-        silent = set()
+    def _check(self, rows: Iterable[JobRow]) -> None:
+        unreported = set()
         for row in rows:
-            place = queue.place(self.connection, row.id, row.generation)
-            if place.standing == "absent":
+            found = queue.status(self.connection, row.id, row.generation)
+            if found.state == "absent":
                 if queue.enqueue(self.connection, row.id, row.generation):
                     self.metrics.requeued.inc()
                     log.warning("job was lost by the queue, enqueued again", job=row.id)
-            elif place.standing in _ENDED:
+            elif found.state in _ENDED:
                 mark = (row.id, row.generation)
-                if place.standing == "finished" and mark not in self._silent:
-                    silent.add(mark)
+                if found.state == "finished" and mark not in self._unreported:
+                    unreported.add(mark)
                 else:
-                    self._give_up(row, place)
-        self._silent = silent
+                    self._give_up(row, found)
+        self._unreported = unreported
 
-    def _give_up(self, row: JobRow, place: queue.Place) -> None:
+    def _give_up(self, row: JobRow, found: queue.QueueStatus) -> None:
         job = self.jobs.get(row.id)
-        facts = {"attempts": job.attempt, "stage": last_stage(job), "reason": place.reason}
-        if place.standing == "failed":
+        facts = {"attempts": job.attempt, "stage": last_stage(job), "reason": found.reason}
+        if found.state == "failed":
             problem = Problem.of(
                 "attempts_exhausted",
-                f"The job's process died in {job.attempt} attempts"
+                f"The job's process ended unexpectedly in each of {job.attempt} attempts"
                 + (f", the last time during {facts['stage']}" if facts["stage"] else "")
-                + (f" ({place.reason})" if place.reason else "")
+                + (f" ({found.reason})" if found.reason else "")
                 + ".",
-                advice="Often the machine ran out of memory: try a smaller image_size or max_gaussians, "
-                "then restart the job; it goes on from its last checkpoint.",
+                advice="Often the machine has run out of memory: start a new job with a smaller "
+                "image_size or "
+                "max_gaussians. A restart resumes from the last checkpoint, with the same options.",
                 facts=facts,
             )
         else:
             problem = Problem.of(
                 "worker_lost",
-                "The worker let go of the job without saying how it ended.",
-                advice="Restart the job; it goes on from its last checkpoint.",
+                "The worker released the job without reporting how it ended.",
+                advice="Restart the job; it resumes from its last checkpoint.",
                 facts=facts,
             )
-        if self.jobs.end(row, "failed", problem):
+        if self.jobs.give_verdict(row, "failed", problem):
             self.metrics.ended.labels(problem.code).inc()
-            log.warning("job given up", job=row.id, code=problem.code, reason=place.reason)
+            log.warning("job given up", job=row.id, code=problem.code, reason=found.reason)

@@ -1,4 +1,4 @@
-"""What the endpoints share: the connections, and the records they lead to. One per app, made by `create_app`."""
+"""What the endpoints of an app share: connections, settings and records. `create_app` makes one per app."""
 
 import asyncio
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ from splatmill_server.settings import Settings
 
 @dataclass
 class Service:
-    """Connections are opened when they are first used, so that an app can be made while Redis is away."""
+    """The state of an app. Connections are opened on first use, so an app can be created before Redis runs."""
 
     settings: Settings
     redis: Redis
@@ -35,11 +35,11 @@ class Service:
     models: Models
     reaper: Reaper
     closing: asyncio.Event = field(default_factory=asyncio.Event)
-    """Set when the server is asked to stop, so that event streams end instead of holding it up."""
+    """Set when the server is stopped, so that event streams end and do not delay it."""
 
     @classmethod
     def of(cls, settings: Settings) -> "Service":
-        """Raises StorageError when the storage cannot be opened."""
+        """Return the state for these settings. Raises StorageError if storage cannot be opened."""
         storage = Storage(settings.storage)
         connection = connect(settings.redis_url, timeout=settings.redis_timeout, retries=1)
         metrics = Metrics()
@@ -69,7 +69,7 @@ def _renderer(settings: Settings) -> httpx.AsyncClient | None:
     if settings.renderer_url is None:
         return None
     base, socket = rendering.address(settings.renderer_url)
-    # The renderer is one of ours on a private address: a proxy meant for the outside world must not come between.
+    # The renderer has a private address, so requests to it must not go through a proxy.
     transport = httpx.AsyncHTTPTransport(uds=socket) if socket else None
     return httpx.AsyncClient(base_url=base, transport=transport, trust_env=False)
 
@@ -79,4 +79,4 @@ def _service(request: Request) -> Service:
 
 
 Shared = Annotated[Service, Depends(_service)]
-"""An endpoint's parameter through which it gets at the service."""
+"""The parameter through which an endpoint receives the service."""

@@ -1,4 +1,4 @@
-"""What an operator can set, by environment variable or `Settings(...)`."""
+"""The settings of the API process, from environment variables or `Settings(...)`."""
 
 import ipaddress
 from pathlib import Path
@@ -13,35 +13,68 @@ from splatmill.schema import DEFAULT_PORT
 
 
 class Settings(BaseSettings):
-    """The API process. Each name is also an environment variable: `SPLATMILL_` and the name in capitals."""
+    """The settings. Each is also an environment variable: `SPLATMILL_` and the name in capitals."""
 
     model_config = SettingsConfigDict(env_prefix="SPLATMILL_", populate_by_name=True, extra="ignore")
 
     redis_url: str = Field(
-        default=DEFAULT_URL, validation_alias="REDIS_URL", description="redis://host:port/0 or unix:///path."
+        default=DEFAULT_URL,
+        validation_alias="REDIS_URL",
+        description="Address of Redis: redis://host:port/0 or unix:///path.",
     )
-    data: Path = Field(default=Path("splatmill-data"), description="Folder for what is kept on this machine.")
-    storage: str = Field(default="", description="file:///folder or s3://bucket/prefix; else DATA/storage.")
-    renderer_url: str | None = Field(default=None, description="http://host:port or unix:/path.")
-    api_key: SecretStr | None = Field(default=None, description="Demanded as `Authorization: Bearer KEY`.")
+    data: Path = Field(default=Path("splatmill-data"), description="Folder for data on this machine.")
+    storage: str = Field(
+        default="",
+        description="file:///folder or s3://bucket/prefix. Left out, the folder storage in `data`.",
+    )
+    renderer_url: str | None = Field(
+        default=None,
+        description="Address of the renderer: http://host:port or unix:/path. Left out, no images are "
+        "rendered.",
+    )
+    api_key: SecretStr | None = Field(
+        default=None, description="Key that requests must send as `Authorization: Bearer KEY`."
+    )
 
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
     port: int = Field(
-        default=DEFAULT_PORT, ge=0, le=65535, description="Port to listen on; 0 takes any free one."
+        default=DEFAULT_PORT, ge=0, le=65535, description="Port to listen on; 0 takes any free port."
     )
-    uds: Path | None = Field(default=None, description="Unix socket to listen on instead of host and port.")
+    uds: Path | None = Field(
+        default=None, description="Path of a unix socket to listen on, in place of host and port."
+    )
 
-    max_file_bytes: int = Field(default=4 << 30, gt=0, description="Largest uploaded file.")
-    max_files_per_capture: int = Field(default=10_000, gt=0, description="Files a capture may hold.")
-    max_json_bytes: int = Field(default=1 << 20, gt=0, description="Largest body that is not a file.")
-    min_free_bytes: int = Field(default=256 << 20, ge=0, description="Space uploads leave on a local disk.")
+    max_file_bytes: int = Field(
+        default=4 << 30, gt=0, description="Largest size of an uploaded file, in bytes."
+    )
+    max_files_per_capture: int = Field(
+        default=10_000, gt=0, description="Largest number of files in a capture."
+    )
+    max_json_bytes: int = Field(
+        default=1 << 20, gt=0, description="Largest size of a request body that is not a file, in bytes."
+    )
+    min_free_bytes: int = Field(
+        default=256 << 20, ge=0, description="Bytes that uploads leave free on a local disk."
+    )
 
     redis_timeout: float = Field(default=5.0, gt=0, description="Seconds to wait for a reply of Redis.")
-    render_timeout: float = Field(default=120.0, gt=0, description="Seconds to wait for the renderer.")
-    orbit_timeout: float = Field(default=900.0, gt=0, description="Seconds to wait for a whole video.")
-    reaper_interval: float = Field(default=10.0, gt=0, description="Seconds between looks for lost attempts.")
-    stop_interval: float = Field(default=0.1, gt=0, description="Seconds between repeated stop messages.")
-    heartbeat: float = Field(default=15.0, gt=0, description="Seconds between comments on a silent stream.")
+    render_timeout: float = Field(
+        default=120.0, gt=0, description="Seconds to wait for an image of the renderer."
+    )
+    orbit_timeout: float = Field(
+        default=900.0, gt=0, description="Seconds to wait for a video of the renderer."
+    )
+    reaper_interval: float = Field(
+        default=10.0, gt=0, description="Seconds between checks for lost attempts."
+    )
+    stop_interval: float = Field(
+        default=0.1,
+        gt=0,
+        description="Seconds between repeated requests to stop a job that is being cancelled.",
+    )
+    heartbeat: float = Field(
+        default=15.0, gt=0, description="Seconds of silence in an event stream after which a comment is sent."
+    )
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -53,14 +86,14 @@ class Settings(BaseSettings):
             self.api_key = None
         if self.api_key is None and self.uds is None and not is_loopback(self.host):
             raise ValueError(
-                f"Listening on {self.host} lets other machines in, which needs an API key: "
+                f"Listening on {self.host} gives other machines access, which requires an API key: "
                 "set SPLATMILL_API_KEY, or listen on 127.0.0.1."
             )
         return self
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach an address."""
+    """Return whether an address can be reached from this machine only."""
     if host == "localhost":
         return True
     try:

@@ -1,8 +1,8 @@
-"""A job's events as server-sent events: two streams and the row, as one sequence with ids that survive reconnects.
+"""The events of a job as server-sent events: two streams and the row, merged into one sequence.
 
-An id is `<states position>_<progress position>_<told>`: all three are needed to go on exactly where a lost
-connection stopped. What the server itself has to say (queued, and its verdict) appears as state events of attempt 0;
-`told` counts these, two for each generation of the job.
+The id of an event is `<states position>_<progress position>_<row events>`, from which a client can resume after a lost
+connection. The events that follow from the row (queued, and the server's verdict) are state events of attempt 0; there
+are up to two of them in each generation of a job.
 """
 
 import asyncio
@@ -15,7 +15,7 @@ import redis
 from prometheus_client import Gauge
 
 from splatmill.backplane import events, keys
-from splatmill.backplane.events import START, Stored, stream_order
+from splatmill.backplane.events import START, StoredEvent, stream_order
 from splatmill.backplane.fold import Fold
 from splatmill.backplane.row import JobRow
 from splatmill.schema import EventRecord, Job, JobState, StateEvent, Time
@@ -24,29 +24,34 @@ from splatmill_server.service import Service
 _CURSOR = re.compile(r"(\d{1,19}-\d{1,19})_(\d{1,19}-\d{1,19})_(\d{1,9})")
 _LINE_ENDS = {0x85: "\\u0085", 0x2028: "\\u2028", 0x2029: "\\u2029"}
 _BLOCK_MS = 500
-"""How long one read waits; also how late a change of the row can be noticed."""
+"""Milliseconds that a read waits for new entries, after which the row is read again."""
 
 
 @dataclass
 class Cursor:
-    """A position in everything that is told about a job."""
+    """A position in the events of a job.
+
+    states: id of the last entry read from the states stream.
+    progress: id of the last entry read from the progress stream.
+    row_events: number of the last event that follows from the row.
+    """
 
     states: str = START
     progress: str = START
-    told: int = 0
+    row_events: int = 0
 
     @classmethod
     def parse(cls, text: str) -> "Cursor | None":
-        """The cursor in a `Last-Event-ID`, None for a text that is none of ours."""
+        """Return the cursor in a `Last-Event-ID`, or None for any other text."""
         match = _CURSOR.fullmatch(text)
         return cls(match[1], match[2], int(match[3])) if match else None
 
     def __str__(self) -> str:
-        return f"{self.states}_{self.progress}_{self.told}"
+        return f"{self.states}_{self.progress}_{self.row_events}"
 
 
 class Follower:
-    """Follows one job from a cursor on. Raises redis.RedisError when Redis goes away."""
+    """Reads the events of a job from a cursor on. Raises redis.RedisError if Redis cannot be reached."""
 
     def __init__(self, service: Service, job_id: str, cursor: Cursor) -> None:
         self.redis = service.redis_async
@@ -55,26 +60,26 @@ class Follower:
         self.cursor = cursor
 
     async def begin(self, row: JobRow) -> bool:
-        """Take what the client has seen already into account; False when nothing is left to tell."""
+        """Apply the events that the client has already seen; return False if the job had ended by then."""
         self.fold = Fold(row)
         seen = await self._reply(self.redis.xrange(keys.states(self.job_id), max=self.cursor.states))
         for stored in events.decode(seen):
             self.fold.apply(stored)
-        if self.cursor.told > 2 * row.generation:
+        if self.cursor.row_events > 2 * row.generation:
             self.fold.close()
         return not self.fold.final
 
     async def run(self) -> AsyncIterator[EventRecord]:
-        """Each event that counts, until the job's end or the server's."""
+        """Yield the events that count, until the job ends or the server stops."""
         while not self.closing.is_set():
             row = JobRow.of(await self._reply(self.redis.hgetall(keys.job(self.job_id))))
             if row is None:
-                return  # Deleted.
+                return  # the job was deleted
             if row.generation != self.fold.row.generation:
                 self.fold = Fold(row)
             self.fold.row = row
-            if self.cursor.told < 2 * row.generation:
-                yield self._own(2 * row.generation, row.queued_at, StateEvent(state=JobState.queued))
+            if self.cursor.row_events < 2 * row.generation:
+                yield self._row_event(2 * row.generation, row.queued_at, StateEvent(state=JobState.queued))
             for stored, is_state in await self._read():
                 if is_state:
                     self.cursor.states = stored.id
@@ -87,15 +92,15 @@ class Follower:
             verdict = row.verdict
             if verdict is not None and stream_order(self.cursor.states) >= stream_order(verdict.after):
                 event = StateEvent(state=JobState(verdict.state), problem=verdict.problem)
-                yield self._own(2 * row.generation + 1, verdict.at, event)
+                yield self._row_event(2 * row.generation + 1, verdict.at, event)
                 return
 
-    def _own(self, told: int, at: Time, event: StateEvent) -> EventRecord:
-        self.cursor.told = told
+    def _row_event(self, number: int, at: Time, event: StateEvent) -> EventRecord:
+        self.cursor.row_events = number
         return EventRecord(id=str(self.cursor), attempt=0, at=at, event=event)
 
-    async def _read(self) -> list[tuple[Stored, bool]]:
-        """New entries of both streams in the order of Redis's clock; waits a little when there are none."""
+    async def _read(self) -> list[tuple[StoredEvent, bool]]:
+        """Return new entries of both streams, sorted by time; wait briefly if there are none."""
         states, progress = keys.states(self.job_id), keys.progress(self.job_id)
         positions: Any = {states: self.cursor.states, progress: self.cursor.progress}
         reply = await self._reply(self.redis.xread(positions, block=_BLOCK_MS))
@@ -106,12 +111,12 @@ class Follower:
         return await pending
 
 
-def _merge(states: list[Stored], progress: list[Stored]) -> list[tuple[Stored, bool]]:
-    """Both in the order of time, each in its own order; True marks states.
+def _merge(states: list[StoredEvent], progress: list[StoredEvent]) -> list[tuple[StoredEvent, bool]]:
+    """Merge the entries of two streams by time, keeping the order within each; True marks states.
 
-    Within one millisecond a state goes before the progress made in it, but a final state after what led to it.
+    Within a millisecond, a state comes before progress, but a final state after it.
     """
-    merged: list[tuple[Stored, bool]] = []
+    merged: list[tuple[StoredEvent, bool]] = []
     waiting = progress[::-1]
     for stored in states:
         final = isinstance(stored.event, StateEvent) and stored.event.state.final
@@ -122,7 +127,7 @@ def _merge(states: list[Stored], progress: list[Stored]) -> list[tuple[Stored, b
 
 
 async def event_stream(follower: Follower, heartbeat: float, open_streams: Gauge) -> AsyncIterator[bytes]:
-    """The bytes of a `text/event-stream`, with a comment whenever `heartbeat` seconds pass in silence."""
+    """Yield the body of a `text/event-stream`, with a comment after every `heartbeat` seconds without an event."""
     records = follower.run()
     pending: asyncio.Future[EventRecord] | None = None
     open_streams.inc()
@@ -138,7 +143,7 @@ async def event_stream(follower: Follower, heartbeat: float, open_streams: Gauge
             try:
                 record = finished.result()
             except (StopAsyncIteration, redis.RedisError):
-                return  # At a job's end; or Redis went away, and the client comes back with its last id.
+                return  # the job has ended, or Redis cannot be reached and the client will reconnect
             yield encode(record)
     finally:
         open_streams.dec()
@@ -148,13 +153,13 @@ async def event_stream(follower: Follower, heartbeat: float, open_streams: Gauge
 
 
 def encode(record: EventRecord) -> bytes:
-    """One message. `data` is a single line also for readers that take U+2028 and its like for ends of lines."""
+    """Encode a message. Line separators such as U+2028 are escaped, because some parsers split lines at them."""
     data = record.model_dump_json(exclude_none=True).translate(_LINE_ENDS)
     return f"id: {record.id}\nevent: {record.event.type}\ndata: {data}\n\n".encode()
 
 
 async def stored_stream(job: Job) -> AsyncIterator[bytes]:
-    """The one thing storage still knows of a job that Redis has lost: how it ended."""
+    """Yield the end of a job that Redis has lost, which is all that storage knows of its events."""
     event = StateEvent(state=job.state, problem=job.problem)
     at = job.finished_at or job.created_at
     yield encode(EventRecord(id=f"{START}_{START}_0", attempt=job.attempt, at=at, event=event))

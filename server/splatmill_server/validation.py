@@ -1,4 +1,4 @@
-"""From pydantic's list of errors to one problem document: the most telling code, and every error as a fact."""
+"""Converts the errors of pydantic into one problem, with the most specific code and all errors among its facts."""
 
 import difflib
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ _LENS = {"camera", "camera_to_world", "convention", "fx", "fy", "cx", "cy", "fov
 
 
 def problem_of_validation(errors: Sequence[Any]) -> Problem:
-    """The problem for a request that does not fit the schema. `errors` is `RequestValidationError.errors()`."""
+    """Return the problem for a request that does not match the schema; `errors` are those of pydantic."""
     facts: dict[str, Any] = {"errors": [_fact(error) for error in errors[:20]]}
     if any(error["type"] == "json_invalid" for error in errors):
         where = errors[0]["loc"][-1]
         detail = (
-            f"The body is not JSON: {errors[0].get('ctx', {}).get('error', 'it breaks off')} (at {where})."
+            f"The body is not JSON: {errors[0].get('ctx', {}).get('error', 'it is incomplete')} (at {where})."
         )
         return Problem.of("malformed_body", detail, advice="Send one JSON object.", facts=facts)
     for error in errors:
@@ -26,32 +26,36 @@ def problem_of_validation(errors: Sequence[Any]) -> Problem:
             code, detail, advice = found
             return Problem.of(code, detail, advice=advice, facts=facts)
     shown = "; ".join(f"{_path(error)}: {error['msg']}" for error in errors[:3])
-    return Problem.of("invalid_request", f"The request does not fit the schema: {shown}.", facts=facts)
+    return Problem.of("invalid_request", f"The request does not match the schema: {shown}.", facts=facts)
 
 
 def _named(error: Any) -> tuple[str, str, str | None] | None:
-    """Code, sentence and advice for the errors that have a code of their own."""
+    """Return code, detail and advice of an error with a specific code, or None."""
     loc = [str(part) for part in error["loc"] if part != "body"]
     field, kind, given = (loc[-1] if loc else ""), error["type"], error.get("input")
     if loc[:1] == ["options"] and len(loc) > 1:
         if kind == "extra_forbidden":
             near = difflib.get_close_matches(field, TrainOptions.model_fields, n=1)
             advice = f"Did you mean {near[0]!r}?" if near else None
-            return "unknown_option", f"There is no option {field!r}.", advice or "GET /v1/options lists them."
+            return (
+                "unknown_option",
+                f"There is no option {field!r}.",
+                advice or "List the options with GET /v1/options.",
+            )
         if kind in _RANGE:
             detail = f"The option {loc[1]!r} cannot be {_short(given)}: {_sentence(error)}"
-            return "option_out_of_range", detail, "GET /v1/options lists every range."
+            return "option_out_of_range", detail, "List the accepted values with GET /v1/options."
         return None
     if field in _SIZES and kind != "missing":
-        detail = f"The picture's {field} cannot be {_short(given)}: {_sentence(error)}"
+        detail = f"The {field} of the image cannot be {_short(given)}: {_sentence(error)}"
         limits = (
             f"Give sides of 1 to {MAX_RENDER_SIDE} pixels, and at most {MAX_RENDER_PIXELS} pixels in all."
         )
         return "size_out_of_range", detail, limits
     if isinstance(given, dict) and kind == "value_error" and _pixels(given) > MAX_RENDER_PIXELS:
-        return "size_out_of_range", _sentence(error), "Ask for a smaller picture."
+        return "size_out_of_range", _sentence(error), "Request a smaller image."
     if _LENS & set(loc):
-        return "camera_invalid", f"The camera cannot be rendered from: {_sentence(error)}", None
+        return "camera_invalid", f"The camera is not valid: {_sentence(error)}", None
     return None
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from splatmill.backplane.events import Stored
+from splatmill.backplane.events import StoredEvent
 from splatmill.backplane.fold import Fold, fold
 from splatmill.backplane.row import JobRow, Verdict
 from splatmill.schema import Job, JobState, PlanEvent, Problem, ProgressEvent, StateEvent, TrainOptions
@@ -20,12 +20,12 @@ ROW = JobRow(id="a" * 16, capture="b" * 16, options=TrainOptions(), created_at=M
 WHY = Problem.of("sfm_failed", "It failed.")
 
 
-def state(number: int, generation: int, attempt: int, name: str) -> Stored:
+def state(number: int, generation: int, attempt: int, name: str) -> StoredEvent:
     problem = WHY if name == "failed" else None
-    return Stored(f"{number}-0", generation, attempt, StateEvent(state=JobState(name), problem=problem))
+    return StoredEvent(f"{number}-0", generation, attempt, StateEvent(state=JobState(name), problem=problem))
 
 
-def state_of(stored: Stored) -> JobState:
+def state_of(stored: StoredEvent) -> JobState:
     assert isinstance(stored.event, StateEvent)
     return stored.event.state
 
@@ -90,7 +90,7 @@ def test_a_restart_begins_anew(walk: Any) -> None:
 
 def test_progress_of_a_superseded_attempt_is_not_shown() -> None:
     told = [state(1, 1, 1, "training"), state(2, 1, 2, "preparing")]
-    old = Stored("3-0", 1, 1, ProgressEvent(stage="training", done=9))
+    old = StoredEvent("3-0", 1, 1, ProgressEvent(stage="training", done=9))
     assert fold(ROW, told, old).progress is None
     new = replace(old, attempt=2)
     progress = fold(ROW, told, new).progress
@@ -101,7 +101,7 @@ def test_progress_of_a_superseded_attempt_is_not_shown() -> None:
 def test_the_plan_and_the_times_are_those_of_the_events() -> None:
     told = [
         state(1_000, 1, 1, "preparing"),
-        Stored("2000-0", 1, 1, PlanEvent(plan={"sh": 3})),
+        StoredEvent("2000-0", 1, 1, PlanEvent(plan={"sh": 3})),
         state(3_000, 1, 1, "succeeded"),
     ]
     job: Job = fold(ROW, told)

@@ -32,8 +32,8 @@ def test_a_job_is_accepted_queued_and_seen(app: Running) -> None:
         100,
     )
     assert app.http.get(made.headers["location"]).json() == job
-    place = queue.place(app.redis, job["id"], 1)
-    assert (place.standing, place.position) == ("waiting", 0)
+    place = queue.status(app.redis, job["id"], 1)
+    assert (place.state, place.position) == ("waiting", 0)
 
 
 def test_what_a_worker_says_is_what_a_client_sees(app: Running) -> None:
@@ -192,7 +192,7 @@ def test_a_failed_job_says_why_and_restarts_as_a_new_generation(app: Running) ->
     found = row.read(app.redis, job_id)
     assert found is not None
     assert found.generation == 2
-    assert queue.place(app.redis, job_id, 2).standing == "waiting"
+    assert queue.status(app.redis, job_id, 2).state == "waiting"
 
 
 def test_deleting_a_job_removes_its_model_and_every_key(app: Running) -> None:

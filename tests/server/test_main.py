@@ -45,9 +45,9 @@ def test_reasons_not_to_start_are_sentences(tmp_path: Path, redis_url: str) -> N
     assert "SPLATMILL_API_KEY" in refusal(SPLATMILL_HOST="0.0.0.0", SPLATMILL_DATA=data)
     assert "SPLATMILL_API_KEY" in refusal("--host", "0.0.0.0", SPLATMILL_DATA=data)
     (tmp_path / "file").write_text("x")
-    assert "cannot be made" in refusal(SPLATMILL_DATA=str(tmp_path / "file"))
+    assert "cannot be created" in refusal(SPLATMILL_DATA=str(tmp_path / "file"))
     # Nobody, not even root, can make a folder there.
-    assert "cannot be made" in refusal(SPLATMILL_DATA="/proc/splatmill")
+    assert "cannot be created" in refusal(SPLATMILL_DATA="/proc/splatmill")
     assert "SPLATMILL_PORT" in refusal(SPLATMILL_PORT="99999999", SPLATMILL_DATA=data)
     assert "renderer" in refusal(SPLATMILL_RENDERER_URL="ftp://x", SPLATMILL_DATA=data).lower()
     with socket.create_server(("127.0.0.1", 0)) as taken:

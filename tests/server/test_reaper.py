@@ -114,12 +114,12 @@ def test_a_dead_workers_attempt_is_queued_again(app: Running, tmp_path: Path) ->
     pid_file = tmp_path / "pid"
     with worker(app, pid_file) as process:
         pid = int(wait_for(lambda: pid_file.exists() and pid_file.read_text(), 20))
-        assert queue.place(app.redis, job_id, 1).standing == "running"
+        assert queue.status(app.redis, job_id, 1).state == "running"
         process.kill()
         process.wait()
         os.kill(pid, 9)
     # Its heartbeat was good for two seconds; the reaper sees that it is over.
-    wait_for(lambda: app.service.reaper.tick() or queue.place(app.redis, job_id, 1).standing == "waiting", 15)
+    wait_for(lambda: app.service.reaper.tick() or queue.status(app.redis, job_id, 1).state == "waiting", 15)
     assert app.state(job_id) == "queued"
 
 
@@ -129,7 +129,7 @@ def test_a_job_whose_tries_are_used_up_fails_by_name(app: Running, tmp_path: Pat
     app.say(job_id, StateEvent(state=JobState.training), ProgressEvent(stage="training", done=3))
     with worker(app, tmp_path / "pid", "die") as process:
         process.wait(60)
-    assert queue.place(app.redis, job_id, 1).standing == "failed"
+    assert queue.status(app.redis, job_id, 1).state == "failed"
     app.service.reaper.tick()
     job = app.http.get(f"/v1/jobs/{job_id}").json()
     assert job["state"] == "failed"
@@ -154,7 +154,7 @@ def test_an_attempt_that_ends_without_a_word_is_noticed_on_the_second_look(
 def test_a_job_the_queue_forgot_is_queued_again_once(app: Running) -> None:
     job_id = app.job()
     queue.forget(app.redis, job_id, 1)
-    assert queue.place(app.redis, job_id, 1).standing == "absent"
+    assert queue.status(app.redis, job_id, 1).state == "absent"
     for _ in range(3):
         app.service.reaper.tick()
     assert queue.waiting(app.redis) == {"train": 1}
@@ -219,5 +219,5 @@ def test_a_verdict_on_what_changed_meanwhile_is_not_given(app: Running, change: 
     app.say(job_id, StateEvent(state=JobState.succeeded))
     if change == "restart":
         app.http.post(f"/v1/jobs/{job_id}/restart")
-    assert app.service.jobs.end(old, "cancelled") is False
+    assert app.service.jobs.give_verdict(old, "cancelled") is False
     assert app.state(job_id) == ("queued" if change == "restart" else "succeeded")

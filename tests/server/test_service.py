@@ -114,7 +114,7 @@ def test_other_machines_need_a_key() -> None:
 
 def test_storage_that_cannot_be_opened_is_said_so(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
-    with pytest.raises(StorageError, match="cannot be made"):
+    with pytest.raises(StorageError, match="cannot be created"):
         create_app(Settings(data=tmp_path / "file"))
     with pytest.raises(StorageError, match="neither file"):
         create_app(Settings(storage="ftp://x/y"))

@@ -44,7 +44,7 @@ class Walk(RuleBasedStateMachine):
 
     def entry(self, job_id: str) -> QueueJob | None:
         found = row.read(self.redis, job_id)
-        if found is None or queue.place(self.redis, job_id, found.generation).standing == "absent":
+        if found is None or queue.status(self.redis, job_id, found.generation).state == "absent":
             return None
         rq_id = queue.rq_id(job_id, found.generation)
         return QueueJob.fetch(rq_id, connection=self.redis, serializer=queue.SERIALIZER)
@@ -151,7 +151,7 @@ class Walk(RuleBasedStateMachine):
         for job_id in self.known:
             job, found = self.service.jobs.get(job_id), row.read(self.redis, job_id)
             assert found is not None
-            standing = queue.place(self.redis, job_id, found.generation).standing
+            standing = queue.status(self.redis, job_id, found.generation).state
             assert job.state.final or standing in ("waiting", "running"), (job, standing)
             if found.cancel_requested_at is not None:
                 assert job.state.final or standing == "running"

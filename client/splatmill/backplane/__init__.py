@@ -1,4 +1,4 @@
-"""What server and worker share behind the API: Redis keys and streams, the queue, and the storage layout.
+"""What the server and the worker share behind the API: Redis keys and streams, the job queue, and the storage layout.
 
-Install it with the extra `splatmill[backplane]`. The SDK and the command line never import it.
+It is installed with the extra `splatmill[backplane]`. The SDK and the command line never import it.
 """

@@ -1,4 +1,4 @@
-"""One way to open Redis, so that server and worker agree on time-outs and encoding."""
+"""Redis clients for the server and the worker, with the same timeouts, retries and encoding."""
 
 from typing import Any
 
@@ -12,11 +12,11 @@ DEFAULT_URL = "redis://127.0.0.1:6379/0"
 
 
 def connect(url: str = DEFAULT_URL, *, timeout: float | None = None, retries: int = 3) -> redis.Redis:
-    """A synchronous client. Replies are bytes, because RQ, which shares it, expects bytes.
+    """Return a synchronous client, which connects on first use. Its replies are bytes, as RQ expects.
 
-    `unix:///path/to/redis.sock` and `redis://host:port/db` are both understood; no connection is made yet.
-    `timeout` (seconds) bounds the wait for a reply, `retries` how often a lost connection is tried anew: an API
-    that must answer takes few, a worker that can wait takes the defaults.
+    url: `redis://host:port/db` or `unix:///path/to/redis.sock`.
+    timeout: seconds to wait for a reply; None waits for ever.
+    retries: how often a command is retried after a lost connection. The API, which must answer, uses few.
     """
     return redis.Redis.from_url(
         url,
@@ -28,7 +28,7 @@ def connect(url: str = DEFAULT_URL, *, timeout: float | None = None, retries: in
 
 
 def connect_async(url: str = DEFAULT_URL) -> redis.asyncio.Redis:
-    """An asyncio client for waiting on streams, without a time-out of its own (`XREAD BLOCK` waits)."""
+    """Return an asyncio client for reading streams. It has no timeout, because `XREAD BLOCK` waits by design."""
     return redis.asyncio.Redis.from_url(
         url,
         health_check_interval=15,

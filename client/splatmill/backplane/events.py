@@ -1,7 +1,7 @@
-"""The two event streams of a job: `states` is never trimmed, `progress` is. Only the worker appends.
+"""The two event streams of a job: `states`, which is never trimmed, and `progress`, which is. Only workers append.
 
-Each entry carries the generation and attempt that said it; its time is Redis's own, taken from the entry's id, so
-that all machines share one clock.
+Each entry carries its generation and attempt. Its time is taken from the entry's id, which Redis assigns, so all
+machines share one clock.
 """
 
 from collections.abc import Iterable, Mapping
@@ -15,18 +15,24 @@ from splatmill.backplane import keys
 from splatmill.schema import EVENT, Event, EventRecord, PlanEvent, ProgressEvent, StateEvent
 
 PROGRESS_LENGTH = 4000
-"""Entries of the progress stream that are kept, about one megabyte per job."""
+"""Number of entries to which the progress stream is trimmed: about one megabyte per job."""
 
 START = "0-0"
 """The position before the first entry of a stream."""
 
-_PAGE = 100
+_PAGE = 100  # entries per read
 _PAGES = 10
 
 
 @dataclass(frozen=True)
-class Stored:
-    """An event as it lies in a stream. `id` is the entry's id in its own stream, `<milliseconds>-<number>`."""
+class StoredEvent:
+    """An event in a stream.
+
+    id: id of the entry in its stream, `<milliseconds>-<number>`.
+    generation: generation of the job; each restart begins a new one.
+    attempt: number of the attempt that appended it.
+    event: the event itself.
+    """
 
     id: str
     generation: int
@@ -39,42 +45,42 @@ class Stored:
 
     @property
     def order(self) -> tuple[int, int]:
-        """Sorts entries of one stream as Redis does; ids do not sort as text."""
+        """A key that sorts the entries of a stream as Redis does; ids do not sort as text."""
         return stream_order(self.id)
 
     def record(self, cursor: str) -> EventRecord:
-        """The event on the wire, with `cursor` (a position in both streams) as its id."""
+        """Return the event as it is sent to clients, with `cursor`, a position in both streams, as its id."""
         return EventRecord(id=cursor, attempt=self.attempt, at=self.at, event=self.event)
 
 
 def stream_order(entry_id: str) -> tuple[int, int]:
-    """The two numbers of a stream entry's id."""
+    """Return the two numbers in the id of a stream entry."""
     milliseconds, _, number = entry_id.partition("-")
     return int(milliseconds), int(number or 0)
 
 
 def stream_of(job_id: str, event: Event) -> str:
-    """The key of the stream an event belongs to: what the fold cannot do without is never trimmed."""
+    """Return the key of the stream for an event: `fold` needs every state and plan, so these are never trimmed."""
     return keys.states(job_id) if isinstance(event, StateEvent | PlanEvent) else keys.progress(job_id)
 
 
 def begin_attempt(connection: redis.Redis, job_id: str) -> int:
-    """Count a new attempt and return its number, from 1 up over all generations. Called by the worker, once."""
+    """Count a new attempt and return its number, which starts at 1 and continues over generations. For workers."""
     return connection.incr(keys.attempts(job_id))
 
 
 def append(connection: redis.Redis, job_id: str, generation: int, attempt: int, event: Event) -> str:
-    """Append an event and return its id in its stream. Called by the worker only."""
+    """Append an event to its stream and return the id of the entry. For workers."""
     key = stream_of(job_id, event)
     fields = {"g": generation, "a": attempt, "e": event.model_dump_json(exclude_none=True)}
     maxlen = PROGRESS_LENGTH if key == keys.progress(job_id) else None
     return cast(bytes, connection.xadd(key, cast(Any, fields), maxlen=maxlen)).decode()
 
 
-def decode(entries: Iterable[tuple[bytes, Mapping[bytes, bytes]]]) -> list[Stored]:
-    """The events in a reply of XRANGE, XREVRANGE or one stream of XREAD, in its order."""
+def decode(entries: Iterable[tuple[bytes, Mapping[bytes, bytes]]]) -> list[StoredEvent]:
+    """Return the events in the reply to XRANGE, XREVRANGE, or XREAD of one stream, in the same order."""
     return [
-        Stored(
+        StoredEvent(
             id=entry_id.decode(),
             generation=int(fields[b"g"]),
             attempt=int(fields[b"a"]),
@@ -84,18 +90,18 @@ def decode(entries: Iterable[tuple[bytes, Mapping[bytes, bytes]]]) -> list[Store
     ]
 
 
-def read_states(connection: redis.Redis, job_id: str) -> list[Stored]:
-    """Every state and plan of a job, oldest first."""
+def read_states(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
+    """Return all states and plans of a job, oldest first."""
     return decode(cast(Any, connection.xrange(keys.states(job_id))))
 
 
-def read_progress(connection: redis.Redis, job_id: str) -> list[Stored]:
-    """What is left of a job's progress stream, oldest first."""
+def read_progress(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
+    """Return the entries of a job's progress stream that were not trimmed, oldest first."""
     return decode(cast(Any, connection.xrange(keys.progress(job_id))))
 
 
-def last_progress(connection: redis.Redis, job_id: str) -> Stored | None:
-    """The newest `ProgressEvent`. Log lines and metrics lie in between, so it looks back over at most 1000 entries."""
+def last_progress(connection: redis.Redis, job_id: str) -> StoredEvent | None:
+    """Return the newest `ProgressEvent` among the last 1000 entries, which include log lines and metrics, or None."""
     end = "+"
     for _ in range(_PAGES):
         page = decode(cast(Any, connection.xrevrange(keys.progress(job_id), max=end, count=_PAGE)))

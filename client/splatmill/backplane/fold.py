@@ -1,24 +1,22 @@
-"""What a client sees of a job, as a pure function of the row, the states and the last progress.
+"""The state machine of the service: a job as clients see it, as a pure function of its row, states and progress.
 
-The state machine of the service lives here and nowhere else:
-
-- a restart is a new generation; events of other generations do not count;
-- a later attempt wins over an earlier one, whose process may still be writing;
-- nothing follows the final state of a generation;
-- `cancelled` is the server's word alone, given once no process is left; a worker's own is not final.
+- A restart begins a new generation; events of other generations are ignored.
+- A later attempt supersedes an earlier one, whose process may still be appending events.
+- Nothing follows the final state of a generation.
+- Only the server makes a job cancelled, once no process of it is left; a worker's own `cancelled` is ignored.
 """
 
 from collections.abc import Iterable
 from datetime import datetime
 from typing import Any
 
-from splatmill.backplane.events import Stored, stream_order
+from splatmill.backplane.events import StoredEvent, stream_order
 from splatmill.backplane.row import JobRow
 from splatmill.schema import Job, JobState, PlanEvent, Problem, Progress, ProgressEvent, StateEvent
 
 
 class Fold:
-    """The fold, one event at a time, for a reader that follows the streams."""
+    """The state of one job, updated event by event, for a reader that follows the streams."""
 
     def __init__(self, row: JobRow) -> None:
         self.row = row
@@ -34,8 +32,8 @@ class Fold:
     def final(self) -> bool:
         return self.state.final
 
-    def counts(self, stored: Stored) -> bool:
-        """Whether an event changes what a client sees, or comes from a superseded attempt or too late."""
+    def counts(self, stored: StoredEvent) -> bool:
+        """Return whether an event counts; not if its attempt is superseded or it follows the end of the job."""
         if stored.generation != self.row.generation or stored.attempt < self.attempt or self.final:
             return False
         event, verdict = stored.event, self.row.verdict
@@ -44,8 +42,8 @@ class Fold:
             return not late and event.state is not JobState.cancelled
         return True
 
-    def apply(self, stored: Stored) -> bool:
-        """Take an event into account; False when it does not count."""
+    def apply(self, stored: StoredEvent) -> bool:
+        """Update the state by an event; return False if the event does not count."""
         if not self.counts(stored):
             return False
         event = stored.event
@@ -65,7 +63,7 @@ class Fold:
         return True
 
     def close(self) -> bool:
-        """Apply the server's verdict, if there is one and no worker's final state came before it."""
+        """Apply the server's verdict. Return False if there is none, or if a worker's final state came first."""
         verdict = self.row.verdict
         if verdict is None or self.final:
             return False
@@ -75,7 +73,7 @@ class Fold:
         return True
 
     def job(self) -> Job:
-        """The job as a client sees it now."""
+        """Return the job as clients see it now."""
         row = self.row
         return Job(
             id=row.id,
@@ -95,12 +93,12 @@ class Fold:
         )
 
 
-def fold(row: JobRow, states: Iterable[Stored], last_progress: Stored | None = None) -> Job:
-    """The job that a row, its states (in stream order) and its newest progress amount to."""
+def fold(row: JobRow, states: Iterable[StoredEvent], last_progress: StoredEvent | None = None) -> Job:
+    """Return the job that follows from its row, its states in stream order, and its newest progress."""
     folded = Fold(row)
     for stored in states:
         folded.apply(stored)
-    # Progress lies in a stream of its own: the newest one says how far things were even after the final state.
+    # Progress has a stream of its own, so the newest one is applied even if a final state was reached.
     latest = last_progress
     if latest is not None and latest.generation == row.generation and latest.attempt >= folded.attempt:
         assert isinstance(latest.event, ProgressEvent)

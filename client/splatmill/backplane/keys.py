@@ -1,48 +1,47 @@
-"""The names of everything Splatmill keeps in Redis, in one place.
+"""The names of all keys of Splatmill in Redis. RQ keeps its own under `rq:`.
 
-RQ keeps its own keys under `rq:`. Nothing here expires: a job's keys go when the job is deleted.
+The keys of a job are deleted with the job; only those of `idempotency` expire.
 """
 
 PREFIX = "splatmill:"
 
 JOBS = PREFIX + "jobs"
-"""Sorted set of job ids, scored by creation time in milliseconds: the order of the list endpoint."""
+"""Sorted set of job ids, scored by time of creation in milliseconds: the order in which jobs are listed."""
 
 ACTIVE = PREFIX + "active"
-"""Set of ids of jobs that have not ended, as far as the server has seen: what the reaper looks at. An ended job may
-still be in it; one that has not ended always is."""
+"""Set of the ids of unfinished jobs, which the reaper checks. It may still hold jobs that have ended."""
 
 
 def job(job_id: str) -> str:
-    """Hash: the job row. Only the server writes it."""
+    """Return the key of the job row, a hash. Only the server writes it."""
     return f"{PREFIX}job:{job_id}"
 
 
 def states(job_id: str) -> str:
-    """Stream of state changes, never trimmed. Only the worker appends."""
+    """Return the key of the stream of states and plans, which is never trimmed. Only workers append."""
     return f"{PREFIX}job:{job_id}:states"
 
 
 def progress(job_id: str) -> str:
-    """Stream of metrics, log lines and previews, trimmed. Only the worker appends."""
+    """Return the key of the stream of progress, metrics, logs and previews, which is trimmed. Only workers append."""
     return f"{PREFIX}job:{job_id}:progress"
 
 
 def attempts(job_id: str) -> str:
-    """Counter: how many attempts began, over all generations. Only the worker counts."""
+    """Return the key of the number of attempts that have begun, over all generations. Only workers count."""
     return f"{PREFIX}job:{job_id}:attempts"
 
 
 def lock(job_id: str) -> str:
-    """Hash: the process that works on a job now. Only workers write it."""
+    """Return the key of the lock, a hash with the process that works on the job. Only workers write it."""
     return f"{PREFIX}job:{job_id}:lock"
 
 
 def idempotency(key_digest: str) -> str:
-    """String: what an `Idempotency-Key` was first used for. Holds the job id and the digest of the body."""
+    """Return the key of a string with the job id and the body digest that an `Idempotency-Key` was first used for."""
     return f"{PREFIX}idempotency:{key_digest}"
 
 
 def of_job(job_id: str) -> tuple[str, ...]:
-    """Every key that belongs to one job, for deletion."""
+    """Return all keys of a job, for deletion."""
     return job(job_id), states(job_id), progress(job_id), attempts(job_id), lock(job_id)

@@ -1,15 +1,15 @@
-"""Where things lie in storage: pure functions from ids to paths.
+"""The layout of storage: pure functions from ids to paths.
 
-captures/{id}/capture.json                  the capture's record
-captures/{id}/files/{role}/{name}           what was uploaded; role is images, masks or poses, name is safe_name's
-captures/{id}/sha256/{role}/{name}          hex digest of that file; written first, so it decides who owns a name
-captures/{id}/incoming/{token}              an upload under way; renamed into files/ when whole
-captures/{id}/sfm/...                       reconstruction shared by the jobs of this capture
-jobs/{id}/work/...                          checkpoints and state that another machine may pick up
+captures/{id}/capture.json                  record of the capture
+captures/{id}/files/{role}/{name}           uploaded file; role is images, masks or poses, name a `safe_name`
+captures/{id}/sha256/{role}/{name}          hex digest of that file; written first, so that it claims the name
+captures/{id}/incoming/{token}              upload in progress; renamed into files/ when complete
+captures/{id}/sfm/...                       reconstruction, shared by the jobs of the capture
+jobs/{id}/work/...                          checkpoints and other files from which another machine can resume
 models/{id}/{file}                          model.ply, report.json, report.png, report.html, cameras.json, ...
-models/{id}/job.json                        the job as it ended; its presence is what makes a model exist
+models/{id}/job.json                        record of the ended job; written last: a model exists once it does
 
-A model's id is the id of the job that made it.
+The id of a model is that of the job that made it.
 """
 
 from splatmill.schema import Role
@@ -25,11 +25,11 @@ MODEL_FILES = {
     "preview.jpg": "image/jpeg",
     "progress.mp4": "video/mp4",
 }
-"""Names a model may hold, with the media type each is served under."""
+"""The files that a model may have, with their media types."""
 
 
 def is_id(text: str) -> bool:
-    """Whether `text` has the shape of a capture or job id; anything else must never reach a path."""
+    """Return whether `text` has the form of an id. No other text may become part of a path."""
     return ID.fullmatch(text) is not None
 
 
@@ -46,7 +46,7 @@ def capture_record(capture_id: str) -> str:
 
 
 def capture_files(capture_id: str, role: Role | None = None) -> str:
-    """The folder of all uploads, or of those of one role: `images`, `masks` and `poses` lie side by side in it."""
+    """Return the folder of all uploaded files, or of those of one role."""
     folder = f"captures/{capture_id}/files"
     return folder if role is None else f"{folder}/{role}"
 
@@ -60,7 +60,7 @@ def capture_digest(capture_id: str, role: Role, name: str) -> str:
 
 
 def capture_incoming(capture_id: str, token: str | None = None) -> str:
-    """The folder of uploads under way, or one of them."""
+    """Return the folder of uploads in progress, or the path of one of them."""
     folder = f"captures/{capture_id}/incoming"
     return folder if token is None else f"{folder}/{token}"
 
@@ -90,5 +90,5 @@ def model_file(model_id: str, name: str) -> str:
 
 
 def job_record(job_id: str) -> str:
-    """`job.json` beside the model: the truth about a finished job when Redis is gone."""
+    """Return the path of `job.json`, from which a finished job is read when Redis has lost it."""
     return f"models/{job_id}/job.json"

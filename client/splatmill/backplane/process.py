@@ -1,6 +1,6 @@
-"""Processes that must not outlive others, and proof that a process is dead.
+"""Processes that end with their parent, and a reliable test whether a process has ended.
 
-Both serve one promise: no attempt at a job keeps running unseen, and none begins while an older one may still run.
+Together they ensure that no attempt at a job runs unnoticed, and that none begins while an earlier one may still run.
 """
 
 import ctypes
@@ -19,10 +19,10 @@ _WATCH_SECONDS = 0.5
 def die_with_parent(parent: int, sig: signal.Signals = signal.SIGKILL) -> None:
     """Have the kernel send `sig` to this process when its parent ends, however the parent ends.
 
-    `parent` is the process id the caller knows its parent by, from before the fork: if the parent died between
-    the fork and this call, no signal would ever come, so the process ends itself here and now. The kernel watches
-    the parent's *thread*; fork from one that lives as long as the process. Where the kernel has no such call
-    (macOS), a thread looks twice a second whether the parent is still there.
+    `parent` is the parent's process id, read before the fork: if the parent ended between the fork and this call, no
+    signal would ever arrive, so this process then exits at once. Linux watches the *thread* that forked, so fork from
+    one that lives as long as the parent. On other systems (macOS), a thread checks twice a second whether the parent
+    still exists.
     """
     if sys.platform == "linux":
         libc = ctypes.CDLL(None, use_errno=True)
@@ -42,10 +42,13 @@ def _watch(parent: int, sig: signal.Signals) -> None:
 
 @dataclass(frozen=True)
 class ProcessIdentity:
-    """A process, told apart from every other one that ever had its number.
+    """A unique identity of a process: process ids are reused, these are not. Fields unknown on a platform are empty.
 
-    machine is the host's id and name, boot the kernel's id of this boot, namespace that of the process numbers,
-    started the process's start in clock ticks since boot. Fields a platform does not tell are empty.
+    machine: machine id and host name.
+    boot: the kernel's id of the current boot.
+    namespace: the namespace that the process id belongs to.
+    pid: process id.
+    started: start of the process in clock ticks since boot.
     """
 
     machine: str
@@ -56,7 +59,7 @@ class ProcessIdentity:
 
     @classmethod
     def of(cls, pid: int) -> "ProcessIdentity":
-        """The identity of a process on this machine; ProcessLookupError when there is none."""
+        """Return the identity of a process on this machine. Raises ProcessLookupError if there is none."""
         started = start_time(pid)
         if started is None:
             raise ProcessLookupError(f"There is no process {pid}.")
@@ -64,7 +67,7 @@ class ProcessIdentity:
 
     @classmethod
     def load(cls, fields: dict[str, object]) -> "ProcessIdentity":
-        """From what `dump` gave. Raises KeyError, TypeError or ValueError for anything else."""
+        """Return the identity that `dump` wrote. Raises KeyError, TypeError or ValueError for other fields."""
         return cls(
             machine=str(fields["machine"]),
             boot=str(fields["boot"]),
@@ -77,26 +80,26 @@ class ProcessIdentity:
         return asdict(self)
 
     def visible(self) -> bool:
-        """Whether this machine can tell if the process lives: it ran here, in this namespace of process numbers,
-        or before the last boot."""
+        """Return whether this machine can tell if the process runs: it belongs to this machine, and to this namespace
+        of process ids or to an earlier boot."""
         if self.machine != _machine():
             return False
         return self.boot != _boot() or self.namespace == _namespace()
 
     def dead(self) -> bool:
-        """Whether the process is gone for certain. A process elsewhere never is, seen from here."""
+        """Return whether the process has certainly ended. This cannot be known of a process elsewhere."""
         if not self.visible():
             return False
         return self.boot != _boot() or start_time(self.pid) != self.started
 
 
 def start_time(pid: int) -> str | None:
-    """Start of a live process in clock ticks since boot ("" where the platform does not tell), None for none.
+    """Return the start of a running process in clock ticks since boot ("" where that is unknown), or None.
 
-    A zombie counts as gone: it runs nothing, and waits only to be noticed.
+    A zombie counts as ended: it only waits for its parent to read its status.
     """
     try:
-        # The second field, the name in parentheses, may hold blanks and parentheses of its own.
+        # The second field, the name in parentheses, may itself contain spaces and parentheses.
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except (FileNotFoundError, ProcessLookupError):
         if sys.platform == "linux":
@@ -112,7 +115,7 @@ def start_time(pid: int) -> str | None:
 
 
 def wait_gone(pid: int, started: str | None, seconds: float) -> bool:
-    """Wait until the process that began at `started` has ended; False when it still runs after `seconds`."""
+    """Wait until the process that began at `started` has ended; return False if it still runs after `seconds`."""
     deadline = time.monotonic() + seconds
     while started is not None and start_time(pid) == started:
         if time.monotonic() > deadline:
@@ -122,7 +125,7 @@ def wait_gone(pid: int, started: str | None, seconds: float) -> bool:
 
 
 def _machine() -> str:
-    # Containers of one image may share the id, and machines of two networks the name.
+    # Containers of one image may share the machine id, and machines in two networks the host name.
     return f"{_first_line('/etc/machine-id')}/{os.uname().nodename}"
 
 

@@ -1,7 +1,7 @@
-"""The queue between server and worker: RQ, with every setting that must differ from its defaults in one place.
+"""The job queue between server and worker: RQ, and all settings that differ from its defaults.
 
-An RQ job is one generation of one Splatmill job; each try at it is an attempt. The server enqueues and stops by
-the dotted name of the function, so it never imports the worker.
+An RQ job is one generation of a Splatmill job, and each run of it is an attempt. The server enqueues the worker's
+function by its dotted name, so that it need not import the worker.
 """
 
 from dataclasses import dataclass
@@ -15,48 +15,47 @@ from rq.job import Job, JobStatus
 from rq.serializers import JSONSerializer
 
 TRAIN = "train"
-"""The queue of workers that take a job from photos to model. One queue per worker kind: listening on several
-opens a small window in which RQ loses a job."""
+"""The queue of training jobs. A worker listens on one queue: with several, RQ can lose a job while it is dequeued."""
 
 QUEUES = (TRAIN,)
 
 ATTEMPT = "splatmill_worker.service.job.run_attempt"
-"""What a worker calls, with the job id as its one argument; the generation is in the RQ job's id."""
+"""The function that a worker calls with the job id; the generation is part of the id of the RQ job."""
 
 SERIALIZER = JSONSerializer
-"""JSON, not RQ's default pickle: whoever can write to Redis must not thereby run code in a worker."""
+"""JSON in place of pickle, RQ's default, so that write access to Redis does not allow running code in a worker."""
 
 JOB_TIMEOUT = -1
-"""No time limit (RQ's default is 180 s); a job's own `time_budget` ends its training."""
+"""No time limit (RQ's default is 180 s); the option `time_budget` limits the training."""
 
 MAX_RETRIES = 3
-"""Tries after the first when a process dies; a failure the pipeline reports itself is not tried again."""
+"""Number of further attempts when the process of a job dies. A failure that the pipeline reports is not retried."""
 
 WORKER_TTL = 30
-"""Seconds until an idle worker that went away is forgotten (RQ's default is 420)."""
+"""Seconds after which an idle worker that has disappeared is no longer listed (RQ's default is 420)."""
 
 MAINTENANCE_INTERVAL = 10
-"""Seconds between an idle worker's clean-ups (RQ's default is 600)."""
+"""Seconds between the clean-ups of an idle worker (RQ's default is 600)."""
 
 MONITORING_INTERVAL = 5
-"""Seconds between heartbeats of a busy worker's parent process (RQ's default is 30)."""
+"""Seconds between the heartbeats of a busy worker (RQ's default is 30)."""
 
 HEARTBEAT_SLACK = 10
-"""Seconds a heartbeat may be late before the attempt counts as lost (RQ builds in 60). With the interval above,
-a job whose machine died is taken up again after 15 s plus one reaper tick."""
+"""Seconds by which a heartbeat may be late before the attempt counts as lost (RQ's constant is 60). If a machine
+dies, its job is requeued after MONITORING_INTERVAL + HEARTBEAT_SLACK and one interval of the reaper."""
 
 KEEP_FINISHED = 24 * 3600
-"""Seconds RQ keeps its own record of a finished job; Splatmill's record stays until the job is deleted."""
+"""Seconds for which RQ keeps its record of a finished job. Splatmill's own stays until the job is deleted."""
 
-Standing = Literal["waiting", "running", "finished", "failed", "stopped", "absent"]
-"""What the queue knows of a generation: `failed` means its tries are used up, `stopped` that it was killed on
-request or taken out of the queue and no process of it is left, `absent` that RQ has no record."""
+QueueState = Literal["waiting", "running", "finished", "failed", "stopped", "absent"]
+"""State of a generation in the queue. `failed`: all attempts were used up. `stopped`: it was killed on request or
+withdrawn, and no process of it is left. `absent`: RQ has no record of it."""
 
 _OUR_LOCK = 30
 _RQ_LOCK = 899
-"""Seconds after which our lock on cleaning a queue, and RQ's own, expire."""
+"""Seconds after which the lock on cleaning a queue expires when `reclaim` or RQ itself holds it."""
 
-_STANDINGS: dict[JobStatus, Standing] = {
+_STATES: dict[JobStatus, QueueState] = {
     JobStatus.QUEUED: "waiting",
     JobStatus.DEFERRED: "waiting",
     JobStatus.SCHEDULED: "waiting",
@@ -69,28 +68,33 @@ _STANDINGS: dict[JobStatus, Standing] = {
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a generation stands in the queue: `position` counts from 0 while waiting; `reason` is RQ's last word
-    on a failed one; `worker` names the one that runs it."""
+class QueueStatus:
+    """What the queue knows about a generation.
 
-    standing: Standing
+    state: its state in the queue.
+    position: number of jobs before it while it waits.
+    worker: name of the worker that runs it.
+    reason: last line of RQ's error message if it failed.
+    """
+
+    state: QueueState
     position: int | None = None
     worker: str | None = None
     reason: str | None = None
 
 
 def open_queue(connection: redis.Redis, name: str = TRAIN) -> Queue:
-    """The RQ queue with our serializer and no time limit."""
+    """Return the RQ queue with this name, with JSON as serializer and without a time limit."""
     return Queue(name, connection=connection, serializer=SERIALIZER, default_timeout=JOB_TIMEOUT)
 
 
 def rq_id(job_id: str, generation: int) -> str:
-    """RQ's id of one generation of a job. RQ allows letters, digits, `_` and `-` only."""
+    """Return RQ's id of a generation of a job. RQ allows only letters, digits, `_` and `-`."""
     return f"{job_id}-{generation}"
 
 
 def split_rq_id(text: str) -> tuple[str, int]:
-    """The job id and generation in RQ's id; ValueError when it is not one of ours."""
+    """Return the job id and the generation in an id of RQ. Raises ValueError for an id of another form."""
     job_id, _, generation = text.rpartition("-")
     if not job_id or not generation.isdigit():
         raise ValueError(f"{text!r} is not '<job id>-<generation>'.")
@@ -98,7 +102,7 @@ def split_rq_id(text: str) -> tuple[str, int]:
 
 
 def enqueue(connection: redis.Redis, job_id: str, generation: int, name: str = TRAIN) -> bool:
-    """Put a generation at the end of the queue; False when RQ already has it, so two callers cannot double it."""
+    """Append a generation to the queue; return False if RQ already has it, so two callers cannot enqueue it twice."""
     try:
         open_queue(connection, name).enqueue_call(
             ATTEMPT,
@@ -115,27 +119,27 @@ def enqueue(connection: redis.Redis, job_id: str, generation: int, name: str = T
     return True
 
 
-def place(connection: redis.Redis, job_id: str, generation: int) -> Place:
-    """Where a generation stands now."""
+def status(connection: redis.Redis, job_id: str, generation: int) -> QueueStatus:
+    """Return what the queue knows about a generation."""
     job = _fetch(connection, job_id, generation)
     if job is None:
-        return Place("absent")
-    standing = _STANDINGS.get(job.get_status(refresh=False), "waiting")
-    if standing == "waiting":
-        return Place(standing, position=open_queue(connection, job.origin).get_job_position(job))
-    if standing == "failed":
+        return QueueStatus("absent")
+    state = _STATES.get(job.get_status(refresh=False), "waiting")
+    if state == "waiting":
+        return QueueStatus(state, position=open_queue(connection, job.origin).get_job_position(job))
+    if state == "failed":
         result = job.latest_result()
-        return Place(standing, reason=_last_line(result.exc_string if result else None))
-    return Place(standing, worker=job.worker_name or None)
+        return QueueStatus(state, reason=_last_line(result.exc_string if result else None))
+    return QueueStatus(state, worker=job.worker_name or None)
 
 
 def withdraw(connection: redis.Redis, job_id: str, generation: int) -> bool:
-    """Take a waiting generation out of the queue. True means it was there and no process will ever run it."""
+    """Remove a waiting generation from the queue. Return True if it was there; then no process will run it."""
     job = _fetch(connection, job_id, generation)
     if job is None:
         return False
     queue = open_queue(connection, job.origin)
-    # LREM decides the race with a worker that is just taking the job: only one of the two gets it.
+    # LREM is atomic: of this call and a worker that dequeues the job at the same time, only one gets it.
     removed = connection.lrem(queue.key, 1, job.id)
     if removed:
         job.cancel()
@@ -143,8 +147,10 @@ def withdraw(connection: redis.Redis, job_id: str, generation: int) -> bool:
 
 
 def stop(connection: redis.Redis, job_id: str, generation: int) -> bool:
-    """Ask the worker that runs this generation to kill it. Repeat until `place` says `stopped`: the message goes by
-    publish and subscribe, which forgets. False when no worker is known to run it now."""
+    """Ask the worker that runs this generation to kill it; return False if no worker is known to run it.
+
+    Repeat the call until `status` is `stopped`: the message is sent by publish and subscribe and may be lost.
+    """
     try:
         send_stop_job_command(connection, rq_id(job_id, generation), serializer=SERIALIZER)
     except (NoSuchJobError, InvalidJobOperation):
@@ -153,32 +159,32 @@ def stop(connection: redis.Redis, job_id: str, generation: int) -> bool:
 
 
 def forget(connection: redis.Redis, job_id: str, generation: int) -> None:
-    """Remove RQ's record of a generation that is over."""
+    """Delete RQ's record of a generation that has ended."""
     job = _fetch(connection, job_id, generation)
     if job is not None:
         job.delete()
 
 
 def reclaim(connection: redis.Redis) -> None:
-    """Requeue attempts whose worker stopped giving heartbeats, and fail those without tries left.
+    """Requeue the generations whose worker stopped sending heartbeats, and fail those without attempts left.
 
-    A busy worker never does this for a crashed neighbour; the API process calls it every few seconds.
+    RQ does this only in idle workers, so the API process calls it every few seconds.
     """
     for name in QUEUES:
         queue = open_queue(connection, name)
-        # The lock that idle workers clean under: two cleaners at once would requeue an attempt twice.
+        # Idle workers use the same lock: two clean-ups at the same time would requeue a job twice.
         if connection.set(queue.registry_cleaning_key, 1, nx=True, ex=_OUR_LOCK):
             try:
                 queue.started_job_registry.cleanup()
             finally:
                 connection.delete(queue.registry_cleaning_key)
         elif _OUR_LOCK < connection.ttl(queue.registry_cleaning_key) < _RQ_LOCK - _OUR_LOCK:
-            # Held for longer than any cleaning takes: its worker was killed while it cleaned.
+            # The lock is older than any clean-up takes: the worker that held it was killed.
             connection.delete(queue.registry_cleaning_key)
 
 
 def waiting(connection: redis.Redis) -> dict[str, int]:
-    """How many generations wait in each queue."""
+    """Return the number of waiting generations by queue."""
     return {name: open_queue(connection, name).count for name in QUEUES}
 
 

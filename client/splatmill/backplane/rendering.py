@@ -1,26 +1,26 @@
-"""How the server talks to the renderer process: HTTP, on a port or a unix socket, by these paths.
+"""The HTTP interface of the renderer process, on a port or a unix socket.
 
-Bodies and answers are those of the public API (`RenderRequest`, `OrbitRequest`, problem documents), so that the
-server only forwards. `If-None-Match` travels along; the renderer makes the ETag and answers 304 itself.
+Requests and responses are those of the public API (`RenderRequest`, `OrbitRequest`, problem documents), so the server
+only forwards them. The renderer computes ETags and answers `If-None-Match` itself.
 """
 
 HEALTH = "/healthz"
 
 
 def render_path(model_id: str) -> str:
-    """POST a `RenderRequest`; the answer is the picture."""
+    """Return the path to which a `RenderRequest` is posted; the response is the image."""
     return f"/v1/models/{model_id}/render"
 
 
 def orbit_path(model_id: str) -> str:
-    """POST an `OrbitRequest`; the answer is an MP4."""
+    """Return the path to which an `OrbitRequest` is posted; the response is an MP4 video."""
     return f"/v1/models/{model_id}/orbit"
 
 
 def address(url: str) -> tuple[str, str | None]:
-    """The base URL and, for `unix:/path/to.sock`, the socket path to reach it by.
+    """Return the base URL of the renderer and, for `unix:/path/to.sock`, the path of the socket.
 
-    Raises ValueError with a sentence for anything but `http://host:port`, `https://...` and `unix:/path`.
+    Raises ValueError unless `url` is `http://host:port`, `https://...` or `unix:/path`.
     """
     if url.startswith("unix:"):
         path = url.removeprefix("unix:").removeprefix("//")
@@ -28,4 +28,6 @@ def address(url: str) -> tuple[str, str | None]:
             return "http://renderer", path
     elif url.startswith(("http://", "https://")):
         return url.rstrip("/"), None
-    raise ValueError(f"SPLATMILL_RENDERER_URL={url!r} is neither http://host:port nor unix:/path/to.sock.")
+    raise ValueError(
+        f"SPLATMILL_RENDERER_URL={url!r} is neither http://host:port nor unix:/path/to.sock; set it to one."
+    )

@@ -1,4 +1,4 @@
-"""The job row: a Redis hash that only the server writes. It holds what was asked for and what the server decided."""
+"""The job row: a Redis hash with the request and the server's decisions. Only the server writes it."""
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -12,10 +12,13 @@ from splatmill.schema import Problem, Time, TrainOptions
 
 
 class Verdict(BaseModel):
-    """How the server ended a generation that no worker ended itself: cancelled, or given up as failed.
+    """The end of a generation that the server decided, because no worker had ended it.
 
-    `after` is the last entry of the states stream the server had read. A final state that a worker appends later
-    comes too late and does not count, so what a client was told never changes.
+    state: cancelled, or failed if the server gave the job up.
+    at: time of the decision.
+    after: id of the last entry in the states stream at that time. Final states that a worker appends later are
+        ignored, so that the end a client has seen never changes.
+    problem: reason of a failure.
     """
 
     state: Literal["cancelled", "failed"]
@@ -25,9 +28,9 @@ class Verdict(BaseModel):
 
 
 class JobRow(BaseModel):
-    """One job's request and the server's decisions about it.
+    """The request for a job, and the server's decisions about it.
 
-    `generation` grows with each restart; `queued_at`, `cancel_requested_at` and `verdict` belong to it.
+    `generation` grows with each restart. `queued_at`, `cancel_requested_at` and `verdict` refer to the current one.
     """
 
     id: str
@@ -41,7 +44,7 @@ class JobRow(BaseModel):
     verdict: Verdict | None = None
 
     def fields(self) -> dict[str, str]:
-        """The hash as it is stored: one field per attribute, JSON inside, absent ones left out."""
+        """Return the fields of the hash: one per attribute that is not None, with models as JSON."""
         return {
             name: getattr(self, name).model_dump_json() if isinstance(value, dict) else str(value)
             for name, value in self.model_dump(mode="json", exclude_none=True).items()
@@ -49,7 +52,7 @@ class JobRow(BaseModel):
 
     @classmethod
     def of(cls, stored: Mapping[bytes, bytes]) -> "JobRow | None":
-        """The row in a reply to HGETALL; None for an empty one, which is how Redis says there is no such hash."""
+        """Return the row in a reply to HGETALL, or None for an empty reply: there is no such hash."""
         if not stored:
             return None
         plain: dict[str, object] = {key.decode(): value.decode() for key, value in stored.items()}
@@ -60,10 +63,10 @@ class JobRow(BaseModel):
 
 
 def read(connection: redis.Redis, job_id: str) -> JobRow | None:
-    """The row of a job, or None when Redis has none. Raises redis.RedisError when Redis cannot be reached."""
+    """Return the row of a job, or None if Redis has none. Raises redis.RedisError if Redis cannot be reached."""
     return JobRow.of(cast(dict[bytes, bytes], connection.hgetall(keys.job(job_id))))
 
 
 def now() -> datetime:
-    """The present, with its time zone."""
+    """Return the current time in UTC."""
     return datetime.now(UTC)

@@ -1,8 +1,8 @@
-"""Storage for captures, checkpoints and models: a local folder by default, S3-compatible by URL, through obstore.
+"""Storage of captures, checkpoints and models through obstore: a local folder or an S3-compatible bucket.
 
-Every write is atomic: a reader sees the old file, the new one, or none, never a part. Paths are those of
-`splatmill.backplane.layout`. Synchronous methods are for the worker and for threads; the `stream_*` ones are
-asynchronous, so that the API passes files through without holding them in memory.
+Every write is atomic: a reader sees the old file, the new one, or none. Paths are those of
+`splatmill.backplane.layout`. The synchronous methods are for workers and threads. The asynchronous ones (`stream_*`)
+let the API pass files through without holding them in memory.
 """
 
 import os
@@ -24,25 +24,31 @@ if TYPE_CHECKING:  # These names exist in its stubs alone.
     from obstore.store import ClientConfig, RetryConfig
 
 CHUNK = 1 << 20
-"""Bytes per piece when a file is streamed: memory per transfer stays at a few of these."""
+"""Bytes per piece of a streamed file. A transfer holds a few of them in memory."""
 
 _S3_RETRY: "RetryConfig" = {"max_retries": 4, "retry_timeout": timedelta(seconds=20)}
-"""obstore's own patience is three minutes, in which a client of the API has long given up."""
+"""By default, obstore retries for three minutes, which is longer than a client of the API waits."""
 
 _FULL = ("os error 28", "os error 122", "os error 27", "No space left", "QuotaExceeded", "StorageFull")
 
 
 class StorageError(Exception):
-    """Storage cannot be read or written now; the text says what was tried and what came back."""
+    """Storage cannot be read or written. The message says what was tried, and the reason."""
 
 
 class StorageFullError(StorageError):
-    """No room (disk full, quota reached, file size limit): nothing was stored."""
+    """Storage is full (disk, quota or file size limit). Nothing was stored."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A stored file: `path` below the storage root, `size` in bytes, `etag` without quotes, and its time."""
+    """A stored file.
+
+    path: relative to the storage root.
+    size: in bytes.
+    etag: without quotes.
+    modified: time of the last write.
+    """
 
     path: str
     size: int
@@ -53,8 +59,8 @@ class Entry:
 class Storage:
     """Files by path under one root.
 
-    `url` is `file:///folder` (made when missing), a plain folder path, or `s3://bucket/prefix` with the usual
-    `AWS_*` environment variables. Raises StorageError with a sentence when it cannot be opened.
+    `url` is `file:///folder`, the path of a folder (created if missing), or `s3://bucket/prefix` with the usual `AWS_*`
+    environment variables. Raises StorageError if it cannot be opened.
     """
 
     def __init__(self, url: str) -> None:
@@ -66,25 +72,28 @@ class Storage:
             try:
                 self.root.mkdir(parents=True, exist_ok=True)
             except OSError as error:
-                raise StorageError(f"The storage folder {self.root} cannot be made: {error}.") from error
+                raise StorageError(f"The storage folder {self.root} cannot be created: {error}.") from error
             if not os.access(self.root, os.W_OK | os.X_OK):
-                raise StorageError(f"The storage folder {self.root} is not writable by this user.")
-            # Empty folders go with their last file, so that deleting a capture leaves no skeleton behind.
+                raise StorageError(
+                    f"The storage folder {self.root} is not writable by this user; change its permissions, "
+                    "or set SPLATMILL_STORAGE to another folder."
+                )
+            # A folder is removed with its last file, so that a deleted capture leaves no empty folders.
             self.store: ObjectStore = LocalStore(self.root, automatic_cleanup=True)
         elif parts.scheme == "s3":
             self.store = from_url(url, client_options=_s3_client(), retry_config=_S3_RETRY)
         else:
             raise StorageError(
-                f"SPLATMILL_STORAGE={url!r} is neither file:///folder nor s3://bucket/prefix; give one of these."
+                f"SPLATMILL_STORAGE={url!r} is neither file:///folder nor s3://bucket/prefix; set it to one."
             )
 
     def local_path(self, path: str) -> Path | None:
-        """Where `path` lies on this machine, or None when storage is remote. The file need not exist."""
+        """Return the local path of `path`, or None if storage is remote. The file need not exist."""
         return None if self.root is None else self.root / path
 
     def head(self, path: str) -> Entry | None:
-        """The entry at `path`, or None when there is none."""
-        with _sentences("read", path):
+        """Return the entry at `path`, or None if there is none."""
+        with _storage_errors("read", path):
             try:
                 return _entry(obstore.head(self.store, path))
             except FileNotFoundError:
@@ -94,21 +103,21 @@ class Storage:
         return self.head(path) is not None
 
     def get(self, path: str, start: int = 0, end: int | None = None) -> bytes:
-        """The bytes [start, end) of a small file. Raises FileNotFoundError."""
-        with _sentences("read", path):
+        """Return the bytes [start, end) of a file, all in memory. Raises FileNotFoundError."""
+        with _storage_errors("read", path):
             if start == 0 and end is None:
                 return bytes(obstore.get(self.store, path).bytes())
             stop = end if end is not None else obstore.head(self.store, path)["size"]
             return bytes(obstore.get_range(self.store, path, start=start, end=stop))
 
     def put(self, path: str, data: bytes | Path) -> None:
-        """Store bytes, or the file at a local path (streamed), replacing what was there."""
-        with _sentences("write", path):
+        """Store bytes, or a local file, which is streamed. An existing file is replaced."""
+        with _storage_errors("write", path):
             obstore.put(self.store, path, data)
 
     def put_new(self, path: str, data: bytes) -> bool:
-        """Store bytes only if nothing is there yet; False when something is. Decides races between writers."""
-        with _sentences("write", path):
+        """Store bytes if `path` is free; return False if it is not. Of several writers, exactly one succeeds."""
+        with _storage_errors("write", path):
             try:
                 obstore.put(self.store, path, data, mode="create")
             except AlreadyExistsError:
@@ -116,13 +125,13 @@ class Storage:
             return True
 
     async def stream_put(self, path: str, chunks: AsyncIterator[bytes]) -> None:
-        """Store what `chunks` yields. If it raises, nothing is stored and the exception passes through."""
-        with _sentences("write", path):
+        """Store the bytes that `chunks` yields. If it raises, nothing is stored and the exception is passed on."""
+        with _storage_errors("write", path):
             await obstore.put_async(self.store, path, chunks, chunk_size=8 * CHUNK, max_concurrency=2)
 
     async def stream_get(self, path: str, start: int = 0, end: int | None = None) -> AsyncIterator[bytes]:
-        """The bytes [start, end) in pieces of about CHUNK. Raises FileNotFoundError before the first piece."""
-        with _sentences("read", path):
+        """Yield the bytes [start, end) in pieces of about CHUNK. Raises FileNotFoundError before the first piece."""
+        with _storage_errors("read", path):
             if end is not None:
                 result = await obstore.get_async(self.store, path, options={"range": (start, end)})
             elif start:
@@ -134,36 +143,39 @@ class Storage:
 
     def rename(self, source: str, target: str) -> None:
         """Move a file. Raises FileNotFoundError."""
-        with _sentences("write", target):
+        with _storage_errors("write", target):
             obstore.rename(self.store, source, target)
 
     def entries(self, prefix: str) -> Iterator[Entry]:
-        """Every file under the folder `prefix`, in order of path."""
-        with _sentences("list", prefix):
+        """Yield all files under the folder `prefix`, sorted by path."""
+        with _storage_errors("list", prefix):
             found = [_entry(meta) for page in obstore.list(self.store, prefix) for meta in page]
         yield from sorted(found, key=lambda entry: entry.path)
 
     def children(self, prefix: str) -> list[str]:
-        """The names of the folders directly under `prefix`, sorted."""
-        with _sentences("list", prefix):
+        """Return the names of the folders directly under `prefix`, sorted."""
+        with _storage_errors("list", prefix):
             result = obstore.list_with_delimiter(self.store, prefix)
         return sorted(folder.rsplit("/", 1)[-1] for folder in result["common_prefixes"])
 
     def delete(self, path: str) -> None:
-        """Remove one file; nothing happens when there is none."""
-        with _sentences("delete", path), suppress(FileNotFoundError):
+        """Delete a file, if it exists."""
+        with _storage_errors("delete", path), suppress(FileNotFoundError):
             obstore.delete(self.store, path)
 
     def delete_prefix(self, prefix: str) -> int:
-        """Remove every file under a folder and return how many went."""
+        """Delete all files under a folder, and return their number."""
         paths = [entry.path for entry in self.entries(prefix)]
         for path in paths:
             self.delete(path)
         return len(paths)
 
     def delete_stale(self, prefix: str, seconds: float) -> int:
-        """Remove the files under a folder that are older than this, and how many; also the ones the local store
-        stages a write in, which no listing shows and a killed process leaves behind."""
+        """Delete the files under a folder that are older than `seconds`, and return their number.
+
+        This includes the files in which the local store stages a write. They are not listed, and a process that is
+        killed leaves them behind.
+        """
         before = datetime.now(UTC).timestamp() - seconds
         stale = [entry.path for entry in self.entries(prefix) if entry.modified.timestamp() < before]
         for path in stale:
@@ -176,12 +188,12 @@ class Storage:
 
     def download(self, path: str, target: Path) -> None:
         """Copy a stored file to a local path, atomically. Raises FileNotFoundError."""
-        with _sentences("read", path), replacing(target) as part, part.open("wb") as file:
+        with _storage_errors("read", path), replacing(target) as part, part.open("wb") as file:
             for chunk in obstore.get(self.store, path).stream(min_chunk_size=CHUNK):
                 file.write(chunk)
 
     def download_prefix(self, prefix: str, folder: Path) -> list[str]:
-        """Copy every file under `prefix` into `folder`; files there with the same size stay. Returns the names."""
+        """Copy all files under `prefix` to `folder`, except those of the same size already there; return the names."""
         names = []
         for entry in self.entries(prefix):
             name = entry.path[len(prefix.rstrip("/")) + 1 :]
@@ -192,15 +204,15 @@ class Storage:
         return names
 
     def check(self) -> None:
-        """Prove that storage takes a write. Raises StorageError when it does not."""
+        """Write and delete a file to test storage. Raises StorageError if that fails."""
         path = f"health/{os.getpid()}"
         self.put(path, b"ok")
         self.delete(path)
 
 
 @contextmanager
-def _sentences(verb: str, path: str) -> Iterator[None]:
-    """Turn obstore's errors, which carry a Rust debug dump, into one sentence; FileNotFoundError stays itself."""
+def _storage_errors(verb: str, path: str) -> Iterator[None]:
+    """Convert errors of obstore, which contain Rust debug output, into a StorageError with one sentence."""
     try:
         yield
     except FileNotFoundError:
@@ -209,12 +221,12 @@ def _sentences(verb: str, path: str) -> Iterator[None]:
         text = str(error)
         fact = text.split("\n\nDebug source")[0].strip()
         if any(sign in text for sign in _FULL):
-            raise StorageFullError(f"Storage is full: could not {verb} {path} ({fact}).") from error
+            raise StorageFullError(f"Storage is full: it could not {verb} {path} ({fact}).") from error
         raise StorageError(f"Storage could not {verb} {path}: {fact}.") from error
 
 
 def _s3_client() -> "ClientConfig":
-    """obstore's own limit of 30 s counts the whole body, which a large model exceeds on a slow line."""
+    """Return options for S3. obstore's default timeout of 30 s includes the body, which is short for a large model."""
     endpoint = os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or ""
     return {"connect_timeout": "5s", "timeout": "600s", "allow_http": endpoint.startswith("http://")}
 

@@ -1,1 +1,1 @@
-"""The HTTP endpoints, one router per noun. They read requests and write answers; the records do the work."""
+"""The HTTP endpoints, with one router per resource. They parse requests and build responses."""

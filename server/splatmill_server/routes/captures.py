@@ -1,4 +1,4 @@
-"""`/v1/captures`: photos, masks and poses that belong together."""
+"""The endpoints of `/v1/captures`: photos, masks and poses that belong together."""
 
 from typing import Annotated
 
@@ -8,13 +8,13 @@ from starlette.responses import JSONResponse, Response
 from splatmill.schema import SHA256_HEADER, Capture, CaptureFile, CapturePage, CreateCapture, Role
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.problems import ProblemError
-from splatmill_server.routes.documented import CAPTURE_EXAMPLE, answer, example, problems
+from splatmill_server.routes.openapi import CAPTURE_EXAMPLE, answer, example, problems
 from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/captures", tags=["captures"])
 
-CaptureId = Annotated[str, Path(description="The capture's id.")]
+CaptureId = Annotated[str, Path(description="Id of the capture.")]
 
 _ACCEPTED = {
     Role.images: ("image/", "video/", "application/zip", "application/x-zip", "application/octet-stream"),
@@ -27,7 +27,7 @@ _ACCEPTED = {
     "",
     status_code=201,
     responses=problems("unsupported_media_type", "malformed_body", "body_too_large", "storage_full")
-    | example(201, CAPTURE_EXAMPLE | {"files": []}, "The capture, empty so far"),
+    | example(201, CAPTURE_EXAMPLE | {"files": []}, "The new, empty capture"),
     dependencies=[JSON_ONLY],
 )
 def create_capture(
@@ -35,7 +35,7 @@ def create_capture(
     response: Response,
     request: Annotated[CreateCapture | None, Body(examples=[{"name": "fox"}])] = None,
 ) -> Capture:
-    """Begin a capture. Its files follow one by one."""
+    """Create an empty capture. Its files are uploaded one by one afterwards."""
     capture = service.captures.create(request.name if request is not None else None)
     response.headers["Location"] = f"/v1/captures/{capture.id}"
     return capture
@@ -43,7 +43,7 @@ def create_capture(
 
 @router.get("", responses=problems("cursor_invalid"))
 def list_captures(service: Shared, cursor: Cursor = None, limit: Limit = DEFAULT_LIMIT) -> CapturePage:
-    """Captures, newest first, without their files."""
+    """List captures, newest first, without their files."""
     return service.captures.page(cursor, limit)
 
 
@@ -52,19 +52,19 @@ def list_captures(service: Shared, cursor: Cursor = None, limit: Limit = DEFAULT
     responses=problems("capture_not_found") | example(200, CAPTURE_EXAMPLE, "The capture with its files"),
 )
 async def get_capture(service: Shared, capture_id: CaptureId) -> Capture:
-    """A capture with every file and its digest."""
+    """Get a capture with its files and their digests."""
     return await service.captures.read(capture_id)
 
 
 @router.delete("/{capture_id}", status_code=204, responses=problems("capture_not_found", "capture_in_use"))
 def delete_capture(service: Shared, capture_id: CaptureId) -> Response:
-    """Remove a capture and its files, unless a job that has not ended uses it."""
+    """Delete a capture and its files, unless an unfinished job uses it."""
     service.captures.record(capture_id)
-    if (job_id := service.jobs.uses(capture_id)) is not None:
+    if (job_id := service.jobs.unfinished_on(capture_id)) is not None:
         raise ProblemError(
             "capture_in_use",
             f"The job {job_id} uses this capture and has not ended.",
-            advice=f"Cancel it with POST /v1/jobs/{job_id}/cancel, or wait for its end.",
+            advice=f"Cancel it with POST /v1/jobs/{job_id}/cancel, or wait until it has ended.",
             facts={"job": job_id},
         )
     service.captures.delete(capture_id)
@@ -75,7 +75,7 @@ def delete_capture(service: Shared, capture_id: CaptureId) -> Response:
     "/{capture_id}/{role}/{name:path}",
     status_code=201,
     response_model=CaptureFile,
-    responses=answer(200, "The same bytes were there already", model=CaptureFile)
+    responses=answer(200, "The same bytes were already stored", model=CaptureFile)
     | problems(
         "capture_not_found",
         "name_taken",
@@ -90,7 +90,7 @@ def delete_capture(service: Shared, capture_id: CaptureId) -> Response:
     openapi_extra={
         "requestBody": {
             "required": True,
-            "description": "The file's bytes, as they are.",
+            "description": "The bytes of the file, not encoded.",
             "content": {
                 name: {"schema": {"type": "string", "format": "binary"}}
                 for name in ("application/octet-stream", "image/jpeg", "image/png")
@@ -106,18 +106,18 @@ async def put_file(
     name: Annotated[str, Path(description="Relative path with '/', unique within the role.")],
     digest: Annotated[
         str | None,
-        Header(alias=SHA256_HEADER, description="Hex SHA-256 of the bytes; checked when given."),
+        Header(alias=SHA256_HEADER, description="SHA-256 of the bytes in hex; checked if given."),
     ] = None,
 ) -> Response:
-    """Store a file. Sending the same bytes again changes nothing; other bytes under a taken name are refused."""
+    """Upload a file. The same bytes may be sent again; other bytes under the same name are refused."""
     media_type = (
         request.headers.get("content-type", "application/octet-stream").partition(";")[0].strip().lower()
     )
     if not media_type.startswith(_ACCEPTED[role]):
         raise ProblemError(
             "unsupported_media_type",
-            f"A file of {role.value} cannot have the content type {media_type[:80]!r}.",
-            advice="Send the file's bytes as they are, with Content-Type: application/octet-stream.",
+            f"The content type {media_type[:80]!r} is not accepted for {role.value}.",
+            advice="Send the bytes of the file with Content-Type: application/octet-stream.",
             facts={"accepted": list(_ACCEPTED[role])},
         )
     length = request.headers.get("content-length", "")

@@ -1,4 +1,4 @@
-"""`/v1/jobs`: from a capture to a model."""
+"""The endpoints of `/v1/jobs`: trainings of captures."""
 
 from typing import Annotated, Any
 
@@ -9,18 +9,18 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import IDEMPOTENCY_HEADER, CreateJob, Job, JobPage, JobState
-from splatmill_server.oneshot import check_start, create_from_form
+from splatmill_server.job_form import check_start_model, create_from_form
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.problems import ProblemError
-from splatmill_server.routes.documented import JOB_REQUESTS, answer, problems
+from splatmill_server.routes.openapi import JOB_REQUESTS, answer, problems
 from splatmill_server.routes.requests import Cursor, Limit
 from splatmill_server.service import Service, Shared
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
-JobId = Annotated[str, Path(description="The job's id.")]
+JobId = Annotated[str, Path(description="Id of the job.")]
 
-_LOCATION = {"Location": {"schema": {"type": "string"}, "description": "The job's address."}}
+_LOCATION = {"Location": {"schema": {"type": "string"}, "description": "Address of the job."}}
 _FORM = {
     "type": "object",
     "required": ["images"],
@@ -38,7 +38,7 @@ _FORM = {
     "",
     status_code=202,
     response_model=Job,
-    responses=answer(202, "The job, queued", headers=_LOCATION)
+    responses=answer(202, "The queued job", headers=_LOCATION)
     | problems(
         "malformed_body",
         "body_cut_off",
@@ -77,11 +77,12 @@ async def create_job(
             alias=IDEMPOTENCY_HEADER,
             min_length=1,
             max_length=200,
-            description="Requests with one key make one job; repeat a request with its key when its answer was lost.",
+            description="Requests with the same key create one job, so a request whose response was lost can "
+            "be repeated.",
         ),
     ] = None,
 ) -> Response:
-    """Train a capture, or upload photos as a form and train them in one request."""
+    """Create a job that trains a capture, or upload photos as a form and train them in one request."""
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type == "multipart/form-data":
         job, new = await create_from_form(service, request, key)
@@ -90,8 +91,9 @@ async def create_job(
     else:
         raise ProblemError(
             "unsupported_media_type",
-            f"A job is made from JSON or from a form; the content type is {media_type[:80] or 'missing'!r}.",
-            advice="Send application/json with a capture, or multipart/form-data with images.",
+            f"A job is created from JSON or from a form; the content type is "
+            f"{media_type[:80] or 'missing'!r}.",
+            advice="Send application/json with the id of a capture, or multipart/form-data with images.",
         )
     headers = {"Location": f"/v1/jobs/{job.id}"} | ({} if new else {"Idempotency-Replayed": "true"})
     return JSONResponse(job.model_dump(mode="json"), 202, headers)
@@ -104,10 +106,10 @@ async def _create_from_json(service: Service, body: bytes, key: str | None) -> t
         raise RequestValidationError(_located(error)) from error
 
     def make() -> tuple[Job, bool]:
-        # A repeated request is answered with its job even if its capture is gone by now.
-        if key is None or service.jobs.known(key) is None:
+        # A repeated request returns its job even if the capture was deleted meanwhile.
+        if key is None or service.jobs.id_of_key(key) is None:
             service.captures.check_trainable(create.capture)
-            check_start(service, create)
+            check_start_model(service, create)
         return service.jobs.create(create, key=key, body=create.model_dump_json())
 
     return await run_in_threadpool(make)
@@ -122,31 +124,31 @@ def list_jobs(
     service: Shared,
     cursor: Cursor = None,
     limit: Limit = DEFAULT_LIMIT,
-    state: Annotated[JobState | None, Query(description="Only jobs in this state.")] = None,
+    state: Annotated[JobState | None, Query(description="List only jobs in this state.")] = None,
 ) -> JobPage:
-    """Jobs, newest first."""
+    """List jobs, newest first."""
     return service.jobs.page(cursor, limit, state)
 
 
 @router.get("/{job_id}", responses=problems("job_not_found"))
 def get_job(service: Shared, job_id: JobId) -> Job:
-    """A job as it stands now."""
+    """Get a job."""
     return service.jobs.get(job_id)
 
 
 @router.delete("/{job_id}", status_code=204, responses=problems("job_not_found", "job_running"))
 def delete_job(service: Shared, job_id: JobId) -> Response:
-    """Remove an ended job with its model. Its capture stays."""
+    """Delete a job that has ended, and its model. Its capture is kept."""
     service.jobs.delete(job_id)
     return Response(status_code=204)
 
 
 @router.post("/{job_id}/cancel", status_code=202, responses=problems("job_not_found", "job_finished"))
 async def cancel_job(service: Shared, job_id: JobId) -> Job:
-    """Ask for a job's end. It is `cancelled` once its process is gone; until then `cancel_requested` is true."""
+    """Cancel a job. Its state is `cancelled` once its process has ended; until then, `cancel_requested` is true."""
     job = await run_in_threadpool(service.jobs.cancel, job_id)
     if not job.state.final:
-        # The first push now, so that a job that only waits is cancelled in this very answer.
+        # The first step is taken here, so that a job that waits in the queue is cancelled in this response.
         row = await run_in_threadpool(service.jobs.row, job_id)
         await run_in_threadpool(service.reaper.cancel, row)
         service.reaper.wake()
@@ -160,5 +162,5 @@ async def cancel_job(service: Shared, job_id: JobId) -> Job:
     responses=problems("job_not_found", "job_running", "capture_not_found"),
 )
 def restart_job(service: Shared, job_id: JobId) -> Job:
-    """Run an ended job once more; it goes on from its last checkpoint where there is one."""
+    """Run a job that has ended again, with the same options, from its last checkpoint if there is one."""
     return service.jobs.restart(job_id)

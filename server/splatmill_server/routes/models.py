@@ -1,4 +1,4 @@
-"""`/v1/models`: finished scenes, their files and cameras, and pictures of them."""
+"""The endpoints of `/v1/models`: finished models, their files and cameras, and images rendered from them."""
 
 from typing import Annotated
 
@@ -13,16 +13,16 @@ from splatmill.schema import Model, ModelCameras, ModelPage, OrbitRequest, Rende
 from splatmill_server.files import file_response
 from splatmill_server.forward import forward
 from splatmill_server.paging import DEFAULT_LIMIT
-from splatmill_server.routes.documented import CAMERA, RENDER_REQUESTS, answer, binary, problems
+from splatmill_server.routes.openapi import CAMERA, RENDER_REQUESTS, answer, binary, problems
 from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
 
-ModelId = Annotated[str, Path(description="The model's id, which is that of its job.")]
+ModelId = Annotated[str, Path(description="Id of the model, which is that of its job.")]
 
-_RENDERED = binary("The picture", "image/png", "image/jpeg", "image/webp", "application/x-npy") | {
-    304: {"description": "The picture with the ETag in `If-None-Match` is still right."}
+_RENDERED = binary("The image", "image/png", "image/jpeg", "image/webp", "application/x-npy") | {
+    304: {"description": "The image with the ETag in `If-None-Match` is unchanged."}
 }
 _RENDER_PROBLEMS = problems(
     "model_not_found",
@@ -38,9 +38,9 @@ _CAMERA_QUERY = [
         "name": "camera_to_world",
         "in": "query",
         "required": True,
-        "description": "16 numbers, row by row, separated by commas.",
+        "description": "The 16 numbers of the matrix, row by row, separated by commas.",
         "schema": {"type": "string"},
-        "example": ",".join(str(x) for row in CAMERA["camera_to_world"] for x in row),  # type: ignore[attr-defined]
+        "example": ",".join(str(x) for row in CAMERA["camera_to_world"] for x in row),  # type: ignore[attr-defined]  # the values of CAMERA have different types
     },
     *(
         {"name": name, "in": "query", "required": name in ("width", "height"), "schema": {"type": kind}}
@@ -64,13 +64,13 @@ _CAMERA_QUERY = [
 
 @router.get("", responses=problems("cursor_invalid"))
 def list_models(service: Shared, cursor: Cursor = None, limit: Limit = DEFAULT_LIMIT) -> ModelPage:
-    """Models, newest first. They are read from storage, whatever became of their jobs."""
+    """List finished models, newest first."""
     return service.models.page(cursor, limit)
 
 
 @router.get("/{model_id}", responses=problems("model_not_found", "model_not_ready", "model_corrupt"))
 def get_model(service: Shared, model_id: ModelId) -> Model:
-    """A model with its files."""
+    """Get a model with its files."""
     return service.models.get(model_id)
 
 
@@ -78,15 +78,13 @@ def get_model(service: Shared, model_id: ModelId) -> Model:
 @router.get(
     "/{model_id}/files/{name}",
     response_class=Response,
-    responses=binary(
-        "The file, or with `Range` a part of it (206)", *sorted(set(layout.MODEL_FILES.values()))
-    )
-    | answer(206, "The part that was asked for")
-    | answer(304, "Unchanged")
+    responses=binary("The file", *sorted(set(layout.MODEL_FILES.values())))
+    | answer(206, "The requested range of the file")
+    | answer(304, "The file is unchanged")
     | problems("model_not_found", "file_not_found", "model_not_ready", "range_not_satisfiable"),
 )
 async def get_file(service: Shared, model_id: ModelId, name: str, request: Request) -> Response:
-    """One file of a model: `model.ply`, `report.json`, `report.png`, `report.html`, `cameras.json`, ..."""
+    """Download a file of a model: `model.ply`, `report.json`, `report.png`, `report.html`, `cameras.json`, ..."""
     entry = await run_in_threadpool(service.models.file, model_id, name)
     download = f"{model_id}.ply" if name == "model.ply" else None
     return await file_response(
@@ -99,7 +97,7 @@ async def get_file(service: Shared, model_id: ModelId, name: str, request: Reque
     responses=problems("model_not_found", "model_not_ready", "file_not_found", "model_corrupt"),
 )
 def get_cameras(service: Shared, model_id: ModelId) -> ModelCameras:
-    """The cameras of the photos in the model's world, held-out ones marked `test`."""
+    """Get the cameras of the photos in the coordinates of the model; `split` marks the held-out ones."""
     return service.models.cameras(model_id)
 
 
@@ -113,12 +111,12 @@ async def render(
     service: Shared,
     model_id: ModelId,
     request: Request,
-    wish: Annotated[RenderRequest, Body(openapi_examples=RENDER_REQUESTS)],
+    body: Annotated[RenderRequest, Body(openapi_examples=RENDER_REQUESTS)],
 ) -> Response:
-    """A picture of the model from a camera: colour, depth or coverage."""
+    """Render an image of a model from a camera: colour, depth or opacity."""
     await run_in_threadpool(service.models.check, model_id)
     return await forward(
-        service.renderer, request, rendering.render_path(model_id), wish, service.settings.render_timeout
+        service.renderer, request, rendering.render_path(model_id), body, service.settings.render_timeout
     )
 
 
@@ -129,15 +127,15 @@ async def render(
     openapi_extra={"parameters": _CAMERA_QUERY},
 )
 async def render_cacheable(service: Shared, model_id: ModelId, request: Request) -> Response:
-    """The same picture at an address that browsers and proxies can keep."""
+    """Render an image of a model at an address that browsers and proxies can cache."""
     try:
-        wish = RenderRequest.from_query(request.query_params)
+        body = RenderRequest.from_query(request.query_params)
     except ValidationError as error:
         located = [{**found, "loc": ("query", *found["loc"])} for found in error.errors()]
         raise RequestValidationError(located) from error
     await run_in_threadpool(service.models.check, model_id)
     return await forward(
-        service.renderer, request, rendering.render_path(model_id), wish, service.settings.render_timeout
+        service.renderer, request, rendering.render_path(model_id), body, service.settings.render_timeout
     )
 
 
@@ -145,7 +143,7 @@ async def render_cacheable(service: Shared, model_id: ModelId, request: Request)
     "/{model_id}/orbit",
     response_class=Response,
     responses=binary("The video", "video/mp4")
-    | answer(304, "Unchanged")
+    | answer(304, "The video is unchanged")
     | _RENDER_PROBLEMS
     | problems("unsupported_media_type", "body_too_large", "size_out_of_range"),
     dependencies=[JSON_ONLY],
@@ -154,9 +152,9 @@ async def orbit(
     service: Shared,
     model_id: ModelId,
     request: Request,
-    wish: Annotated[OrbitRequest | None, Body(examples=[{"seconds": 4, "width": 480, "height": 360}])] = None,
+    body: Annotated[OrbitRequest | None, Body(examples=[{"seconds": 4, "width": 480, "height": 360}])] = None,
 ) -> Response:
-    """A video that circles the scene once."""
+    """Render a video (MP4) that circles the scene once."""
     await run_in_threadpool(service.models.check, model_id)
     path, seconds = rendering.orbit_path(model_id), service.settings.orbit_timeout
-    return await forward(service.renderer, request, path, wish or OrbitRequest(), seconds)
+    return await forward(service.renderer, request, path, body or OrbitRequest(), seconds)

@@ -1,17 +1,17 @@
-"""Parameters that several endpoints share."""
+"""The parameters that several endpoints share."""
 
 from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 
-from splatmill_server.paging import DEFAULT_LIMIT, MAX_LIMIT
+from splatmill_server.paging import MAX_LIMIT
 from splatmill_server.problems import ProblemError
 
 Cursor = Annotated[
     str | None,
-    Query(max_length=200, description="The `cursor` of the previous page; left out for the first."),
+    Query(max_length=200, description="The `cursor` of the previous page. Left out, the first page."),
 ]
-Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description=f"Entries per page (usually {DEFAULT_LIMIT}).")]
+Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Largest number of entries in a page.")]
 
 
 def _json_only(request: Request) -> None:
@@ -20,10 +20,10 @@ def _json_only(request: Request) -> None:
     if has_body and media_type != "application/json" and not media_type.endswith("+json"):
         raise ProblemError(
             "unsupported_media_type",
-            f"This address takes JSON; the content type is {media_type[:80] or 'missing'!r}.",
+            f"This address accepts JSON; the content type is {media_type[:80] or 'missing'!r}.",
             advice="Send the header 'Content-Type: application/json'.",
         )
 
 
 JSON_ONLY: Any = Depends(_json_only)
-"""A dependency that refuses a body which is not JSON with 415, before it is looked into."""
+"""A dependency that refuses a body that is not JSON with a 415 problem, before the body is parsed."""

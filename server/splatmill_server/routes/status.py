@@ -1,4 +1,4 @@
-"""What the service says of itself: options, info, health, metrics."""
+"""The endpoints about the service itself: options, info, health and metrics."""
 
 from datetime import UTC, datetime
 
@@ -23,7 +23,7 @@ from splatmill.schema import (
     describe_options,
 )
 from splatmill_server import metrics
-from splatmill_server.routes.documented import problems
+from splatmill_server.routes.openapi import problems
 from splatmill_server.service import Service, Shared
 
 router = APIRouter(tags=["service"])
@@ -31,13 +31,13 @@ router = APIRouter(tags=["service"])
 
 @router.get("/v1/options", responses=problems())
 def get_options() -> OptionList:
-    """Every setting of a training run with type, default, range and help."""
+    """List the training options with type, default, range and help."""
     return OptionList(options=describe_options())
 
 
 @router.get("/v1/info", responses=problems())
 def get_info(service: Shared) -> Info:
-    """Version, limits, the workers and how many jobs wait."""
+    """Get the version, the limits, the workers and the number of waiting jobs."""
     return Info(
         version=splatmill.__version__,
         storage="file" if service.storage.root is not None else "s3",
@@ -55,17 +55,17 @@ def get_info(service: Shared) -> Info:
 
 @router.get("/healthz")
 async def healthz() -> Health:
-    """The process answers."""
+    """Check that the process runs."""
     return Health()
 
 
 @router.get(
     "/readyz",
     response_model=Ready,
-    responses={503: {"model": Ready, "description": "A part that jobs need is not there"}},
+    responses={503: {"model": Ready, "description": "A part that jobs need is not available"}},
 )
 async def readyz(service: Shared) -> Response:
-    """Whether jobs can be taken and run. A missing renderer is named, but does not stop jobs."""
+    """Check that jobs can be accepted and run. A missing renderer is reported, but jobs do not need it."""
     checks = {
         "redis": await run_in_threadpool(_redis_check, service),
         "storage": await run_in_threadpool(_storage_check, service),
@@ -77,7 +77,7 @@ async def readyz(service: Shared) -> Response:
 
 @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
 def get_metrics(service: Shared) -> Response:
-    """Prometheus metrics."""
+    """Get the metrics in the text format of Prometheus."""
     gauges = service.metrics
     try:
         for name, count in queue.waiting(service.redis).items():
@@ -138,5 +138,5 @@ async def _renderer_check(service: Service) -> str:
     try:
         answer = await service.renderer.get(rendering.HEALTH, timeout=2.0)
     except Exception as error:
-        return f"it cannot be reached: {type(error).__name__}"
-    return "ok" if answer.is_success else f"it answers {answer.status_code}"
+        return f"the renderer cannot be reached: {type(error).__name__}"
+    return "ok" if answer.is_success else f"the renderer answers with status {answer.status_code}"

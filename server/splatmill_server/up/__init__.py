@@ -1,5 +1,5 @@
-"""`splatmill up`: the whole service on one machine, as children of one small process.
+"""`splatmill up`: the embedded service, which is the whole service on one machine under one supervisor.
 
-Redis, the API, one worker and the renderer start side by side, are started anew when they die, and end with this
-process, however it ends. What they keep lies in one data folder, so that the next start goes on from there.
+Redis, the API, one worker and the renderer are child processes. They are restarted when they die, and end with the
+supervisor, however it ends. Their data lies in one folder, from which the next start continues.
 """

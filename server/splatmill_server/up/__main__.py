@@ -1,4 +1,4 @@
-"""`python -m splatmill_server.up`, which is what `splatmill up` runs."""
+"""`python -m splatmill_server.up`, the program behind `splatmill up`."""
 
 import argparse
 import errno
@@ -11,11 +11,11 @@ from pathlib import Path
 
 from splatmill.schema import DEFAULT_PORT
 from splatmill_server.up.folder import DataFolder, UpError
-from splatmill_server.up.service import Service
+from splatmill_server.up.supervisor import Supervisor
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the service until Ctrl-C; returns the exit status."""
+    """Run the service until Ctrl-C, and return the exit status."""
     chosen = _parser().parse_args(argv)
     key = os.environ.get("SPLATMILL_API_KEY") or None
     try:
@@ -23,21 +23,22 @@ def main(argv: list[str] | None = None) -> int:
             folder = DataFolder(chosen.data)
             try:
                 url = _url(chosen.host, listener.getsockname()[1])
-                service = Service(folder, listener, _say)
+                supervisor = Supervisor(folder, listener, _print)
 
                 def ready() -> None:
                     if chosen.json_ready:
                         print(json.dumps({"url": url, "api_key": key}), flush=True)
                     else:
-                        _say(
-                            f"Splatmill is ready at {url}\nData: {folder.path}\nCtrl-C ends it; nothing is lost."
+                        _print(
+                            f"Splatmill is ready at {url}\nData: {folder.path}\nStop it with "
+                            f"Ctrl-C; unfinished jobs resume at the next start."
                         )
 
-                service.run(ready, until_closed=sys.stdin.fileno() if chosen.json_ready else None)
+                supervisor.run(ready, until_closed=sys.stdin.fileno() if chosen.json_ready else None)
             finally:
                 folder.close()
     except UpError as error:
-        _say(str(error))
+        _print(str(error))
         return 1
     return 0
 
@@ -46,30 +47,38 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="splatmill up", description="Run the whole service on this machine."
     )
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
     parser.add_argument(
-        "--port", type=int, default=DEFAULT_PORT, help="0 takes any free one (default %(default)s)"
+        "--host",
+        default="127.0.0.1",
+        help="address to listen on (default: %(default)s); other machines need SPLATMILL_API_KEY",
+    )
+    parser.add_argument(
+        "--port",
+        type=int,
+        default=DEFAULT_PORT,
+        help="port to listen on; 0 takes any free port (default: %(default)s)",
     )
     parser.add_argument(
         "--data",
         type=Path,
         default=Path(os.environ.get("SPLATMILL_DATA") or "splatmill-data"),
-        help="folder for everything that is kept (default: SPLATMILL_DATA, else splatmill-data)",
+        help="folder for all data (default: SPLATMILL_DATA, else splatmill-data)",
     )
     parser.add_argument(
         "--json-ready",
         action="store_true",
-        help="for programs: print one line of JSON (url, api_key) when ready, and end when standard input closes",
+        help="for programs: print one line of JSON (url, api_key) when ready, and stop when standard "
+        "input closes",
     )
     return parser
 
 
 def _listen(host: str, port: int, key: str | None) -> socket.socket:
-    """The listening socket. Raises UpError for a port in use, and for an open door without a key."""
+    """Return the listening socket. Raises UpError for a port in use, and for a public address without a key."""
     if not 0 <= port <= 65535:
-        # getaddrinfo would take it modulo 65536 and listen elsewhere.
+        # getaddrinfo takes the port modulo 65536
         raise UpError(
-            f"There is no port {port}. Choose one of 1 to 65535 with --port, or 0 for any free one."
+            f"There is no port {port}. Choose one from 1 to 65535 with --port, or 0 for any free port."
         )
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
@@ -78,8 +87,9 @@ def _listen(host: str, port: int, key: str | None) -> socket.socket:
     family, kind, protocol, _, address = found[0]
     if key is None and not _loopback(str(address[0])):
         raise UpError(
-            f"Listening on {host} lets other machines in, which needs an API key: set SPLATMILL_API_KEY to a "
-            "secret of your own, or listen on 127.0.0.1."
+            f"Listening on {host} gives other machines access, which requires an API key: set "
+            f"SPLATMILL_API_KEY to a "
+            "secret text, or listen on 127.0.0.1."
         )
     listener = socket.socket(family, kind, protocol)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -91,7 +101,7 @@ def _listen(host: str, port: int, key: str | None) -> socket.socket:
         if error.errno == errno.EADDRINUSE:
             raise UpError(
                 f"Port {port} on {host} is in use by another program. Choose another with --port "
-                "(--port 0 takes any free one)."
+                "(--port 0 takes any free port)."
             ) from error
         raise UpError(f"Cannot listen on {host}:{port}: {error}. Choose another --host or --port.") from error
     return listener
@@ -106,7 +116,7 @@ def _url(host: str, port: int) -> str:
     return f"http://[{shown}]:{port}" if ":" in shown else f"http://{shown}:{port}"
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 

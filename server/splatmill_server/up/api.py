@@ -1,6 +1,6 @@
-"""The API child of an embedded service: uvicorn on a socket that its parent opened and keeps.
+"""The API process of the embedded service: uvicorn on a socket that the supervisor has opened.
 
-The parent holds the port, so nobody else can take it while the API is started anew, and requests wait meanwhile.
+The supervisor keeps the socket open, so the port stays taken and requests wait while the API is restarted.
 """
 
 import socket
@@ -12,15 +12,15 @@ from splatmill_server.__main__ import Server, configure_logging
 from splatmill_server.app import create_app
 from splatmill_server.settings import Settings
 
-END_SECONDS = 3
-"""Seconds open requests get to end; event streams end at once by themselves."""
+STOP_SECONDS = 3
+"""Seconds for which running requests may continue after a signal to stop; event streams end at once."""
 
 
 def main(descriptor: int) -> None:
-    """Serve on the listening socket with this file descriptor until told to stop."""
+    """Serve on the listening socket with this file descriptor until a signal arrives."""
     configure_logging()
     app = create_app(Settings())
-    config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=END_SECONDS)
+    config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=STOP_SECONDS)
     Server(config, app).run(sockets=[socket.socket(fileno=descriptor)])
 
 

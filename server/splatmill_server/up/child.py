@@ -1,4 +1,4 @@
-"""One child of the embedded service: started, started anew when it dies, ended."""
+"""A child process of the embedded service, which is restarted when it dies."""
 
 import os
 import signal
@@ -10,24 +10,32 @@ from dataclasses import dataclass, field
 
 from splatmill.backplane.process import die_with_parent
 
-_FIRST_PAUSE = 0.1
-_LONGEST_PAUSE = 10.0
-_STEADY = 30.0
-"""Seconds a child must live for its next death to count as the first again."""
+_FIRST_PAUSE = 0.1  # seconds
+_LONGEST_PAUSE = 10.0  # seconds
+_STEADY_SECONDS = 30.0
+"""Run time after which the pause before the next restart is the shortest one again."""
 
 
 @dataclass
 class Child:
-    """`patience` is how many seconds it gets to end by itself; `at_death` the signal it gets when we die.
+    """A child process. It runs in its own session, so that Ctrl-C in a terminal reaches only the supervisor.
 
-    It runs in a session of its own: Ctrl-C in the terminal reaches only the process that ends all in order.
+    name: for messages and the log file.
+    command: program and arguments.
+    environment: all environment variables.
+    open_log: returns a file descriptor for its output.
+    stop_seconds: time for it to end after a signal, before it is killed.
+    at_death: signal that it receives when the supervisor dies.
+    inherited: file descriptors that it inherits.
+    deaths: how often it has died.
+    due: monotonic time at which it is to be started; None while it runs.
     """
 
     name: str
     command: Sequence[str]
     environment: Mapping[str, str]
     open_log: Callable[[], int]
-    patience: float
+    stop_seconds: float
     at_death: signal.Signals = signal.SIGKILL
     inherited: tuple[int, ...] = ()
     deaths: int = 0
@@ -45,7 +53,7 @@ class Child:
         return self._process.pid if self._process else None
 
     def start(self) -> None:
-        """Start the process. Must be called from the main thread, with whose end the children end."""
+        """Start the process. Call this in the main thread, because the child dies with the thread that forks it."""
         parent = os.getpid()
         log = self.open_log()
         try:
@@ -65,12 +73,12 @@ class Child:
         self.due = None
 
     def reap(self) -> str | None:
-        """How it ended, if it has; its next start is then due after a pause that grows with each early death."""
+        """Return how the process ended, or None while it runs. It is due after a pause, longer for early deaths."""
         if self._process is None or (code := self._process.poll()) is None:
             return None
         lived = time.monotonic() - self._began
         self._process = None
-        self._pause = _FIRST_PAUSE if lived > _STEADY else min(2 * self._pause, _LONGEST_PAUSE)
+        self._pause = _FIRST_PAUSE if lived > _STEADY_SECONDS else min(2 * self._pause, _LONGEST_PAUSE)
         self.due = time.monotonic() + self._pause
         self.deaths += 1
         return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit status {code}"
@@ -81,7 +89,7 @@ class Child:
                 self._process.send_signal(sig)
 
     def wait(self, seconds: float) -> bool:
-        """Wait for its end; killed with all its own when it takes longer. False when it had to be killed."""
+        """Wait for the process to end, and kill its process group after `seconds`; return False if it was killed."""
         if self._process is None:
             return True
         try:

@@ -1,4 +1,4 @@
-"""The data folder of an embedded service: who has it, and where in it things lie."""
+"""The data folder of an embedded service: its lock, its paths and its logs."""
 
 import fcntl
 import hashlib
@@ -11,18 +11,18 @@ from pathlib import Path
 from splatmill.backplane.process import start_time
 
 _SOCKET_LIMIT = 100  # sun_path holds 108 bytes on Linux, 104 on macOS
-_LOG_BYTES = 10 << 20
-_DYING_SECONDS = 10.0
+_LOG_BYTES = 10 << 20  # a larger log is renamed when its process starts
+_DYING_SECONDS = 10.0  # for the Redis of a supervisor that was killed to end
 
 
 class UpError(Exception):
-    """The service cannot start; the text says why and what to do."""
+    """The service cannot start. The message says why, and what to do."""
 
 
 class DataFolder:
-    """The folder, held for the life of this process. Raises UpError when it cannot be written or is in use.
+    """The data folder, locked by this process. Raises UpError if it cannot be written or is in use.
 
-    `lock` is the open lock file: a child that inherits it keeps the folder taken until it has ended too.
+    `lock` is the descriptor of the lock file. A child that inherits it holds the lock until it ends, too.
     """
 
     def __init__(self, path: Path) -> None:
@@ -44,12 +44,12 @@ class DataFolder:
 
     @property
     def redis(self) -> Path:
-        """Redis's append-only log."""
+        """The folder of the append-only log of Redis."""
         return self.path / "redis"
 
     @property
     def logs(self) -> Path:
-        """One file per child."""
+        """The folder of the logs, one file per child."""
         return self.path / "logs"
 
     @property
@@ -61,14 +61,14 @@ class DataFolder:
         return self._sockets / "renderer.sock"
 
     def log(self, name: str) -> int:
-        """An open file descriptor at the end of a child's log; a long log is put aside first."""
+        """Open the log of a child to append to it, and return the descriptor; a large log is renamed first."""
         path = self.logs / f"{name}.log"
         if path.exists() and path.stat().st_size > _LOG_BYTES:
             path.replace(path.with_suffix(".old.log"))
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
 
-    def last_words(self, name: str, lines: int = 6) -> str:
-        """The end of a child's log."""
+    def log_end(self, name: str, lines: int = 6) -> str:
+        """Return the last lines of a child's log."""
         try:
             text = (self.logs / f"{name}.log").read_text(errors="replace")
         except OSError:
@@ -76,7 +76,7 @@ class DataFolder:
         return "\n".join(f"  {line}" for line in text.strip().splitlines()[-lines:])
 
     def close(self) -> None:
-        """Give the folder up."""
+        """Release the folder."""
         if self._sockets != self.path:
             shutil.rmtree(self._sockets, ignore_errors=True)
         os.close(self.lock)
@@ -96,7 +96,7 @@ class DataFolder:
                         + (f" (process {holder})" if alive else "")
                         + ". Use that one, stop it, or choose another folder with --data."
                     ) from None
-                # That process is dead; its Redis is still putting its log away.
+                # That process is dead, but its Redis still writes its log.
                 time.sleep(0.05)
         os.ftruncate(self.lock, 0)
         os.pwrite(self.lock, f"{os.getpid()}\n".encode(), 0)
@@ -109,5 +109,9 @@ class DataFolder:
         folder.mkdir(mode=0o700, exist_ok=True)
         seen = folder.lstat()
         if folder.is_symlink() or seen.st_uid != os.getuid() or seen.st_mode & 0o077:
-            raise UpError(f"{folder}, which is to hold private sockets, belongs to somebody else; remove it.")
+            raise UpError(
+                f"The folder {folder}, which is needed for private sockets, belongs to another "
+                f"user or is open to others; "
+                "remove it."
+            )
         return folder

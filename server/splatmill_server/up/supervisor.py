@@ -1,4 +1,4 @@
-"""The embedded service as a whole: which children there are, how they start, and in what order they end."""
+"""The supervisor of the embedded service: starts its processes, restarts them, and stops them in order."""
 
 import http.client
 import importlib.util
@@ -20,23 +20,24 @@ from splatmill_server.up.folder import DataFolder, UpError
 WORKER = "splatmill_worker"
 
 READY_SECONDS = 60.0
-"""A first start on a cold disk reads a few hundred megabytes of libraries."""
+"""Time for the service to become ready; a first start may read several hundred megabytes of libraries from disk."""
 
-_WORKER_PATIENCE = 20.0
-_POLL = 0.02
-_GIVE_UP_DEATHS = 5
+_WORKER_STOP_SECONDS = 20.0  # a worker writes a checkpoint before it ends
+_POLL_SECONDS = 0.02  # between two checks whether the service is ready
+_MAX_DEATHS = 5  # of one child before the service is ready
 
 
-class Service:
-    """Children of one data folder behind one listening socket. `say` takes lines for the operator.
+class Supervisor:
+    """The processes of one data folder behind one listening socket. `say` prints messages for the operator.
 
-    Raises UpError when a part or Redis is not installed.
+    Raises UpError if the worker or Redis is not installed.
     """
 
     def __init__(self, folder: DataFolder, listener: socket.socket, say: Callable[[str], None]) -> None:
         if importlib.util.find_spec(WORKER) is None:
             raise UpError(
-                "The part splatmill-worker, which trains and renders, is not installed: pip install splatmill-worker."
+                "The package splatmill-worker, which trains and renders, is not installed: pip "
+                "install splatmill-worker."
             )
         self.folder = folder
         self.say = say
@@ -52,18 +53,18 @@ class Service:
         if own_redis:
             environment["REDIS_URL"] = f"unix://{folder.redis_socket}"
 
-        def child(name: str, command: list[str], patience: float, **more: object) -> Child:
-            return Child(name, command, environment, lambda: folder.log(name), patience, **more)  # type: ignore[arg-type]
+        def child(name: str, command: list[str], stop_seconds: float, **more: object) -> Child:
+            return Child(name, command, environment, lambda: folder.log(name), stop_seconds, **more)  # type: ignore[arg-type]  # more: the optional fields of Child
 
         python = sys.executable
-        self.worker = child("worker", [python, "-m", WORKER, "train"], _WORKER_PATIENCE)
+        self.worker = child("worker", [python, "-m", WORKER, "train"], _WORKER_STOP_SECONDS)
         renderer = [python, "-m", WORKER, "renderer", "--uds", str(folder.renderer_socket)]
         self.renderer = child("renderer", renderer, 3.0)
         api = [python, "-m", "splatmill_server.up.api", str(listener.fileno())]
         self.api = child("api", api, 6.0, inherited=(listener.fileno(),))
         self.redis: Child | None = None
         if own_redis:
-            # SIGTERM: Redis closes its log and goes. Holding the lock, it keeps the folder taken until it has.
+            # On SIGTERM, Redis closes its log and ends. It inherits the lock, so the folder stays locked until then.
             self.redis = child(
                 "redis", redis_server.command(folder), 10.0, at_death=signal.SIGTERM, inherited=(folder.lock,)
             )
@@ -75,12 +76,15 @@ class Service:
         self._wake_end = wake_end
 
     def run(self, ready: Callable[[], None], until_closed: int | None = None) -> None:
-        """Start everything, call `ready` once requests are answered, and keep it up until a signal comes, or the
-        file `until_closed` ends. Returns when no child is left. Raises UpError when it does not become ready."""
+        """Run the service until a signal arrives or the file descriptor `until_closed` is at its end.
+
+        `ready` is called once the API answers. Returns when all children have ended. Raises UpError if the service does
+        not become ready.
+        """
         signal.set_wakeup_fd(self._wake_end.fileno(), warn_on_full_buffer=False)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
-        signal.signal(signal.SIGCHLD, lambda *_: None)  # only to wake the loop
+        signal.signal(signal.SIGCHLD, lambda *_: None)  # wakes the loop
         waiting = selectors.DefaultSelector()
         waiting.register(self._wake, selectors.EVENT_READ)
         if until_closed is not None:
@@ -102,41 +106,42 @@ class Service:
                         return
         finally:
             waiting.close()
-            self._end()
+            self._stop()
 
     def _on_signal(self, signum: int, frame: FrameType | None) -> None:
         self._signals += 1
         if self._signals > 1:
-            # A second Ctrl-C: the worker hands its job back without waiting for a checkpoint.
+            # At a second Ctrl-C, the worker hands its job back without writing a checkpoint.
             self.worker.signal(signal.SIGTERM)
 
     def _tend(self) -> None:
-        """Start what is due, and notice what has died."""
+        """Start the children that are due, and report those that have died."""
         for child in self.children:
             if (how := child.reap()) is not None:
                 self.say(
-                    f"The {child.name} {how}; starting it anew. Its log: {self.folder.logs / child.name}.log"
+                    f"The {child.name} {how} and will be restarted. Its log: "
+                    f"{self.folder.logs / child.name}.log"
                 )
             if child.due is not None and child.due <= time.monotonic():
                 child.start()
 
     def _pause(self, announced: bool) -> float | None:
         if not announced:
-            return _POLL
+            return _POLL_SECONDS
         due = [child.due for child in self.children if child.due is not None]
         return max(0.0, min(due) - time.monotonic()) if due else None
 
     def _check_start(self, deadline: float) -> None:
         for child in self.children:
-            if child.deaths >= _GIVE_UP_DEATHS:
+            if child.deaths >= _MAX_DEATHS:
                 raise UpError(
-                    f"The {child.name} does not start. Its last words:\n{self.folder.last_words(child.name)}"
+                    f"The {child.name} does not start. The end of its log:\n{self.folder.log_end(child.name)}"
                 )
         if time.monotonic() > deadline:
-            raise UpError(f"The service did not become ready in {READY_SECONDS:.0f} s: {self._unready()}")
+            raise UpError(f"The service was not ready after {READY_SECONDS:.0f} s: {self._unready()}")
 
     def _answers(self) -> bool:
-        """Whether the API says that it, Redis and the storage are there."""
+        """Return whether the API reports that Redis and storage are available."""
         return self._ask()[0] == 200
 
     def _unready(self) -> str:
@@ -144,8 +149,8 @@ class Service:
         try:
             checks = json.loads(body)["checks"]
         except (ValueError, KeyError, TypeError):
-            return f"the API does not answer.\n{self.folder.last_words('api')}"
-        return "; ".join(f"{name}: {said}" for name, said in checks.items() if said != "ok")
+            return f"the API does not answer. The end of its log:\n{self.folder.log_end('api')}"
+        return "; ".join(f"{name}: {found}" for name, found in checks.items() if found != "ok")
 
     def _ask(self) -> tuple[int, bytes]:
         if not self.api.running:
@@ -162,8 +167,8 @@ class Service:
         finally:
             connection.close()
 
-    def _end(self) -> None:
-        """End every child: the worker saves its job's state first, and Redis, which it says so to, goes last."""
+    def _stop(self) -> None:
+        """Stop all children. Redis is stopped last, because the worker needs it to hand its job back."""
         first = [child for child in self.children if child is not self.redis]
         began = time.monotonic()
         for child in first:
@@ -172,6 +177,6 @@ class Service:
             if child is self.redis:
                 child.signal(signal.SIGTERM)
                 began = time.monotonic()
-            if not child.wait(child.patience - (time.monotonic() - began)):
-                self.say(f"The {child.name} did not end in {child.patience:.0f} s and was killed.")
+            if not child.wait(child.stop_seconds - (time.monotonic() - began)):
+                self.say(f"The {child.name} did not end within {child.stop_seconds:.0f} s and was killed.")
         signal.set_wakeup_fd(-1)

@@ -1,4 +1,4 @@
-"""What the OpenAPI document says besides the schema: the problems an endpoint answers with, and examples."""
+"""Additions to the OpenAPI document: the problems of each endpoint, and examples."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ CAPTURE_EXAMPLE = {
     "files": [{"role": "images", "name": "0001.jpg", "size": 183402, "sha256": "5d" * 32}],
 }
 JOB_REQUESTS = {
-    "defaults": {"summary": "Let the photos decide", "value": {"capture": CAPTURE_ID}},
+    "defaults": {"summary": "All options decided from the photos", "value": {"capture": CAPTURE_ID}},
     "budget": {
         "summary": "Five minutes, at most 300,000 Gaussians",
         "value": {"capture": CAPTURE_ID, "options": {"time_budget": "5m", "max_gaussians": 300_000}},
@@ -29,16 +29,16 @@ CAMERA = {
     "fov_y_deg": 50,
 }
 RENDER_REQUESTS = {
-    "color": {"summary": "A colour picture", "value": {"camera": CAMERA}},
+    "color": {"summary": "A colour image", "value": {"camera": CAMERA}},
     "depth": {
-        "summary": "Depth in 16 bit, scale in a header",
+        "summary": "16-bit depth, with the scale in a header",
         "value": {"camera": CAMERA, "output": "depth", "format": "png"},
     },
 }
 
 
 def problems(*codes: str) -> Responses:
-    """The `responses` of an endpoint for these codes; those with one status share an entry."""
+    """Return the responses for problems with these codes; codes with the same status share an entry."""
     by_status: dict[int, list[str]] = {}
     for code in ("unauthorized", "invalid_request", "queue_unavailable", *codes):
         by_status.setdefault(PROBLEMS[code].status, []).append(code)
@@ -64,16 +64,16 @@ def problems(*codes: str) -> Responses:
 
 
 def example(status: int, value: Any, description: str) -> Responses:
-    """A successful answer with an example."""
+    """Return a response with an example."""
     return {status: {"description": description, "content": {"application/json": {"example": value}}}}
 
 
 def answer(status: int, description: str, **more: Any) -> Responses:
-    """Any other answer."""
+    """Return a response with this status and description."""
     return {status: {"description": description, **more}}
 
 
 def binary(description: str, *media_types: str) -> Responses:
-    """A successful answer that is a file."""
+    """Return a successful response that is a file of one of these media types."""
     schema = {"type": "string", "format": "binary"}
     return {200: {"description": description, "content": {name: {"schema": schema} for name in media_types}}}

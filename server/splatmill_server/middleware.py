@@ -1,6 +1,6 @@
-"""What stands before every endpoint: request id, API key, size of the body, metrics and the access log.
+"""The middleware before all endpoints: request id, API key, size limit of bodies, metrics and access log.
 
-Plain ASGI, because Starlette's BaseHTTPMiddleware would hold back streams.
+It is plain ASGI, because Starlette's BaseHTTPMiddleware buffers streams.
 """
 
 import hmac
@@ -22,11 +22,11 @@ from splatmill_server.settings import Settings
 log = structlog.get_logger()
 
 OPEN_PATHS = frozenset({"/healthz", "/readyz", "/openapi.json", "/docs"})
-"""What a probe or a browser may see without a key: nothing of it belongs to a user."""
+"""Paths that need no API key, for probes and browsers. They contain no data of users."""
 
 
-class Edge:
-    """Wraps the whole app."""
+class RequestMiddleware:
+    """Wraps the app."""
 
     def __init__(self, app: ASGIApp, settings: Settings, metrics: Metrics) -> None:
         self.app = app
@@ -67,7 +67,7 @@ class Edge:
                     await self._answer(scope, self._bounded(scope, headers, receive), send_marked)
         finally:
             seconds = time.perf_counter() - begun
-            # The template, not the path: ids would make a new time series each.
+            # The route template in place of the path: otherwise each id would be a time series of its own.
             route = getattr(scope.get("route"), "path", None) or "other"
             self.metrics.requests.labels(scope["method"], route, str(status)).inc()
             self.metrics.seconds.labels(route).observe(seconds)
@@ -81,7 +81,7 @@ class Edge:
             )
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let the app answer; a mistake of ours becomes a problem document, and a trace in the log."""
+        """Call the app; an unexpected exception becomes a problem document and a traceback in the log."""
         begun = False
 
         async def send_noted(message: Message) -> None:
@@ -92,15 +92,17 @@ class Edge:
         try:
             await self.app(scope, receive, send_noted)
         except ClientDisconnect:
-            log.debug("the client went away", path=scope["path"])
+            log.debug("the client disconnected", path=scope["path"])
         except Exception as error:
-            log.exception("mistake", method=scope["method"], path=scope["path"])
+            log.exception("unexpected error", method=scope["method"], path=scope["path"])
             if begun:
-                raise  # The status is sent; only breaking off tells the client that the rest is missing.
+                raise  # The status is already sent, so only a broken connection shows that the rest is missing.
             problem = Problem.of(
                 "internal_error",
-                f"The service made a mistake while it answered {scope['method']} {scope['path']}.",
-                advice="The server's log has the details under this answer's X-Request-ID; please report it.",
+                f"The service failed to handle {scope['method']} {scope['path']} because of an "
+                f"unexpected error.",
+                advice="Find the X-Request-ID of this response in the server's log, and report the "
+                "error shown there.",
                 facts={"kind": type(error).__name__},
             )
             await ProblemResponse(problem, scope["path"])(scope, receive, send)
@@ -111,8 +113,8 @@ class Edge:
             if scheme.lower() != "bearer" or not hmac.compare_digest(given.strip().encode(), self.key):
                 return Problem.of(
                     "unauthorized",
-                    "This service asks for an API key and got none, or a wrong one.",
-                    advice="Send the header 'Authorization: Bearer KEY'. Keys in the address are not read.",
+                    "The request has no API key, or a wrong one.",
+                    advice="Send the header 'Authorization: Bearer KEY'. A key in the address is ignored.",
                 )
         length = headers.get("content-length", "0")
         if not _streams(scope, headers) and length.isdigit() and int(length) > self.max_body:
@@ -120,7 +122,7 @@ class Edge:
         return None
 
     def _bounded(self, scope: Scope, headers: Headers, receive: Receive) -> Callable[[], Awaitable[Message]]:
-        """`receive`, ending with 413 once a body without an announced length grows too large."""
+        """Return a `receive` that raises a 413 problem once a body without Content-Length grows too large."""
         if _streams(scope, headers):
             return receive
         seen = 0
@@ -139,14 +141,15 @@ class Edge:
     def _too_large(self, size: int) -> Problem:
         return Problem.of(
             "body_too_large",
-            f"The body has {format_bytes(size)} or more; at most {format_bytes(self.max_body)} are taken here.",
-            advice="Upload photos one by one with PUT /v1/captures/{id}/images/{name}.",
+            f"The body has {format_bytes(size)} or more; at most {format_bytes(self.max_body)} "
+            f"are accepted here.",
+            advice="Upload files one by one with PUT /v1/captures/{id}/images/{name}.",
             facts={"limit": self.max_body},
         )
 
 
 def _streams(scope: Scope, headers: Headers) -> bool:
-    """Whether the endpoint passes the body on as it comes, with limits of its own per file."""
+    """Return whether the endpoint streams the body and limits its files itself."""
     multipart = headers.get("content-type", "").lower().startswith("multipart/form-data")
     return (scope["method"] == "PUT" and scope["path"].startswith("/v1/captures/")) or (
         scope["method"] == "POST" and scope["path"] == "/v1/jobs" and multipart

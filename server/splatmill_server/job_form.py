@@ -1,4 +1,4 @@
-"""One request that uploads photos and starts a job: `POST /v1/jobs` with a form."""
+"""`POST /v1/jobs` with a form: uploads photos and starts a job in one request."""
 
 import json
 
@@ -8,7 +8,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 
 from splatmill.schema import CaptureFile, CreateJob, Job, Role
-from splatmill_server.captures import names
+from splatmill_server.captures import fingerprints
 from splatmill_server.multipart import Part, read_parts
 from splatmill_server.problems import ProblemError
 from splatmill_server.service import Service
@@ -17,10 +17,10 @@ _FIELDS = ("name", "options")
 
 
 async def create_from_form(service: Service, request: Request, key: str | None) -> tuple[Job, bool]:
-    """Store the files of a form in a new capture and start a job on it; True when the job is new.
+    """Store the files of a form in a new capture and start a job on it; return the job, and whether it is new.
 
-    Files are the parts `images` (and `masks`, `poses`), each under its file name; `options` is JSON, `name` text.
-    When anything about the form is refused, nothing of it stays.
+    The files are the parts `images`, `masks` and `poses`; the field `options` is JSON, and `name` is text. If any part
+    is refused, the capture is deleted.
     """
     capture = await run_in_threadpool(service.captures.create)
     kept = False
@@ -28,8 +28,8 @@ async def create_from_form(service: Service, request: Request, key: str | None) 
         files, fields = await _receive(service, request, capture.id)
         create = _request(capture.id, fields)
         await run_in_threadpool(service.captures.check_trainable, capture.id)
-        await run_in_threadpool(check_start, service, create)
-        described = create.model_dump_json(exclude={"capture"}) + "\n".join(names(files))
+        await run_in_threadpool(check_start_model, service, create)
+        described = create.model_dump_json(exclude={"capture"}) + "\n".join(fingerprints(files))
         job, new = await run_in_threadpool(lambda: service.jobs.create(create, key=key, body=described))
         kept = job.capture == capture.id
         return job, new
@@ -38,11 +38,11 @@ async def create_from_form(service: Service, request: Request, key: str | None) 
             await run_in_threadpool(service.captures.delete, capture.id)
 
 
-def check_start(service: Service, create: CreateJob) -> None:
-    """Raise the problem that says why a job cannot start from the model it names, if it names one."""
+def check_start_model(service: Service, create: CreateJob) -> None:
+    """Raise a problem if the model to start from, where the request names one, does not exist."""
     options = create.options
     if options.start_file is not None:
-        service.captures.check_start(create.capture, options.start_file)
+        service.captures.check_start_file(create.capture, options.start_file)
     elif options.start_model is not None:
         service.models.check(options.start_model)
 
@@ -61,15 +61,16 @@ async def _receive(
             kind = "file" if part.filename is not None else "field"
             raise ProblemError(
                 "invalid_request",
-                f"The form holds a {kind} {part.name[:80]!r}, which is not known.",
-                advice="Files are 'images', 'masks' and 'poses'; fields are 'options' (JSON) and 'name'.",
+                f"The form contains an unknown {kind}, {part.name[:80]!r}.",
+                advice="Send the files as 'images', 'masks' and 'poses', and the fields 'options' "
+                "(JSON) and 'name'.",
             )
     return files, fields
 
 
 async def _store(service: Service, capture_id: str, part: Part, filename: str) -> CaptureFile:
     if not filename:
-        raise ProblemError("name_invalid", f"A file of {part.name} in the form has no name.")
+        raise ProblemError("name_invalid", f"A file among the {part.name} of the form has no file name.")
     file, _ = await service.captures.store(capture_id, Role(part.name), filename, part.chunks)
     return file
 
@@ -79,7 +80,9 @@ def _request(capture_id: str, fields: dict[str, str]) -> CreateJob:
         options = json.loads(fields.get("options") or "{}")
     except ValueError as error:
         raise ProblemError(
-            "malformed_body", f"The field 'options' is not JSON: {error}.", advice='Write {"steps": 1000}.'
+            "malformed_body",
+            f"The field 'options' is not JSON: {error}.",
+            advice='Send a JSON object such as {"steps": 1000}.',
         ) from error
     body = {"capture": capture_id, "options": options, "name": fields.get("name") or None}
     try:
