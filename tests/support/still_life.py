@@ -40,10 +40,7 @@ def scene() -> Scene:
         z = depth[rows, columns]
         near = z < 15.0
         rows, columns, z = rows[near], columns[near], z[near]
-        local = np.stack(
-            [(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z], axis=1
-        )
-        points.append((local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])
+        points.append(camera.unproject(columns + 0.5, rows + 0.5, z))
         colors.append(rgb[rows, columns])
     return Scene(tuple(views), np.concatenate(points), np.concatenate(colors), "transforms")
 

@@ -13,7 +13,6 @@ from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.schedule import Schedule
-from splatmill_worker.splat.start.cells import projected
 from splatmill_worker.splat.start.points import from_points
 from splatmill_worker.splat.views import TrainingView
 from tests.support import still_life
@@ -63,7 +62,7 @@ def sparse_scene() -> tuple[Scene, list[TrainingView]]:
     world = Normalization.of(still_life.scene()).apply(still_life.scene())
     points, views = world.points[::5], still_life.training_views()
     rows = [
-        [i for i, view in enumerate(views) if len(projected(view.full.camera, point[None]))]
+        [i for i, view in enumerate(views) if view.full.camera.project(point[None]).inside[0]]
         for point in points
     ]
     tracks = PointViews(np.cumsum([0, *map(len, rows)]), np.concatenate(rows).astype(np.int32))

@@ -14,7 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 Float = npt.NDArray[np.float64]
+Real = npt.NDArray[np.floating[Any]]
 Source = Literal["sfm", "colmap", "transforms", "blender"]
+
+MIN_DEPTH = 1e-9
+"""World units: a point that is not at least this far in front of a camera has no position on its photo."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +35,30 @@ class Lens:
     height: int
 
 
+class Projection(NamedTuple):
+    """Where n points fall on a photo.
+
+    columns, rows: position in pixels, float64 [n]; the first pixel covers 0 to 1. NaN where the point is not in
+        front of the camera.
+    depths: distance from the plane through the camera's centre along the optical axis, float64 [n], in world units.
+    inside: whether the point is in front of the camera and within the photo, bool [n]; False for NaN.
+    """
+
+    columns: Float
+    rows: Float
+    depths: Float
+    inside: npt.NDArray[np.bool_]
+
+
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: size and intrinsics in pixels, and the rigid world-to-camera matrix [4,4]."""
+    """A pinhole camera.
+
+    width, height: size of the photo, in pixels.
+    fx, fy: focal lengths, in pixels.
+    cx, cy: principal point, in pixels; the centre of the first pixel is at 0.5.
+    viewmat: rigid world-to-camera matrix, float64 [4,4].
+    """
 
     width: int
     height: int
@@ -53,12 +78,78 @@ class Camera:
         """The camera's position in the world [3]."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
+    @property
+    def axis(self) -> Float:
+        """The viewing direction in the world, a unit vector [3]."""
+        axis: Float = self.viewmat[2, :3]
+        return axis
+
+    def to_camera(self, points: Float) -> Float:
+        """World points [n,3] in the camera's frame (x right, y down, z forward)."""
+        local: Float = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        return local
+
+    def to_world(self, local: Float) -> Float:
+        """Points [n,3] of the camera's frame in the world."""
+        points: Float = (local - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
+        return points
+
+    def project(self, points: Float) -> Projection:
+        """Where world points [n,3] fall on the photo; points with NaN or infinite coordinates are not inside."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            local = self.to_camera(points)
+            depths = local[:, 2]
+            safe = np.where(depths > MIN_DEPTH, depths, np.nan)
+            columns = local[:, 0] / safe * self.fx + self.cx
+            rows = local[:, 1] / safe * self.fy + self.cy
+        inside = (columns >= 0) & (columns < self.width) & (rows >= 0) & (rows < self.height)
+        return Projection(columns, rows, depths, inside)
+
+    def normalized(self, columns: Any, rows: Any) -> tuple[Any, Any]:
+        """Normalised image coordinates: x and y of the rays (x, y, 1) through pixel positions, in the camera's frame.
+
+        `columns` and `rows` are numpy arrays or torch tensors of any shape; the results have their type and dtype.
+        """
+        return (columns - self.cx) / self.fx, (rows - self.cy) / self.fy
+
+    def unproject(self, columns: Real, rows: Real, depths: Real) -> Float:
+        """World points [n,3] at pixel positions [n] and depths [n]: the inverse of `project`."""
+        x, y = self.normalized(columns, rows)
+        return self.to_world(np.stack([x * depths, y * depths, depths], axis=1))
+
+    def moved_to(self, center: Float) -> Camera:
+        """The same camera with its centre at `center` [3]."""
+        return replace(self, viewmat=viewmat_of(self.viewmat[:3, :3], center))
+
     def scaled_to(self, width: int, height: int) -> Camera:
         """The same camera for a photo resampled to `width` x `height` pixels."""
         x, y = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
         )
+
+
+def viewmat_of(rotation: Float, center: Float) -> Float:
+    """The world-to-camera matrix [4,4] of a camera with the world-to-camera `rotation` [3,3] at `center` [3]."""
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ center
+    return viewmat
+
+
+def looked_at(centers: Float, axes: Float, ridge: float = 1e-3) -> Float:
+    """The point [3] with the least sum of squared distances to all optical axes.
+
+    centers, axes: positions and viewing directions [n,3] of the cameras; directions of any length.
+    ridge: weight per camera of the squared distance to the cameras' mean position. Parallel axes leave the point
+        undetermined; the ridge then keeps it near the cameras. With 0, parallel axes raise numpy's LinAlgError.
+    """
+    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
+    middle = centers.mean(axis=0)
+    right = (across @ (centers - middle)[:, :, None]).sum(axis=0)[:, 0]
+    target: Float = middle + np.linalg.solve(across.sum(axis=0) + ridge * len(centers) * np.eye(3), right)
+    return target
 
 
 @dataclass(frozen=True)
@@ -161,21 +252,13 @@ class Normalization:
         """Points [M,3] of the scene's world in the training world."""
         return np.asarray(points, np.float64) * self.scale + self.translation
 
-    def undo_points(self, points: Float) -> Float:
-        """Points [M,3] of the training world back in the scene's world."""
-        return (np.asarray(points, np.float64) - self.translation) / self.scale
-
     def camera(self, camera: Camera) -> Camera:
         """The camera in the training world; the picture it takes is the same, depths are `scale` times as large."""
-        viewmat = camera.viewmat.copy()
-        viewmat[:3, 3] = -viewmat[:3, :3] @ (self.scale * camera.center + self.translation)
-        return replace(camera, viewmat=viewmat)
+        return camera.moved_to(self.scale * camera.center + self.translation)
 
     def undo_camera(self, camera: Camera) -> Camera:
         """The camera back in the scene's world."""
-        viewmat = camera.viewmat.copy()
-        viewmat[:3, 3] = -viewmat[:3, :3] @ ((camera.center - self.translation) / self.scale)
-        return replace(camera, viewmat=viewmat)
+        return camera.moved_to((camera.center - self.translation) / self.scale)
 
     def apply(self, scene: Scene) -> Scene:
         """The scene in the training world."""

@@ -17,7 +17,7 @@ from splatmill_worker.capture import cameras_of
 from splatmill_worker.images import load_views
 from splatmill_worker.scene import Lens, Scene, View
 from splatmill_worker.sfm import Cancelled, posed, stereo
-from splatmill_worker.sfm.plane_sweep import Shot, placed, sweep
+from splatmill_worker.sfm.plane_sweep import Shot, sweep
 from tests.support import still_life
 
 WIDTH, HEIGHT = 320, 240
@@ -42,7 +42,7 @@ def depth_errors(scene: Scene, points: np.ndarray, seen: np.ndarray) -> np.ndarr
     still, errors = synthetic.still_life(), []
     for index, view in enumerate(scene.views):
         own = seen[:, index] & ~seen[:, :index].any(axis=1)
-        _, x, y, z = placed(view.camera, points[own])
+        x, y, z, _ = view.camera.project(points[own])
         _, depth = synthetic.photograph(still, view.camera, samples=1)
         rows = np.clip(y.astype(int)[:, None] + np.repeat([-1, 0, 1], 3), 0, HEIGHT - 1)
         columns = np.clip(x.astype(int)[:, None] + np.tile([-1, 0, 1], 3), 0, WIDTH - 1)
@@ -65,7 +65,7 @@ def test_points_are_found_on_the_surfaces_without_any_to_begin_with(bare: Scene,
 def test_colours_are_those_of_the_photos(bare: Scene, added: stereo.Added) -> None:
     camera = bare.views[0].camera
     own = np.flatnonzero(added.seen[:, 0])
-    inside, x, y, _ = placed(camera, added.points[own])
+    x, y, _, inside = camera.project(added.points[own])
     photo = np.asarray(Image.open(bare.views[0].image)).astype(float)
     there = photo[y[inside].astype(int), x[inside].astype(int)]
     assert np.median(np.abs(there - added.colors[own][inside])) < 12
@@ -101,8 +101,7 @@ def test_masked_places_get_no_points(bare: Scene, tmp_path: Path) -> None:
     found = sweep(1, shots[1], [(0, shots[0]), (2, shots[2])], bare.points, 3, 1.5, 12.0)
     assert found.tried > 50
     assert len(found.points) > 20
-    _, x, _, _ = placed(shots[1].camera, found.points)
-    assert x.min() >= WIDTH // 2
+    assert shots[1].camera.project(found.points).columns.min() >= WIDTH // 2
 
 
 def of_noise(scene: Scene, count: int, folder: Path) -> Scene:

@@ -71,10 +71,8 @@ def tracked(gains: np.ndarray) -> tuple[Scene, list[object]]:
     offsets, track = [0], []
     for point in world.points:
         for i, (camera, _, depth) in enumerate(still_life.pictures()):
-            x, y, z = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
-            u, v = x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy
-            inside = z > 0 and 0 <= u < camera.width and 0 <= v < camera.height
-            if inside and abs(depth[int(v), int(u)] - z) < 0.05 * z:
+            (column,), (row,), (z,), (inside,) = camera.project(point[None])
+            if inside and abs(depth[int(row), int(column)] - z) < 0.05 * z:
                 track.append(i)
         offsets.append(len(track))
     for view, gain in zip(views, gains, strict=True):
@@ -141,20 +139,13 @@ def test_without_points_gaussians_start_inside_the_visual_hull() -> None:
     assert colors.dtype == torch.uint8
     outside = 0
     for target in targets:
-        camera = target.camera
-        local = points.double().numpy() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        u = (local[:, 0] / local[:, 2] * camera.fx + camera.cx).astype(int)
-        v = (local[:, 1] / local[:, 2] * camera.fy + camera.cy).astype(int)
-        inside = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        columns, rows, _, inside = target.camera.project(points.double().numpy())
         assert target.alpha is not None
-        outside += int((target.alpha.numpy()[v[inside], u[inside]] == 0).sum())
+        alpha = target.alpha.numpy()[rows[inside].astype(int), columns[inside].astype(int)]
+        outside += int((alpha == 0).sum())
     assert outside < 0.05 * 800 * len(targets)
 
 
-def test_what_cameras_look_at_is_where_their_axes_meet() -> None:
-    centers = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 3.0]])
-    target, distance = frusta.looked_at(centers, -centers)
-    assert np.allclose(target, 0.0, atol=0.01)
-    assert distance == pytest.approx(3.0, abs=0.02)
-    _, distance = frusta.looked_at(np.zeros((3, 3)), np.tile([0.0, 0.0, 1.0], (3, 1)))
-    assert distance > 0
+def test_cameras_in_one_place_have_a_distance_all_the_same() -> None:
+    assert frusta.median_distance(np.array([[3.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.zeros(3)) == 2.0
+    assert frusta.median_distance(np.zeros((3, 3)), np.zeros(3)) == 1.0

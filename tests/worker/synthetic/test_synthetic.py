@@ -16,10 +16,7 @@ from splatmill_worker import synthetic
 def points_of(camera, depth):
     """World points [H*W, 3] behind the pixel centres of a depth image."""
     column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    x = (column - camera.cx) / camera.fx * depth
-    y = (row - camera.cy) / camera.fy * depth
-    local = np.stack([x, y, depth], -1).reshape(-1, 3)
-    return (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    return camera.unproject(column.ravel(), row.ravel(), depth.ravel())
 
 
 def test_depth_lands_on_the_surfaces():
@@ -47,12 +44,10 @@ def test_two_views_agree_where_both_see_a_diffuse_point():
     rgb_b, depth_b = synthetic.photograph(scene, second, samples=2)
     points = points_of(first, depth_a.astype(np.float64))
     table = np.abs(points[:, 2]) < 1e-3
-    local = points @ second.viewmat[:3, :3].T + second.viewmat[:3, 3]
-    u = local[:, 0] / local[:, 2] * second.fx + second.cx
-    v = local[:, 1] / local[:, 2] * second.fy + second.cy
-    inside = table & (local[:, 2] > 0) & (u > 1) & (u < 159) & (v > 1) & (v < 119)
+    u, v, z, _ = second.project(points)
+    inside = table & (u > 1) & (u < 159) & (v > 1) & (v < 119)
     row, column = v[inside].astype(int), u[inside].astype(int)
-    seen = np.abs(depth_b[row, column] - local[inside, 2]) < 0.05
+    seen = np.abs(depth_b[row, column] - z[inside]) < 0.05
     difference = np.abs(rgb_a.reshape(-1, 3)[inside].astype(float) - rgb_b[row, column]).mean(1)[seen]
     assert seen.sum() > 1000
     # Resampling at integer pixels costs a few levels; a wrong pose costs tens.

@@ -44,8 +44,8 @@ def pinhole(lens: Lens, viewmat: npt.NDArray[np.float64]) -> Camera:
 @lru_cache(maxsize=4096)
 def _pinhole_of(lens: Lens) -> tuple[float, float, float, float, float]:
     camera = colmap_camera(lens)
-    fx, fy = camera.focal_length_x, camera.focal_length_y
-    cx, cy = camera.principal_point_x, camera.principal_point_y
+    plain = without_distortion(camera)
+    cx, cy = plain.cx, plain.cy
     t = np.linspace(0.0, 1.0, BORDER_SAMPLES)
     x, y = t * lens.width, t * lens.height
     frame = np.concatenate(
@@ -56,7 +56,7 @@ def _pinhole_of(lens: Lens) -> tuple[float, float, float, float, float]:
             np.stack([np.full_like(y, lens.width), y], 1),
         ]
     )
-    rays = (frame - (cx, cy)) / (fx, fy)
+    rays = np.stack(plain.normalized(frame[:, 0], frame[:, 1]), axis=1)
 
     def reach(zoom: float) -> tuple[bool, float]:
         """Whether the frame at this zoom lies inside the photo, and how far from the centre its corners land."""
@@ -74,18 +74,31 @@ def _pinhole_of(lens: Lens) -> tuple[float, float, float, float, float]:
         if not inside or distance <= before:
             break
         zoom, before = float(wider), distance
-    return fx, fy, cx, cy, zoom
+    return plain.fx, plain.fy, cx, cy, zoom
 
 
 @lru_cache(maxsize=4096)
 def distortion(lens: Lens) -> float:
     """The farthest that the lens moves a pixel on the photo's border from where a pinhole would have put it."""
     camera = colmap_camera(lens)
-    center = np.array([camera.principal_point_x, camera.principal_point_y])
     corner = np.array([[0.0, 0.0], [lens.width, 0.0], [0.0, lens.height], [lens.width, lens.height]])
     frame = np.concatenate([corner, (corner + corner[[1, 3, 0, 2]]) / 2])
-    seen = project(camera, (frame - center) / (camera.focal_length_x, camera.focal_length_y))
+    rays = np.stack(without_distortion(camera).normalized(frame[:, 0], frame[:, 1]), axis=1)
+    seen = project(camera, rays)
     return float(np.linalg.norm(seen - frame, axis=1).max())
+
+
+def without_distortion(camera: pycolmap.Camera) -> Camera:
+    """The pinhole camera with the size, focal lengths and principal point of a COLMAP camera, at the origin."""
+    return Camera(
+        camera.width,
+        camera.height,
+        camera.focal_length_x,
+        camera.focal_length_y,
+        camera.principal_point_x,
+        camera.principal_point_y,
+        np.eye(4),
+    )
 
 
 def colmap_camera(lens: Lens) -> pycolmap.Camera:

@@ -181,9 +181,9 @@ def _look_up(
     Returns the grid [samples * height, samples * width, 2] in grid_sample's -1..1 and the pixels whose centre
     the photo covers [height, width].
     """
-    fx, fy, cx, cy = intrinsics
-    x = ((np.arange(width * samples) + 0.5) / samples - cx) / fx
-    y = ((np.arange(height * samples) + 0.5) / samples - cy) / fy
+    x, y = Camera(width, height, *intrinsics, np.eye(4)).normalized(
+        (np.arange(width * samples) + 0.5) / samples, (np.arange(height * samples) + 0.5) / samples
+    )
     rays = np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1).reshape(-1, 2)
     pixels = lenses.project(lenses.colmap_camera(lens), rays)
     grid = pixels / (lens.width, lens.height) * 2.0 - 1.0

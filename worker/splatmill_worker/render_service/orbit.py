@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from splatmill.schema import ModelCameras, OrbitRequest
-
-if TYPE_CHECKING:
-    from splatmill_worker.scene import Camera
+from splatmill_worker.scene import Camera, looked_at, viewmat_of
 
 Float = npt.NDArray[np.float64]
 
@@ -84,17 +81,13 @@ def path_around(points: Float) -> Path3:
 
 def cameras_along(path: Path3, wish: OrbitRequest, fov_y_deg: float) -> Iterable[Camera]:
     """One engine camera per frame, looking at the target."""
-    from splatmill_worker.scene import Camera
-
     focal = 0.5 * wish.height / math.tan(math.radians(fov_y_deg) / 2)
     for index in range(wish.frames):
         eye = path.eye(index / wish.frames)
         forward = _unit(path.target - eye, path.front)
         right = _unit(np.cross(forward, path.up), path.right)
         rotation = np.stack([right, np.cross(forward, right), forward])
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = rotation
-        viewmat[:3, 3] = -rotation @ eye
+        viewmat = viewmat_of(rotation, eye)
         yield Camera(wish.width, wish.height, focal, focal, wish.width / 2, wish.height / 2, viewmat)
 
 
@@ -108,11 +101,10 @@ def of_model(stored: ModelCameras | None, points: Float, wish: OrbitRequest) -> 
 
 
 def _nearest_to_axes(centers: Float, forwards: Float) -> Float:
-    projectors = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
-    system = projectors.sum(axis=0)
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()) or 1.0
-    if np.linalg.eigvalsh(system)[0] > 1e-3 * len(centers):
-        nearest: Float = np.linalg.solve(system, np.einsum("nij,nj->i", projectors, centers))
+    alignment = np.linalg.eigvalsh(forwards.T @ forwards / len(forwards))[-1]  # 1 for parallel axes
+    if alignment < 1.0 - 1e-3:
+        nearest = looked_at(centers, forwards, ridge=0.0)
         # Axes that only seem to meet do so behind the cameras or far out.
         if np.median(np.einsum("nj,nj->n", nearest - centers, forwards)) > 0.1 * spread:
             return nearest

@@ -59,10 +59,7 @@ def residuals(model: pycolmap.Reconstruction) -> dict[int, tuple[int, float]]:
             result[image_id] = 0, math.inf
             continue
         world = np.array([points[point.point3D_id] for point in seen])
-        pose = image.cam_from_world().matrix()
-        projected = np.asarray(
-            model.cameras[image.camera_id].img_from_cam(world @ pose[:, :3].T + pose[:, 3])
-        )
+        projected = np.asarray(model.cameras[image.camera_id].img_from_cam(image.cam_from_world() * world))
         error = np.linalg.norm(projected - np.array([point.xy for point in seen]), axis=1)
         result[image_id] = len(seen), float(np.mean(error)) if np.isfinite(error).all() else math.inf
     return result

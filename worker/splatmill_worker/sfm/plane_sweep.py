@@ -58,16 +58,6 @@ class Shot:
         return Shot(photo.camera, grey, photo)
 
 
-def placed(camera: Camera, points: Float) -> tuple[npt.NDArray[np.bool_], Float, Float, Float]:
-    """Whether each point [n,3] falls on the photo, its pixel x and y, and its depth."""
-    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    z = local[:, 2]
-    ahead = z > 1e-9
-    safe = np.where(ahead, z, 1.0)
-    x, y = local[:, 0] / safe * camera.fx + camera.cx, local[:, 1] / safe * camera.fy + camera.cy
-    return ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height), x, y, z
-
-
 def sweep(
     index: int,
     shot: Shot,
@@ -81,15 +71,13 @@ def sweep(
 
     `others` are at least AGREE neighbours with their indices. Depths are evenly spaced in their inverse.
     """
-    inside, x, y, _ = placed(shot.camera, points)
-    columns, rows = _candidates(shot, x[inside], y[inside])
+    known = shot.camera.project(points)
+    columns, rows = _candidates(shot, known.columns[known.inside], known.rows[known.inside])
     offsets = torch.arange(-RADIUS, RADIUS + 1, dtype=torch.float32)
     dy, dx = (grid.flatten() for grid in torch.meshgrid(offsets, offsets, indexing="ij"))
     px, py = columns[:, None] + 0.5 + dx, rows[:, None] + 0.5 + dy
     camera = shot.camera
-    rays = torch.stack(
-        [(px - camera.cx) / camera.fx, (py - camera.cy) / camera.fy, torch.ones_like(px)], dim=-1
-    )
+    rays = torch.stack([*camera.normalized(px, py), torch.ones_like(px)], dim=-1)
     patch = shot.grey[(rows[:, None] + dy).long(), (columns[:, None] + dx).long()]
     patch = patch - patch.mean(1, keepdim=True)
     textured = patch.square().mean(1).sqrt() >= MIN_CONTRAST
@@ -107,13 +95,14 @@ def sweep(
     good = torch.isfinite(best).nonzero()[:, 0]
     depth = 1.0 / torch.from_numpy(np.interp(place[good].numpy(), np.arange(len(inverse)), inverse.numpy()))
     local = rays[good, (2 * RADIUS + 1) ** 2 // 2].double() * depth[:, None]
-    world = (local.numpy() - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
     seen = np.zeros((len(good), views), bool)
     seen[:, index] = True
     for (k, _), agrees in zip(others, agreeing[:, good].numpy(), strict=True):
         seen[:, k] = agrees
     column, row = columns[textured][good].long().numpy(), rows[textured][good].long().numpy()
-    return Found(world, shot.photo.rgb[row, column], error[good].double().numpy(), seen, tried)
+    return Found(
+        camera.to_world(local.numpy()), shot.photo.rgb[row, column], error[good].double().numpy(), seen, tried
+    )
 
 
 def _candidates(shot: Shot, x: Float, y: Float) -> tuple[torch.Tensor, torch.Tensor]:

@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatmill_worker.images import load_view
-from splatmill_worker.scene import PointViews, Scene, View
+from splatmill_worker.scene import PointViews, Scene, View, looked_at
 from splatmill_worker.sfm.cancellation import stop_if
-from splatmill_worker.sfm.plane_sweep import AGREE, Found, Shot, placed, sweep
+from splatmill_worker.sfm.plane_sweep import AGREE, Found, Shot, sweep
 from splatmill_worker.sfm.run import OnProgress
 
 Float = npt.NDArray[np.float64]
@@ -77,7 +77,7 @@ def sightings_per_view(scene: Scene) -> float:
         return 0.0
     if scene.point_views is not None:
         return len(scene.point_views.views) / len(scene.views)
-    return float(np.mean([placed(view.camera, scene.points)[0].sum() for view in scene.views]))
+    return float(np.mean([view.camera.project(scene.points).inside.sum() for view in scene.views]))
 
 
 def wanted(scene: Scene) -> bool:
@@ -104,8 +104,8 @@ def find(
     views = [scene.views[index] for index in used]
     count = len(views)
     shots = _shots(views, cancelled)
-    centers, axes = scene.centers[used], np.array([view.camera.viewmat[2, :3] for view in views])
-    target = _looked_at(centers, axes)
+    centers, axes = scene.centers[used], np.array([view.camera.axis for view in views])
+    target = looked_at(centers, axes)
     points, batches = scene.points, list[Found]()
     trial = np.unique(np.linspace(0, count - 1, min(TRIAL, count)).round().astype(int))
     others = np.setdiff1d(np.arange(count), trial)
@@ -113,9 +113,10 @@ def find(
     for done, index in enumerate([*trial, *others], 1):
         stop_if(cancelled)
         on_progress("stereo", done - 1, count, "points between those known")
-        inside, _, _, z = placed(shots[index].camera, points)
-        if inside.sum() >= KNOWN:
-            near, middle, far = np.percentile(z[inside], [1, 50, 99]) * (1.0 / MARGIN, 1.0, MARGIN)
+        known = shots[index].camera.project(points)
+        if known.inside.sum() >= KNOWN:
+            depths = known.depths[known.inside]
+            near, middle, far = np.percentile(depths, [1, 50, 99]) * (1.0 / MARGIN, 1.0, MARGIN)
         else:
             middle = float(np.linalg.norm(target - centers[index]))
             near, far = UNKNOWN_DEPTHS[0] * middle, UNKNOWN_DEPTHS[1] * middle
@@ -221,15 +222,6 @@ def _shots(views: Sequence[View], cancelled: Callable[[], bool]) -> list[Shot]:
 
 def _yield(batches: list[Found]) -> float:
     return sum(len(batch.points) for batch in batches) / max(1, sum(batch.tried for batch in batches))
-
-
-def _looked_at(centers: Float, axes: Float) -> Float:
-    """The point [3] nearest to all optical axes; a small ridge keeps it near cameras whose axes are parallel."""
-    across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
-    middle = centers.mean(axis=0)
-    right = (across @ (centers - middle)[:, :, None]).sum(axis=0)[:, 0]
-    target: Float = middle + np.linalg.solve(across.sum(axis=0) + 1e-3 * len(centers) * np.eye(3), right)
-    return target
 
 
 def _partners(index: int, depth: float, centers: Float, axes: Float) -> list[int]:

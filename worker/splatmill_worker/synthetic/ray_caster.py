@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from splatmill_worker.scene import Camera
+from splatmill_worker.scene import Camera, viewmat_of
 from splatmill_worker.synthetic.textures import MipMap, painted, planks, sky
 
 Tensor = torch.Tensor
@@ -211,10 +211,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, focal:
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation
-    viewmat[:3, 3] = -rotation @ eye
-    return Camera(width, height, focal, focal, width / 2, height / 2, viewmat)
+    return Camera(width, height, focal, focal, width / 2, height / 2, viewmat_of(rotation, eye))
 
 
 def photograph(scene: StillLife, camera: Camera, samples: int = 2) -> tuple[np.ndarray, np.ndarray]:
@@ -264,9 +261,8 @@ def _cast(
 ) -> tuple[Tensor, Tensor]:
     """One ray a pixel of `rows` through (column + du, row + dv): colour [rows, W, 3] and depth [rows, W]."""
     rotation = torch.from_numpy(camera.viewmat[:3, :3].astype(np.float32))
-    eye = torch.from_numpy((-camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]).astype(np.float32))
-    x = (torch.arange(camera.width) + du - camera.cx) / camera.fx
-    y = (torch.arange(rows.start, rows.stop) + dv - camera.cy) / camera.fy
+    eye = torch.from_numpy(camera.center.astype(np.float32))
+    x, y = camera.normalized(torch.arange(camera.width) + du, torch.arange(rows.start, rows.stop) + dv)
     grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)
     local = torch.cat([grid, torch.ones_like(grid[..., :1])], -1).reshape(-1, 3)
     length = local.norm(dim=-1)

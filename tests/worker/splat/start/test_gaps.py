@@ -14,7 +14,7 @@ import torch
 
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.start import far_shell, gaps, seeding, sky
-from splatmill_worker.splat.start.cells import Cells, cells_of, located, projected
+from splatmill_worker.splat.start.cells import Cells, cells_of, projected
 from splatmill_worker.splat.start.points import from_points
 from splatmill_worker.splat.views import Target, TrainingView
 from tests.support.training import sparse_scene
@@ -109,14 +109,14 @@ def test_the_shell_is_far_and_wherever_photos_look() -> None:
     assert distance.min() > 0.99 * far_shell.DISTANCE * 3.0
     assert distance.max() / distance.min() < 1.01
     for grid in grids:
-        cells, on = located(grid.camera, places)
-        assert on.sum() > 0.7 * 16 * 24
-        up, down = cells[:, 1] < 14, cells[:, 1] > 18
+        columns, rows, _, inside = grid.camera.project(places)
+        assert inside.sum() > 0.7 * 16 * 24
+        up, down = rows < 14, rows > 18
         assert (colors[up] == BLUE).all()
         assert (colors[down] == BRICK).all()
         # Beyond the borders too, by a few cells.
-        assert -far_shell.BEYOND - 2 < cells[:, 0].min() < -3
-        assert 48 + 3 < cells[:, 0].max() < 48 + far_shell.BEYOND + 2
+        assert -far_shell.BEYOND - 2 < columns.min() < -3
+        assert 48 + 3 < columns.max() < 48 + far_shell.BEYOND + 2
 
 
 def test_what_a_photo_shows_outweighs_what_another_continues() -> None:
@@ -127,10 +127,10 @@ def test_what_a_photo_shows_outweighs_what_another_continues() -> None:
     grey = first.full._replace(camera=beside, rgb=torch.full_like(first.full.rgb, 200))
     grids = [Cells.of(first, points), Cells.of(TrainingView("beside", {1: grey}), points)]
     places, colors = far_shell.shell_points(grids, points)
-    cells, _ = located(grids[0].camera, places)
-    lower = cells[:, 1] > 18
-    left = lower & (cells[:, 0] > 19) & (cells[:, 0] < 20.5)
-    right = lower & (cells[:, 0] > 50) & (cells[:, 0] < 53)
+    columns, rows, _, _ = grids[0].camera.project(places)
+    lower = rows > 18
+    left = lower & (columns > 19) & (columns < 20.5)
+    right = lower & (columns > 50) & (columns < 53)
     assert left.any()
     assert right.any()
     assert np.abs(np.median(colors[left], axis=0) - BRICK).max() < 10
@@ -142,8 +142,7 @@ def test_masked_cells_leave_no_colour_on_the_shell() -> None:
     mask[:, :48] = False
     points = np.array([[0.2, 0.3, 2.0], [0.3, 0.3, 2.0], [0.5, 0.3, 2.0]])
     grid = Cells.of(street(mask=mask), points)
-    cells, _ = located(grid.camera, far_shell.shell_points([grid], points)[0])
-    assert cells[:, 0].min() > 23
+    assert grid.camera.project(far_shell.shell_points([grid], points)[0]).columns.min() > 23
     masked = Cells.of(street(mask=torch.zeros(64, 96, dtype=torch.bool)), points)
     places, colors = far_shell.shell_points([masked], points)
     assert places.shape == colors.shape == (0, 3)

@@ -12,10 +12,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from splatmill_worker.kernels.reference.project import rotation
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.train.density import prune
 from splatmill_worker.splat.train.density.clone_split import Change, decayed, densify
-from splatmill_worker.splat.train.density.rows import rotations
 
 
 def gaussians(n: int, scale: float = 0.05, opacity: float = 0.5) -> Gaussians:
@@ -127,12 +127,12 @@ def test_what_is_far_keeps_its_opacity() -> None:
     assert torch.sigmoid(engine.held.logit_opacities).tolist() == pytest.approx([0.45, 0.5, 0.45, 0.5])
 
 
-def test_rotations_are_rotations() -> None:
-    turn = rotations(torch.randn(50, 4, generator=random()).double())
+def test_quaternions_become_rotations() -> None:
+    turn = rotation(torch.randn(50, 4, generator=random()).double())
     identity = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
     assert torch.allclose(turn @ turn.transpose(1, 2), identity, atol=1e-12)
     assert torch.allclose(torch.linalg.det(turn), torch.ones(50, dtype=torch.float64))
-    quarter = rotations(torch.tensor([[math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4)]]))
+    quarter = rotation(torch.tensor([[math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4)]]))
     assert torch.allclose(
         quarter[0] @ torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]), atol=1e-6
     )

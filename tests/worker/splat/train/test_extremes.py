@@ -158,9 +158,7 @@ def test_the_size_and_place_of_the_world_do_not_matter(size: float, far: float) 
     scene = still_life.scene()
     views = []
     for view in scene.views:
-        viewmat = view.camera.viewmat.copy()
-        viewmat[:3, 3] = -viewmat[:3, :3] @ (size * view.camera.center + far)
-        views.append(replace(view, camera=replace(view.camera, viewmat=viewmat)))
+        views.append(replace(view, camera=view.camera.moved_to(size * view.camera.center + far)))
     moved = replace(scene, views=tuple(views), points=size * scene.points + far)
     frame = Normalization.of(moved)
     world = frame.apply(moved)

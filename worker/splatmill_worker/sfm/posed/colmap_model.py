@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from PIL import Image
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.decode import upright_size
-from splatmill_worker.images.lens import lens_of, pinhole
+from splatmill_worker.images.lens import lens_of, pinhole, without_distortion
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
 from splatmill_worker.sfm.files import ImageFiles
 
@@ -68,18 +69,7 @@ def camera_and_lens(camera: pycolmap.Camera, viewmat: npt.NDArray[np.float64]) -
     lens = lens_of(camera)
     if lens is not None:
         return pinhole(lens, viewmat), lens
-    return (
-        Camera(
-            camera.width,
-            camera.height,
-            camera.focal_length_x,
-            camera.focal_length_y,
-            camera.principal_point_x,
-            camera.principal_point_y,
-            viewmat,
-        ),
-        None,
-    )
+    return replace(without_distortion(camera), viewmat=viewmat), None
 
 
 def fit_to_file(posed: tuple[Camera, Lens | None], name: str, path: Path, mask: Path | None) -> View:

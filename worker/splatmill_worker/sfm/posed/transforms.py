@@ -17,7 +17,7 @@ from PIL import Image
 from plyfile import PlyData, PlyParseError
 
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.scene import Scene, Source, View
+from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.files import ImageFiles
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
 
@@ -139,10 +139,7 @@ def world_to_camera(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     camera_to_world[:3, :3] = u @ v
     camera_to_world[:3, 3] = matrix[:3, 3]
     camera_to_world = camera_to_world @ OPENGL_TO_OPENCV
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = camera_to_world[:3, :3].T
-    viewmat[:3, 3] = -camera_to_world[:3, :3].T @ camera_to_world[:3, 3]
-    return viewmat
+    return viewmat_of(camera_to_world[:3, :3].T, camera_to_world[:3, 3])
 
 
 def _colmap_camera(values: dict[str, Any], photo: Path) -> pycolmap.Camera:

@@ -262,14 +262,12 @@ class _Observations:
         for i, view in enumerate(views):
             rows = point[photo == i]
             camera, rgb = view.full.camera, view.full.rgb.numpy()
-            local = scene.points[rows] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-            z = np.maximum(local[:, 2], 1e-9)
-            u = (local[:, 0] / z * camera.fx + camera.cx).astype(np.int64)
-            v = (local[:, 1] / z * camera.fy + camera.cy).astype(np.int64)
-            on = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-            away = scene.points[rows[on]] - camera.center
+            seen = camera.project(scene.points[rows])
+            rows, z = rows[seen.inside], seen.depths[seen.inside]
+            color = rgb[seen.rows[seen.inside].astype(np.int64), seen.columns[seen.inside].astype(np.int64)]
+            away = scene.points[rows] - camera.center
             direction = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-            columns.append((rows[on], np.full(on.sum(), i), rgb[v[on], u[on]], z[on] / camera.fx, direction))
+            columns.append((rows, np.full(len(rows), i), color, z / camera.fx, direction))
         joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
         if len(joined[0]) < 40:
             return None

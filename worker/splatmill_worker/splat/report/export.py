@@ -42,9 +42,7 @@ class Frame:
     def camera(self, camera: Camera) -> Camera:
         """A camera of the training world in the exported world."""
         home = self.normalization.undo_camera(camera)
-        viewmat = home.viewmat.copy()
-        viewmat[:3, 3] = -viewmat[:3, :3] @ (home.center - self.offset)
-        return Camera(home.width, home.height, home.fx, home.fy, home.cx, home.cy, viewmat)
+        return home.moved_to(home.center - self.offset)
 
 
 def export(

@@ -64,12 +64,7 @@ class Cells:
 
     def at(self, cells: Index, depth: Float) -> Float:
         """Points [k, 3] in the world at camera depths [k] behind the middles of `cells` [k, 2] (row, column)."""
-        camera = self.camera
-        x = (cells[:, 1] + 0.5 - camera.cx) / camera.fx * depth
-        y = (cells[:, 0] + 0.5 - camera.cy) / camera.fy * depth
-        local = np.stack([x, y, depth], axis=1)
-        world: Float = (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
-        return world
+        return self.camera.unproject(cells[:, 1] + 0.5, cells[:, 0] + 0.5, depth)
 
 
 def cells_of(scene: Scene, views: Sequence[TrainingView]) -> list[Cells]:
@@ -90,20 +85,10 @@ def points_of(scene: Scene, views: Sequence[TrainingView]) -> list[Float]:
     return [scene.points[of_view[number[view.name]]] for view in views]
 
 
-def located(camera: Camera, points: Float) -> tuple[Float, Flags]:
-    """Column, row and depth [n, 3] of `points` [n, 3], and which of them fall into the picture of `camera` [n]."""
-    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    z = np.maximum(local[:, 2], 1e-9)
-    u = local[:, 0] / z * camera.fx + camera.cx
-    v = local[:, 1] / z * camera.fy + camera.cy
-    on = (local[:, 2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    return np.stack([u, v, z], axis=1), on
-
-
 def projected(camera: Camera, points: Float) -> Float:
     """Column, row and depth [k, 3] of those `points` [n, 3] that fall into the picture of `camera`."""
-    places, on = located(camera, points)
-    inside: Float = places[on]
+    seen = camera.project(points)
+    inside: Float = np.stack([seen.columns, seen.rows, seen.depths], axis=1)[seen.inside]
     return inside
 
 

@@ -9,8 +9,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from splatmill_worker.scene import Camera
-from splatmill_worker.splat.start.cells import located
+from splatmill_worker.scene import Camera, looked_at
 from splatmill_worker.splat.start.points import ENOUGH_POINTS
 from splatmill_worker.splat.views import Target
 
@@ -39,9 +38,8 @@ def sample_frusta(targets: Sequence[Target], count: int, seed: int) -> tuple[Ten
     some = targets[:: max(1, len(targets) // HULL_VIEWS)]
     cameras = [target.camera for target in targets]
     centers = np.array([camera.center for camera in cameras])
-    axes = np.array([camera.viewmat[2, :3] for camera in cameras])
-    _, distance = looked_at(centers, axes)
-    points = _along_rays(cameras, distance, CANDIDATES * count, random)
+    target = looked_at(centers, np.array([camera.axis for camera in cameras]))
+    points = _along_rays(cameras, median_distance(centers, target), CANDIDATES * count, random)
     rank, color = _occupancy(some, points)
     solid = points[rank > 0.5 * rank.max()]
     if any(target.alpha is not None for target in targets) and len(solid) >= ENOUGH_POINTS:
@@ -69,19 +67,10 @@ def _occupancy(targets: Sequence[Target], points: Float) -> tuple[Float, Pixels]
     return seen - 4.0 * missed, mean.clip(0, 255).astype(np.uint8)
 
 
-def looked_at(centers: Float, axes: Float) -> tuple[Float, float]:
-    """The point [3] nearest to all optical axes (least squares), and the cameras' median distance to it.
-
-    For parallel axes the least-squares problem is singular; a small ridge keeps the answer near the cameras.
-    """
-    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
-    middle = centers.mean(axis=0)
-    ridge = 1e-3 * len(centers) * np.eye(3)
-    right = (across @ (centers - middle)[:, :, None]).sum(axis=0)[:, 0]
-    target = middle + np.linalg.solve(across.sum(axis=0) + ridge, right)
+def median_distance(centers: Float, target: Float) -> float:
+    """The median distance from camera positions [n, 3] to the point `target` [3]; 1 where that is zero."""
     distance = float(np.median(np.linalg.norm(centers - target, axis=1)))
-    return target, distance if distance > 1e-6 else 1.0
+    return distance if distance > 1e-6 else 1.0
 
 
 def _along_rays(cameras: Sequence[Camera], distance: float, count: int, random: np.random.Generator) -> Float:
@@ -93,14 +82,12 @@ def _along_rays(cameras: Sequence[Camera], distance: float, count: int, random: 
         u = random.uniform(0, camera.width, len(rows))
         v = random.uniform(0, camera.height, len(rows))
         z = distance * np.cbrt(random.uniform(0.2**3, 1.8**3, len(rows)))
-        local = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
-        points[rows] = (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+        points[rows] = camera.unproject(u, v, z)
     return points
 
 
 def _pixels(camera: Camera, points: Float) -> tuple[Index, Index, Index]:
     """Indices of the points that fall on the photo, with the row and the column that they fall on."""
-    places, on = located(camera, points)
-    inside = np.flatnonzero(on)
-    column, row = places[inside, :2].astype(np.int64).T
-    return inside, row, column
+    seen = camera.project(points)
+    inside = np.flatnonzero(seen.inside)
+    return inside, seen.rows[inside].astype(np.int64), seen.columns[inside].astype(np.int64)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from splatmill_worker.kernels.reference.project import rotation
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.gaussians import Gaussians, concatenate
 
@@ -42,19 +43,8 @@ class Rows:
         engine.replace(self.gaussians.parameters(), self.exp_avg, self.exp_avg_sq)
 
 
-def rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions wxyz [N, 4] with any norm above zero."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rows = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
-    return torch.stack(rows, dim=1).reshape(-1, 3, 3)
-
-
 def offsets(gaussians: Gaussians, random: torch.Generator) -> Tensor:
     """One random displacement per Gaussian [N, 3], drawn from the Gaussian itself."""
     # Drawn on the CPU, so that a seed means the same on every device.
     local = torch.randn(gaussians.count, 3, generator=random).to(gaussians.means)
-    return torch.einsum("nij,nj->ni", rotations(gaussians.quats), local * gaussians.log_scales.exp())
+    return torch.einsum("nij,nj->ni", rotation(gaussians.quats), local * gaussians.log_scales.exp())
