@@ -1,6 +1,6 @@
 """Finished models over real HTTP: files with ranges and ETags, cameras, and what is refused.
 
-Not proved here: that a model is good, and the pictures themselves (tests/service has the renderer).
+Not proved here: that a model is good, and the pictures themselves (tests/worker/render_service).
 """
 
 import hashlib

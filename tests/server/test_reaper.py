@@ -23,25 +23,24 @@ from .conftest import Running, Serve, wait_for
 
 WORKER = textwrap.dedent(
     """
-    import os, pathlib, sys, time, types
-    module = types.ModuleType("splatmill_worker.service.job")
-    def run_attempt(job_id):
-        pathlib.Path(sys.argv[2]).write_text(str(os.getpid()))
-        if sys.argv[3] == "die":
-            os._exit(1)
-        while sys.argv[3] == "sleep":
-            time.sleep(0.05)
-    module.run_attempt = run_attempt
-    sys.modules["splatmill_worker"] = types.ModuleType("splatmill_worker")
-    sys.modules["splatmill_worker.service.job"] = module
+    import os, pathlib, sys, time
     from rq import Worker
     from splatmill.backplane import queue
     from splatmill.backplane.connection import connect
+    class Entry(queue.QueueEntry):
+        def func(self, job_id):
+            pathlib.Path(sys.argv[2]).write_text(str(os.getpid()))
+            if sys.argv[3] == "die":
+                os._exit(1)
+            while sys.argv[3] == "sleep":
+                time.sleep(0.05)
     class Quick(Worker):
         def get_heartbeat_ttl(self, job):
             return 2
     connection = connect(sys.argv[1])
-    worker = Quick([queue.open_queue(connection)], connection=connection, serializer=queue.SERIALIZER)
+    worker = Quick(
+        [queue.open_queue(connection)], connection=connection, job_class=Entry, serializer=queue.SERIALIZER
+    )
     worker.work(burst=sys.argv[3] != "sleep", logging_level="ERROR")
     """
 )

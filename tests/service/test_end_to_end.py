@@ -16,8 +16,8 @@ from PIL import Image
 
 from splatmill_worker import synthetic
 from splatmill_worker.scene import Camera
-
-from .conftest import Up, gone, wait_for
+from tests.support.up import Up
+from tests.support.waiting import gone, wait_for
 
 COUNT, WIDTH, HEIGHT = 10, 160, 120
 

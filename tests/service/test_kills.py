@@ -6,13 +6,14 @@ Does not cover the loss of a machine among several: there the heartbeat decides,
 
 import os
 import signal
+from functools import partial
 
 import httpx
 import pytest
 
 from splatmill.backplane import queue
-
-from .conftest import Up, gone, wait_for
+from tests.support.up import Up
+from tests.support.waiting import gone, wait_for
 
 STEPS = 40
 
@@ -47,8 +48,12 @@ def test_a_killed_worker_takes_its_trainer_along_and_is_followed(service: Up) ->
 
 def test_a_worker_killed_again_and_again_does_not_use_up_the_tries(service: Up) -> None:
     job_id = service.submit(steps=60)
+
+    def began(attempts: int) -> bool:
+        return len(service.diary(job_id)) == attempts
+
     for attempt in range(1, queue.MAX_RETRIES + 2):
-        wait_for(lambda seen=attempt: len(service.diary(job_id)) == seen)
+        wait_for(partial(began, attempt))
         os.kill(service.worker, signal.SIGKILL)
     job = service.ended(job_id)
     assert job["state"] == "succeeded", job

@@ -6,7 +6,8 @@ The pipeline is a stand-in: nothing here says that a model looks like its photos
 import json
 import time
 
-from .conftest import Up, gone, wait_for
+from tests.support.up import Up
+from tests.support.waiting import gone, wait_for
 
 
 def test_a_job_becomes_a_model_and_leaves_no_work_behind(service: Up) -> None:

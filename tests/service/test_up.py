@@ -3,7 +3,6 @@
 Does not cover what happens to jobs (test_kills) or how fast it starts.
 """
 
-import json
 import os
 import signal
 import socket
@@ -15,7 +14,9 @@ import httpx
 import psutil
 import pytest
 
-from .conftest import RedisServer, Up, gone, wait_for
+from tests.support.redis_server import RedisServer
+from tests.support.up import Up
+from tests.support.waiting import gone, wait_for
 
 
 def refused(*options: str, **environment: str) -> str:
@@ -82,7 +83,7 @@ def test_without_redis_on_the_path_the_one_in_the_wheel_serves(own_service: Up) 
     assert own_service.ended(own_service.submit(steps=1))["state"] == "succeeded"
 
 
-def test_a_redis_of_the_operators_own_is_used(own_service: Up, redis_server: RedisServer) -> None:
+def test_a_redis_of_the_operators_own_is_used(redis_server: RedisServer, own_service: Up) -> None:
     own_service.environment["REDIS_URL"] = f"unix://{redis_server.path}"
     own_service.start()
     assert not [child for child in own_service.tree() if "redis" in child.name()]
@@ -142,33 +143,3 @@ def test_the_idle_service_is_small(service: Up) -> None:
     }
     print({name: round(size / 1e6) for name, size in parts.items()})
     assert sum(parts.values()) < 600e6
-
-
-def test_a_worker_started_by_hand_says_that_redis_is_away(tmp_path: Path) -> None:
-    environment = dict(os.environ) | {"REDIS_URL": f"unix://{tmp_path}/nothing.sock"}
-    code = "import splatmill_worker.service.command as c; c.REDIS_PATIENCE = 0.1; raise SystemExit(c.serve(None))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60
-    )
-    assert done.returncode == 1
-    assert "nothing.sock" in done.stderr
-    assert "REDIS_URL" in done.stderr
-
-
-def test_doctor_reports_this_machine_and_finds_what_is_wrong(tmp_path: Path) -> None:
-    def doctor(**environment: str) -> tuple[int, dict[str, str]]:
-        done = subprocess.run(
-            [sys.executable, "-m", "splatmill_worker", "doctor", "--json"],
-            env=dict(os.environ) | {"SPLATMILL_DATA": str(tmp_path)} | environment,
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
-        return done.returncode, {line["topic"]: line["verdict"] for line in json.loads(done.stdout)}
-
-    status, verdicts = doctor()
-    assert status == 0
-    assert {"python", "kernels", "memory", "disk", "redis", "storage", "gpu"} <= verdicts.keys()
-    status, verdicts = doctor(REDIS_URL=f"unix://{tmp_path}/nothing.sock")
-    assert status == 1
-    assert verdicts["redis"] == "bad"

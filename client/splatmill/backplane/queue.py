@@ -19,11 +19,13 @@ TRAIN = "train"
 
 QUEUES = (TRAIN,)
 
-ATTEMPT = "splatmill_worker.service.job.run_attempt"
-"""The function that a worker calls with the job id; the generation is part of the id of the RQ job."""
+ATTEMPT = "splatmill_worker.job.run_attempt"
+"""The function name that each entry carries, because RQ requires one, with the job id as its argument. A worker runs
+its own attempt function whatever the name says. The name stays for workers of earlier versions, which import it."""
 
 SERIALIZER = JSONSerializer
-"""JSON in place of pickle, RQ's default, so that write access to Redis does not allow running code in a worker."""
+"""JSON in place of pickle, RQ's default, so that write access to Redis does not allow running code in a worker.
+`QueueEntry` serves the same end."""
 
 JOB_TIMEOUT = -1
 """No time limit (RQ's default is 180 s); the option `time_budget` limits the training."""
@@ -83,9 +85,23 @@ class QueueStatus:
     reason: str | None = None
 
 
+class QueueEntry(Job):
+    """RQ's record of one generation of a job, without callbacks, which RQ would import by names found in Redis."""
+
+    success_callback = None
+    failure_callback = None
+    stopped_callback = None
+
+
 def open_queue(connection: redis.Redis, name: str = TRAIN) -> Queue:
-    """Return the RQ queue with this name, with JSON as serializer and without a time limit."""
-    return Queue(name, connection=connection, serializer=SERIALIZER, default_timeout=JOB_TIMEOUT)
+    """Return the RQ queue with this name, with JSON as serializer, `QueueEntry` as job class and no time limit."""
+    return Queue(
+        name,
+        connection=connection,
+        serializer=SERIALIZER,
+        job_class=QueueEntry,
+        default_timeout=JOB_TIMEOUT,
+    )
 
 
 def rq_id(job_id: str, generation: int) -> str:
@@ -190,7 +206,7 @@ def waiting(connection: redis.Redis) -> dict[str, int]:
 
 def _fetch(connection: redis.Redis, job_id: str, generation: int) -> Job | None:
     try:
-        return Job.fetch(rq_id(job_id, generation), connection=connection, serializer=SERIALIZER)
+        return QueueEntry.fetch(rq_id(job_id, generation), connection=connection, serializer=SERIALIZER)
     except NoSuchJobError:
         return None
 

@@ -49,11 +49,10 @@ Pipeline = Callable[[Path, Path, TrainOptions, Callable[[Event], None], Callable
 log = logging.getLogger("splatmill_worker")
 
 
-def run_attempt(job_id: str) -> None:
-    """The attempt that `attempt.current` describes; RQ passes the job's id."""
+def run_attempt() -> None:
+    """Run the attempt that `attempt.current` describes, in the process forked for it."""
     this = attempt.current
     assert this is not None
-    assert this.job_id == job_id
     request = _wanted(this)
     if request is not None:
         outbox = Outbox(this)

@@ -18,7 +18,7 @@ from rq.worker_registration import get_keys
 
 from splatmill.backplane import keys
 from splatmill.backplane.process import ProcessIdentity, wait_gone
-from splatmill.backplane.queue import split_rq_id
+from splatmill.backplane.queue import QueueEntry, split_rq_id
 from splatmill_worker.service import attempt
 from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.lock import Holder, JobLock
@@ -90,9 +90,9 @@ def _adopt_started(worker: Worker, queue: Queue, rq_job_id: str, execution_id: s
     registry = queue.started_job_registry
     if not connection.zrem(registry.key, f"{rq_job_id}:{execution_id}"):
         return  # another worker, or the server's clean-up, was faster
-    if not Job.exists(rq_job_id, connection):
+    if not QueueEntry.exists(rq_job_id, connection):
         return
-    job = Job.fetch(rq_job_id, connection=connection, serializer=worker.serializer)
+    job = QueueEntry.fetch(rq_job_id, connection=connection, serializer=worker.serializer)
     number = holder.attempt if holder else 0
     told = Attempt(connection, job_id, generation, number or attempts(worker, job_id), lock)
     attempt.requeued(told, "The worker ended in the middle of the job; the job goes back to the queue.")

@@ -30,6 +30,7 @@ from splatmill_worker.service import attempt, recovery
 from splatmill_worker.service.attempt import Attempt, HandedBack
 from splatmill_worker.service.clean_up import sweep
 from splatmill_worker.service.ending import Ending, oom_kills
+from splatmill_worker.service.job import run_attempt
 from splatmill_worker.service.lock import Held, JobLock
 
 STOP_GRACE = 15.0
@@ -39,6 +40,18 @@ attempt goes on from the checkpoint before."""
 _GONE = (RedisConnectionError, RedisTimeoutError)
 _RETRY_SECONDS = 0.5
 _SWEEP_SECONDS = 3600.0
+
+
+class AttemptEntry(backplane.QueueEntry):
+    """An entry of the queue that runs `run_attempt`, whatever function name and arguments it carries.
+
+    RQ imports and calls the function that an entry names. Here nothing that lies in Redis decides what runs, and
+    entries of servers that know the attempt function by another name still run.
+    """
+
+    def func(self, *args: object, **kwargs: object) -> None:
+        """Called by RQ in place of the named function, with the entry's arguments."""
+        run_attempt()
 
 
 class AttemptWorker(Worker):
@@ -53,6 +66,7 @@ class AttemptWorker(Worker):
             [backplane.open_queue(connection, queue)],
             name=f"{os.uname().nodename}-{os.getpid()}-{uuid4().hex[:6]}",
             connection=connection,
+            job_class=AttemptEntry,
             serializer=backplane.SERIALIZER,
             worker_ttl=backplane.WORKER_TTL,
             maintenance_interval=backplane.MAINTENANCE_INTERVAL,

@@ -4,41 +4,29 @@ The model is a ball, red on the side of +x and blue on the other, whose picture 
 right is proven in tests/kernels.
 """
 
-import asyncio
 import io
-import math
 import os
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
+import numpy.typing as npt
 import pytest
 from PIL import Image
 
 from splatmill.backplane import layout, rendering
 from splatmill.backplane.storage import Storage
-from splatmill.schema import DEPTH_SCALE_HEADER, CameraSpec, OrbitRequest, RenderRequest
-from splatmill_worker.render_service import orbit
-from splatmill_worker.render_service.model_cache import ModelCache, NoModelError
-from splatmill_worker.render_service.renderer import Busy, Turns
+from splatmill.schema import DEPTH_SCALE_HEADER, CameraSpec, Format, OrbitRequest, Output, RenderRequest
+from tests.support.ball import BALL, store_ball
+from tests.support.waiting import wait_for
 
-from . import standin
-from .conftest import wait_for
-
-BALL = "ball0000"
 FRONT = CameraSpec.looking_at((4, 0, 0), (0, 0, 0), width=64, height=48)
 BACK = CameraSpec.looking_at((-4, 0, 0), (0, 0, 0), width=64, height=48)
-
-
-def store_ball(storage: Storage, folder: Path, model_id: str = BALL, count: int = 400) -> None:
-    standin.write_ply(folder / "model.ply", count)
-    storage.put(layout.model_file(model_id, "model.ply"), folder / "model.ply")
-    storage.put(layout.job_record(model_id), b"{}")
 
 
 @pytest.fixture(scope="module")
@@ -77,15 +65,16 @@ def picture(http: httpx.Client, wish: RenderRequest, **headers: str) -> httpx.Re
     )
 
 
-def pixels(answer: httpx.Response) -> np.ndarray:
+def pixels(answer: httpx.Response) -> npt.NDArray[Any]:
     assert answer.status_code == 200, answer.text
     if answer.headers["content-type"] == "application/x-npy":
-        return np.load(io.BytesIO(answer.content))
+        array: npt.NDArray[Any] = np.load(io.BytesIO(answer.content))
+        return array
     return np.asarray(Image.open(io.BytesIO(answer.content)))
 
 
-@pytest.mark.parametrize("kind", ["png", "jpeg", "webp"])
-def test_colour_in_every_format(http: httpx.Client, kind: str) -> None:
+@pytest.mark.parametrize("kind", [Format.png, Format.jpeg, Format.webp])
+def test_colour_in_every_format(http: httpx.Client, kind: Format) -> None:
     front = picture(http, RenderRequest(camera=FRONT, format=kind, background="white"))
     assert front.headers["content-type"] == f"image/{kind}"
     image = pixels(front).astype(int)
@@ -102,17 +91,17 @@ def test_transparent_pictures_carry_coverage(http: httpx.Client) -> None:
     assert image.shape == (48, 64, 4)
     assert image[0, 0, 3] == 0
     assert image[24, 32, 3] > 200
-    coverage = pixels(picture(http, RenderRequest(camera=FRONT, output="alpha")))
+    coverage = pixels(picture(http, RenderRequest(camera=FRONT, output=Output.alpha)))
     assert np.abs(coverage.astype(int) - image[..., 3]).max() <= 1
 
 
 def test_depth_as_floats_and_as_sixteen_bits(http: httpx.Client) -> None:
-    floats = pixels(picture(http, RenderRequest(camera=FRONT, output="depth", format="npy")))
+    floats = pixels(picture(http, RenderRequest(camera=FRONT, output=Output.depth, format=Format.npy)))
     assert floats.dtype == np.float32
     # A unit ball seen from 4 lies between 3 and 5; its near side hides most of the far one.
     assert 2.9 < floats[24, 32] < 4.0
     assert floats[0, 0] == 0
-    answer = picture(http, RenderRequest(camera=FRONT, output="depth"))
+    answer = picture(http, RenderRequest(camera=FRONT, output=Output.depth))
     whole = pixels(answer)
     scale = float(answer.headers[DEPTH_SCALE_HEADER])
     assert np.abs(whole * scale - floats).max() <= scale
@@ -134,7 +123,7 @@ def test_the_same_picture_is_not_sent_twice(http: httpx.Client) -> None:
 
 
 def test_a_replaced_model_is_read_anew(http: httpx.Client, storage: Storage, tmp_path: Path) -> None:
-    wish = RenderRequest(camera=FRONT, output="alpha")
+    wish = RenderRequest(camera=FRONT, output=Output.alpha)
     before = picture(http, wish)
     store_ball(storage, tmp_path, count=30)
     after = picture(http, wish)
@@ -167,7 +156,7 @@ def test_an_orbit_is_a_video_that_shows_both_sides(http: httpx.Client) -> None:
     answer = http.post(rendering.orbit_path(BALL), content=wish.model_dump_json(exclude_none=True))
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "video/mp4"
-    with av.open(io.BytesIO(answer.content)) as container:
+    with av.open(io.BytesIO(answer.content), "r") as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     assert len(frames) == wish.frames
     leanings = [int(frame[..., 0].sum()) - int(frame[..., 2].sum()) for frame in frames]
@@ -177,90 +166,6 @@ def test_an_orbit_is_a_video_that_shows_both_sides(http: httpx.Client) -> None:
         rendering.orbit_path(BALL), content=wish.model_dump_json(exclude_none=True), headers=etag
     )
     assert again.status_code == 304
-
-
-def test_the_cache_keeps_to_its_bytes(storage: Storage, tmp_path: Path) -> None:
-    for number in range(3):
-        store_ball(storage, tmp_path, f"cached0{number}")
-    one = ModelCache(storage, 0).get("cached00").bytes
-    cache = ModelCache(storage, 2 * one)
-    first = cache.get("cached00")
-    cache.get("cached01")
-    assert cache.get("cached00") is first
-    cache.get("cached02")
-    assert cache.bytes == 2 * one
-    assert cache.get("cached00") is first, "the one used last must stay"
-    with pytest.raises(NoModelError):
-        cache.get("../../etc")
-
-
-def test_more_requests_than_may_wait_are_sent_away() -> None:
-    async def crowd() -> tuple[int, int, int]:
-        turns, release, inside, most = Turns(waiting=2), threading.Event(), 0, 0
-
-        def work() -> None:
-            nonlocal inside, most
-            inside += 1
-            most = max(most, inside)
-            release.wait(10)
-            inside -= 1
-
-        async def visit() -> bool:
-            try:
-                async with turns.admitted():
-                    await turns.run(work)
-            except Busy:
-                return False
-            return True
-
-        visits = [asyncio.create_task(visit()) for _ in range(5)]
-        done, _ = await asyncio.wait(visits, return_when=asyncio.FIRST_COMPLETED)
-        release.set()
-        served = await asyncio.gather(*visits)
-        return len(done), sum(served), most
-
-    assert asyncio.run(crowd()) == (2, 3, 1)
-
-
-def ring(first: float, last: float, count: int = 12) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cameras on an arc (degrees) of radius 3 at height 1 around (5, 0, 0), looking at it."""
-    turns = np.radians(np.linspace(first, last, count))
-    target = np.array([5.0, 0.0, 0.0])
-    centers = target + np.stack([3 * np.cos(turns), 3 * np.sin(turns), np.ones(count)], axis=1)
-    forwards = (target - centers) / np.linalg.norm(target - centers, axis=1, keepdims=True)
-    rights = np.cross(forwards, [0.0, 0.0, 1.0])
-    ups = np.cross(rights / np.linalg.norm(rights, axis=1, keepdims=True), forwards)
-    return centers, forwards, ups
-
-
-def test_the_orbit_circles_where_photos_were_taken_all_around() -> None:
-    path = orbit.path_through(*ring(0, 330))
-    assert path.target == pytest.approx([5.0, 0.0, 0.0], abs=1e-6)
-    assert path.radius == pytest.approx(3.0)
-    assert path.height == pytest.approx(1.0)
-    eyes = np.array([path.eye(share) for share in np.linspace(0, 1, 37)])
-    assert eyes[0] == pytest.approx(eyes[-1])
-    turned = np.unwrap(np.arctan2(eyes[:, 1], eyes[:, 0] - 5.0))
-    assert abs(turned[-1] - turned[0]) == pytest.approx(2 * math.pi)
-
-
-def test_the_orbit_stays_on_the_side_that_was_seen() -> None:
-    path = orbit.path_through(*ring(-40, 40))
-    eyes = np.array([path.eye(share) for share in np.linspace(0, 1, 37)])
-    azimuths = np.degrees(np.arctan2(eyes[:, 1], eyes[:, 0] - 5.0))
-    assert azimuths.min() == pytest.approx(-40, abs=1)
-    assert azimuths.max() == pytest.approx(40, abs=1)
-
-
-def test_orbit_cameras_look_at_the_target() -> None:
-    wish = OrbitRequest(seconds=0.5, fps=12, width=64, height=48)
-    path = orbit.path_through(*ring(0, 330))
-    for camera in orbit.cameras_along(path, wish, 50.0):
-        rotation = camera.viewmat[:3, :3]
-        assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-9)
-        seen = camera.project(path.target[None])
-        assert (*seen.columns, *seen.rows) == pytest.approx((32.0, 24.0), abs=1e-6)
-        assert rotation[1] @ np.array([0.0, 0.0, 1.0]) < 0, "the picture's down must not be the world's up"
 
 
 def _flipped(camera: CameraSpec) -> list[list[float]]:

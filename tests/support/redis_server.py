@@ -1,0 +1,55 @@
+"""A real Redis of a test's own. A conftest.py that imports `redis_server` or `connection` offers them as fixtures."""
+
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import redis
+
+from splatmill.backplane.connection import connect
+from splatmill_server.up.redis_server import find
+from tests.support.waiting import wait_for
+
+
+class RedisServer:
+    """A Redis without the service. It can be killed, and has all its data again when it is started anew."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / "r.sock"
+        self.url = f"unix://{self.path}"
+        self.connection = connect(self.url, retries=0)
+        self._command = [str(find()[0]), "--port", "0", "--unixsocket", str(self.path)]
+        self._command += ["--appendonly", "yes", "--save", "", "--dir", str(folder)]
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        self._process = subprocess.Popen(self._command, stdout=subprocess.DEVNULL)
+        wait_for(self._answers)
+
+    def kill(self) -> None:
+        assert self._process is not None
+        self._process.kill()
+        self._process.wait(10)
+
+    def _answers(self) -> bool:
+        try:
+            return bool(self.connection.ping())
+        except redis.ConnectionError:
+            return False
+
+
+@pytest.fixture
+def redis_server(tmp_path: Path) -> Iterator[RedisServer]:
+    """A running Redis that the test may kill."""
+    server = RedisServer(tmp_path)
+    server.start()
+    yield server
+    server.connection.close()
+    server.kill()
+
+
+@pytest.fixture
+def connection(redis_server: RedisServer) -> redis.Redis:
+    """A connection to an empty Redis."""
+    return redis_server.connection

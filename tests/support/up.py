@@ -1,0 +1,168 @@
+"""`splatmill up` as the service's tests run it: a real process with real Redis, real HTTP and a stand-in pipeline."""
+
+import contextlib
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+import redis
+
+from splatmill.backplane.connection import connect
+from tests.support.paths import ROOT
+from tests.support.waiting import wait_for
+
+FINAL = {"succeeded", "failed", "cancelled"}
+
+STANDIN = {"SPLATMILL_PIPELINE": "tests.support.standin", "PYTHONPATH": str(ROOT)}
+"""The environment of a worker that runs tests/support/standin.py instead of the engine."""
+
+
+class Up:
+    """`splatmill up` on a data folder, started and stopped as often as a test wants."""
+
+    def __init__(self, data: Path, environment: Mapping[str, str] | None = None) -> None:
+        self.data = data
+        self.log = data.parent / f"{data.name}.log"
+        self.environment = dict(os.environ) | {**STANDIN}
+        for name in ("REDIS_URL", "SPLATMILL_API_KEY", "SPLATMILL_STORAGE", "SPLATMILL_DATA"):
+            self.environment.pop(name, None)
+        self.environment |= environment or {}
+        self.process: subprocess.Popen[str] | None = None
+        self.http = httpx.Client()
+
+    def start(self, *options: str, largest_file: int | None = None) -> "Up":
+        """Start and wait until it is ready. `largest_file` (bytes) makes the disk full for anything larger."""
+
+        def limit() -> None:
+            if largest_file is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
+
+        program = [sys.executable, "-m", "splatmill_server.up"]
+        with self.log.open("a") as log:
+            self.process = subprocess.Popen(
+                [*program, "--json-ready", "--port", "0", "--data", str(self.data), *options],
+                env=self.environment,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+                preexec_fn=limit,
+            )
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, self.log.read_text()
+        self.http.close()
+        self.http = httpx.Client(base_url=json.loads(line)["url"], timeout=30)
+        return self
+
+    def stop(self) -> int:
+        """End it as a closing program does, and return the exit status."""
+        assert self.process is not None
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        status = self.process.wait(60)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        self.process = None
+        return status
+
+    def kill(self, *, children: bool) -> list[int]:
+        """kill -9, of everything or of the one process alone. Returns the pids of all that ran."""
+        assert self.process is not None
+        family = [self.process.pid, *(child.pid for child in self.tree())]
+        for pid in family if children else family[:1]:
+            os.kill(pid, signal.SIGKILL)
+        self.process.wait(10)
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.close()
+        self.process.stdout.close()
+        self.process = None
+        return family
+
+    def close(self) -> None:
+        if self.process is not None:
+            self.stop()
+        self.http.close()
+
+    def tree(self) -> list[psutil.Process]:
+        """Every process below `up`."""
+        assert self.process is not None
+        below: list[psutil.Process] = psutil.Process(self.process.pid).children(recursive=True)
+        return below
+
+    def child(self, *words: str) -> int:
+        """The pid of the child whose command line holds all these words."""
+        assert self.process is not None
+        parent = psutil.Process(self.process.pid)
+
+        def find() -> int | None:
+            for child in parent.children():
+                try:
+                    line = " ".join(child.cmdline())
+                except psutil.Error:
+                    continue
+                if all(word in line for word in words):
+                    return int(child.pid)
+            return None
+
+        return wait_for(find)
+
+    @property
+    def worker(self) -> int:
+        return self.child("splatmill_worker", "train")
+
+    @contextlib.contextmanager
+    def redis(self) -> Iterator[redis.Redis]:
+        """The service's own Redis."""
+        with connect(f"unix://{self.data / 'redis.sock'}") as connection:
+            yield connection
+
+    # Jobs of the stand-in
+
+    def submit(self, **script: Any) -> str:
+        """A job that follows `script`; returns its id."""
+        script = {"steps": 10, "pause": 0.05} | script
+        capture = self.http.post("/v1/captures", json={}).json()["id"]
+        script["diary"] = str(self.data.parent / f"{capture}.diary")
+        body = json.dumps(script).encode()
+        answer = self.http.put(f"/v1/captures/{capture}/images/script.json", content=body)
+        assert answer.status_code == 201, answer.text
+        answer = self.http.post("/v1/jobs", json={"capture": capture})
+        assert answer.status_code == 202, answer.text
+        return str(answer.json()["id"])
+
+    def job(self, job_id: str) -> Any:
+        answer = self.http.get(f"/v1/jobs/{job_id}")
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
+    def ended(self, job_id: str, seconds: float = 60.0) -> Any:
+        """The job once it has ended."""
+        return wait_for(lambda: (job := self.job(job_id))["state"] in FINAL and job, seconds)
+
+    def reached(self, job_id: str, step: int) -> None:
+        """Wait until the job has come to a step."""
+
+        def arrived() -> Any:
+            progress = self.job(job_id)["progress"]
+            return progress is not None and (progress["step"] or 0) >= step
+
+        wait_for(arrived)
+
+    def diary(self, job_id: str) -> list[Any]:
+        """What each attempt wrote when it began."""
+        path = self.data.parent / f"{self.job(job_id)['capture']}.diary"
+        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+    def trainer(self, job_id: str) -> int:
+        """The process of the attempt that began last."""
+        return int(self.diary(job_id)[-1]["pid"])

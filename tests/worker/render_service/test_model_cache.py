@@ -1,0 +1,25 @@
+"""Proves that the models in memory keep to a bound in bytes, the one used last staying."""
+
+from pathlib import Path
+
+import pytest
+
+from splatmill.backplane.storage import Storage
+from splatmill_worker.render_service.model_cache import ModelCache, NoModelError
+from tests.support.ball import store_ball
+
+
+def test_the_cache_keeps_to_its_bytes(tmp_path: Path) -> None:
+    storage = Storage((tmp_path / "storage").as_uri())
+    for number in range(3):
+        store_ball(storage, tmp_path, f"cached0{number}")
+    one = ModelCache(storage, 0).get("cached00").bytes
+    cache = ModelCache(storage, 2 * one)
+    first = cache.get("cached00")
+    cache.get("cached01")
+    assert cache.get("cached00") is first
+    cache.get("cached02")
+    assert cache.bytes == 2 * one
+    assert cache.get("cached00") is first, "the one used last must stay"
+    with pytest.raises(NoModelError):
+        cache.get("../../etc")

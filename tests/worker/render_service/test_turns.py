@@ -1,0 +1,34 @@
+"""Proves that requests run one at a time, and that those beyond the bound are sent away at once."""
+
+import asyncio
+import threading
+
+from splatmill_worker.render_service.renderer import Busy, Turns
+
+
+def test_more_requests_than_may_wait_are_sent_away() -> None:
+    async def crowd() -> tuple[int, int, int]:
+        turns, release, inside, most = Turns(waiting=2), threading.Event(), 0, 0
+
+        def work() -> None:
+            nonlocal inside, most
+            inside += 1
+            most = max(most, inside)
+            release.wait(10)
+            inside -= 1
+
+        async def visit() -> bool:
+            try:
+                async with turns.admitted():
+                    await turns.run(work)
+            except Busy:
+                return False
+            return True
+
+        visits = [asyncio.create_task(visit()) for _ in range(5)]
+        done, _ = await asyncio.wait(visits, return_when=asyncio.FIRST_COMPLETED)
+        release.set()
+        served = await asyncio.gather(*visits)
+        return len(done), sum(served), most
+
+    assert asyncio.run(crowd()) == (2, 3, 1)

@@ -1,0 +1,34 @@
+"""What the queue worker's tests share: a Redis of the test's own, and storage that holds one capture.
+
+Remote storage is played by a local folder that does not say where its files lie: each copy then really happens.
+"""
+
+from pathlib import Path
+
+import pytest
+
+from splatmill.backplane import layout
+from splatmill.backplane.storage import Storage
+from splatmill.schema import Role
+from tests.support.redis_server import connection as connection
+from tests.support.redis_server import redis_server as redis_server
+
+CAPTURE = "capture1"
+
+
+@pytest.fixture
+def local(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Storage:
+    """Storage in a folder of this machine, with two photos and a mask in CAPTURE."""
+    monkeypatch.setenv("SPLATMILL_DATA", str(tmp_path / "data"))
+    storage = Storage((tmp_path / "storage").as_uri())
+    for name in ("a.jpg", "deep/b.jpg"):
+        storage.put(layout.capture_file(CAPTURE, Role.images, name), name.encode())
+    storage.put(layout.capture_file(CAPTURE, Role.masks, "a.png"), b"mask")
+    return storage
+
+
+@pytest.fixture
+def remote(local: Storage) -> Storage:
+    """The same storage, as if it were an S3 bucket."""
+    local.root = None
+    return local

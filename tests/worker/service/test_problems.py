@@ -1,0 +1,54 @@
+"""Proves that each error that can end an attempt has a code and advice, and which ones are tried again.
+
+Does not prove that each place raises the right error. The errors of the engine's own tree: tests/worker/test_errors.py.
+"""
+
+import errno
+
+import pytest
+import redis
+
+from splatmill.backplane.storage import StorageError, StorageFullError
+from splatmill_worker.errors import SfmFailed
+from splatmill_worker.service.problems import Transient, problem_of
+
+NO_PARALLAX = SfmFailed(
+    "sfm_no_parallax", "The camera only turned.", {"parallax_deg": 0.2}, "Walk around the scene."
+)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (NO_PARALLAX, "sfm_no_parallax"),
+        (MemoryError(), "out_of_memory"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "out_of_memory"),
+        (OSError(errno.ENOSPC, "No space left on device", "x"), "storage_full"),
+        (OSError(errno.EFBIG, "File too large", "x"), "storage_full"),
+        (PermissionError(errno.EACCES, "Permission denied", "x"), "storage_unwritable"),
+        (StorageFullError("Storage is full: could not write x."), "storage_full"),
+        (ZeroDivisionError("division by zero"), "internal_error"),
+    ],
+)
+def test_every_mishap_has_a_name_and_advice(error: Exception, code: str) -> None:
+    problem = problem_of(error)
+    assert problem.code == code
+    assert problem.advice
+
+
+def test_a_named_failure_keeps_its_facts() -> None:
+    assert problem_of(NO_PARALLAX).facts == {"parallax_deg": 0.2}
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (StorageError("Storage could not read x: connection refused."), "storage_unavailable"),
+        (redis.ConnectionError("Connection refused"), "queue_unavailable"),
+        (redis.TimeoutError("Timeout reading from socket"), "queue_unavailable"),
+    ],
+)
+def test_what_is_only_away_is_tried_again(error: Exception, code: str) -> None:
+    with pytest.raises(Transient) as caught:
+        problem_of(error)
+    assert caught.value.problem.code == code
