@@ -16,7 +16,7 @@ import splatmill
 from splatmill.schema import describe_options
 
 ROOT = Path(__file__).parent.parent
-PAGES = ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md"]
+PAGES = ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md"]
 PAGES += [str(p.relative_to(ROOT)) for p in sorted((ROOT / "worker").rglob("*.md")) if "build" not in p.parts]
 
 
