@@ -66,4 +66,4 @@ def test_training_on_the_gpu_engine_ends_where_the_cpu_engine_ends() -> None:
     assert gpu.held_out is not None
     assert cpu.held_out is not None
     assert gpu.held_out.psnr == pytest.approx(cpu.held_out.psnr, abs=1e-2)
-    assert torch.isfinite(torch.tensor([row.loss for row in gpu.rows])).all()
+    assert torch.isfinite(torch.tensor([point.loss for point in gpu.curve])).all()

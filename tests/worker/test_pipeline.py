@@ -113,9 +113,8 @@ def test_the_model_shows_the_photos_at_the_reported_error_in_the_captures_own_wo
         assert seen.psnr == pytest.approx(row.psnr, abs=0.05)
 
 
-def test_a_cancelled_run_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cancelled_run_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     capture = still_life.posed_capture(tmp_path / "capture")
-    monkeypatch.setattr("splatmill_worker.splat.train.loop.Hooks.checkpoint_seconds", 0.0)
     metrics = 0
 
     def count(event: Event) -> None:

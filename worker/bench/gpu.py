@@ -175,7 +175,7 @@ def curves(capture: Path, size: int, steps: int, seed: int) -> list[Row]:
     }
     rows: list[Row] = [
         {**common, "engine": "splatmill", "steps": done.steps, **asdict(row)}
-        for row in done.rows
+        for row in done.curve
         if row.psnr is not None
     ]
 

@@ -9,8 +9,9 @@ from splatmill.schema import Event, LogEvent, MetricEvent, PreviewEvent, Progres
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.picture import save_jpeg
 from splatmill_worker.splat.plan.plan import Plan
-from splatmill_worker.splat.train.loop import Tick, drawer, evaluation_background
-from splatmill_worker.splat.train.run import Row
+from splatmill_worker.splat.train.curve import CurvePoint
+from splatmill_worker.splat.train.loop import Progress
+from splatmill_worker.splat.train.renderer import render_view
 from splatmill_worker.splat.views import TrainingView
 
 Emit = Callable[[Event], None]
@@ -33,43 +34,43 @@ class TrainingEvents:
 
     def __init__(self, emit: Emit, workdir: Path, plan: Plan, view: TrainingView) -> None:
         self._emit, self._workdir, self._plan, self._view = emit, workdir, plan, view
-        self._last: Row | None = None
+        self._last: CurvePoint | None = None
         self.warnings: list[str] = []
 
-    def progress(self, tick: Tick) -> None:
+    def progress(self, progress: Progress) -> None:
         """Emit how far the run is, with the last measured PSNR and SSIM."""
         self._emit(
             ProgressEvent(
                 stage="training",
-                done=tick.step,
-                total=tick.steps,
-                step=tick.step,
-                loss=tick.loss,
+                done=progress.step,
+                total=progress.steps,
+                step=progress.step,
+                loss=progress.loss,
                 psnr=None if self._last is None else self._last.psnr,
                 ssim=None if self._last is None else self._last.ssim,
-                gaussians=tick.gaussians,
-                seconds=tick.seconds,
-                eta=tick.eta,
+                gaussians=progress.gaussians,
+                seconds=progress.seconds,
+                eta=progress.eta,
             )
         )
 
-    def measured(self, row: Row, engine: Engine) -> None:
+    def evaluated(self, point: CurvePoint, engine: Engine) -> None:
         """Emit a point of the curve, and renew the preview."""
-        self._last = row
+        self._last = point
         self._emit(
             MetricEvent(
-                seconds=row.seconds,
-                step=row.step,
-                loss=row.loss,
-                psnr=row.psnr,
-                ssim=row.ssim,
-                gaussians=row.gaussians,
-                memory=row.memory,
-                train_psnr=row.train_psnr,
-                train_ssim=row.train_ssim,
+                seconds=point.seconds,
+                step=point.step,
+                loss=point.loss,
+                psnr=point.psnr,
+                ssim=point.ssim,
+                gaussians=point.gaussians,
+                memory=point.memory,
+                train_psnr=point.train_psnr,
+                train_ssim=point.train_ssim,
             )
         )
-        self.preview(engine, row.step)
+        self.preview(engine, point.step)
 
     def warn(self, message: str) -> None:
         """Emit a warning, and keep it for the report."""
@@ -78,6 +79,6 @@ class TrainingEvents:
 
     def preview(self, engine: Engine, step: int) -> None:
         """Render the preview from what `engine` holds, and emit where it is."""
-        color = drawer(engine, self._plan)(self._view.full, evaluation_background(self._plan, [self._view]))
+        color = render_view(engine, self._plan, self._view)
         save_jpeg(self._workdir / "out" / "preview.jpg", color)
         self._emit(PreviewEvent(path="out/preview.jpg", step=step))

@@ -6,7 +6,6 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import av
 import torch
@@ -26,9 +25,9 @@ from splatmill_worker.splat.plan.facts import Facts, measure
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.plan_file import read_plan, write_plan
 from splatmill_worker.splat.plan.probe import probe
-from splatmill_worker.splat.report.export import Frame, export
+from splatmill_worker.splat.report.export import ExportWorld, export
 from splatmill_worker.splat.report.progress_film import ProgressFilm
-from splatmill_worker.splat.report.report import write_report
+from splatmill_worker.splat.report.report import FinishedTraining, PlannedScene, write_report
 from splatmill_worker.splat.report.stages import Stages
 from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS, sample_frusta
 from splatmill_worker.splat.start.given_model import GivenModel, assess, read_given_model
@@ -36,6 +35,8 @@ from splatmill_worker.splat.start.points import ENOUGH_POINTS, from_points
 from splatmill_worker.splat.start.seeding import add_seeds, most_opaque
 from splatmill_worker.splat.train import checkpoint
 from splatmill_worker.splat.train.loop import Hooks, Trained, train
+from splatmill_worker.splat.train.renderer import renderer
+from splatmill_worker.splat.train.snapshot import Snapshot
 from splatmill_worker.splat.views import TrainingView
 
 EXTENT = 1.1
@@ -270,23 +271,23 @@ def _trained(task: Task, engine: Engine, photos: Photos, plan: Plan) -> Training
         plan,
         extent=EXTENT,
         hooks=Hooks(
-            tick=events.progress,
-            measured=events.measured,
+            progress=events.progress,
+            evaluated=events.evaluated,
             warn=events.warn,
             cancelled=task.cancelled,
-            checkpoint=lambda state: checkpoint.save(checkpoints, state),
-            watcher=film,
+            checkpoint=lambda snapshot: checkpoint.save(checkpoints, snapshot),
+            observer=film,
         ),
         resume_from=earlier,
     )
     return Training(trained, events, film)
 
 
-def _resumable(checkpoints: Path, photos: Photos) -> dict[str, Any] | None:
+def _resumable(checkpoints: Path, photos: Photos) -> Snapshot | None:
     """The checkpoint of an earlier attempt at the same photos."""
-    state = checkpoint.load(checkpoints)
-    same = state is not None and state["views"] == [view.name for view in photos.training]
-    return state if same else None
+    snapshot = checkpoint.load(checkpoints)
+    names = tuple(view.name for view in photos.training)
+    return snapshot if snapshot is not None and snapshot.view_names == names else None
 
 
 def _leave(
@@ -301,10 +302,9 @@ def _leave(
 ) -> None:
     """Write the model, its cameras, the last preview, the film and the report."""
     trained, events = training.trained, training.events
-    frame = Frame.of(cameras.normalization, cameras.scene)
-    views = list(trained.views)
+    world = ExportWorld.of(cameras.normalization, cameras.scene)
     with stages.measured("export"):
-        written = export(task.out, trained, plan, frame, views, photos.held_out)
+        exported = export(task.out, trained, plan, world, photos.held_out)
         events.preview(engine, trained.steps)
     if training.film is not None:
         try:
@@ -315,15 +315,7 @@ def _leave(
         stages.add("film", training.film.seconds)
     write_report(
         task.out,
-        trained,
-        plan,
-        facts,
-        cameras.scene,
-        stages,
-        written,
-        frame,
-        engine,
-        views,
-        photos.held_out,
-        events.warnings,
+        PlannedScene(cameras.scene, facts, plan, photos.held_out),
+        FinishedTraining(trained, exported, stages.seconds, events.warnings),
+        renderer(engine, plan),
     )

@@ -29,7 +29,7 @@ from splatmill_worker.images import load_views
 from splatmill_worker.scene import Normalization, Scene
 from splatmill_worker.sfm import posed
 from splatmill_worker.splat import ply
-from splatmill_worker.splat.evaluate import evaluate, judged_over
+from splatmill_worker.splat.evaluate import benchmark_background, evaluate
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.render import render
 from splatmill_worker.splat.report.report import plain
@@ -126,7 +126,7 @@ def judge(job: Row) -> Row:
 
     views = [TrainingView.of(photo, frame) for photo in load_views(test, options.image_size)]
     with torch.no_grad():
-        score = evaluate(draw, views, judged_over(views))
+        score = evaluate(draw, views, benchmark_background(views))
     judged: Row = rounded(
         {
             "kind": "peer",

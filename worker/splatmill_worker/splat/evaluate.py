@@ -13,8 +13,8 @@ from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.reference.loss import C1, C2, SIGMA, WINDOW
 from splatmill_worker.splat.views import Target, TrainingView
 
-Draw = Callable[[Target, Tensor], Tensor]
-"""Colour [H, W, 3] of a camera over a background [3]."""
+Renderer = Callable[[Target, Tensor], Tensor]
+"""Renders colour [H, W, 3] of a target's camera over a background [3]."""
 
 
 @dataclass(frozen=True)
@@ -46,17 +46,17 @@ class Score:
         return sum(view.mse for view in self.views) / len(self.views)
 
 
-def evaluate(draw: Draw, views: Sequence[TrainingView], background: Tensor) -> Score:
+def evaluate(render: Renderer, views: Sequence[TrainingView], background: Tensor) -> Score:
     """Score of every view at full training resolution, over `background` [3] where photos are transparent."""
     scores = []
     for view in views:
         target = view.full
-        scores.append(compare(view.name, draw(target, background), target.over(background), target.mask))
+        scores.append(compare(view.name, render(target, background), target.over(background), target.mask))
     return Score(tuple(scores))
 
 
-def judged_over(views: Sequence[TrainingView]) -> Tensor:
-    """Background [3] of an evaluation: white where any photo is transparent, else black."""
+def benchmark_background(views: Sequence[TrainingView]) -> Tensor:
+    """RGB [3] behind evaluated views in published results: white where any photo is transparent, black otherwise."""
     return torch.full((3,), float(any(view.full.alpha is not None for view in views)))
 
 

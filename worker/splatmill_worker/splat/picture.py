@@ -9,6 +9,8 @@ from pathlib import Path
 from PIL import Image
 from torch import Tensor
 
+from splatmill.files import replacing
+
 
 def as_image(color: Tensor) -> Image.Image:
     """An 8-bit picture of colour [H, W, 3] in 0..1 (or of uint8 values as they are)."""
@@ -18,10 +20,9 @@ def as_image(color: Tensor) -> Image.Image:
 
 
 def save_jpeg(path: Path, color: Tensor) -> None:
-    """Write colour [H, W, 3] in 0..1 as JPEG; the file is replaced whole."""
-    part = path.with_suffix(".part")
-    as_image(color).save(part, "JPEG", quality=88)
-    part.replace(path)
+    """Write colour [H, W, 3] in 0..1 as JPEG; the file is replaced atomically."""
+    with replacing(path) as part:
+        as_image(color).save(part, "JPEG", quality=88)
 
 
 def data_uri(color: Tensor, longest: int) -> str:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
 import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from splatmill.files import replacing
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -41,7 +40,7 @@ def write(
 
     Left out are rows with a non-finite parameter and those with an opacity under 1/255; quaternions become
     unit length. `degree` pads or cuts the SH coefficients (some viewers insist on 3); None keeps them.
-    The file appears whole or not at all: it is written beside `path`, synced and renamed.
+    The file is replaced atomically and synced.
     """
     if degree is not None:
         gaussians = gaussians.padded(degree)
@@ -69,18 +68,8 @@ def write(
     )
     document = PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=list(comments))
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
-            document.write(stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with replacing(path, sync=True) as part, part.open("wb") as stream:
+        document.write(stream)
     return n
 
 

@@ -210,12 +210,12 @@ def test_a_time_budget_corrects_how_many_steps_it_holds() -> None:
     assert planned(time_budget=60, steps=200).schedule.expected_steps == 200
     pace, budget = Pace(30_000), Budget(None, 100.0)
     for _ in range(99):
-        pace.timed(0.1)
+        pace.record(0.1)
     assert pace.steps(budget, 99, 9.9) == 30_000
-    pace.timed(0.1)
+    pace.record(0.1)
     assert pace.steps(budget, 100, 10.0) == 1000
     for _ in range(2000):
-        pace.timed(0.2)
+        pace.record(0.2)
     assert pace.steps(budget, 1100, 60.0) == pytest.approx(1300, abs=1)
     assert pace.steps(Budget(1200, 100.0), 1100, 60.0) == 1200
     assert pace.steps(budget, 1100, 100.5) == 1100

@@ -14,7 +14,7 @@ import torch
 from splatmill_worker.splat.motion import motion
 from splatmill_worker.splat.plan.probe import ZERO_RATES
 from splatmill_worker.splat.train.loop import Trained, train
-from splatmill_worker.splat.train.poses import Poses, gauge, moved, typical_depth
+from splatmill_worker.splat.train.poses import Poses, gauge, mean_depth, moved
 from splatmill_worker.splat.views import TrainingView
 from tests.support.training import first_engine, plan, split
 
@@ -124,8 +124,8 @@ def test_a_state_goes_on_where_it_was() -> None:
 
 
 def test_depth_of_an_empty_view_is_the_radius_of_the_cameras() -> None:
-    assert typical_depth(torch.zeros(3, 4), torch.zeros(3, 4)) == 1.0
-    assert typical_depth(torch.full((3, 4), 1.5), torch.full((3, 4), 0.5)) == pytest.approx(3.0)
+    assert mean_depth(torch.zeros(3, 4), torch.zeros(3, 4)) == 1.0
+    assert mean_depth(torch.full((3, 4), 1.5), torch.full((3, 4), 0.5)) == pytest.approx(3.0)
 
 
 def test_the_reference_gives_the_same_gradient_as_the_fused_step() -> None:

@@ -22,8 +22,10 @@ from splatmill_worker.splat.start import frusta
 from splatmill_worker.splat.start.points import from_points
 from splatmill_worker.splat.train import checkpoint
 from splatmill_worker.splat.train.exposure import Exposure
-from splatmill_worker.splat.train.loop import Hooks, Tick, evaluation_background, train
-from splatmill_worker.splat.train.run import Run
+from splatmill_worker.splat.train.loop import Hooks, Progress, train
+from splatmill_worker.splat.train.renderer import evaluation_background
+from splatmill_worker.splat.train.run import TrainingRun
+from splatmill_worker.splat.train.snapshot import Snapshot
 from splatmill_worker.splat.views import TrainingView
 from tests.support import still_life
 from tests.support.training import first_engine, plan, split
@@ -34,7 +36,7 @@ def test_held_out_views_are_learned() -> None:
     trained = train(first_engine(), views, held_out, plan(400), extent=1.1)
     assert trained.stopped == "the budget is spent"
     assert trained.steps == 400
-    curve = [row.psnr for row in trained.rows]
+    curve = [point.psnr for point in trained.curve]
     assert curve[-1] is not None
     assert curve[0] is not None
     assert curve[-1] > curve[0] + 4.0
@@ -44,7 +46,7 @@ def test_held_out_views_are_learned() -> None:
     few = {view.name for view in views[:: math.ceil(len(views) / 4)]}
     seen = [view.psnr for view in trained.on_training.views if view.name in few]
     assert len(seen) == len(few)
-    assert trained.rows[-1].train_psnr == pytest.approx(sum(seen) / len(seen), abs=1e-6)
+    assert trained.curve[-1].train_psnr == pytest.approx(sum(seen) / len(seen), abs=1e-6)
     assert 1500 < trained.gaussians.count <= 4000
     assert trained.gaussians.degree == 1
     assert bool(trained.gaussians.finite().all())
@@ -55,7 +57,7 @@ def test_steps_are_as_long_as_suits_what_the_time_turns_out_to_hold() -> None:
     views, _ = split()
     wrong = plan(None, 1000.0)
     course = replace(wrong.schedule, annealing=Annealing(boost=None), expected_steps=10**6)
-    run = Run(first_engine(), replace(wrong, schedule=course), views, 1.1, None, lambda _: None)
+    run = TrainingRun(first_engine(), replace(wrong, schedule=course), views, 1.1)
     assert run.rates(0.0).log_scales == pytest.approx(5e-3)
     # Sixty steps on small photos, which tell nothing of the others, and a hundred that do.
     for _ in range(159):
@@ -124,7 +126,7 @@ def test_the_reference_trains_through_the_same_loop_and_agrees() -> None:
         short = plan(densify=False, kernels=kernels)
         short = replace(short, schedule=course)
         trained = train(first_engine(kernels, 200), views, [], short, extent=1.1)
-        losses[kernels] = [row.loss for row in trained.rows] + [trained.on_training.mse]
+        losses[kernels] = [point.loss for point in trained.curve] + [trained.on_training.mse]
     # Adam divides by the gradient's own size, so that parameters with almost none (the turn of a ball) may take
     # either sign of a full step; what is seen stays together.
     assert losses["cpu"] == pytest.approx(losses["reference"], rel=2e-3)
@@ -132,13 +134,13 @@ def test_the_reference_trains_through_the_same_loop_and_agrees() -> None:
 
 def test_a_time_budget_ends_on_time_with_rates_annealed() -> None:
     views, held_out = split()
-    ticks: list[Tick] = []
-    hooks = Hooks(tick=ticks.append)
+    reports: list[Progress] = []
+    hooks = Hooks(progress=reports.append)
     trained = train(first_engine(), views, held_out, plan(None, 2.0), extent=1.1, hooks=hooks)
     assert trained.seconds == pytest.approx(2.0, rel=0.05)
-    assert trained.rows[-1].seconds == pytest.approx(trained.seconds, abs=0.1)
-    assert ticks
-    assert all(tick.steps >= tick.step for tick in ticks)
+    assert trained.curve[-1].seconds == pytest.approx(trained.seconds, abs=0.1)
+    assert reports
+    assert all(report.steps >= report.step for report in reports)
 
 
 def test_a_resumed_run_goes_on_where_it_was(tmp_path: Path) -> None:
@@ -148,9 +150,9 @@ def test_a_resumed_run_goes_on_where_it_was(tmp_path: Path) -> None:
     class PowerCutError(Exception):
         pass
 
-    def save_and_die(state: dict[str, Any]) -> None:
-        if state["step"] >= 100:
-            checkpoint.save(tmp_path, state)
+    def save_and_die(snapshot: Snapshot) -> None:
+        if snapshot.step >= 100:
+            checkpoint.save(tmp_path, snapshot)
             raise PowerCutError
 
     with pytest.raises(PowerCutError):
@@ -158,14 +160,14 @@ def test_a_resumed_run_goes_on_where_it_was(tmp_path: Path) -> None:
             first_engine(), views, held_out, whole, extent=1.1,
             hooks=Hooks(checkpoint=save_and_die, checkpoint_seconds=0.0),
         )  # fmt: skip
-    state = checkpoint.load(tmp_path)
-    assert state is not None
-    assert state["step"] == 100
-    resumed = train(first_engine(), views, held_out, whole, extent=1.1, resume_from=state)
+    snapshot = checkpoint.load(tmp_path)
+    assert snapshot is not None
+    assert snapshot.step == 100
+    resumed = train(first_engine(), views, held_out, whole, extent=1.1, resume_from=snapshot)
     straight = train(first_engine(), views, held_out, whole, extent=1.1)
     assert resumed.steps == 240
-    assert resumed.seconds > state["seconds"]
-    assert [row.step for row in resumed.rows] == [row.step for row in straight.rows]
+    assert resumed.seconds > snapshot.seconds
+    assert [point.step for point in resumed.curve] == [point.step for point in straight.curve]
     assert resumed.held_out is not None
     assert straight.held_out is not None
     assert resumed.held_out.psnr == pytest.approx(straight.held_out.psnr, abs=0.5)
@@ -173,14 +175,14 @@ def test_a_resumed_run_goes_on_where_it_was(tmp_path: Path) -> None:
 
 def test_a_run_that_had_ended_is_measured_and_delivered_when_resumed() -> None:
     views, held_out = split()
-    last: list[dict[str, Any]] = []
+    last: list[Snapshot] = []
     whole = plan(40, densify=False)
     hooks = Hooks(checkpoint=last.append, checkpoint_seconds=0.0)
     train(first_engine(), views, held_out, whole, extent=1.1, hooks=hooks)
-    assert last[-1]["step"] == 39
-    ended = last[-1] | {"step": 40}
+    assert last[-1].step == 39
+    ended = replace(last[-1], step=40)
     resumed = train(first_engine(), views, held_out, whole, extent=1.1, resume_from=ended)
-    assert resumed.rows[-1].step == resumed.steps
+    assert resumed.curve[-1].step == resumed.steps
     assert resumed.held_out is not None
 
 
@@ -294,7 +296,7 @@ def test_exposures_are_fitted_where_photos_differ() -> None:
         view.full.rgb.copy_((view.full.rgb.float() * 0.7).to(torch.uint8))
     exposure = Exposure(len(views))
     course = plan(500, exposure=True, densify=False)
-    run = Run(first_engine(), course, views, 1.1, exposure, warn=lambda _: None)
+    run = TrainingRun(first_engine(), course, views, 1.1, exposure=exposure)
     while run.progress < 1.0:
         run.advance()
     gains = exposure.affine.detach()[:, :, :3].diagonal(dim1=1, dim2=2).mean(dim=1)

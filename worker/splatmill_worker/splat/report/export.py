@@ -1,4 +1,4 @@
-"""The finished scene as files, in the world that the cameras came in."""
+"""The trained scene as files, in the world that the cameras came in."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from splatmill.files import atomic_write
 from splatmill.schema import CameraSpec, ModelCamera, ModelCameras
 from splatmill_worker.scene import Camera, Normalization, Scene
 from splatmill_worker.splat import ply
@@ -19,66 +20,74 @@ from splatmill_worker.splat.train.loop import Trained
 from splatmill_worker.splat.views import TrainingView
 
 FAR = 1e4
-"""Distance from the origin over the cameras' radius from which float32 coordinates lose what photos resolve."""
+"""Distance of the cameras from the origin, in radii of the cameras, from which float32 coordinates would lose what
+photos resolve."""
 
 
 @dataclass(frozen=True)
-class Frame:
-    """From the training world to the exported one: world = (trained - translation) / scale - offset.
+class ExportWorld:
+    """The world of the exported files, and how to get there from the training world.
 
-    `offset` is zero except for scenes far from their origin (geo-referenced ones), which keep local coordinates.
+    A point is exported at (p - translation) / scale - offset, with `translation` and `scale` of the normalization.
+
+    normalization: from the world that the cameras came in to the training world.
+    offset: [3], added to an exported point to get to the world that the cameras came in. Zero except for scenes far
+        from their origin (geo-referenced ones).
     """
 
     normalization: Normalization
     offset: npt.NDArray[np.float64]
 
     @staticmethod
-    def of(normalization: Normalization, scene: Scene) -> Frame:
-        """The scene's own world, or a local one where float32 could not hold it."""
+    def of(normalization: Normalization, scene: Scene) -> ExportWorld:
+        """The world of `scene`, or one that is moved near the cameras where float32 could not hold that."""
         middle = scene.centers.mean(axis=0)
         far = float(np.linalg.norm(middle)) * normalization.scale > FAR
-        return Frame(normalization, np.round(middle) if far else np.zeros(3))
+        return ExportWorld(normalization, np.round(middle) if far else np.zeros(3))
 
     def camera(self, camera: Camera) -> Camera:
-        """A camera of the training world in the exported world."""
-        home = self.normalization.undo_camera(camera)
-        return home.moved_to(home.center - self.offset)
+        """A camera of the training world in this world."""
+        original = self.normalization.undo_camera(camera)
+        return original.moved_to(original.center - self.offset)
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What `export` wrote: how many Gaussians, and into which world."""
+
+    gaussians: int
+    world: ExportWorld
 
 
 def export(
-    out: Path,
-    trained: Trained,
-    plan: Plan,
-    frame: Frame,
-    views: Sequence[TrainingView],
-    held_out: Sequence[TrainingView],
-) -> int:
-    """Write model.ply and cameras.json into `out`; returns the number of Gaussians written."""
-    scale = 1.0 / frame.normalization.scale
-    shift = -scale * frame.normalization.translation - frame.offset
-    home = trained.gaussians.moved(scale, torch.from_numpy(shift))
+    out: Path, trained: Trained, plan: Plan, world: ExportWorld, held_out: Sequence[TrainingView]
+) -> Exported:
+    """Write model.ply and cameras.json into the folder `out`."""
+    scale = 1.0 / world.normalization.scale
+    shift = -scale * world.normalization.translation - world.offset
+    gaussians = trained.gaussians.moved(scale, torch.from_numpy(shift))
     comments = ["Made by Splatmill"]
-    if frame.offset.any():
-        comments.append("offset " + " ".join(f"{value:.0f}" for value in frame.offset))
-    written = ply.write(out / "model.ply", home, degree=plan.schedule.degree, comments=tuple(comments))
+    if world.offset.any():
+        comments.append("offset " + " ".join(f"{value:.0f}" for value in world.offset))
+    written = ply.write(out / "model.ply", gaussians, degree=plan.schedule.degree, comments=tuple(comments))
     errors = {} if trained.held_out is None else {view.name: view.psnr for view in trained.held_out.views}
     cameras = [
         ModelCamera(
             name=view.name,
             split=split,
-            camera=spec_of(frame.camera(view.full.camera)),
+            camera=spec_of(world.camera(view.full.camera)),
             psnr=errors.get(view.name),
         )
-        for split, group in (("train", views), ("test", held_out))
-        for view in group
+        for split, views in (("train", trained.views), ("test", held_out))
+        for view in views
     ]
     document = ModelCameras(cameras=cameras).model_dump(mode="json", exclude_none=True)
-    (out / "cameras.json").write_text(json.dumps(document, indent=1))
-    return written
+    atomic_write(out / "cameras.json", json.dumps(document, indent=1))
+    return Exported(written, world)
 
 
 def spec_of(camera: Camera) -> CameraSpec:
-    """The wire's camera for one of the engine."""
+    """The wire's description of a camera."""
     inverse = np.eye(4)
     inverse[:3, :3] = camera.viewmat[:3, :3].T
     inverse[:3, 3] = camera.center

@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
+from splatmill.files import replacing
 from splatmill.schema import format_duration
 from splatmill_worker.film import Film, even, whole
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.plan.plan import Plan
-from splatmill_worker.splat.train.loop import drawer, evaluation_background
+from splatmill_worker.splat.train.renderer import render_view
 from splatmill_worker.splat.views import TrainingView
 
 SHOTS = 96
@@ -42,24 +43,23 @@ class ProgressFilm:
         self._next = max(taken, default=-1) + 1
         self.seconds = 0.0
 
-    def due(self, progress: float) -> bool:
+    def is_due(self, progress: float) -> bool:
         """Whether a shot is to be taken at this share of the budget."""
         return self._next < len(MOMENTS) and MOMENTS[self._next] <= progress
 
-    def take(self, engine: Engine, progress: float, seconds: float) -> None:
+    def observe(self, engine: Engine, progress: float, seconds: float) -> None:
         """Take the shot that is due, `seconds` into the training."""
         started = time.perf_counter()
-        color = drawer(engine, self._plan)(self._view.full, evaluation_background(self._plan, [self._view]))
+        color = render_view(engine, self._plan, self._view)
         picture = Image.fromarray(
             even((color.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy())
         )
         _caption(picture, f"{format_duration(seconds)}   {engine.count:,} Gaussians")
-        while self.due(progress):
+        while self.is_due(progress):
             self._next += 1
         path = self._folder / f"{self._next - 1:03d}.jpg"
-        part = path.with_name(f".{path.name}.part")  # a dotted name is not copied to storage
-        picture.save(part, "JPEG", quality=QUALITY, subsampling=0)
-        part.replace(path)
+        with replacing(path) as part:
+            picture.save(part, "JPEG", quality=QUALITY, subsampling=0)
         self.seconds += time.perf_counter() - started
 
     def develop(self, path: Path) -> bool:

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from splatmill.files import atomic_write
 from splatmill_worker.scene import Scene
-from splatmill_worker.splat.engine.protocol import Engine
-from splatmill_worker.splat.evaluate import Score
+from splatmill_worker.splat.evaluate import Renderer, Score
 from splatmill_worker.splat.machine import machine, peak_memory, versions
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.report import page
-from splatmill_worker.splat.report.export import Frame
+from splatmill_worker.splat.report.export import Exported
 from splatmill_worker.splat.report.figure import draw_curve
-from splatmill_worker.splat.report.stages import Stages
-from splatmill_worker.splat.train.loop import Trained, drawer, evaluation_background
+from splatmill_worker.splat.train.loop import Trained
+from splatmill_worker.splat.train.renderer import evaluation_background
 from splatmill_worker.splat.views import Target, TrainingView
 
 MISFIT = 6.0
@@ -35,64 +35,95 @@ NO_LPIPS = (
 )
 
 
+@dataclass(frozen=True)
+class PlannedScene:
+    """The scene that was trained, and what was measured and decided before.
+
+    scene: the cameras and points in the world that they came in, and the photos without a camera.
+    facts: what was measured before training.
+    plan: what was decided from it.
+    held_out: the views that were not trained on.
+    """
+
+    scene: Scene
+    facts: Facts
+    plan: Plan
+    held_out: Sequence[TrainingView]
+
+
+@dataclass(frozen=True)
+class FinishedTraining:
+    """A training whose model is written.
+
+    trained: its result.
+    exported: the files of the model.
+    seconds: wall time by stage, over all attempts; "train" and "evaluate" are added from `trained`.
+    warnings: what was warned of on the way, one sentence each.
+    """
+
+    trained: Trained
+    exported: Exported
+    seconds: Mapping[str, float]
+    warnings: Sequence[str]
+
+
 def write_report(
-    out: Path,
-    trained: Trained,
-    plan: Plan,
-    facts: Facts,
-    scene: Scene,
-    stages: Stages,
-    written: int,
-    frame: Frame,
-    engine: Engine,
-    views: Sequence[TrainingView],
-    held_out: Sequence[TrainingView],
-    warnings: Sequence[str],
+    out: Path, planned: PlannedScene, finished: FinishedTraining, render: Renderer
 ) -> dict[str, Any]:
-    """Write report.json, report.png and report.html into `out`; returns the report."""
-    report: dict[str, Any] = {
-        "curve": [asdict(row) for row in trained.rows],
-        "result": _result(trained, written),
-        "seconds": {
-            "sfm": 0.0,
-            **stages.seconds,
-            "train": trained.seconds,
-            "evaluate": trained.evaluate_seconds,
-        },
-        "views": _view_rows(trained),
-        "plan": plan.as_dict(),
-        "left_out": [
-            *({"what": name, "why": reason} for name, reason in plan.left_out.items()),
-            *({"photo": name, "why": reason} for name, reason in scene.left_out),
-            {"what": "lpips", "why": NO_LPIPS},
-        ],
-        "warnings": [*warnings, *_unplaced(scene), *_misfits(trained)],
-        "facts": facts.as_dict(),
-        "sfm": scene.facts,
-        "offset": frame.offset.tolist() if frame.offset.any() else None,
-        "peak_memory": peak_memory(),
-        "versions": versions(plan.kernels),
-        "machine": machine(),
-    }
-    report = plain(report)
-    (out / "report.json").write_text(json.dumps(report, indent=1, allow_nan=False))
+    """Write report.json, report.png and report.html into the folder `out`; returns the report.
+
+    render: renders the trained scene, for the pictures of the views that it shows worst.
+    """
+    trained, plan, offset = finished.trained, planned.plan, finished.exported.world.offset
+    report: dict[str, Any] = plain(
+        {
+            "curve": [asdict(point) for point in trained.curve],
+            "result": _result(trained, finished.exported.gaussians),
+            "seconds": {
+                "sfm": 0.0,
+                **finished.seconds,
+                "train": trained.seconds,
+                "evaluate": trained.evaluate_seconds,
+            },
+            "views": _view_rows(trained),
+            "plan": plan.as_dict(),
+            "left_out": [
+                *({"what": name, "why": reason} for name, reason in plan.left_out.items()),
+                *({"photo": name, "why": reason} for name, reason in planned.scene.left_out),
+                {"what": "lpips", "why": NO_LPIPS},
+            ],
+            "warnings": [*finished.warnings, *_unplaced(planned.scene), *_misfits(trained)],
+            "facts": planned.facts.as_dict(),
+            "sfm": planned.scene.facts,
+            "offset": offset.tolist() if offset.any() else None,
+            "peak_memory": peak_memory(),
+            "versions": versions(plan.kernels),
+            "machine": machine(),
+        }
+    )
+    atomic_write(out / "report.json", json.dumps(report, indent=1, allow_nan=False))
     draw_curve(out / "report.png", report["curve"], report["seconds"])
-    judged = held_out or views
-    score = trained.held_out or trained.on_training
-    draw = drawer(engine, plan)
-    backdrop = evaluation_background(plan, views)
-    pictures = []
-    for view_score in sorted(score.views, key=lambda row: row.psnr)[:WORST]:
-        view = next(view for view in judged if view.name == view_score.name)
-        rendered = draw(view.full, backdrop).clone()
-        pictures.append(page.Pair(view_score, rendered, _counted(view.full, backdrop)))
-    (out / "report.html").write_text(page.render(report, out / "report.png", pictures))
+    worst = _worst_views(planned, trained, render)
+    atomic_write(out / "report.html", page.render(report, out / "report.png", worst))
     return report
 
 
-def _counted(target: Target, backdrop: Tensor) -> Tensor:
+def _worst_views(planned: PlannedScene, trained: Trained, render: Renderer) -> list[page.Pair]:
+    """The views with the lowest PSNR beside their photos: held-out ones where there are any."""
+    views = planned.held_out or trained.views
+    score = trained.held_out or trained.on_training
+    background = evaluation_background(planned.plan, trained.views)
+    pairs = []
+    for view_score in sorted(score.views, key=lambda row: row.psnr)[:WORST]:
+        view = next(view for view in views if view.name == view_score.name)
+        rendered = render(view.full, background).clone()
+        pairs.append(page.Pair(view_score, rendered, _compared_part(view.full, background)))
+    return pairs
+
+
+def _compared_part(target: Target, background: Tensor) -> Tensor:
     """The photo uint8 [H, W, 3], grey where a mask keeps pixels out."""
-    photo = target.over(backdrop)
+    photo = target.over(background)
     return photo if target.mask is None else torch.where(target.mask[..., None], photo, photo.new_tensor(128))
 
 

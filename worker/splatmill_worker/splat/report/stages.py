@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from splatmill.files import atomic_write
+
 
 class Stages:
     """Wall seconds by stage name, kept in a file: a later attempt adds to what earlier ones spent."""
@@ -28,6 +30,4 @@ class Stages:
     def add(self, stage: str, seconds: float) -> None:
         """Adds `seconds` that were measured elsewhere to `stage`."""
         self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
-        part = self._path.with_suffix(".part")
-        part.write_text(json.dumps(self.seconds))
-        part.replace(self._path)
+        atomic_write(self._path, json.dumps(self.seconds))

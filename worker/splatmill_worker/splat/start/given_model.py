@@ -13,7 +13,7 @@ from torch import Tensor
 from splatmill_worker.errors import ModelUnreadable, StartUnusable
 from splatmill_worker.scene import Normalization
 from splatmill_worker.splat import ply
-from splatmill_worker.splat.evaluate import compare, judged_over
+from splatmill_worker.splat.evaluate import benchmark_background, compare
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.render import render
 from splatmill_worker.splat.views import TrainingView
@@ -75,7 +75,7 @@ def read_given_model(path: Path, frame: Normalization) -> Gaussians:
 def assess(gaussians: Gaussians, views: Sequence[TrainingView]) -> GivenModel:
     """How `gaussians` show some of `views`. Raises StartUnusable where they show something else."""
     some = views[:: max(1, len(views) // ASSESSED_VIEWS)]
-    backdrop = judged_over(views)
+    backdrop = benchmark_background(views)
     shown: list[float] = []
     plain: list[float] = []
     other: list[float] = []

@@ -1,41 +1,32 @@
-"""Checkpoints on disk: whole or not there, so that a killed attempt goes on from the last one."""
+"""Snapshots of a training run on disk, written atomically, so that a killed attempt goes on from the last one."""
 
 from __future__ import annotations
 
-import os
 import pickle
-import tempfile
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from splatmill.files import replacing
+from splatmill_worker.splat.plan.budget import Budget
+from splatmill_worker.splat.train.curve import CurvePoint
+from splatmill_worker.splat.train.snapshot import Snapshot
+
 NAME = "checkpoint.pt"
 FORMAT = 1
+"""Number of the file's format: the keys of `_encoded`. A file with another number is not read."""
 
 
-def save(directory: Path, state: dict[str, Any]) -> None:
-    """Replace the checkpoint in `directory` by `state` (plain values and tensors), atomically and synced."""
-    directory.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(dir=directory, prefix=f".{NAME}.")
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
-            torch.save({"format": FORMAT, **state}, stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, directory / NAME)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-    folder = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(folder)  # the rename itself must survive a power cut
-    finally:
-        os.close(folder)
+def save(directory: Path, snapshot: Snapshot) -> None:
+    """Replace the checkpoint in `directory`, atomically and synced. Raises OSError where that fails."""
+    with replacing(directory / NAME, sync=True) as part:
+        torch.save(_encoded(snapshot), part)
 
 
-def load(directory: Path) -> dict[str, Any] | None:
-    """The last checkpoint; None when there is none, or none that this version can read.
+def load(directory: Path) -> Snapshot | None:
+    """The last checkpoint; None where there is none, or none that this version can read.
 
     Only tensors and plain values are unpickled: a checkpoint may come from a shared folder.
     """
@@ -44,6 +35,52 @@ def load(directory: Path) -> dict[str, Any] | None:
         return None
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, ValueError, OSError, pickle.UnpicklingError):
+        return _decoded(state) if state.get("format") == FORMAT else None
+    except (RuntimeError, EOFError, ValueError, OSError, KeyError, TypeError, pickle.UnpicklingError):
         return None
-    return state if state.get("format") == FORMAT else None
+
+
+def _encoded(snapshot: Snapshot) -> dict[str, Any]:
+    """The file's plain values and tensors by key."""
+    return {
+        "format": FORMAT,
+        "parameters": snapshot.parameters,
+        "exp_avg": snapshot.exp_avg,
+        "exp_avg_sq": snapshot.exp_avg_sq,
+        "step": snapshot.step,
+        "seconds": snapshot.seconds,
+        "rows": [asdict(point) for point in snapshot.curve],
+        "recoveries": snapshot.recoveries,
+        "rate_scale": snapshot.rate_scale,
+        "order": list(snapshot.upcoming),
+        "random": snapshot.random,
+        "views": list(snapshot.view_names),
+        "exposure": snapshot.exposure,
+        "poses": snapshot.poses,
+        "budget": asdict(snapshot.budget),
+        "shortened": snapshot.shortened,
+        "most": snapshot.max_gaussians,
+        "ever_saw": snapshot.ever_visible,
+    }
+
+
+def _decoded(state: dict[str, Any]) -> Snapshot:
+    return Snapshot(
+        parameters=state["parameters"],
+        exp_avg=state["exp_avg"],
+        exp_avg_sq=state["exp_avg_sq"],
+        poses=state["poses"],
+        exposure=state["exposure"],
+        step=state["step"],
+        seconds=state["seconds"],
+        budget=Budget(**state["budget"]),
+        shortened=state["shortened"],
+        curve=tuple(CurvePoint(**row) for row in state["rows"]),
+        recoveries=state["recoveries"],
+        rate_scale=state["rate_scale"],
+        max_gaussians=state["most"],
+        upcoming=tuple(state["order"]),
+        random=state["random"],
+        ever_visible=state["ever_saw"],
+        view_names=tuple(state["views"]),
+    )

@@ -1,4 +1,4 @@
-"""Is the optimisation still going somewhere? Watches the loss and the parameters, and names what went wrong."""
+"""Watches the loss of every step, and ends training by name when it diverges."""
 
 from __future__ import annotations
 
@@ -7,55 +7,67 @@ from dataclasses import dataclass
 
 from splatmill_worker.errors import FailureName, TrainingFailed
 
-MEMORY = 0.95
-"""Weight of the past in the smoothed loss: about 20 steps, since single photos differ by a factor of a few."""
+SMOOTHING = 0.95
+"""Weight of the past in the smoothed loss: a mean over about 20 steps, because losses of single photos differ by a
+factor of a few."""
 
-RISE = 3.0
-"""A smoothed loss this many times its lowest value (plus MARGIN) is a divergence."""
+DIVERGENCE_RATIO, DIVERGENCE_MARGIN = 3.0, 0.05
+"""A smoothed loss above its lowest value times DIVERGENCE_RATIO plus DIVERGENCE_MARGIN is a divergence."""
 
-MARGIN = 0.05
+GOOD_RATIO, GOOD_MARGIN = 1.2, 0.01
+"""A smoothed loss up to its lowest value times GOOD_RATIO plus GOOD_MARGIN marks a state worth a snapshot."""
 
-GOOD, GOOD_MARGIN = 1.2, 0.01
-"""A state is good while the smoothed loss is within this of its lowest."""
+GRACE_STEPS = 100
+"""Steps at the start, after a change of resolution and after a resumption in which the loss may rise."""
 
-GRACE = 100
-"""Steps after a disturbance (an opacity reset, another resolution) in which a rise is expected."""
-
-BLIND = 200
-"""Steps in a row that see no Gaussian at all."""
+EMPTY_STEPS = 200
+"""Steps in a row whose photo shows no Gaussian, after which the scene counts as empty."""
 
 
 @dataclass
 class Health:
-    """Fed with every step's loss; raises TrainingFailed by name."""
+    """The course of the loss.
+
+    smoothed: exponential mean of the loss; None before the first step.
+    lowest: lowest smoothed loss since checks began; infinite before.
+    checked_from: number of the step from which a rise of the loss is a divergence.
+    empty_steps: steps in a row, up to the last one, whose photo showed no Gaussian.
+    """
 
     smoothed: float | None = None
     lowest: float = math.inf
-    calm_from: int = GRACE
-    blind: int = 0
+    checked_from: int = GRACE_STEPS
+    empty_steps: int = 0
 
     @property
-    def well(self) -> bool:
-        """Whether the loss is near its lowest: a state worth going back to."""
-        return self.smoothed is not None and self.smoothed <= GOOD * self.lowest + GOOD_MARGIN
+    def near_lowest(self) -> bool:
+        """Whether the smoothed loss is close enough to its lowest value for a snapshot to roll back to."""
+        return self.smoothed is not None and self.smoothed <= GOOD_RATIO * self.lowest + GOOD_MARGIN
 
-    def disturbed(self, step: int) -> None:
-        """The loss is about to rise for a reason that is known."""
-        self.calm_from = step + GRACE
+    def expect_rise(self, step: int) -> None:
+        """Forget the lowest loss, and allow a rise for GRACE_STEPS from `step`."""
+        self.checked_from = step + GRACE_STEPS
         self.lowest = math.inf
 
-    def watch(self, step: int, loss: float, visible: int) -> None:
-        """Judge one step."""
+    def check(self, step: int, loss: float, visible: int) -> None:
+        """Take in the loss of `step` and the number of Gaussians that its photo showed.
+
+        Raises TrainingFailed: non_finite, empty_scene or divergence.
+        """
         if not math.isfinite(loss):
             raise TrainingFailed(FailureName.non_finite, f"the loss became {loss}.", step=step)
-        self.blind = self.blind + 1 if visible == 0 else 0
-        if self.blind >= BLIND:
-            seen = f"none of the last {BLIND} photos showed any Gaussian."
+        self.empty_steps = self.empty_steps + 1 if visible == 0 else 0
+        if self.empty_steps >= EMPTY_STEPS:
+            seen = f"none of the last {EMPTY_STEPS} photos showed any Gaussian."
             raise TrainingFailed(FailureName.empty_scene, seen, step=step)
-        self.smoothed = loss if self.smoothed is None else MEMORY * self.smoothed + (1.0 - MEMORY) * loss
-        if step < self.calm_from:
+        self.smoothed = (
+            loss if self.smoothed is None else SMOOTHING * self.smoothed + (1.0 - SMOOTHING) * loss
+        )
+        if step < self.checked_from:
             return
         self.lowest = min(self.lowest, self.smoothed)
-        if not self.smoothed <= RISE * self.lowest + MARGIN:
+        if (
+            not self.smoothed <= DIVERGENCE_RATIO * self.lowest + DIVERGENCE_MARGIN
+        ):  # written so that NaN fails
             seen = f"the loss rose from {self.lowest:.3f} to {self.smoothed:.3f}."
             raise TrainingFailed(FailureName.divergence, seen, step=step)

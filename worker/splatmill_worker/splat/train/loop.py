@@ -1,47 +1,61 @@
-"""Training: runs until the budget is spent, measures on the way, and recovers from numerical failures."""
+"""Training: takes steps until the budget is spent, evaluates on the way, and rolls back after numerical failures."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol
-
-import torch
-from torch import Tensor
+from dataclasses import dataclass
+from typing import Protocol
 
 from splatmill_worker.errors import Cancelled, FailureName, TrainingFailed
 from splatmill_worker.splat.engine.open import gaussians_of
 from splatmill_worker.splat.engine.protocol import Engine
-from splatmill_worker.splat.evaluate import Score, evaluate, judged_over
+from splatmill_worker.splat.evaluate import Score, evaluate
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.machine import resident_memory
 from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.train.curve import CurvePoint, is_flat
 from splatmill_worker.splat.train.exposure import Exposure
-from splatmill_worker.splat.train.poses import Poses, typical_depth
-from splatmill_worker.splat.train.run import Row, Run
-from splatmill_worker.splat.views import Target, TrainingView
+from splatmill_worker.splat.train.poses import Poses, mean_depth
+from splatmill_worker.splat.train.renderer import evaluation_background, render_view, renderer
+from splatmill_worker.splat.train.run import TrainingRun
+from splatmill_worker.splat.train.snapshot import Snapshot
+from splatmill_worker.splat.views import TrainingView
 
 MAX_RECOVERIES = 3
-TICK_SECONDS = 0.5
-MEASURED_AT = (0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-"""Shares of the budget at which the held-out views are rendered: close together where the curve is steep."""
+"""Roll-backs of a run; the next failure ends it."""
 
-ALSO_MEASURED = 4
-"""Training views, evenly chosen, that are rendered for each point of the curve beside the held-out ones."""
+PROGRESS_SECONDS = 0.5
+"""Seconds between two reports of progress."""
 
-FLAT_GAIN = 0.02
-"""dB on the held-out views; training that gains less over FLAT_SHARE of its time is not worth it."""
+CHECKPOINT_SECONDS = 20.0
+"""Seconds between two checkpoints."""
 
-FLAT_SHARE, FLAT_ROWS = 0.4, 3
+EVALUATED_AT = (0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""Shares of the budget at which the held-out views are evaluated: close together where the curve is steep."""
+
+ALSO_EVALUATED = 4
+"""Training views, evenly chosen, that are evaluated at each point of the curve beside the held-out ones."""
+
+FINALLY_EVALUATED = 16
+"""Training views, evenly chosen, that are evaluated at the end: this many, and less than twice as many."""
 
 FLAT_TAIL = 0.1
+"""Share of the time spent so far in which the rates fall to their ends once the curve is flat."""
 
 
 @dataclass(frozen=True)
-class Tick:
-    """Where the run stands between two points of the curve; eta in seconds."""
+class Progress:
+    """Where a run stands.
+
+    step: training steps so far.
+    steps: steps of the whole run, estimated under a time budget.
+    loss: training loss of the last step.
+    gaussians: how many the scene has.
+    seconds: training time so far.
+    eta: training seconds to come, estimated.
+    """
 
     step: int
     steps: int
@@ -51,39 +65,58 @@ class Tick:
     eta: float
 
 
-class Watcher(Protocol):
-    """Who looks at the scene at moments of its own, while the training clock stands still."""
+class Observer(Protocol):
+    """Looks at the scene at moments of its own choice, while the training clock stands still."""
 
-    def due(self, progress: float) -> bool:
-        """Whether to look at this share of the budget."""
+    def is_due(self, progress: float) -> bool:
+        """Whether to look at the scene now, at this share of the budget."""
 
-    def take(self, engine: Engine, progress: float, seconds: float) -> None:
-        """Look, `seconds` into the training."""
+    def observe(self, engine: Engine, progress: float, seconds: float) -> None:
+        """Look at what `engine` holds, `seconds` into the training."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Hooks:
-    """What a caller watches and decides. `checkpoint` gets plain values and tensors to store."""
+    """What training calls while it runs.
 
-    tick: Callable[[Tick], None] = lambda _: None
-    measured: Callable[[Row, Engine], None] = lambda _row, _engine: None
+    progress: every PROGRESS_SECONDS.
+    evaluated: with every new point of the curve.
+    warn: with a sentence, when a numerical failure was rolled back.
+    cancelled: before every step; training ends when it returns True.
+    checkpoint: with a snapshot to store, every `checkpoint_seconds` and on a cancellation; None: never.
+    checkpoint_seconds: seconds between two checkpoints.
+    observer: looks at the scene at moments of its own; None: nobody does.
+    """
+
+    progress: Callable[[Progress], None] = lambda _: None
+    evaluated: Callable[[CurvePoint, Engine], None] = lambda _point, _engine: None
     warn: Callable[[str], None] = lambda _: None
     cancelled: Callable[[], bool] = lambda: False
-    checkpoint: Callable[[dict[str, Any]], None] | None = None
-    checkpoint_seconds: float = 20.0
-    watcher: Watcher | None = None
+    checkpoint: Callable[[Snapshot], None] | None = None
+    checkpoint_seconds: float = CHECKPOINT_SECONDS
+    observer: Observer | None = None
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What came out. `gaussians` are in the training world; `stopped` says why the run ended.
+    """The result of a training run.
 
-    `views` are the training views with their cameras as the run left them, `cameras_moved` by how many pixels (the
-    median); None where the plan leaves cameras as they come.
+    gaussians: the scene, in the training world, on the CPU.
+    curve: the evaluations on the way.
+    held_out: score of the held-out views at the end; None where there are none.
+    on_training: score of an even choice of the training views at the end.
+    steps: training steps.
+    seconds: training time, without evaluations and checkpoints.
+    evaluate_seconds: time of all evaluations of this attempt.
+    stopped: why the run ended, a clause or, after a failure, a sentence.
+    failure: the failure that ended the run with its last good state; None where none did.
+    recoveries: roll-backs.
+    views: the training views with their cameras as the run left them.
+    cameras_moved: median correction of the cameras, pixels; None where they are not refined.
     """
 
     gaussians: Gaussians
-    rows: tuple[Row, ...]
+    curve: tuple[CurvePoint, ...]
     held_out: Score | None
     on_training: Score
     steps: int
@@ -92,17 +125,8 @@ class Trained:
     stopped: str
     failure: TrainingFailed | None
     recoveries: int
-    views: Sequence[TrainingView]
+    views: tuple[TrainingView, ...]
     cameras_moved: float | None
-
-
-@dataclass
-class _Measuring:
-    """Seconds spent on evaluation, and which points of the curve are done."""
-
-    seconds: float = 0.0
-    done: int = 0
-    since: float = field(default_factory=time.perf_counter)
 
 
 def train(
@@ -113,116 +137,141 @@ def train(
     *,
     extent: float,
     hooks: Hooks | None = None,
-    resume_from: dict[str, Any] | None = None,
+    resume_from: Snapshot | None = None,
 ) -> Trained:
-    """Optimise what `engine` holds until it shows `views`, as `plan` says.
+    """Optimise the scene that `engine` holds until it shows `views`, as `plan` says.
 
-    extent: radius of the cameras in the training world, the unit of the position rate. resume_from: a state that
-    `hooks.checkpoint` was given by an earlier attempt with the same plan. Evaluation and checkpoints are not on
-    the training clock. Raises TrainingFailed when nothing usable was reached, Cancelled on request.
+    held_out: views to evaluate on, which may be none.
+    extent: radius of the cameras in the training world, the unit of the position rate.
+    resume_from: what `hooks.checkpoint` was given in an earlier attempt with the same views and plan.
+
+    Evaluations and checkpoints are not on the training clock. Raises TrainingFailed where no usable state was reached,
+    and Cancelled when `hooks.cancelled` returns True.
     """
     hooks = hooks or Hooks()
     exposure = Exposure(len(views)) if plan.exposure else None
-    warm_up(engine, views[0], plan)
+    render_view(engine, plan, views[0])  # code is loaded and memory allocated before the clock starts
     poses = None
     if plan.pose_refinement:
-        poses = Poses(views, _depth_seen(engine, views, plan))
+        poses = Poses(views, _scene_depth(engine, views, plan))
         engine.keep_pose_gradient = True
-    run = Run(engine, plan, views, extent, exposure, hooks.warn, poses)
+    run = TrainingRun(engine, plan, views, extent, exposure=exposure, poses=poses, warn=hooks.warn)
     if resume_from is not None:
         run.resume(resume_from)
-    # The last point is always measured: an attempt may end after its last step and before its model is written.
-    done = min(sum(share <= run.progress for share in MEASURED_AT), len(MEASURED_AT) - 1)
-    measuring = _Measuring(done=done)
+    evaluations = _Evaluations(run, held_out)
     stopped, failure = "", None
-    last_tick = last_checkpoint = time.monotonic()
+    last_progress = last_checkpoint = time.monotonic()
     while not stopped:
         if hooks.cancelled():
-            # Whoever asks a run to end may have it go on later.
             if hooks.checkpoint is not None and run.step > 0:
-                hooks.checkpoint(run.state())
+                hooks.checkpoint(run.snapshot())
             raise Cancelled
         try:
             run.advance()
-        except TrainingFailed as named:
-            if run.recoveries >= MAX_RECOVERIES or named.name is FailureName.empty_scene:
-                if not run.ever_saw or not run.rows or not run.restore_good():
+        except TrainingFailed as failed:
+            if run.recoveries >= MAX_RECOVERIES or failed.name is FailureName.empty_scene:
+                if not run.ever_visible or not run.curve or not run.restore_last_good():
                     raise
-                stopped, failure = f"{named}", named
+                stopped, failure = f"{failed}", failed
                 break
-            run.recover(named)
-        if run.progress >= MEASURED_AT[measuring.done]:
+            run.roll_back(failed)
+        if evaluations.due:
             with run.clock.stopped():
-                row = _measure(run, held_out, measuring)
-                hooks.measured(row, engine)
-            stopped = _enough(run, plan)
-        if hooks.watcher is not None and hooks.watcher.due(run.progress):
+                hooks.evaluated(evaluations.evaluate(), engine)
+            stopped = _reason_to_stop(run)
+        if hooks.observer is not None and hooks.observer.is_due(run.progress):
             with run.clock.stopped():
-                hooks.watcher.take(engine, run.progress, run.clock.seconds)
+                hooks.observer.observe(engine, run.progress, run.clock.seconds)
         now = time.monotonic()
-        if now - last_tick >= TICK_SECONDS:
-            last_tick = now
-            hooks.tick(_tick(run))
+        if now - last_progress >= PROGRESS_SECONDS:
+            last_progress = now
+            hooks.progress(_progress(run))
         if hooks.checkpoint is not None and not stopped and now - last_checkpoint >= hooks.checkpoint_seconds:
             with run.clock.stopped():
-                hooks.checkpoint(run.state())
+                hooks.checkpoint(run.snapshot())
             last_checkpoint = time.monotonic()
+    return _result(run, held_out, evaluations, stopped, failure)
+
+
+class _Evaluations:
+    """Evaluates a run at the shares of its budget that EVALUATED_AT lists, and counts the seconds that this takes."""
+
+    def __init__(self, run: TrainingRun, held_out: Sequence[TrainingView]) -> None:
+        self._run, self._held_out = run, held_out
+        self.seconds = 0.0
+        # A resumed run is evaluated at the end again: an attempt may die after its last step and before its export.
+        passed = sum(share <= run.progress for share in EVALUATED_AT)
+        self._next = min(passed, len(EVALUATED_AT) - 1)
+
+    @property
+    def due(self) -> bool:
+        """Whether the next share of the budget is reached."""
+        return self._run.progress >= EVALUATED_AT[self._next]
+
+    def evaluate(self) -> CurvePoint:
+        """Evaluate now; the point is added to the curve of the run."""
+        started = time.perf_counter()
+        run, plan = self._run, self._run.plan
+        while self._next < len(EVALUATED_AT) and run.progress >= EVALUATED_AT[self._next]:
+            self._next += 1
+        render, background = renderer(run.engine, plan), evaluation_background(plan, run.views)
+        score = evaluate(render, self._held_out, background) if self._held_out else None
+        views = _corrected(run)
+        on_training = evaluate(render, views[:: math.ceil(len(views) / ALSO_EVALUATED)], background)
+        point = CurvePoint(
+            seconds=run.clock.seconds,
+            step=run.step,
+            loss=run.loss,
+            psnr=None if score is None else score.psnr,
+            ssim=None if score is None else score.ssim,
+            gaussians=run.engine.count,
+            memory=resident_memory(),
+            train_psnr=on_training.psnr,
+            train_ssim=on_training.ssim,
+        )
+        run.curve.append(point)
+        self.seconds += time.perf_counter() - started
+        return point
+
+
+def _result(
+    run: TrainingRun,
+    held_out: Sequence[TrainingView],
+    evaluations: _Evaluations,
+    stopped: str,
+    failure: TrainingFailed | None,
+) -> Trained:
+    """What the run ends with, evaluated once more: after a failure, the scene is not that of the last point."""
     seconds = run.clock.seconds
     started = time.perf_counter()
-    draw = drawer(engine, plan)
-    backdrop = evaluation_background(plan, views)
-    final = evaluate(draw, held_out, backdrop) if held_out else None
-    engine.keep_pose_gradient = False
-    seen_from = list(views) if poses is None else poses.corrected(views)
-    sample = seen_from[:: max(1, len(views) // 16)]
-    on_training = evaluate(draw, sample, backdrop)
+    render, background = renderer(run.engine, run.plan), evaluation_background(run.plan, run.views)
+    final = evaluate(render, held_out, background) if held_out else None
+    run.engine.keep_pose_gradient = False
+    views = _corrected(run)
+    on_training = evaluate(render, views[:: max(1, len(views) // FINALLY_EVALUATED)], background)
     return Trained(
-        gaussians_of(engine).padded(plan.schedule.degree),
-        tuple(run.rows),
-        final,
-        on_training,
-        run.step,
-        seconds,
-        measuring.seconds + time.perf_counter() - started,
-        stopped,
-        failure,
-        run.recoveries,
-        seen_from,
-        None if poses is None else poses.pixels_moved(),
+        gaussians=gaussians_of(run.engine).padded(run.plan.schedule.degree),
+        curve=tuple(run.curve),
+        held_out=final,
+        on_training=on_training,
+        steps=run.step,
+        seconds=seconds,
+        evaluate_seconds=evaluations.seconds + time.perf_counter() - started,
+        stopped=stopped,
+        failure=failure,
+        recoveries=run.recoveries,
+        views=views,
+        cameras_moved=None if run.poses is None else run.poses.pixels_moved(),
     )
 
 
-def drawer(engine: Engine, plan: Plan) -> Callable[[Target, Tensor], Tensor]:
-    """Renders targets with what the engine holds now."""
-
-    def draw(target: Target, background: Tensor) -> Tensor:
-        camera = target.camera
-        color, _, _ = engine.forward(
-            target.viewmat,
-            target.K,
-            camera.width,
-            camera.height,
-            degree=plan.schedule.degree,
-            background=background,
-            antialias=plan.antialias,
-        )
-        return color
-
-    return draw
+def _corrected(run: TrainingRun) -> tuple[TrainingView, ...]:
+    """The training views with their cameras as they are now."""
+    return tuple(run.views if run.poses is None else run.poses.corrected(run.views))
 
 
-def evaluation_background(plan: Plan, views: Sequence[TrainingView]) -> Tensor:
-    """What published results are judged on: white behind transparent photos, black behind opaque ones.
-
-    A colour that the plan fixes is kept: the Gaussians know no other.
-    """
-    if plan.background == "random":
-        return judged_over(views)
-    return torch.full((3,), 1.0 if plan.background == "white" else 0.0)
-
-
-def _depth_seen(engine: Engine, views: Sequence[TrainingView], plan: Plan) -> float:
-    """Mean depth of what some of the views show before training."""
+def _scene_depth(engine: Engine, views: Sequence[TrainingView], plan: Plan) -> float:
+    """Median, over about eight views, of the mean depth that they show before training."""
     depths = []
     for view in views[:: max(1, len(views) // 8)]:
         target = view.full
@@ -234,67 +283,25 @@ def _depth_seen(engine: Engine, views: Sequence[TrainingView], plan: Plan) -> fl
             degree=0,
             antialias=plan.antialias,
         )
-        depths.append(typical_depth(depth, alpha))
+        depths.append(mean_depth(depth, alpha))
     return sorted(depths)[len(depths) // 2]
 
 
-def warm_up(engine: Engine, view: TrainingView, plan: Plan) -> None:
-    """Touch code and memory once before the clock starts; changes nothing."""
-    drawer(engine, plan)(view.full, evaluation_background(plan, [view]))
-
-
-def _measure(run: Run, held_out: Sequence[TrainingView], measuring: _Measuring) -> Row:
-    started = time.perf_counter()
-    while measuring.done < len(MEASURED_AT) and run.progress >= MEASURED_AT[measuring.done]:
-        measuring.done += 1
-    draw, backdrop = drawer(run.engine, run.plan), evaluation_background(run.plan, run.views)
-    score = evaluate(draw, held_out, backdrop) if held_out else None
-    seen_from = run.views if run.poses is None else run.poses.corrected(run.views)
-    on_training = evaluate(draw, seen_from[:: math.ceil(len(seen_from) / ALSO_MEASURED)], backdrop)
-    row = Row(
-        run.clock.seconds,
-        run.step,
-        run.loss,
-        None if score is None else score.psnr,
-        None if score is None else score.ssim,
-        run.engine.count,
-        resident_memory(),
-        on_training.psnr,
-        on_training.ssim,
-    )
-    run.rows.append(row)
-    measuring.seconds += time.perf_counter() - started
-    return row
-
-
-def _enough(run: Run, plan: Plan) -> str:
-    """Why the run ends here; empty when it goes on."""
+def _reason_to_stop(run: TrainingRun) -> str:
+    """Why the run ends after its last evaluation; empty where it goes on. Cuts the budget where the curve is flat."""
+    plan = run.plan
     if run.progress >= 1.0:
         return "the held-out curve became flat" if run.shortened else "the budget is spent"
-    reached = run.rows[-1].psnr
+    reached = run.curve[-1].psnr
     if plan.target_psnr is not None and reached is not None and reached >= plan.target_psnr:
         return f"the held-out views reached {reached:.2f} dB"
-    if plan.stops_when_flat and not run.shortened and _flat(run.rows):
+    if plan.stops_when_flat and not run.shortened and is_flat(run.curve):
         run.shorten(FLAT_TAIL)
     return ""
 
 
-def _flat(rows: Sequence[Row]) -> bool:
-    """Whether none of the last rows, over FLAT_SHARE of the time, gained FLAT_GAIN on the best one before them.
-
-    One row is no evidence: the curve dips where Gaussians were just added or the photos became larger.
-    """
-    scores = [(row.seconds, row.psnr) for row in rows if row.psnr is not None]
-    if not scores or rows[-1].step < 500:
-        return False
-    since = (1.0 - FLAT_SHARE) * scores[-1][0]
-    before = [psnr for seconds, psnr in scores if seconds <= since]
-    after = [psnr for seconds, psnr in scores if seconds > since]
-    return bool(before) and len(after) >= FLAT_ROWS and max(after) < max(before) + FLAT_GAIN
-
-
-def _tick(run: Run) -> Tick:
+def _progress(run: TrainingRun) -> Progress:
     progress, seconds = run.progress, run.clock.seconds
     total = run.step if progress <= 0 else round(run.step / progress)
     eta = seconds * (1.0 - progress) / max(progress, 1e-6)
-    return Tick(run.step, max(run.step, total), run.loss, run.engine.count, seconds, eta)
+    return Progress(run.step, max(run.step, total), run.loss, run.engine.count, seconds, eta)

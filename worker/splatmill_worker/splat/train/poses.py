@@ -131,7 +131,7 @@ def moved(view: TrainingView, viewmat: Tensor) -> TrainingView:
     return replace(view, levels={factor: turned(target) for factor, target in view.levels.items()})
 
 
-def typical_depth(depth: Tensor, alpha: Tensor) -> float:
+def mean_depth(depth: Tensor, alpha: Tensor) -> float:
     """Mean depth of a rendered view (depth and alpha [H, W]); 1, the cameras' radius, where it shows nothing."""
     total = float(alpha.sum())
     return float(depth.sum()) / total if total > 0.0 else 1.0

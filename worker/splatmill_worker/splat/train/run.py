@@ -1,11 +1,10 @@
-"""A training run in flight: one photo at a time, and whatever is due after it."""
+"""A training run: one photo per step, densification, and the roll-back after a numerical failure."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -14,223 +13,225 @@ from splatmill_worker.errors import FailureName, TrainingFailed
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.engine.protocol import Engine, StepResult
-from splatmill_worker.splat.plan.budget import Budget, Clock
+from splatmill_worker.splat.plan.budget import Clock
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
+from splatmill_worker.splat.train.curve import CurvePoint
 from splatmill_worker.splat.train.density import clone_split
 from splatmill_worker.splat.train.exposure import Exposure
 from splatmill_worker.splat.train.health import Health
 from splatmill_worker.splat.train.pace import Pace
 from splatmill_worker.splat.train.poses import Poses
+from splatmill_worker.splat.train.renderer import fixed_background
+from splatmill_worker.splat.train.snapshot import Snapshot
 from splatmill_worker.splat.views import Target, TrainingView
 
 SNAPSHOT_SHARE = 0.04
-"""Of the budget between two copies of a good state: 2 % of the time at most, and little is lost."""
+"""Share of the budget between two snapshots to roll back to: copying costs at most 2 % of the time."""
 
 MEMORY_SHRINK = 0.8
-"""Of the Gaussians there were when memory ran out."""
+"""Share of the Gaussians that is kept after memory ran out."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """One point of error against run time.
+class TrainingRun:
+    """Everything that changes while training.
 
-    psnr and ssim: on the held-out views, None where there are none. train_psnr and train_ssim: on a few of those
-    trained on; what they gain while the others lose is learnt by heart. memory: resident bytes.
+    engine: the scene, its optimiser and the kernels.
+    plan: what was decided before training.
+    views: the training views; `poses`, `exposure` and `upcoming` hold their indices.
+    extent: radius of the cameras in the training world, the unit of the position rate.
+    exposure: fitted colours of the photos; None where none are.
+    poses: corrections of the cameras; None where they are taken as given.
+    warn: gets a sentence at each roll-back.
+    budget: what the run may spend; cut where the curve becomes flat.
+    clock: training seconds.
+    step: training steps so far.
+    loss: training loss of the last step; NaN before the first.
+    curve: the evaluations so far, appended by the loop.
+    recoveries: roll-backs so far.
+    rate_scale: factor on all learning rates.
+    max_gaussians: most Gaussians that there may be.
+    reduction: factor by which the photos of the last step were reduced; 0 before the first.
+    upcoming: indices of the photos still to come in this round, the next one last.
+    health: judges the loss.
+    pace: seconds per step.
+    shortened: whether the budget was cut.
+    ever_visible: whether any photo has shown a Gaussian.
+    last_good: the snapshot to roll back to; None before the first.
     """
 
-    seconds: float
-    step: int
-    loss: float
-    psnr: float | None
-    ssim: float | None
-    gaussians: int
-    memory: int | None = None
-    train_psnr: float | None = None
-    train_ssim: float | None = None
-
-
-@dataclass
-class Run:
-    """Everything that changes while training. `extent` is the radius of the cameras in the training world."""
-
-    engine: Engine
-    plan: Plan
-    views: Sequence[TrainingView]
-    extent: float
-    exposure: Exposure | None
-    warn: Callable[[str], None]
-    poses: Poses | None = None
-    clock: Clock = field(default_factory=Clock)
-    step: int = 0
-    loss: float = math.nan
-    rows: list[Row] = field(default_factory=list)
-    recoveries: int = 0
-    rate_scale: float = 1.0
-    reduction: int = 0
-    order: list[int] = field(default_factory=list)
-    health: Health = field(default_factory=Health)
-    shortened: bool = False
-    ever_saw: bool = False
-
-    def __post_init__(self) -> None:
-        self.budget: Budget = self.plan.schedule.budget
-        self.pace = Pace(self.plan.schedule.expected_steps)
-        self.random = torch.Generator().manual_seed(self.plan.seed)
-        self._good: tuple[dict[str, Tensor], Tensor, Tensor] | None = None
-        self._good_poses: dict[str, Tensor] | None = None
-        self._good_exposure: dict[str, Any] | None = None
-        self._good_progress = -math.inf
-        self._good_level = math.inf
-        self._most = self.plan.max_gaussians
-        self._fixed = torch.full((3,), 1.0 if self.plan.background == "white" else 0.0)
+    def __init__(
+        self,
+        engine: Engine,
+        plan: Plan,
+        views: Sequence[TrainingView],
+        extent: float,
+        *,
+        exposure: Exposure | None = None,
+        poses: Poses | None = None,
+        warn: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.engine, self.plan, self.views, self.extent = engine, plan, views, extent
+        self.exposure, self.poses, self.warn = exposure, poses, warn
+        self.budget = plan.schedule.budget
+        self.clock = Clock()
+        self.step = 0
+        self.loss = math.nan
+        self.curve: list[CurvePoint] = []
+        self.recoveries = 0
+        self.rate_scale = 1.0
+        self.max_gaussians = plan.max_gaussians
+        self.reduction = 0
+        self.upcoming: list[int] = []
+        self.health = Health()
+        self.pace = Pace(plan.schedule.expected_steps)
+        self.shortened = False
+        self.ever_visible = False
+        self.last_good: Snapshot | None = None
+        self._random = torch.Generator().manual_seed(plan.seed)
 
     @property
     def progress(self) -> float:
-        """Share of the budget that is spent, 0..1."""
+        """Share of the budget that is spent, 0 to 1."""
         return self.budget.progress(self.step, self.clock.seconds)
 
     def advance(self) -> None:
-        """One step, and densification where it is due. Raises TrainingFailed by name."""
+        """Take one step, and densify where the schedule says so. Raises TrainingFailed for a numerical failure."""
         schedule = self.plan.schedule
         progress = self.progress
-        if self._good is None or (progress - self._good_progress >= SNAPSHOT_SHARE and self.health.well):
-            self._remember(progress)
+        if self.last_good is None or (
+            progress - self.last_good.progress >= SNAPSHOT_SHARE and self.health.near_lowest
+        ):
+            self.last_good = self._checked_snapshot()
         self.step += 1
         reduction = schedule.reduction(self.step)
         if reduction != self.reduction:
             self.reduction = reduction
-            self.health.disturbed(self.step)
-        number = self._next_view()
-        target = self.views[number].reduced(reduction)
+            self.health.expect_rise(self.step)
+        index = self._next_view()
         rates = self.rates(progress)
         began = self.clock.seconds
-        try:
-            if self.poses is not None:
-                target = target._replace(viewmat=self.poses.viewmat(number))
-            if self.exposure is None:
-                result = self._plain_step(number, target, rates)
-            else:
-                result = self._exposed_step(self.exposure, number, target, rates)
-        except MemoryError as short:
-            raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
+        result = self._step(index, rates)
         self.loss = result.loss
         if reduction == 1:
-            self.pace.timed(self.clock.seconds - began)
+            self.pace.record(self.clock.seconds - began)
         if self.poses is not None and self.engine.pose_gradient is not None:
-            self.poses.update(number, self.engine.pose_gradient, progress, self.rate_scale)
-        self.ever_saw |= result.visible > 0
-        self.health.watch(self.step, result.loss, result.visible)
-        # What nobody will read is not summed.
+            self.poses.update(index, self.engine.pose_gradient, progress, self.rate_scale)
+        self.ever_visible |= result.visible > 0
+        self.health.check(self.step, result.loss, result.visible)
+        # Scores cost time, so they are summed only while densification goes on.
         self.engine.keep_scores = self.plan.densify and progress < schedule.densify_until
         if self.plan.densify and schedule.densifies(self.step, progress):
             self._densify()
 
     def rates(self, progress: float) -> Rates:
-        """Of a step at `progress`; in a time budget as long as suits the steps that it turns out to hold."""
+        """Learning rates at `progress`, 0 to 1. Under a time budget they are scaled to the measured number of steps."""
         annealing = self.plan.schedule.annealing
         if annealing.boost is None:
             steps = self.pace.steps(self.budget, self.step, self.clock.seconds)
             annealing = replace(annealing, boost=boost_of(steps))
         return RateSchedule(self.extent, annealing, self.rate_scale).at(progress)
 
-    def recover(self, failure: TrainingFailed) -> None:
-        """Back to the last good state, with steps half as long."""
-        if self._good is None:
-            raise failure
-        self.recoveries += 1
-        if failure.name is FailureName.memory:
-            self._shrink(failure)
-            return
-        self.rate_scale *= 0.5
-        self._go_back(self._good)
-        self.health = Health(lowest=self._good_level, calm_from=self.step + len(self.views))
-        self.warn(f"{failure} Went back to the last good state, with steps half as long.")
-
-    def _shrink(self, failure: TrainingFailed) -> None:
-        """Go on with four fifths of the Gaussians, the most opaque ones, and never have more again."""
-        self._most = max(1, int(MEMORY_SHRINK * self.engine.count))
-        assert self._good is not None
-        parameters, exp_avg, exp_avg_sq = self._good
-        order = torch.argsort(parameters["logit_opacities"], descending=True, stable=True)
-        kept = torch.sort(order[: self._most]).values
-        self._good = (
-            {name: value[kept] for name, value in parameters.items()},
-            exp_avg[kept],
-            exp_avg_sq[kept],
-        )
-        self._go_back(self._good)
-        self.health = Health(lowest=self._good_level, calm_from=self.step + len(self.views))
-        self.warn(f"{failure} Went back to the last good state, and on with at most {self._most} Gaussians.")
-
     def shorten(self, tail: float) -> None:
         """End after another `tail` of what was spent so far: rates fall to their ends in that time."""
         self.budget = self.budget.ending_at(self.progress, tail)
         self.shortened = True
 
-    def restore_good(self) -> bool:
-        """Back to the last good state without going on; False when there is none."""
-        if self._good is None:
+    def roll_back(self, failure: TrainingFailed) -> None:
+        """Restore the last good snapshot and go on with half the learning rates, or with fewer Gaussians where
+        memory ran out. Raises `failure` where there is no snapshot yet.
+        """
+        if self.last_good is None:
+            raise failure
+        self.recoveries += 1
+        if failure.name is FailureName.memory:
+            self.max_gaussians = max(1, int(MEMORY_SHRINK * self.engine.count))
+            self.last_good = most_opaque(self.last_good, self.max_gaussians)
+            measure = f"with at most {self.max_gaussians} Gaussians"
+        else:
+            self.rate_scale *= 0.5
+            measure = "with half the learning rates"
+        self._restore(self.last_good)
+        self.health = Health(lowest=self.last_good.lowest_loss, checked_from=self.step + len(self.views))
+        self.warn(f"{failure} Training went back to the last good state and goes on {measure}.")
+
+    def restore_last_good(self) -> bool:
+        """Restore what was optimised from the last good snapshot; False where there is none."""
+        if self.last_good is None:
             return False
-        self._go_back(self._good)
+        self._restore(self.last_good)
         return True
 
-    def _go_back(self, good: tuple[dict[str, Tensor], Tensor, Tensor]) -> None:
-        self.engine.replace(*good)
-        if self.poses is not None and self._good_poses is not None:
-            self.poses.restore(self._good_poses)
-        if self.exposure is not None and self._good_exposure is not None:
-            self.exposure.restore(self._good_exposure)
-
-    def background(self) -> Tensor:
-        """RGB [3] behind this step's photo."""
-        return torch.rand(3, generator=self.random) if self.plan.background == "random" else self._fixed
-
-    def state(self) -> dict[str, Any]:
-        """Everything a later attempt needs to go on, as plain values and tensors."""
+    def snapshot(self) -> Snapshot:
+        """The state of the run now."""
         exp_avg, exp_avg_sq = self.engine.moments()
-        return {
-            "parameters": self.engine.parameters(),
-            "exp_avg": exp_avg,
-            "exp_avg_sq": exp_avg_sq,
-            "step": self.step,
-            "seconds": self.clock.seconds,
-            "rows": [asdict(row) for row in self.rows],
-            "recoveries": self.recoveries,
-            "rate_scale": self.rate_scale,
-            "order": self.order,
-            "random": self.random.get_state(),
-            "views": [view.name for view in self.views],
-            "exposure": None if self.exposure is None else self.exposure.state(),
-            "poses": None if self.poses is None else self.poses.state(),
-            "budget": asdict(self.budget),
-            "shortened": self.shortened,
-            "most": self._most,
-            "ever_saw": self.ever_saw,
-        }
+        return Snapshot(
+            parameters=self.engine.parameters(),
+            exp_avg=exp_avg,
+            exp_avg_sq=exp_avg_sq,
+            poses=None if self.poses is None else self.poses.state(),
+            exposure=None if self.exposure is None else self.exposure.state(),
+            step=self.step,
+            seconds=self.clock.seconds,
+            budget=self.budget,
+            shortened=self.shortened,
+            curve=tuple(self.curve),
+            recoveries=self.recoveries,
+            rate_scale=self.rate_scale,
+            max_gaussians=self.max_gaussians,
+            upcoming=tuple(self.upcoming),
+            random=self._random.get_state(),
+            ever_visible=self.ever_visible,
+            view_names=tuple(view.name for view in self.views),
+            lowest_loss=self.health.lowest,
+        )
 
-    def resume(self, state: dict[str, Any]) -> None:
-        """Go on from `state`; densification scores and what the health watch remembers start again."""
-        self.engine.replace(state["parameters"], state["exp_avg"], state["exp_avg_sq"])
-        self.step = state["step"]
-        self.clock = Clock(state["seconds"])
-        self.rows = [Row(**row) for row in state["rows"]]
-        self.recoveries = state["recoveries"]
-        self.rate_scale = state["rate_scale"]
-        self.order = list(state["order"])
-        self.random.set_state(state["random"])
-        self.budget = Budget(**state["budget"])
-        self.shortened = state["shortened"]
-        self._most = state["most"]
-        self.ever_saw = state["ever_saw"]
-        self.health.disturbed(self.step)
-        if self.exposure is not None:
-            self.exposure.restore(state["exposure"])
-        if self.poses is not None:
-            self.poses.restore(state["poses"])
+    def resume(self, snapshot: Snapshot) -> None:
+        """Go on from `snapshot`. Densification scores, the pace and the health of the loss start anew."""
+        self._restore(snapshot)
+        self.step = snapshot.step
+        self.clock = Clock(snapshot.seconds)
+        self.budget = snapshot.budget
+        self.shortened = snapshot.shortened
+        self.curve = list(snapshot.curve)
+        self.recoveries = snapshot.recoveries
+        self.rate_scale = snapshot.rate_scale
+        self.max_gaussians = snapshot.max_gaussians
+        self.upcoming = list(snapshot.upcoming)
+        self._random.set_state(snapshot.random)
+        self.ever_visible = snapshot.ever_visible
+        self.health.expect_rise(self.step)
 
-    def _plain_step(self, number: int, target: Target, rates: Rates) -> StepResult:
-        background = self.background()
+    def _restore(self, snapshot: Snapshot) -> None:
+        """Put back what was optimised: Gaussians, moments, cameras and exposures."""
+        self.engine.replace(snapshot.parameters, snapshot.exp_avg, snapshot.exp_avg_sq)
+        if self.poses is not None and snapshot.poses is not None:
+            self.poses.restore(snapshot.poses)
+        if self.exposure is not None and snapshot.exposure is not None:
+            self.exposure.restore(snapshot.exposure)
+
+    def _checked_snapshot(self) -> Snapshot:
+        """A snapshot to roll back to. Raises TrainingFailed where parameters are not finite."""
+        snapshot = self.snapshot()
+        bad = sum(int((~torch.isfinite(value)).sum()) for value in snapshot.parameters.values())
+        if bad:
+            raise TrainingFailed(FailureName.non_finite, f"{bad} parameters are not finite.", step=self.step)
+        return snapshot
+
+    def _step(self, index: int, rates: Rates) -> StepResult:
+        """One optimisation step on photo number `index`, at the reduction of this step."""
+        target = self.views[index].reduced(self.reduction)
+        try:
+            if self.poses is not None:
+                target = target._replace(viewmat=self.poses.viewmat(index))
+            if self.exposure is None:
+                return self._plain_step(index, target, rates)
+            return self._exposed_step(self.exposure, index, target, rates)
+        except MemoryError as short:
+            raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
+
+    def _plain_step(self, index: int, target: Target, rates: Rates) -> StepResult:
+        background = self._background()
         return self.engine.train_photo(
             target.viewmat,
             target.K,
@@ -241,11 +242,12 @@ class Run:
             background=background,
             mask=target.mask,
             antialias=self.plan.antialias,
-            key=(number, self.reduction) if target.alpha is None else None,
+            key=(index, self.reduction) if target.alpha is None else None,
         )
 
-    def _exposed_step(self, exposure: Exposure, number: int, target: Target, rates: Rates) -> StepResult:
-        background = self.background()
+    def _exposed_step(self, exposure: Exposure, index: int, target: Target, rates: Rates) -> StepResult:
+        """A step whose loss compares the photo with the rendered colour under the photo's fitted exposure."""
+        background = self._background()
         color, alpha, _ = self.engine.forward(
             target.viewmat,
             target.K,
@@ -256,32 +258,38 @@ class Run:
             antialias=self.plan.antialias,
         )
         color = color.detach().clone().requires_grad_()
-        seen = exposure.applied(number, color)
+        seen = exposure.applied(index, color)
         photo = target.over(background).to(seen.device)
         mask = None if target.mask is None else target.mask.to(seen.device)
         loss = ops.loss(seen, photo, mask=mask, backend=self.plan.kernels)
-        (loss + exposure.penalty(number).to(loss.device)).backward()  # type: ignore[no-untyped-call]  # torch's own gap
-        if bool(torch.isfinite(loss)):  # else the step is about to be undone
+        (loss + exposure.penalty(index).to(loss.device)).backward()  # type: ignore[no-untyped-call]  # torch's own gap
+        if bool(torch.isfinite(loss)):  # otherwise this step is about to be rolled back
             exposure.update(self.rate_scale)
         assert color.grad is not None
         self.engine.backward_update(color.grad, rates=rates, step=self.step)
         return StepResult(float(loss.detach()), int(bool((alpha > 0).any())), 0)
 
+    def _background(self) -> Tensor:
+        """RGB [3] behind this step's photo. A random one keeps training from hiding holes in the surface."""
+        if self.plan.background == "random":
+            return torch.rand(3, generator=self._random)
+        return fixed_background(self.plan)
+
     def _next_view(self) -> int:
-        """Every photo once in random order, then again."""
-        if not self.order:
-            self.order = torch.randperm(len(self.views), generator=self.random).tolist()
-        return self.order.pop()
+        """The index of the next photo: all photos once in random order, then all of them again."""
+        if not self.upcoming:
+            self.upcoming = torch.randperm(len(self.views), generator=self._random).tolist()
+        return self.upcoming.pop()
 
     def _densify(self) -> None:
-        allowed = min(self.plan.max_gaussians, self._most)
+        allowed = min(self.plan.max_gaussians, self.max_gaussians)
         if self.plan.max_memory is not None:
             allowed = min(allowed, self.plan.gaussians_within(self.plan.max_memory))
         within = self.plan.schedule.decay_within
         try:
             clone_split.densify(
                 self.engine,
-                self.random,
+                self._random,
                 extent=self.extent,
                 allowed=allowed,
                 opacity_decay=self.plan.schedule.opacity_decay,
@@ -293,15 +301,14 @@ class Run:
             seen = "every Gaussian became transparent and was removed."
             raise TrainingFailed(FailureName.empty_scene, seen, step=self.step)
 
-    def _remember(self, progress: float) -> None:
-        parameters = self.engine.parameters()
-        spoilt = sum(int((~torch.isfinite(value)).sum()) for value in parameters.values())
-        if spoilt:
-            raise TrainingFailed(
-                FailureName.non_finite, f"{spoilt} parameters are not finite.", step=self.step
-            )
-        self._good = (parameters, *self.engine.moments())
-        self._good_poses = None if self.poses is None else self.poses.state()
-        self._good_exposure = None if self.exposure is None else self.exposure.state()
-        self._good_progress = progress
-        self._good_level = self.health.lowest
+
+def most_opaque(snapshot: Snapshot, count: int) -> Snapshot:
+    """The snapshot with its `count` most opaque Gaussians, in the same order."""
+    order = torch.argsort(snapshot.parameters["logit_opacities"], descending=True, stable=True)
+    kept = torch.sort(order[:count]).values
+    return replace(
+        snapshot,
+        parameters={name: value[kept] for name, value in snapshot.parameters.items()},
+        exp_avg=snapshot.exp_avg[kept],
+        exp_avg_sq=snapshot.exp_avg_sq[kept],
+    )
