@@ -33,17 +33,17 @@ RATES = {
 
 
 def position_rate(step: int, steps: int, extent: float) -> float:
-    """Of the means at `step` of `steps`: exponential from 1.6e-4 of the extent to a hundredth of that."""
+    """Learning rate of the means at `step` of `steps`, which falls exponentially from 1.6e-4 of the extent to 1 %."""
     return RATES["means"] * extent * math.exp(math.log(0.01) * step / steps)
 
 
 def degree_at(step: int) -> int:
-    """Highest SH degree in use."""
+    """SH degree in use at a step: one more every thousand steps, as in the default trainer."""
     return min(step // DEGREE_EVERY, 3)
 
 
 def parameters_of(gaussians: Gaussians) -> dict[str, Tensor]:
-    """The package's names and shapes; the same numbers."""
+    """The Gaussians under gsplat's parameter names and in its shapes."""
     full = gaussians.padded(3)
     return {
         "means": full.means,
@@ -56,7 +56,7 @@ def parameters_of(gaussians: Gaussians) -> dict[str, Tensor]:
 
 
 class GsplatTrainer:
-    """One scene under the package's rasterizer and strategy, on the GPU."""
+    """A scene trained by gsplat's rasterizer and densification strategy on the GPU."""
 
     def __init__(self, gaussians: Gaussians, extent: float, steps: int = STEPS) -> None:
         self._package: Any = importlib.import_module("gsplat")
@@ -81,7 +81,7 @@ class GsplatTrainer:
         return len(self.params["means"])
 
     def render(self, target: Target, degree: int) -> tuple[Tensor, dict[str, Any]]:
-        """Colour [H, W, 3] and what the strategy wants to know."""
+        """Colour [H, W, 3], and the information that gsplat's strategy reads."""
         here = self._on_device(target)
         p = self.params
         image, _, info = self._package.rasterization(
@@ -125,7 +125,7 @@ class GsplatTrainer:
 
 
 def order(views: int, steps: int, seed: int) -> Sequence[int]:
-    """Which view each step takes: every one once in random order, then again."""
+    """The view of each step: a random permutation of all views, repeated."""
     g = torch.Generator().manual_seed(seed)
     rounds = [torch.randperm(views, generator=g) for _ in range(-(-steps // views))]
     found: list[int] = torch.cat(rounds)[:steps].tolist()

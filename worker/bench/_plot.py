@@ -23,7 +23,7 @@ COLORS = {
 LOSER = "#c0392b"
 WINNER = "#2d2d2d"
 LETTERS_PER_INCH = 18.0
-"""Of the footer's size: 7 points, sans serif."""
+"""Letters of the footer (7 points, sans serif) that fit an inch; it sets where lines are wrapped."""
 
 plt.rcParams.update(
     {

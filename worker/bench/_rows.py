@@ -24,7 +24,7 @@ Row = dict[str, Any]
 
 @cache
 def origin() -> Row:
-    """Commit (with + where the tree differs from it), machine and versions."""
+    """Commit, machine and versions. A + behind the commit says that the tree had changes that were not committed."""
 
     def git(*arguments: str) -> str:
         return subprocess.run(
@@ -49,7 +49,7 @@ def origin() -> Row:
 
 
 def footer(rows: list[Row]) -> str:
-    """One line under a figure or table: all that the rows were measured on."""
+    """The line under a figure or table: the machines, versions and commits of its rows."""
 
     def distinct(found: Iterable[str], between: str) -> str:
         return between.join(dict.fromkeys(found))
@@ -61,13 +61,13 @@ def footer(rows: list[Row]) -> str:
 
 
 def worked() -> float:
-    """CPU seconds that the whole machine has worked: what others took is seen in the row, not guessed."""
+    """CPU seconds of all programs on the machine since boot. The share of other programs is stored with each row."""
     times = psutil.cpu_times()
     return float(sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0))
 
 
 def write(name: str, rows: list[Row]) -> Path:
-    """results/NAME.jsonl, replaced whole."""
+    """Replace results/NAME.jsonl by `rows`, each with its origin; returns the path."""
     path = HERE / "results" / f"{name}.jsonl"
     path.parent.mkdir(exist_ok=True)
     path.write_text("".join(json.dumps({**row, **origin()}) + "\n" for row in rows))
@@ -75,7 +75,7 @@ def write(name: str, rows: list[Row]) -> Path:
 
 
 def append(path: Path, row: Row) -> None:
-    """One more line, on the disk before this returns; what an interrupted write left of a line is cut off first."""
+    """Append a row and sync the file. An incomplete last line of an interrupted write is removed first."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab+") as stream:
         stream.seek(0)
@@ -86,7 +86,7 @@ def append(path: Path, row: Row) -> None:
 
 
 def lines(path: Path) -> list[Row]:
-    """The rows of a file, none where there is no file; a last line without its end was cut short and does not count."""
+    """The rows of a file; none where there is no file. An incomplete last line is ignored."""
     text = path.read_text() if path.is_file() else ""
     return [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
 
@@ -97,7 +97,7 @@ def read(name: str) -> list[Row]:
 
 @contextmanager
 def build(name: str) -> Iterator[None]:
-    """Let every CPU op in this process run one build of the engine: avx512, avx2 or baseline."""
+    """Run every CPU op in this block with one build of the kernels: avx512, avx2 or baseline."""
     from splatmill_worker.kernels.cpu import bin, composite, loss, project, step  # noqa: F401
 
     engine = isa.load(name)

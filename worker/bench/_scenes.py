@@ -49,7 +49,7 @@ def start_from(points: Tensor, colors: Tensor) -> list[Tensor]:
 
 
 def morton(points: Tensor) -> Tensor:
-    """Order in which neighbours in space are neighbours in memory: 6 % off a step against a random one."""
+    """Indices that sort points [N, 3] along a Morton curve, so that neighbours in space are near in memory."""
     low, high = torch.quantile(points[:100_000], torch.tensor([0.02, 0.98]), dim=0)
     q = ((points - low) / (high - low) * 1023).clamp(0, 1023).long()
     code = torch.zeros(len(points), dtype=torch.int64)
@@ -60,7 +60,7 @@ def morton(points: Tensor) -> Tensor:
 
 
 def densified(groups: list[Tensor], n: int) -> list[Tensor]:
-    """A stand-in for training's densification: copies drawn from each Gaussian's own shape.
+    """`n` Gaussians drawn from the shapes of the given ones, as a model of a densified scene.
 
     They are narrowed so that the volume they fill stays as it was (scale / copies^(1/3)), get an opacity of 0.4 to 0.6
     and a slight dependence on the view.

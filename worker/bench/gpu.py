@@ -85,7 +85,7 @@ def median_ms(work: Callable[[], object], repeats: int = REPEATS) -> float:
 
 
 def seconds_to(curve: Sequence[Row], psnr: float) -> float | None:
-    """Training seconds at which a curve first reaches `psnr` dB, between its points along a line; None
+    """Training seconds at which a curve first reaches `psnr` dB, by linear interpolation; None
     when it never does.
     """
     before: Row | None = None
@@ -100,7 +100,7 @@ def seconds_to(curve: Sequence[Row], psnr: float) -> float | None:
 
 
 def equal(counts: Sequence[int]) -> list[Row]:
-    """Both engines on the same Gaussians, view and photo, nothing moving."""
+    """Step and render times of both engines on the same Gaussians, view and photo, with zero learning rates."""
     rows: list[Row] = []
     for n in counts:
         gaussians, target = cloud(n)
@@ -143,7 +143,7 @@ def equal(counts: Sequence[int]) -> list[Row]:
 
 
 def _drawn(trainer: _gsplat.GsplatTrainer, degree: int, target: Target, _: Tensor) -> Tensor:
-    """What gsplat's model shows from a camera, at an SH degree; it knows no background but black."""
+    """The view that gsplat's model renders of a target at an SH degree, over black."""
     return trainer.render(target, degree)[0].clamp(0, 1)
 
 

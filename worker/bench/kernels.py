@@ -34,7 +34,7 @@ STILL = Rates(
 )  # everything is computed and written, nothing moves: each round is the same work
 THREADS = (1, 2)
 MULTIPLIES = {"forward": 11, "backward": 24}
-"""Vector multiplications and fused multiply-adds that a block of sixteen pixels takes for each Gaussian that reaches it, counted
+"""Vector multiplications and fused multiply-adds for a block of sixteen pixels and one Gaussian that touches it, counted
 in composite_forward.cpp and composite_backward.cpp (colour alone, plain scores): what the multipliers must do at the least."""
 
 
@@ -169,7 +169,7 @@ def measure_memory(kind: str) -> None:
 def draw_and_differentiate(
     scene: Scene, backend: ops.Backend, dtype: torch.dtype
 ) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """The ops one by one, on one view: the image and the gradients of a fixed weighting of it."""
+    """The image of one view and the gradients of a fixed weighted sum of it, by the ops one after another."""
     v = scene.views[0]
     leaves = [x.to(dtype).requires_grad_() for x in scene.groups]
     means, log_scales, quats, logit_opacities, sh = leaves
@@ -342,7 +342,7 @@ def _size_row(axis: str, value: int, scene: Scene, build_name: str, threads: int
 
 
 def exponent(points: list[Row], key: str) -> float:
-    """Slope of log time over log size, over the upper half of the sweep where fixed costs no longer show."""
+    """Slope of log time over log size in the upper half of the sweep, where fixed costs are negligible."""
     upper = sorted(points, key=lambda r: r["value"])[len(points) // 2 :] if len(points) > 3 else points
     x, y = np.log([r["value"] for r in upper]), np.log([r[key] for r in upper])
     return float(np.polyfit(x, y, 1)[0])
@@ -470,7 +470,7 @@ def ratios(steps: list[Row]) -> list[str]:
 
 
 def shares(steps: list[Row], probes: list[Row]) -> list[str]:
-    """What each pass uses of the probed peaks: compositing of the multipliers, the update of the memory.
+    """The share of the measured peaks that passes reach: compositing of arithmetic, the update of memory bandwidth.
 
     The update reads and writes parameters and two moments, 59 floats a Gaussian.
     """

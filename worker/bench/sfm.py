@@ -57,7 +57,7 @@ BUSY = 0.1  # of the machine's time, taken by other programs
 
 @dataclass(frozen=True)
 class Result:
-    """What one setting made of a scene: the posed scene or the failure's name, and seconds by stage."""
+    """The result of one setting on a scene: the posed scene or the failure's code, and the seconds of each stage."""
 
     scene: Scene | None
     failure: str | None
@@ -77,7 +77,7 @@ def ours(options: sfm.SfmOptions) -> Callable[[Path, Path], Result]:
 
 
 def defaults(images: Path, workdir: Path) -> Result:
-    """What people run: COLMAP's own pipeline at 1000 pixels and 4096 features, all pairs, one camera, incremental."""
+    """COLMAP's own pipeline: 1000 pixels, 4096 features, exhaustive matching, one camera, incremental mapping."""
     workdir.mkdir(parents=True)
     database, models = workdir / "database.db", workdir / "models"
     models.mkdir()
@@ -127,7 +127,7 @@ SETTINGS: dict[str, Callable[[Path, Path], Result]] = {
 
 
 def aligned(ours: Float, theirs: Float) -> tuple[Float, Float]:
-    """Distances [n] in the unit of `theirs` after the best similarity (Umeyama 1991), and its rotation [3,3]."""
+    """Distances [n], as `theirs`, after the least-squares similarity (Umeyama 1991), and its rotation [3, 3]."""
     a, b = ours - ours.mean(0), theirs - theirs.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
     sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -165,7 +165,7 @@ def pose_error(scene: Scene, truth: dict[str, Camera]) -> dict[str, float]:
 
 
 def gps_error(scene: Scene, images: Path, workdir: Path) -> dict[str, float]:
-    """Median distance in metres from the photos' GPS places; nothing where they have none."""
+    """Median distance in metres to the GPS positions of the photos; empty where they have none."""
     photos = {photo.name: photo for photo in prepare(images, None, workdir).photos}
     views = [view for view in scene.views if view.name in photos]
     places = pairs.positions([photos[view.name] for view in views])
@@ -266,7 +266,7 @@ def measure(
 
 
 def reference(name: str) -> dict[str, Camera]:
-    """The cameras that poses of this scene are compared with."""
+    """The reference cameras of a scene."""
     found = posed.find(_data.SHARED / FOLDERS[name])
     return {view.name: view.camera for view in found.load().views} if found is not None else {}
 
@@ -274,7 +274,7 @@ def reference(name: str) -> dict[str, Camera]:
 def scenes_bench(
     scenes: list[str], settings: list[str], train: float | None, rows: dict[tuple[str, str], _rows.Row]
 ) -> None:
-    """Measures what `rows` (by scene and setting) lacks; each row is stored once it is there."""
+    """Measure the combinations of scene and setting that `rows` lacks, and store each row at once."""
     for name in scenes:
         images = _data.SHARED / FOLDERS[name] / "images"
         if not images.is_dir():
@@ -286,7 +286,7 @@ def scenes_bench(
 
 
 def growth_bench(counts: Sequence[int], setting: str, rows: dict[tuple[str, str], _rows.Row]) -> None:
-    """Generated sets of growing size: evenly spread subsets would change the overlap, so each is its own orbit.
+    """Seconds against the number of photos, on generated orbits of constant overlap between neighbours.
 
     Taking the photos is not on the clock, and each set is taken once in each size by each version of the generator.
     """
@@ -310,7 +310,7 @@ def growth_bench(counts: Sequence[int], setting: str, rows: dict[tuple[str, str]
 
 
 def keep(name: str, rows: dict[tuple[str, str], _rows.Row], row: _rows.Row) -> None:
-    """Adds a row and stores all of them, so that an interrupted benchmark goes on where it stopped."""
+    """Add a row and store all of them, so that an interrupted benchmark can be resumed."""
     rows[row["scene"], row["setting"]] = row | _rows.origin()
     path = _rows.HERE / "results" / f"{name}.jsonl"
     part = path.with_suffix(".part")

@@ -39,7 +39,7 @@ class Scene:
     K: Tensor
 
     def rounded(self) -> Scene:
-        """The scene as float32 holds it, in float64: what every backend is given."""
+        """The scene rounded to float32 and stored as float64: the input of every backend."""
         return Scene(*(x.float().double() for x in vars(self).values()))
 
 
@@ -68,7 +68,7 @@ def cloud(n: int = 60, seed: int = 0, depth: float = 3.0, focal: float = 40.0, s
 
 
 def needles(ratio: float, seed: int) -> Scene:
-    """Projected ellipses whose axes differ by `ratio`: the short one is the 0.3 pixel^2 blur alone."""
+    """Gaussians whose projected axes differ by the factor `ratio`; the short one is the 0.3 pixel^2 filter alone."""
     scene = cloud(40, seed)
     long_axis = math.sqrt(0.3) * ratio * 3.0 / 40.0
     scene.log_scales = torch.full((40, 3), -30.0, dtype=torch.float64)
@@ -85,7 +85,7 @@ def far_along(ratio: float, seed: int) -> Scene:
 
 
 def pile(length: int, seed: int) -> Scene:
-    """`length` Gaussians over the same pixels, as transparent as the 1/255 cut lets a contribution be."""
+    """`length` Gaussians over the same pixels, each with an opacity of 0.006, just above the 1/255 cut."""
     scene = cloud(length, seed)
     scene.means[:, :2] *= 0.05
     scene.log_scales += math.log(4.0)
@@ -94,7 +94,7 @@ def pile(length: int, seed: int) -> Scene:
 
 
 def shifted(distance: float, seed: int) -> Scene:
-    """Scene and camera moved together; the camera's view of it is unchanged but for rounding."""
+    """The scene and its camera moved together by `distance`; the image changes by rounding alone."""
     scene = cloud(seed=seed)
     offset = torch.tensor([0.6, -0.5, 0.62], dtype=torch.float64) * distance
     scene.means = scene.means + offset
@@ -110,7 +110,7 @@ def with_logit(logit: float, seed: int) -> Scene:
 
 
 def with_focal(relative: float, seed: int) -> Scene:
-    """The same pixels through a shorter or longer lens: the scene stands off in proportion, 0.3 units deep."""
+    """The same image with another focal length: the scene is moved away in proportion and 0.3 units deep."""
     focal = relative * SIDE
     scene = cloud(seed=seed, depth=max(0.075 * focal, 0.05), focal=focal, spread=0.0)
     scene.means[:, 2] += 0.01 * torch.randn(
@@ -133,7 +133,7 @@ class Drawn:
 
 
 def draw(scene: Scene, backend: ops.Backend, dtype: torch.dtype) -> Drawn:
-    """The image, and the gradients of a fixed weighting of it."""
+    """The image, and the gradients of a fixed weighted sum of its values."""
     leaves = [getattr(scene, k).to(dtype).requires_grad_() for k in GROUPS]
     means, log_scales, quats, logit_opacities, sh = leaves
     viewmat, K = scene.viewmat.to(dtype), scene.K.to(dtype)
@@ -159,7 +159,7 @@ def errors(got: Drawn, want: Drawn) -> dict[str, float]:
 
 
 def subjects() -> list[tuple[str, str | None, ops.Backend]]:
-    """Name in the figure, build of the engine, and backend."""
+    """The subjects of the sweep: label in the figure, build of the CPU kernels, backend."""
     found: list[tuple[str, str | None, ops.Backend]] = [(f"cpu {b}", b, "cpu") for b in isa.supported()]
     found.append(("reference float32", None, "reference"))
     if torch.cuda.is_available():
@@ -173,7 +173,7 @@ Formulas = dict[str, tuple[float, bool]]
 
 
 def determinants(ratio: float) -> Formulas:
-    """Relative error of det(M M^T + 0.3 I) for random needles, and what a cull on det > 0 would throw away."""
+    """Relative error of det(M M^T + 0.3 I) for random needles, and the share that a cull on det > 0 would remove."""
     g = np.random.default_rng(0)
     n = 2000
     angle, long_axis = g.uniform(0, np.pi, n), math.sqrt(0.3) * ratio
@@ -229,7 +229,7 @@ def transmittances(length: float) -> Formulas:
 
 
 def centres(distance: float) -> Formulas:
-    """Pixel error of a centre when the world is far from its origin, and when it was recentred in float64 first."""
+    """Error in pixels of a projected centre far from the origin, with and without recentring in float64 first."""
     got, want = (x.rounded() for x in (shifted(distance, 0), cloud()))
     W, t = got.viewmat[:3, :3].float(), got.viewmat[:3, 3].float()
     raw = got.means.float() @ W.T + t
@@ -261,7 +261,7 @@ def sigmoid_slopes(logit: float) -> Formulas:
 
 
 def norms(norm: float) -> Formulas:
-    """Error of a unit quaternion made of one of any norm."""
+    """Error of normalising a quaternion of any norm."""
     q = (np.array([0.5, -0.7, 0.3, 0.4]) / np.sqrt(0.99) * norm).astype(np.float32)
     want = q.astype(np.float64) / np.linalg.norm(q.astype(np.float64))
     with np.errstate(all="ignore"):
@@ -332,14 +332,14 @@ TOLERANCE = {
 
 
 DECISION = 3e-6
-"""Relative width around the 1/255 cut in which float32 may take a pixel that float64 skips: twenty-five roundings."""
+"""Relative distance from the 1/255 cut within which float32 may include a pixel that float64 skips: 25 roundings."""
 
 
 def decided(scene: Scene, got: Drawn, error: float) -> dict[str, float]:
-    """Errors of `got` against the nearest definition whose 1/255 cut lies within DECISION of the true one.
+    """Errors of `got` against the closest reference whose 1/255 cut is moved by at most DECISION.
 
-    Where that error is small and the plain one is large, no digits were lost: a pixel stands on the cut, where the image and its
-    gradient jump.
+    A small value beside a large plain error means that a pixel lies on the cut, where the image and its
+    gradient are discontinuous; no digits were lost.
     """
     definition: Any = importlib.import_module("splatmill_worker.kernels.reference.composite")
     cut, best = definition.ALPHA_MIN, {"gradient": error}
@@ -441,7 +441,7 @@ def figure(axis: Axis, rows: list[Row]) -> None:
 
 
 def leaves_tolerance(points: list[Row]) -> str:
-    """The values of the axis that are within tolerance, said as where it is left."""
+    """A text that says from which value of the axis on the error exceeds the tolerance."""
     ordered = sorted(points, key=lambda r: r["value"])
     bad = [r["value"] for r in ordered if not r["error"] <= r["tolerance"]]
     if not bad:

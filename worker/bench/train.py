@@ -34,12 +34,12 @@ CACHE = HERE.parent / "build" / "bench"
 DEFAULT_BUDGETS = ["10s", "30s"]
 REFERENCES = HERE / "results" / "train_references.jsonl"
 LOST = 12.0
-"""dB under which a peer's model is probably not in the frame of the scene's cameras."""
+"""dB below which another trainer's model is probably not in the coordinates of the scene's cameras."""
 
 
 @dataclass(frozen=True)
 class Files:
-    """Where the rows are, and where what is made of them goes."""
+    """The file of rows, and the files that are generated from them."""
 
     rows: Path
     tables: Path
@@ -47,7 +47,7 @@ class Files:
 
     @staticmethod
     def of(given: Path | None) -> Files:
-        """The repository's own, or all three beside a file of rows that was named."""
+        """The repository's own files, or three files beside a given file of rows."""
         if given is None:
             return Files(HERE / "results" / "train.jsonl", HERE / "train.md", HERE / "figures" / "train.png")
         return Files(given, given.with_suffix(".md"), given.with_suffix(".png"))
@@ -55,7 +55,7 @@ class Files:
 
 @dataclass(frozen=True)
 class Peer:
-    """A finished model of another trainer on a scene, and the training seconds it took."""
+    """Another trainer's model of a scene, and the training seconds that it took."""
 
     scene: Scene
     name: str
@@ -65,7 +65,7 @@ class Peer:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a call asks for; `absent` has a sentence for each scene whose data is not there."""
+    """The runs and models that a call asks for; `absent` has a sentence for each scene without data."""
 
     runs: list[BenchRun]
     peers: list[Peer]
@@ -73,7 +73,7 @@ class Wanted:
 
 
 def main(argv: list[str]) -> int:
-    """Measure what is missing, then draw everything; 1 where something could not be had, 2 for bad input."""
+    """Measure what is missing, and generate tables and figure; 1 where something could not be measured."""
     parser = _parser()
     asked = parser.parse_args(argv)
     if asked.job is not None:
@@ -105,7 +105,7 @@ def main(argv: list[str]) -> int:
 
 
 def _wanted(asked: argparse.Namespace) -> Wanted:
-    """Raises ValueError, as a sentence, for input that names nothing."""
+    """What the arguments ask for. Raises ValueError, as a sentence, for unknown names."""
     known, absent = [], []
     for name in _split(asked.scenes) or list(scenes.KNOWN):
         try:
@@ -127,7 +127,7 @@ def _wanted(asked: argparse.Namespace) -> Wanted:
 
 
 def _measure(wanted: Wanted, path: Path, work: Path) -> bool:
-    """Append the rows that are not there yet to the file at `path`; False where one could not be had."""
+    """Measure and append the rows that the file at `path` lacks; False where one could not be measured."""
     found = lines(path)
     todo = [run for run in missing(wanted.runs, found) if not idle(run, found)]
     if wanted.runs:
@@ -161,7 +161,7 @@ def _measure(wanted: Wanted, path: Path, work: Path) -> bool:
 
 
 def _usable(scene: Scene, work: Path) -> bool:
-    """Whether the scene has cameras and views; recovered ones are kept for all rows."""
+    """Whether the scene's cameras are there or could be recovered; they are kept for all rows."""
     try:
         answer = child.prepared(scene, work)
     except child.Fault as fault:
@@ -177,7 +177,7 @@ def _usable(scene: Scene, work: Path) -> bool:
 
 
 def _judge(peer: Peer, path: Path, work: Path) -> bool:
-    """Append the row of a peer's model; False, with a sentence, where it cannot be judged."""
+    """Append the row of another trainer's model; False, with a printed sentence, where it cannot be evaluated."""
     try:
         row = child.judged(peer.scene, peer.name, peer.model, peer.seconds, work)
     except child.Fault as fault:
@@ -200,7 +200,7 @@ def _said(row: Row) -> str:
 
 
 def _split(given: list[str] | None) -> list[str]:
-    """`a b,c` as three names."""
+    """The names in a list of arguments, separated by blanks or commas."""
     return [name for text in given or [] for name in text.split(",") if name]
 
 

@@ -18,11 +18,11 @@ BUSY = "busy machine"
 SAME = "the default's plan is the same"
 
 Place = tuple[str, str, str]
-"""Scene, budget, configuration."""
+"""Key of a comparison: scene, budget, configuration."""
 
 
 def ablation(rows: list[Row]) -> str:
-    """The section: switches over all scenes, then each on each scene, then what they are compared with."""
+    """The section: each switch over all scenes, each on each scene, and the default they are compared with."""
     pairs = compared(rows)
     alone = lonely(rows)
     left = [f"{alone} rows of a switch have no default of the same code, and are not shown."] if alone else []
@@ -44,7 +44,7 @@ def ablation(rows: list[Row]) -> str:
 
 
 def difference(pairs: list[Pair], name: str) -> Spread | None:
-    """The switch's value less the default's, over seeds; None where nothing can be compared or nothing was changed."""
+    """Median and range over seeds of the switch's value minus the default's; None without pairs of rows."""
     known = _comparable(pairs)
     if not known or all(_course(default) == _course(row) for default, row in known):
         return None
@@ -52,7 +52,7 @@ def difference(pairs: list[Pair], name: str) -> Spread | None:
 
 
 def verdict(difference: Spread) -> str:
-    """What the seeds say together."""
+    """`better` or `worse` where all seeds agree in sign, otherwise that there is no clear difference."""
     if difference.count < 2:
         return "one seed says nothing"
     if difference.least > 0:
@@ -63,7 +63,7 @@ def verdict(difference: Spread) -> str:
 
 
 def summary(quality: dict[Place, Spread]) -> str:
-    """Each switch over all scenes and budgets: where it was better or worse, and its median difference there."""
+    """A table with a row per switch: where it was better or worse, and the median difference there."""
     lines = []
     for config in dict.fromkeys(config for _, _, config in quality):
         mine = {f"{place[0]}, {place[1]}": found for place, found in quality.items() if place[2] == config}
@@ -77,7 +77,7 @@ def summary(quality: dict[Place, Spread]) -> str:
 
 
 def defaults(pairs: dict[Place, list[Pair]]) -> str:
-    """What the switches are compared with, and how far seeds alone move it."""
+    """A table of the default configuration, with its range over seeds."""
     rows = whole(once([default for group in pairs.values() for default, _ in group]))
     lines = [
         [
@@ -117,7 +117,7 @@ def _line(place: Place, pairs: list[Pair]) -> list[object]:
 
 
 def _idle(pairs: dict[Place, list[Pair]]) -> list[str]:
-    """A sentence on switches that were not measured on a scene because its plan has them anyway."""
+    """A sentence that names the switches not measured on a scene because its plan already has them."""
     asked = {config for _, _, config in pairs} & CONFIGURATIONS.keys()
     found: dict[str, list[str]] = {}
     for (scene, budget), group in grouped(
@@ -143,5 +143,5 @@ def _comparable(pairs: list[Pair]) -> list[Pair]:
 
 
 def _course(row: Row) -> Row:
-    """What the plan makes a run do, without what it says about it."""
+    """The fields of a plan that affect a run: all but the reasons."""
     return {name: value for name, value in row["plan"].items() if name not in ("left_out", "forced")}

@@ -13,19 +13,19 @@ _STEPS = re.compile(r"(\d+)\s*steps?")
 
 @dataclass(frozen=True)
 class Budget:
-    """Either `steps` or `seconds` is given, the other one is None."""
+    """A budget of training steps or of seconds; the other field is None."""
 
     steps: int | None
     seconds: float | None
 
     @property
     def name(self) -> str:
-        """`600steps` or `60s`: how rows and tables call it."""
+        """The name in rows and tables: `600steps` or `60s`."""
         return f"{self.steps}steps" if self.steps is not None else f"{self.seconds:g}s"
 
     @property
     def options(self) -> dict[str, Any]:
-        """The fields of TrainOptions that say so."""
+        """The fields of TrainOptions that set this budget."""
         return {"steps": self.steps} if self.steps is not None else {"time_budget": self.seconds}
 
 

@@ -14,20 +14,20 @@ from _train.rows import BenchRun
 from _train.scenes import Scene
 
 LAST_WORDS = 2000
-"""Characters of a dead process's errors that are shown."""
+"""Characters of a failed process's standard error that are shown."""
 
 
 class Fault(Exception):
-    """A process ended without an answer; the message holds its last words."""
+    """A process ended without a result; the message holds the end of its standard error."""
 
 
 def prepared(scene: Scene, work: Path) -> Row:
-    """How many views and points the scene has, its cameras recovered and kept; `failure` says why there are none."""
+    """The numbers of views and points of the scene with its cameras; `failure` says why there are none."""
     return _ask({"do": "prepare", **_of(scene, work), "options": scene.options})
 
 
 def measured(run: BenchRun, work: Path) -> Row:
-    """The row of a run, a failure by name included. Raises Fault."""
+    """The row of a run, or of its named failure. Raises Fault."""
     return _ask(
         {
             "do": "measure",

@@ -88,7 +88,7 @@ CONFIGURATIONS = {
     "pose-refinement": _option("training cameras are corrected", "pose_refinement", "on", True),
     "no-pose-refinement": _option("cameras stay as they are", "pose_refinement", "off", False),
 }
-"""Name to switch. A name keeps its meaning: rows already measured carry it."""
+"""The switches by name. A name never changes its meaning, since measured rows refer to it."""
 
 TAKEN_OUT = {
     "absolute": "densification by absolute gradients (Ye et al. 2024)",
@@ -97,7 +97,7 @@ TAKEN_OUT = {
     "mcmc": "MCMC relocation and noise (Kheradmand et al. 2024)",
     "sh-at-once": "the last SH degree from the start, as now, against one after the other (Kerbl et al. 2023)",
 }
-"""Switches of rows measured before what they switch was taken out, as something else pays more."""
+"""Names of switches that rows have but the code no longer has."""
 
 
 def named(name: str) -> Configuration:
@@ -108,7 +108,7 @@ def named(name: str) -> Configuration:
 
 
 def revised(plan: Plan, changes: dict[str, Any]) -> Plan:
-    """`plan` with the fields at dotted paths replaced, and said to be forced.
+    """`plan` with the fields at the dotted paths replaced and named in `forced`.
 
     Raises ValueError for a path that leads to no field.
     """

@@ -10,10 +10,10 @@ from _rows import Row
 from _train.rows import BenchRun, failed
 
 START = 4.0
-"""Seconds that a process needs to load torch and COLMAP."""
+"""Seconds that a new process takes to load torch and COLMAP."""
 
 AROUND = 12.0
-"""Seconds of loading, evaluation and reports around a training of some forty small photos."""
+"""Seconds of loading, evaluation and reports for a training on about forty small photos."""
 
 PER_STEP = 0.012
 
@@ -24,7 +24,7 @@ def seconds_left(runs: Iterable[BenchRun], rows: list[Row]) -> float:
 
 
 def expected(run: BenchRun, rows: list[Row]) -> float:
-    """Wall seconds of one run: what its like took, by the median, else a guess from its budget."""
+    """Expected wall seconds of a run: the median of like runs, else an estimate from its budget."""
     like = (run.scene.name, run.budget.name)
     known = [row for row in rows if row["kind"] == "run" and not failed(row)]
     took = [row["wall_seconds"] for row in known if (row["scene"], row["budget"]) == like]

@@ -21,7 +21,7 @@ COLORS = {name: f"C{number}" for number, name in enumerate(ALL)}
 
 
 def draw(rows: list[Row], references: list[Row], path: Path) -> None:
-    """Held-out PSNR (with the error it stands for) and 1 - SSIM over training seconds, into `path`."""
+    """Plot held-out PSNR (with the mean squared error on the other axis) and 1 - SSIM over training seconds."""
     # One switch needs the unequal exposures; how soon they are learnt says nothing beside scenes that agree.
     timed = [row for row in latest_default(rows) if row["scene"] != UNEQUAL]
     figure, (quality, structure) = _plot.axes(2, width=6.4, height=5.0)
@@ -85,7 +85,7 @@ def _line(panel: Axes, rows: list[Row], what: str, color: str, label: str) -> No
 
 
 def _points(quality: Axes, structure: Axes, rows: list[Row], references: list[Row]) -> None:
-    """Peers judged here are filled, figures from elsewhere hollow."""
+    """Draw the peers: filled where this benchmark evaluated their model, hollow for published figures."""
     judged = {(row["scene"], row["name"]): row for row in rows if row["kind"] == "peer"}
     earlier = [row for row in references if row["kind"] == "reference"]
     drawn = {row["scene"] for row in rows}
@@ -129,7 +129,7 @@ def _points(quality: Axes, structure: Axes, rows: list[Row], references: list[Ro
 
 
 def _decades(axis: Axis, at: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
-    """Ticks at the same places of every decade, as plain numbers."""
+    """Set ticks at the same positions of every decade, labelled with plain numbers."""
     axis.set_major_locator(LogLocator(subs=at))
     axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_formatter(NullFormatter())

@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def table(head: str, lines: Iterable[Iterable[object]]) -> str:
-    """A Markdown table; `head` names the columns, between bars."""
+    """A Markdown table; `head` holds the column names, separated by bars."""
     names = head.split("|")
     rows = [" | ".join(str(cell).replace("|", "/").replace("\n", " ") for cell in cells) for cells in lines]
     return "\n".join(
@@ -17,10 +17,10 @@ def table(head: str, lines: Iterable[Iterable[object]]) -> str:
 
 
 def section(title: str, text: str) -> list[str]:
-    """A heading and its text; nothing where there is no text."""
+    """A heading and its text, or nothing where the text is empty."""
     return [f"## {title}", text] if text else []
 
 
 def beside(path: Path, page: Path) -> str:
-    """How `page` links to `path`."""
+    """The relative link from `page` to `path`."""
     return Path(os.path.relpath(path.resolve(), page.resolve().parent)).as_posix()

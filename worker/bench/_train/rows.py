@@ -20,7 +20,7 @@ from _train.configurations import DEFAULT, named
 from _train.scenes import Scene
 
 QUIET = 0.1
-"""Of a run's own CPU seconds, which other programs may take beside it before its seconds say too little."""
+"""Share of a run's CPU seconds that other programs may use beside it; above, its seconds are not reported."""
 
 _WORKER = Path(splatmill_worker.__file__).parent
 _COMPUTES = [
@@ -32,7 +32,7 @@ _COMPUTES = [
 
 @cache
 def code_version() -> str:
-    """A digest of the sources that a result depends on: the same code, the same row, whatever the commit is called."""
+    """A digest of the sources that a result depends on. Rows of the same digest are rows of the same code."""
     digest = hashlib.sha256()
     for place in _COMPUTES:
         if not place.exists():
@@ -46,12 +46,12 @@ def code_version() -> str:
 
 
 def computing(source: str) -> str:
-    """What of Python `source` computes: a reworded comment or docstring leaves measured rows as they are."""
+    """The syntax tree of Python `source` without comments and docstrings, so that rewording them invalidates no row."""
     return ast.dump(_Textless().visit(ast.parse(source)))
 
 
 class _Textless(ast.NodeTransformer):
-    """Takes out statements that are nothing but a string."""
+    """Removes statements that consist of a string."""
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
         alone = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
@@ -60,7 +60,7 @@ class _Textless(ast.NodeTransformer):
 
 @dataclass(frozen=True)
 class BenchRun:
-    """One run to do: a scene trained by one configuration within one budget from one seed."""
+    """One run: a scene trained in one configuration within one budget from one seed."""
 
     scene: Scene
     config: str
@@ -68,7 +68,7 @@ class BenchRun:
     seed: int
 
     def identity(self) -> Row:
-        """The fields that a row starts with, and by which it is found again."""
+        """The fields that identify the row of this run."""
         configuration = named(self.config)
         return {
             "kind": "run",
@@ -88,14 +88,14 @@ _IDENTITY = ("kind", "scene", "config", "budget", "seed", "options", "revised", 
 
 
 def key(row: Row) -> str:
-    """The same for two rows of the same run on the same code."""
+    """The identity of a row: equal for two rows of the same run on the same code."""
     return json.dumps([row.get(name) for name in _IDENTITY], sort_keys=True)
 
 
 def runs_of(
     scenes: Iterable[Scene], configs: Iterable[str], budgets: Iterable[Budget], seeds: Iterable[int]
 ) -> list[BenchRun]:
-    """Every combination that means something: the default first, and seeds outermost, so that those done are whole."""
+    """Every meaningful combination, the default first; seeds vary slowest, so that finished seeds are complete."""
     scenes, budgets = list(scenes), list(budgets)
     configs = sorted(configs, key=lambda name: name != DEFAULT)
     return [
@@ -109,25 +109,25 @@ def runs_of(
 
 
 def missing(runs: list[BenchRun], rows: list[Row]) -> list[BenchRun]:
-    """Those of `runs` that have no row of today's code."""
+    """Those of `runs` that have no row of the present code."""
     there = {key(row) for row in rows}
     return [run for run in runs if key(run.identity() | {"code": code_version()}) not in there]
 
 
 def idle(run: BenchRun, rows: list[Row]) -> bool:
-    """Whether the default of the same scene, budget, seed and code does already what the switch would do."""
+    """Whether the plan of the default run (same scene, budget, seed and code) already does what the switch would do."""
     defaults, _ = _sides(rows)
     default = defaults.get((run.scene.name, run.budget.name, run.seed, code_version()))
     return default is not None and not failed(default) and not named(run.config).changes(default["plan"])
 
 
 def failed(row: Row) -> bool:
-    """A failed run gets no point; it is counted instead."""
+    """Whether the run failed. A failed run is counted but gets no point in a figure."""
     return bool(row["outcome"] != "trained")
 
 
 def latest_default(rows: list[Row]) -> list[Row]:
-    """Of each scene and budget the default's rows of the last code: those timed, or else those counted in steps."""
+    """The default's rows of the last code for each scene and budget: those with time budgets, else those with steps."""
     defaults = [row for row in rows if row["kind"] == "run" and row["config"] == DEFAULT]
     timed = {row["scene"] for row in defaults if by_time(row)}
     mine = [row for row in defaults if by_time(row) or row["scene"] not in timed]
@@ -136,22 +136,22 @@ def latest_default(rows: list[Row]) -> list[Row]:
 
 
 def by_time(row: Row) -> bool:
-    """Whether the budget was seconds, not steps."""
+    """Whether the row's budget was in seconds."""
     return not row["budget"].endswith("steps")
 
 
 def disturbed(row: Row) -> bool:
-    """Whether other programs took so much of the machine that the row's seconds say too little."""
+    """Whether other programs used more than QUIET of the run's CPU seconds."""
     return bool(row["others_cpu_seconds"] > QUIET * row["cpu_seconds"])
 
 
 def whole(rows: Iterable[Row]) -> list[Row]:
-    """Rows that have a figure."""
+    """The rows of runs that did not fail and have a held-out PSNR."""
     return [row for row in rows if not failed(row) and row["psnr"] is not None]
 
 
 def grouped(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
-    """Rows that agree in the fields `names`, in order of appearance."""
+    """The rows grouped by the values of the fields `names`, in order of appearance."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[name] for name in names), []).append(row)
@@ -164,7 +164,7 @@ def once(rows: list[Row]) -> list[Row]:
 
 
 Pair = tuple[Row, Row]
-"""The default's row and a switch's."""
+"""A pair of rows: the default's and the switch's."""
 
 
 def compared(rows: list[Row]) -> dict[tuple[str, str, str], list[Pair]]:
@@ -185,7 +185,7 @@ def compared(rows: list[Row]) -> dict[tuple[str, str, str], list[Pair]]:
 
 
 def lonely(rows: list[Row]) -> int:
-    """How many rows of a switch have no default to be compared with."""
+    """The number of rows of switches for which there is no default row."""
     defaults, others = _sides(rows)
     return sum(_place(row) not in defaults for row in others)
 

@@ -36,20 +36,20 @@ from splatmill_worker.splat.report.report import plain
 from splatmill_worker.splat.views import Target, TrainingView
 
 NAMED = (Refusal, TrainingFailed, sfm.SfmFailed)
-"""Failures that carry a name and a sentence; they are results, and anything else is a fault."""
+"""Failures that are results of a benchmark. Any other exception is a fault of the program."""
 
 RESULT = ("psnr", "ssim", "mse", "train_psnr", "steps", "gaussians", "recoveries", "stopped")
 
 PHOTOS = 40
-"""Of the still life, in 640 x 480, as `make demo` takes them."""
+"""Photos of the still life, as `make demo` takes them (640 x 480 pixels)."""
 
 
 def _quiet(*_: object) -> None:
-    """Nobody watches."""
+    """Ignore an event."""
 
 
 def prepare(job: Row) -> Row:
-    """What the scene holds; its cameras are kept in the `sfm` folder for the rows that follow."""
+    """The numbers of views and points of a scene; its cameras are kept in the `sfm` folder for later rows."""
     options = TrainOptions.model_validate(job["options"])
     try:
         scene = _posed(job, options)
@@ -60,7 +60,7 @@ def prepare(job: Row) -> Row:
 
 
 def measure(job: Row) -> Row:
-    """One row: the capture trained through the pipeline from an empty folder."""
+    """The row of one run: the capture trained through the pipeline from an empty folder."""
     give_memory_back()
     capture, seed = Path(job["capture"]), job["identity"]["seed"]
     options = TrainOptions.model_validate(job["identity"]["options"] | job["budget"])
@@ -105,7 +105,7 @@ def measure(job: Row) -> Row:
 
 
 def judge(job: Row) -> Row:
-    """A peer's finished model on the held-out views that runs are judged on, at their size."""
+    """The scores of another trainer's model on the held-out views of the runs, at the same size."""
     path = Path(job["model"])
     options = TrainOptions.model_validate(job["options"])
     try:
@@ -150,7 +150,7 @@ JOBS: dict[str, Callable[[Row], Row]] = {"prepare": prepare, "measure": measure,
 
 
 def main(text: str) -> int:
-    """Do the job of a JSON document, and leave what came out in the file that it names."""
+    """Do the job described by a JSON document, and write the result to the file that it names."""
     job = json.loads(text)
     answer = JOBS[job["do"]](job)
     path = Path(job["answer"])
@@ -161,7 +161,7 @@ def main(text: str) -> int:
 
 
 def _posed(job: Row, options: TrainOptions) -> Scene:
-    """The scene of a capture, photographed first where that is ours to do; recovered cameras are kept."""
+    """The posed scene of a capture. The still life is photographed first; recovered cameras are kept."""
     capture = Path(job["capture"])
     if job["made"] and not (capture / "images").is_dir():
         part = capture / "images.part"
@@ -174,7 +174,7 @@ def _posed(job: Row, options: TrainOptions) -> Scene:
 
 
 def _with_cameras(workdir: Path, job: Row) -> Path:
-    """`workdir` with the scene's recovered cameras in the place where the pipeline looks for them."""
+    """`workdir` with the recovered cameras linked where the pipeline looks for them."""
     kept = Path(job["sfm"])
     kept.mkdir(parents=True, exist_ok=True)
     (workdir / "sfm").symlink_to(kept)
@@ -182,7 +182,7 @@ def _with_cameras(workdir: Path, job: Row) -> Path:
 
 
 def rounded(value: Any) -> Any:
-    """Numbers to six significant digits: rows are read by people and kept in the repository."""
+    """`value` with its numbers rounded to six significant digits."""
     if isinstance(value, dict):
         return {name: rounded(each) for name, each in value.items()}
     if isinstance(value, list):

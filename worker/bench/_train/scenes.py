@@ -9,12 +9,12 @@ from typing import Any
 from _data import FOLDERS, SHARED
 
 SIDE = 480
-"""Longest side of the photos in pixels: small enough that a run of a minute has annealed and converged."""
+"""Longest side of the photos in pixels, small enough for a run of one minute to converge."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A capture and the options that every run of it shares. `made`: as what we photograph it on first use."""
+    """A capture and the options that all runs on it share. `made` names the generator of a built-in scene."""
 
     name: str
     folder: Path
@@ -30,13 +30,13 @@ then kept."""
 
 UNEQUAL = "unequal"
 MADE = ("synthetic", UNEQUAL)
-"""The still life that we photograph ourselves, and the same with an exposure of its own for each photo."""
+"""The built-in still life, and the same with a random exposure for each photo."""
 
 ALL = (*KNOWN, UNEQUAL)
 
 
 def named(text: str, work: Path) -> Scene:
-    """A scene by its name, or the folder of a capture; `work` is where things made on the way are kept.
+    """The scene of a name or of a capture's folder; generated photos are kept in `work`.
 
     Raises, with a sentence, ValueError for what is neither, and FileNotFoundError for shared data that is not there.
     """

@@ -20,7 +20,7 @@ class Spread:
 
     @staticmethod
     def of(values: Iterable[float]) -> Spread:
-        """Of at least one value."""
+        """Median and range of at least one value."""
         known = list(values)
         return Spread(statistics.median(known), min(known), max(known), len(known))
 
@@ -34,9 +34,9 @@ class Spread:
 
 
 def seconds_to(row: Row, psnr: float) -> float | None:
-    """Training seconds at which a run's curve first reaches `psnr` dB, on straight lines between its points.
+    """Training seconds at which a run's curve first reaches `psnr` dB, by linear interpolation.
 
-    None where it never does. A first point that is above already counts with its own seconds, which is too many.
+    None where it never does. Where the first point is already above, its seconds are an upper bound.
     """
     before: Row | None = None
     for point in row["curve"]:

@@ -14,7 +14,7 @@ from _train.rows import QUIET, by_time, disturbed, failed, grouped, latest_defau
 from _train.spread import Spread, seconds_to
 
 TOLERANCE = 0.05
-"""Of a time budget, by which a run may end early or late."""
+"""Share of a time budget by which a run may end early or late."""
 
 COMMAND = "splatmill bench train"
 
@@ -27,7 +27,7 @@ fall sooner; the best budget that gets there with every seed counts."""
 
 
 def document(rows: list[Row], references: list[Row], rows_at: Path, here: Path, figure: Path) -> str:
-    """The whole page at `here`: what was measured at `rows_at`, drawn at `figure`."""
+    """The page `here` as Markdown, from the rows of the file `rows_at`, with the figure at `figure`."""
     timed = latest_default(rows)
     parts = [
         "# Training: error against run time",
@@ -46,7 +46,7 @@ def document(rows: list[Row], references: list[Row], rows_at: Path, here: Path, 
 
 
 def budgets(timed: list[Row]) -> str:
-    """What each time budget gave, whether runs ended in time, and whether more time was ever worse."""
+    """A table of the result of each time budget, and whether runs ended in time and never got worse with more time."""
     groups = grouped((row for row in whole(timed) if by_time(row)), "scene", "budget")
     head = "scene|budget|seeds|training s|PSNR dB|SSIM|Gaussians|steps|all wall s|all CPU s|peak MB|cameras s"
     lines, late, worse, busy = [], [], [], []
@@ -99,7 +99,7 @@ def budgets(timed: list[Row]) -> str:
 
 
 def levels(timed: list[Row], references: list[Row]) -> str:
-    """Training seconds to each level, on the curve of the budget that gets there soonest with every seed."""
+    """A table of the training seconds to each PSNR, for the budget that reaches it soonest with every seed."""
     asked = [row for row in references if row["kind"] == "level"]
     others = list(dict.fromkeys(row["who"] for row in references if row["kind"] == "reference"))
     lines = []
@@ -137,7 +137,7 @@ def levels(timed: list[Row], references: list[Row]) -> str:
 
 
 def goals(timed: list[Row], references: list[Row]) -> str:
-    """What a budget should give, and what it gave."""
+    """A table of the goals and what was measured."""
     lines = []
     for goal in (row for row in references if row["kind"] == "goal"):
         group = [row for row in _of_scene(timed, goal["scene"]) if row["budget"] == goal["budget"]]
@@ -161,7 +161,7 @@ def goals(timed: list[Row], references: list[Row]) -> str:
 
 
 def peers(rows: list[Row]) -> str:
-    """Each peer's last row."""
+    """A table of the last row of each other trainer."""
     last = {(row["scene"], row["name"]): row for row in rows if row["kind"] == "peer"}
     lines = [
         [
@@ -183,7 +183,7 @@ def peers(rows: list[Row]) -> str:
 
 
 def left_out(rows: list[Row]) -> str:
-    """What each scene's plan left out, by its last default row."""
+    """A table of what each scene's plan left out, from its last default row."""
     last = {
         row["scene"]: row
         for row in rows
@@ -198,7 +198,7 @@ def left_out(rows: list[Row]) -> str:
 
 
 def failures(rows: list[Row]) -> str:
-    """Every run that ended by name."""
+    """A table of the runs that failed."""
     lines = [
         [row["scene"], row["config"], row["budget"], row["seed"], row["outcome"]]
         for row in once([row for row in rows if row["kind"] == "run"])
@@ -208,7 +208,7 @@ def failures(rows: list[Row]) -> str:
 
 
 def sources(references: list[Row]) -> str:
-    """Where the hollow points come from."""
+    """The sources of published figures."""
     known = {row["who"]: row["source"] for row in references if row["kind"] == "reference"}
     return "\n".join(f"- {who}: {source}." for who, source in known.items())
 

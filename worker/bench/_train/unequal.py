@@ -8,14 +8,14 @@ import numpy as np
 from PIL import Image
 
 SPREAD = 0.3
-"""Standard deviation of the log brightness: 0.4 stops to either side, and twice that for one photo in twenty."""
+"""Standard deviation of the natural logarithm of the exposure (0.3 is 0.43 stops)."""
 
 EVERY = 8
-"""One photo of so many, by name, keeps its exposure: those that are held out have to be judged as they should be."""
+"""Every n-th photo, in order of name, keeps its exposure: these are the held-out photos."""
 
 
 def expose(folder: Path, seed: int = 0) -> None:
-    """Multiply the values of every JPEG in `folder` but the held-out ones by a factor of its own, around 1."""
+    """Multiply the values of every JPEG in `folder`, except the held-out ones, by a random exposure."""
     random = np.random.default_rng(seed)
     for number, path in enumerate(sorted(folder.glob("*.jpg"))):
         gain = float(np.exp(SPREAD * random.standard_normal()))
