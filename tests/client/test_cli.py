@@ -31,6 +31,7 @@ from splatmill.schema import (
     StateEvent,
     describe_options,
 )
+from tests.support.waiting import wait_for
 
 PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n\0\0\0\0"
 PLAN = {
@@ -57,15 +58,6 @@ def _hear_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def eventually(found: Callable[[], object], seconds: float = 20.0) -> object:
-    """What `found` returns once it is not empty; the wait is bounded, not guessed."""
-    end = time.monotonic() + seconds
-    while not (value := found()):
-        assert time.monotonic() < end, "nothing happened"
-        time.sleep(0.01)
-    return value
-
-
 @pytest.fixture
 def photos(tmp_path: Path) -> Path:
     folder = tmp_path / "photos"
@@ -85,7 +77,7 @@ def work(service, ending: Callable[[str], None]) -> threading.Thread:
     """Play the worker for the next job, in the background."""
 
     def play() -> None:
-        job_id = str(eventually(lambda: newest(service)))
+        job_id = str(wait_for(lambda: newest(service)))
         service.begin(job_id)
         service.say(
             job_id,
@@ -257,7 +249,7 @@ def test_a_detached_job_and_what_is_asked_about_it(service, photos: Path, tmp_pa
         assert line in status
     done = invoke("download", job_id, "-o", tmp_path / "model", *at)
     assert done.exit_code == Exit.not_found
-    assert "not finished yet" in done.stderr
+    assert "not finished" in done.stderr
 
     service.finish(job_id, PLY)
     done = invoke("download", job_id, "-o", tmp_path / "model", *at)
@@ -344,10 +336,10 @@ def test_a_second_interruption_does_not_wait(peer, reply, photos: Path, tmp_path
 
     peer.answer = answer
     process = spawn("train", photos, "-o", tmp_path / "out", "--server", peer.url)
-    eventually(lambda: any(seen.path.endswith("/events") for seen in peer.seen))
+    wait_for(lambda: any(seen.path.endswith("/events") for seen in peer.seen))
     process.send_signal(signal.SIGINT)
     process.send_signal(signal.SIGTERM)  # timeout(1) signals the process and its group
-    eventually(lambda: any(seen.path.endswith("/cancel") for seen in peer.seen))
+    wait_for(lambda: any(seen.path.endswith("/cancel") for seen in peer.seen))
     assert process.poll() is None
     time.sleep(2 * ONE_SIGNAL_SECONDS)
     process.send_signal(signal.SIGINT)
@@ -363,7 +355,7 @@ def test_an_interruption_before_the_job_began(peer, reply, photos: Path, tmp_pat
 
     peer.answer = hang
     process = spawn("train", photos, "-o", tmp_path / "out", "--server", peer.url)
-    eventually(lambda: peer.seen)
+    wait_for(lambda: peer.seen)
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=30)
     assert (process.returncode, stderr) == (Exit.cancelled, "Stopped.\n")

@@ -8,7 +8,6 @@ import os
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import psutil
@@ -18,6 +17,7 @@ from splatmill import Client
 from splatmill.cli.embedded import embedded_service
 from splatmill.cli.exits import Exit
 from splatmill.errors import ServiceFailed, Unauthorized
+from tests.support.waiting import wait_for
 
 
 def family() -> set[int]:
@@ -84,10 +84,7 @@ with embedded_service(Path({str(tmp_path / "data")!r})) as service:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     pids = json.loads(done.stdout)
     assert len(pids) >= 4
-    end = time.monotonic() + 30
-    while left := {pid for pid in pids if runs(pid)}:
-        assert time.monotonic() < end, f"{left} outlived the call"
-        time.sleep(0.02)
+    wait_for(lambda: not any(runs(pid) for pid in pids))
 
 
 def test_photos_that_are_none_fail_with_a_sentence(tmp_path: Path):

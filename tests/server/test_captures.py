@@ -19,20 +19,13 @@ import pytest
 
 from splatmill.backplane import layout
 from splatmill.schema import Role
-
-from .conftest import Running, Serve, problem, wait_for
+from tests.support.served_app import Serve, ServedApp, problem, raw, stored
+from tests.support.waiting import wait_for
 
 PHOTO = b"\xff\xd8\xff a photo"
 
 
-def stored(app: Running) -> list[str]:
-    """Every file in storage."""
-    root = app.service.storage.root
-    assert root is not None
-    return sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.is_file())
-
-
-def test_a_capture_is_made_listed_read_and_deleted(app: Running) -> None:
+def test_a_capture_is_made_listed_read_and_deleted(app: ServedApp) -> None:
     made = app.http.post("/v1/captures", json={"name": "fox"})
     assert made.status_code == 201
     capture_id = made.json()["id"]
@@ -52,7 +45,7 @@ def test_a_capture_is_made_listed_read_and_deleted(app: Running) -> None:
     problem(app.http.get(f"/v1/captures/{capture_id}"), 404, "capture_not_found")
 
 
-def test_pages_of_captures_hold_each_once_newest_first(app: Running) -> None:
+def test_pages_of_captures_hold_each_once_newest_first(app: ServedApp) -> None:
     made = [app.http.post("/v1/captures", json={}).json() for _ in range(5)]
     seen, cursor = [], None
     while True:
@@ -71,7 +64,7 @@ def _ms(moment: str) -> float:
     return datetime.fromisoformat(moment).timestamp() * 1000
 
 
-def test_the_same_bytes_again_are_200_and_other_bytes_409_and_lose_nothing(app: Running) -> None:
+def test_the_same_bytes_again_are_200_and_other_bytes_409_and_lose_nothing(app: ServedApp) -> None:
     capture_id = app.http.post("/v1/captures", json={}).json()["id"]
     address = f"/v1/captures/{capture_id}/images/a.jpg"
     assert app.http.put(address, content=PHOTO).status_code == 201
@@ -86,7 +79,7 @@ def test_the_same_bytes_again_are_200_and_other_bytes_409_and_lose_nothing(app: 
     assert app.http.put(f"/v1/captures/{capture_id}/images/\u00e9.jpg", content=PHOTO).status_code == 200
 
 
-def test_of_many_uploads_at_once_under_one_name_exactly_one_wins(app: Running) -> None:
+def test_of_many_uploads_at_once_under_one_name_exactly_one_wins(app: ServedApp) -> None:
     capture_id = app.http.post("/v1/captures", json={}).json()["id"]
     bodies = [b"%d" % i * 300_000 for i in range(8)]
     gate = threading.Barrier(len(bodies))
@@ -117,7 +110,7 @@ def test_of_many_uploads_at_once_under_one_name_exactly_one_wins(app: Running) -
         "C:x",
     ],
 )
-def test_names_that_lead_elsewhere_are_refused(app: Running, name: str) -> None:
+def test_names_that_lead_elsewhere_are_refused(app: ServedApp, name: str) -> None:
     capture_id = app.http.post("/v1/captures", json={}).json()["id"]
     before = stored(app)
     # By hand, because httpx would resolve the dots before sending.
@@ -127,26 +120,7 @@ def test_names_that_lead_elsewhere_are_refused(app: Running, name: str) -> None:
     assert stored(app) == before
 
 
-def raw(app: Running, line: str, body: bytes, *headers: str, length: int | None = None) -> tuple[int, bytes]:
-    """Send a request as these bytes; status and body of the answer."""
-    with socket.create_connection(app.address, 10) as link:
-        head = [
-            line,
-            "Host: test",
-            "Connection: close",
-            f"Content-Length: {length or len(body)}",
-            *headers,
-            "",
-            "",
-        ]
-        link.sendall("\r\n".join(head).encode() + body)
-        answer = b""
-        while chunk := link.recv(65536):
-            answer += chunk
-    return int(answer.split()[1]), answer.partition(b"\r\n\r\n")[2]
-
-
-def test_a_body_that_breaks_off_leaves_nothing_and_the_next_try_works(app: Running) -> None:
+def test_a_body_that_breaks_off_leaves_nothing_and_the_next_try_works(app: ServedApp) -> None:
     capture_id = app.http.post("/v1/captures", json={}).json()["id"]
     before = stored(app)
     for sent in (0, 10, 3_000_000):
@@ -158,7 +132,7 @@ def test_a_body_that_breaks_off_leaves_nothing_and_the_next_try_works(app: Runni
     assert app.http.put(f"/v1/captures/{capture_id}/images/a.jpg", content=whole).status_code == 201
 
 
-def incoming(app: Running) -> list[Path]:
+def incoming(app: ServedApp) -> list[Path]:
     root = app.service.storage.root
     assert root is not None
     return [path for path in root.rglob("*") if path.is_file() and "incoming" in path.parts]
@@ -187,7 +161,7 @@ def test_what_does_not_fit_its_digest_is_empty_or_too_large_is_refused(serve: Se
     problem(app.http.put(f"/v1/captures/{capture_id}/images/c.jpg", content=PHOTO), 413, "body_too_large")
 
 
-def test_unknown_captures_and_roles_are_named(app: Running) -> None:
+def test_unknown_captures_and_roles_are_named(app: ServedApp) -> None:
     problem(
         app.http.put("/v1/captures/0123456789abcdef/images/a.jpg", content=PHOTO), 404, "capture_not_found"
     )
@@ -197,7 +171,7 @@ def test_unknown_captures_and_roles_are_named(app: Running) -> None:
     problem(app.http.put(f"/v1/captures/{capture_id}/videos/a.mp4", content=PHOTO), 422, "invalid_request")
 
 
-def test_a_capture_that_a_job_uses_cannot_be_deleted(app: Running) -> None:
+def test_a_capture_that_a_job_uses_cannot_be_deleted(app: ServedApp) -> None:
     capture_id = app.capture()
     job_id = app.job(capture_id)
     refused = problem(app.http.delete(f"/v1/captures/{capture_id}"), 409, "capture_in_use")
@@ -231,7 +205,7 @@ def test_what_a_killed_server_left_of_an_upload_is_removed_by_the_next(serve: Se
     wait_for(lambda: set(stored(again)) - set(before) == {f"{layout.capture_incoming(capture_id)}/new#1"})
 
 
-def test_an_upload_into_a_capture_that_is_deleted_meanwhile_leaves_nothing(app: Running) -> None:
+def test_an_upload_into_a_capture_that_is_deleted_meanwhile_leaves_nothing(app: ServedApp) -> None:
     capture_id = app.capture()
 
     def body() -> Iterator[bytes]:

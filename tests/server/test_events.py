@@ -6,48 +6,15 @@ Not proved here: what a browser's EventSource does with them, and the SDK's read
 import json
 import threading
 import time
-from collections.abc import Iterator
 from typing import Any
 
 from splatmill.backplane import events
-from splatmill.schema import EventRecord, JobState, LogEvent, PlanEvent, ProgressEvent, StateEvent
-
-from .conftest import Running, Serve, problem
-
-
-def messages(lines: Iterator[str]) -> Iterator[dict[str, str]]:
-    """The messages of an event stream as dicts of their fields; comments under the key ''."""
-    message: dict[str, str] = {}
-    for line in lines:
-        if not line:
-            if message:
-                yield message
-            message = {}
-        else:
-            name, _, value = line.partition(":")
-            message[name] = value.removeprefix(" ")
+from splatmill.schema import JobState, LogEvent, PlanEvent, ProgressEvent, StateEvent
+from tests.support.served_app import Serve, ServedApp, problem
+from tests.support.server_events import brief, follow, messages
 
 
-def follow(app: Running, job_id: str, after: str | None = None) -> list[dict[str, Any]]:
-    """Every event until the server ends the stream."""
-    headers = {"Last-Event-ID": after} if after else {}
-    with app.http.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers) as answer:
-        if answer.status_code == 204:
-            return []
-        assert answer.status_code == 200
-        assert answer.headers["content-type"].startswith("text/event-stream")
-        found = [m for m in messages(answer.iter_lines()) if "data" in m]
-    for message in found:
-        record = EventRecord.model_validate_json(message["data"])
-        assert (record.id, record.event.type) == (message["id"], message["event"])
-    return [json.loads(m["data"]) for m in found]
-
-
-def brief(found: list[dict[str, Any]]) -> list[Any]:
-    return [e["event"].get("state") or e["event"].get("done") or e["event"]["type"] for e in found]
-
-
-def a_whole_job(app: Running) -> str:
+def a_whole_job(app: ServedApp) -> str:
     job_id = app.job()
     app.begin(job_id)
     app.say(job_id, StateEvent(state=JobState.sfm), ProgressEvent(stage="features", done=1))
@@ -65,7 +32,7 @@ def a_whole_job(app: Running) -> str:
 WHOLE = ["queued", "preparing", "sfm", 1, "training", "plan", "log", 2, 3, 4, 5, "succeeded"]
 
 
-def test_a_stream_tells_everything_once_in_order_and_ends(app: Running) -> None:
+def test_a_stream_tells_everything_once_in_order_and_ends(app: ServedApp) -> None:
     found = follow(app, a_whole_job(app))
     # Both streams are put in order by Redis's clock; within one of its milliseconds progress goes first.
     assert sorted(map(str, brief(found))) == sorted(map(str, WHOLE))
@@ -77,7 +44,7 @@ def test_a_stream_tells_everything_once_in_order_and_ends(app: Running) -> None:
     assert [e["attempt"] for e in found] == [0] + [1] * 11
 
 
-def test_a_reconnect_after_any_event_goes_on_exactly_there(app: Running) -> None:
+def test_a_reconnect_after_any_event_goes_on_exactly_there(app: ServedApp) -> None:
     job_id = a_whole_job(app)
     found = follow(app, job_id)
     for index, event in enumerate(found):
@@ -103,7 +70,7 @@ def test_events_arrive_while_they_happen_with_heartbeats_between(serve: Serve) -
         assert brief(rest) == ["succeeded"]
 
 
-def test_a_cancelled_job_ends_its_stream_with_the_servers_word(app: Running) -> None:
+def test_a_cancelled_job_ends_its_stream_with_the_servers_word(app: ServedApp) -> None:
     job_id = app.job()
     found: list[dict[str, Any]] = []
     reader = threading.Thread(target=lambda: found.extend(follow(app, job_id)))
@@ -116,7 +83,7 @@ def test_a_cancelled_job_ends_its_stream_with_the_servers_word(app: Running) -> 
     assert follow(app, job_id, found[1]["id"]) == []
 
 
-def test_what_a_superseded_attempt_still_says_is_not_told(app: Running) -> None:
+def test_what_a_superseded_attempt_still_says_is_not_told(app: ServedApp) -> None:
     job_id = app.job()
     app.begin(job_id)
     app.begin(job_id)
@@ -127,7 +94,7 @@ def test_what_a_superseded_attempt_still_says_is_not_told(app: Running) -> None:
     assert brief(found) == ["queued", "preparing", "preparing", 7, "succeeded"]
 
 
-def test_a_restarted_job_goes_on_after_the_last_id(app: Running) -> None:
+def test_a_restarted_job_goes_on_after_the_last_id(app: ServedApp) -> None:
     job_id = app.job()
     app.begin(job_id)
     app.say(job_id, StateEvent(state=JobState.succeeded))
@@ -141,7 +108,7 @@ def test_a_restarted_job_goes_on_after_the_last_id(app: Running) -> None:
     assert brief(follow(app, job_id)) == ["queued", "preparing", "succeeded"]
 
 
-def test_ids_and_jobs_that_are_not_ours_are_refused(app: Running) -> None:
+def test_ids_and_jobs_that_are_not_ours_are_refused(app: ServedApp) -> None:
     job_id = app.job()
     for bad in ("7", "1-1_2-2", "x_y_z", "1-1_1-1_" + "9" * 40):
         answer = app.http.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": bad})
@@ -161,7 +128,7 @@ def test_an_open_stream_does_not_hold_up_the_end_of_the_server(serve: Serve) -> 
         assert time.monotonic() - begun < 5
 
 
-def test_the_progress_stream_is_trimmed_and_the_states_are_not(app: Running) -> None:
+def test_the_progress_stream_is_trimmed_and_the_states_are_not(app: ServedApp) -> None:
     job_id = app.job()
     app.begin(job_id)
     for n in range(events.PROGRESS_LENGTH + 500):
@@ -174,7 +141,7 @@ def test_the_progress_stream_is_trimmed_and_the_states_are_not(app: Running) -> 
     assert latest.id == left[-1].id
 
 
-def test_logs_are_lines_of_all_attempts(app: Running) -> None:
+def test_logs_are_lines_of_all_attempts(app: ServedApp) -> None:
     job_id = app.job()
     for attempt in ("first", "second"):
         app.begin(job_id)

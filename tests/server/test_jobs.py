@@ -12,14 +12,12 @@ import pytest
 
 from splatmill.backplane import layout, queue, row
 from splatmill.schema import JobState, Problem, ProgressEvent, StateEvent
-
-from .conftest import Running, problem
-from .test_captures import raw, stored
+from tests.support.served_app import ServedApp, problem, raw, stored
 
 PHOTO = b"\xff\xd8\xff a photo"
 
 
-def test_a_job_is_accepted_queued_and_seen(app: Running) -> None:
+def test_a_job_is_accepted_queued_and_seen(app: ServedApp) -> None:
     capture_id = app.capture()
     made = app.http.post("/v1/jobs", json={"capture": capture_id, "name": "fox", "options": {"steps": 100}})
     assert made.status_code == 202
@@ -36,7 +34,7 @@ def test_a_job_is_accepted_queued_and_seen(app: Running) -> None:
     assert (place.state, place.position) == ("waiting", 0)
 
 
-def test_what_a_worker_says_is_what_a_client_sees(app: Running) -> None:
+def test_what_a_worker_says_is_what_a_client_sees(app: ServedApp) -> None:
     job_id = app.job()
     app.begin(job_id)
     app.say(
@@ -55,7 +53,7 @@ def test_what_a_worker_says_is_what_a_client_sees(app: Running) -> None:
     )
 
 
-def test_one_idempotency_key_makes_one_job(app: Running) -> None:
+def test_one_idempotency_key_makes_one_job(app: ServedApp) -> None:
     body: dict[str, Any] = {"capture": app.capture(), "options": {"steps": 5}}
     key = {"Idempotency-Key": "once"}
     first = app.http.post("/v1/jobs", json=body, headers=key)
@@ -72,7 +70,7 @@ def test_one_idempotency_key_makes_one_job(app: Running) -> None:
     assert len(app.http.get("/v1/jobs").json()["jobs"]) == 1
 
 
-def test_many_requests_at_once_with_one_key_make_one_job(app: Running) -> None:
+def test_many_requests_at_once_with_one_key_make_one_job(app: ServedApp) -> None:
     files = [("images", (f"{i}.jpg", PHOTO + b"%d" % i)) for i in range(3)]
     gate = threading.Barrier(6)
 
@@ -103,7 +101,9 @@ def test_many_requests_at_once_with_one_key_make_one_job(app: Running) -> None:
         ([], "invalid_request", "options"),
     ],
 )
-def test_options_that_do_not_exist_or_fit_are_named(app: Running, options: Any, code: str, says: str) -> None:
+def test_options_that_do_not_exist_or_fit_are_named(
+    app: ServedApp, options: Any, code: str, says: str
+) -> None:
     capture_id = app.capture()
     refused = problem(app.http.post("/v1/jobs", json={"capture": capture_id, "options": options}), 422, code)
     assert says in refused["detail"] + (refused.get("advice") or "") + json.dumps(refused["facts"])
@@ -111,7 +111,7 @@ def test_options_that_do_not_exist_or_fit_are_named(app: Running, options: Any, 
     assert app.job(capture_id)
 
 
-def test_captures_that_cannot_become_a_scene_are_refused(app: Running) -> None:
+def test_captures_that_cannot_become_a_scene_are_refused(app: ServedApp) -> None:
     empty = app.http.post("/v1/captures", json={}).json()["id"]
     problem(app.http.post("/v1/jobs", json={"capture": empty}), 422, "no_images")
     single = app.capture("only.jpg")
@@ -124,7 +124,7 @@ def test_captures_that_cannot_become_a_scene_are_refused(app: Running) -> None:
     problem(app.http.post("/v1/jobs", json={"capture": "../../etc"}), 404, "capture_not_found")
 
 
-def test_bodies_that_are_no_json_object_are_refused(app: Running) -> None:
+def test_bodies_that_are_no_json_object_are_refused(app: ServedApp) -> None:
     def post(content: bytes, media_type: str) -> Any:
         return app.http.post("/v1/jobs", content=content, headers={"Content-Type": media_type})
 
@@ -137,7 +137,7 @@ def test_bodies_that_are_no_json_object_are_refused(app: Running) -> None:
     problem(app.http.post("/v1/jobs", content=iter([b" " * 600_000] * 2)), 415, "unsupported_media_type")
 
 
-def test_pages_of_jobs_hold_each_once_newest_first(app: Running) -> None:
+def test_pages_of_jobs_hold_each_once_newest_first(app: ServedApp) -> None:
     capture_id = app.capture()
     made = [app.job(capture_id) for _ in range(7)]
     for job_id in made[::2]:
@@ -148,13 +148,13 @@ def test_pages_of_jobs_hold_each_once_newest_first(app: Running) -> None:
     problem(app.http.get("/v1/jobs?limit=0"), 422, "invalid_request")
 
 
-def created(app: Running, job_id: str) -> tuple[int, str]:
+def created(app: ServedApp, job_id: str) -> tuple[int, str]:
     found = row.read(app.redis, job_id)
     assert found is not None
     return int(found.created_at.timestamp() * 1000), job_id
 
 
-def pages(app: Running, **params: Any) -> list[str]:
+def pages(app: ServedApp, **params: Any) -> list[str]:
     seen: list[str] = []
     while True:
         page = app.http.get("/v1/jobs", params=params).json()
@@ -164,7 +164,7 @@ def pages(app: Running, **params: Any) -> list[str]:
         params["cursor"] = page["cursor"]
 
 
-def test_a_running_job_can_be_neither_deleted_nor_restarted(app: Running) -> None:
+def test_a_running_job_can_be_neither_deleted_nor_restarted(app: ServedApp) -> None:
     job_id = app.job()
     app.begin(job_id)
     problem(app.http.delete(f"/v1/jobs/{job_id}"), 409, "job_running")
@@ -174,7 +174,7 @@ def test_a_running_job_can_be_neither_deleted_nor_restarted(app: Running) -> Non
     assert app.state(job_id) == "succeeded"
 
 
-def test_a_failed_job_says_why_and_restarts_as_a_new_generation(app: Running) -> None:
+def test_a_failed_job_says_why_and_restarts_as_a_new_generation(app: ServedApp) -> None:
     job_id = app.job()
     app.begin(job_id)
     why = Problem.of(
@@ -195,7 +195,7 @@ def test_a_failed_job_says_why_and_restarts_as_a_new_generation(app: Running) ->
     assert queue.status(app.redis, job_id, 2).state == "waiting"
 
 
-def test_deleting_a_job_removes_its_model_and_every_key(app: Running) -> None:
+def test_deleting_a_job_removes_its_model_and_every_key(app: ServedApp) -> None:
     capture_id = app.capture()
     before = stored(app)
     job_id = app.job(capture_id)
@@ -209,7 +209,7 @@ def test_deleting_a_job_removes_its_model_and_every_key(app: Running) -> None:
     problem(app.http.delete(f"/v1/jobs/{job_id}"), 404, "job_not_found")
 
 
-def test_one_request_with_a_form_does_it_all(app: Running) -> None:
+def test_one_request_with_a_form_does_it_all(app: ServedApp) -> None:
     files = [("images", (f"{i:04}.jpg", PHOTO + b"%d" % i)) for i in range(300)]
     files += [("masks", ("0000.png", PHOTO)), ("poses", ("transforms.json", b"{}"))]
     form = {"options": '{"steps": 7}', "name": "fox"}
@@ -227,7 +227,7 @@ def test_one_request_with_a_form_does_it_all(app: Running) -> None:
     assert len(app.http.get("/v1/captures").json()["captures"]) == 1
 
 
-def test_a_form_that_is_refused_leaves_nothing(app: Running) -> None:
+def test_a_form_that_is_refused_leaves_nothing(app: ServedApp) -> None:
     def post(files: Any, **data: str) -> Any:
         return app.http.post("/v1/jobs", files=files, data=data)
 
@@ -249,7 +249,7 @@ def test_a_form_that_is_refused_leaves_nothing(app: Running) -> None:
     assert app.http.get("/v1/jobs").json()["jobs"] == []
 
 
-def test_a_job_starts_only_from_a_model_that_is_there(app: Running) -> None:
+def test_a_job_starts_only_from_a_model_that_is_there(app: ServedApp) -> None:
     capture_id = app.capture()
     body: dict[str, Any] = {"capture": capture_id, "options": {"start": "before.ply"}}
     refused = problem(app.http.post("/v1/jobs", json=body), 404, "file_not_found")
@@ -270,7 +270,7 @@ def test_a_job_starts_only_from_a_model_that_is_there(app: Running) -> None:
         assert app.http.post("/v1/jobs", json=body).status_code == 422
 
 
-def test_a_model_among_the_poses_gives_a_single_photo_no_camera(app: Running) -> None:
+def test_a_model_among_the_poses_gives_a_single_photo_no_camera(app: ServedApp) -> None:
     capture_id = app.capture("only.jpg")
     app.http.put(f"/v1/captures/{capture_id}/poses/m.ply", content=b"ply").raise_for_status()
     answer = app.http.post("/v1/jobs", json={"capture": capture_id, "options": {"start": "m.ply"}})

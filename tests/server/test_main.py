@@ -20,7 +20,8 @@ from typing import Any
 import httpx
 import pytest
 
-from .conftest import problem, wait_for
+from tests.support.served_app import problem
+from tests.support.waiting import wait_for
 
 
 def command(**env: str) -> dict[str, Any]:

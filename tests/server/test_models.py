@@ -8,19 +8,18 @@ import hashlib
 import pytest
 
 from splatmill.backplane import layout
-
-from .conftest import Running, problem, store_model
+from tests.support.served_app import ServedApp, problem, store_model
 
 
 @pytest.fixture
-def model_id(app: Running) -> str:
+def model_id(app: ServedApp) -> str:
     job_id = app.job()
     app.begin(job_id)
     app.finish(job_id)
     return job_id
 
 
-def test_a_model_says_what_it_is(app: Running, model_id: str) -> None:
+def test_a_model_says_what_it_is(app: ServedApp, model_id: str) -> None:
     model = app.http.get(f"/v1/models/{model_id}").json()
     ply = app.http.get(f"/v1/models/{model_id}/files/model.ply")
     assert (model["id"], model["gaussians"], model["sh_degree"], model["psnr"]) == (model_id, 2, 1, 27.5)
@@ -33,7 +32,7 @@ def test_a_model_says_what_it_is(app: Running, model_id: str) -> None:
     assert app.http.get(f"/v1/jobs/{model_id}/preview").content == b"\xff\xd8\xff preview"
 
 
-def test_a_file_can_be_read_in_parts_and_is_not_sent_twice(app: Running, model_id: str) -> None:
+def test_a_file_can_be_read_in_parts_and_is_not_sent_twice(app: ServedApp, model_id: str) -> None:
     address = f"/v1/models/{model_id}/files/model.ply"
     whole = app.http.get(address)
     size, etag = len(whole.content), whole.headers["etag"]
@@ -62,7 +61,7 @@ def test_a_file_can_be_read_in_parts_and_is_not_sent_twice(app: Running, model_i
     assert (head.status_code, head.headers["content-length"], head.content) == (200, str(size), b"")
 
 
-def test_a_large_file_arrives_whole(app: Running, model_id: str) -> None:
+def test_a_large_file_arrives_whole(app: ServedApp, model_id: str) -> None:
     body = hashlib.sha256(b"seed").digest() * 400_000  # 12.8 MB, many pieces
     app.service.storage.put(layout.model_file(model_id, "report.png"), body)
     assert app.http.get(f"/v1/models/{model_id}/files/report.png").content == body
@@ -70,14 +69,14 @@ def test_a_large_file_arrives_whole(app: Running, model_id: str) -> None:
     assert part.content == body[5_000_000:10_000_000]
 
 
-def test_pages_with_scripts_get_no_rights_on_our_origin(app: Running, model_id: str) -> None:
+def test_pages_with_scripts_get_no_rights_on_our_origin(app: ServedApp, model_id: str) -> None:
     report = app.http.get(f"/v1/models/{model_id}/files/report.html")
     assert report.headers["content-type"].startswith("text/html")
     assert "sandbox" in report.headers["content-security-policy"]
     assert report.headers["x-content-type-options"] == "nosniff"
 
 
-def test_unfinished_unknown_and_lost_models_are_told_apart(app: Running) -> None:
+def test_unfinished_unknown_and_lost_models_are_told_apart(app: ServedApp) -> None:
     job_id = app.job()
     for tail in ("", "/files/model.ply", "/cameras"):
         problem(app.http.get(f"/v1/models/{job_id}{tail}"), 409, "model_not_ready")
@@ -89,21 +88,21 @@ def test_unfinished_unknown_and_lost_models_are_told_apart(app: Running) -> None
     problem(app.http.get("/v1/models/0123456789abcdef/files/model.ply"), 404, "model_not_found")
 
 
-def test_only_a_models_own_files_are_served(app: Running, model_id: str) -> None:
+def test_only_a_models_own_files_are_served(app: ServedApp, model_id: str) -> None:
     app.service.storage.put(f"models/{model_id}/secret.txt", b"x")
     for name in ("secret.txt", "nothing.ply", "report.png"):
         problem(app.http.get(f"/v1/models/{model_id}/files/{name}"), 404, "file_not_found")
     problem(app.http.get(f"/v1/models/{model_id}/files/..%2fjob.json"), 404, "not_found")
 
 
-def test_one_unreadable_model_does_not_hide_the_others(app: Running, model_id: str) -> None:
+def test_one_unreadable_model_does_not_hide_the_others(app: ServedApp, model_id: str) -> None:
     store_model(app.service, "b" * 16)
     app.service.storage.put(layout.model_file("b" * 16, "model.ply"), b"not a ply")
     problem(app.http.get("/v1/models/" + "b" * 16), 500, "model_corrupt")
     assert [m["id"] for m in app.http.get("/v1/models").json()["models"]] == [model_id]
 
 
-def test_pages_of_models_hold_each_once(app: Running) -> None:
+def test_pages_of_models_hold_each_once(app: ServedApp) -> None:
     ids = [f"{i:016x}" for i in range(5)]
     for model_id in ids:
         store_model(app.service, model_id)

@@ -15,12 +15,12 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from .conftest import Running
+from tests.support.served_app import ServedApp
 
 CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
 
 
-def test_made_up_requests_get_described_answers(app: Running) -> None:
+def test_made_up_requests_get_described_answers(app: ServedApp) -> None:
     schema = schemathesis.openapi.from_url(f"{str(app.http.base_url).rstrip('/')}/openapi.json")
     tried = 0
     for found in schema.get_all_operations():

@@ -18,8 +18,8 @@ from rq.job import Job, JobStatus
 
 from splatmill.backplane import keys, queue, row
 from splatmill.schema import JobState, ProgressEvent, StateEvent
-
-from .conftest import Running, Serve, wait_for
+from tests.support.served_app import Serve, ServedApp
+from tests.support.waiting import wait_for
 
 WORKER = textwrap.dedent(
     """
@@ -47,7 +47,7 @@ WORKER = textwrap.dedent(
 
 
 @contextmanager
-def worker(app: Running, pid_file: Path, what: str = "sleep") -> Iterator[subprocess.Popen[bytes]]:
+def worker(app: ServedApp, pid_file: Path, what: str = "sleep") -> Iterator[subprocess.Popen[bytes]]:
     command = [sys.executable, "-c", WORKER, app.settings.redis_url, str(pid_file), what]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
@@ -69,7 +69,7 @@ def alive(pid: int) -> bool:
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
 
 
-def test_a_waiting_job_is_cancelled_at_once(app: Running) -> None:
+def test_a_waiting_job_is_cancelled_at_once(app: ServedApp) -> None:
     job_id = app.job()
     answer = app.http.post(f"/v1/jobs/{job_id}/cancel")
     assert (answer.status_code, answer.json()["state"]) == (202, "cancelled")
@@ -97,7 +97,7 @@ def test_cancelled_is_said_only_once_the_process_is_dead(serve: Serve, tmp_path:
     assert app.http.post(f"/v1/jobs/{done}/cancel").status_code == 409
 
 
-def test_a_final_state_that_comes_after_the_verdict_is_too_late(app: Running) -> None:
+def test_a_final_state_that_comes_after_the_verdict_is_too_late(app: ServedApp) -> None:
     job_id = app.job()
     app.begin(job_id)
     app.http.post(f"/v1/jobs/{job_id}/cancel")
@@ -108,7 +108,7 @@ def test_a_final_state_that_comes_after_the_verdict_is_too_late(app: Running) ->
     assert app.state(job_id) == "queued"
 
 
-def test_a_dead_workers_attempt_is_queued_again(app: Running, tmp_path: Path) -> None:
+def test_a_dead_workers_attempt_is_queued_again(app: ServedApp, tmp_path: Path) -> None:
     job_id = app.job()
     pid_file = tmp_path / "pid"
     with worker(app, pid_file) as process:
@@ -122,7 +122,7 @@ def test_a_dead_workers_attempt_is_queued_again(app: Running, tmp_path: Path) ->
     assert app.state(job_id) == "queued"
 
 
-def test_a_job_whose_tries_are_used_up_fails_by_name(app: Running, tmp_path: Path) -> None:
+def test_a_job_whose_tries_are_used_up_fails_by_name(app: ServedApp, tmp_path: Path) -> None:
     job_id = app.job()
     app.begin(job_id)
     app.say(job_id, StateEvent(state=JobState.training), ProgressEvent(stage="training", done=3))
@@ -139,7 +139,7 @@ def test_a_job_whose_tries_are_used_up_fails_by_name(app: Running, tmp_path: Pat
 
 
 def test_an_attempt_that_ends_without_a_word_is_noticed_on_the_second_look(
-    app: Running, tmp_path: Path
+    app: ServedApp, tmp_path: Path
 ) -> None:
     job_id = app.job()
     with worker(app, tmp_path / "pid", "return") as process:
@@ -150,7 +150,7 @@ def test_an_attempt_that_ends_without_a_word_is_noticed_on_the_second_look(
     assert app.http.get(f"/v1/jobs/{job_id}").json()["problem"]["code"] == "worker_lost"
 
 
-def test_a_job_the_queue_forgot_is_queued_again_once(app: Running) -> None:
+def test_a_job_the_queue_forgot_is_queued_again_once(app: ServedApp) -> None:
     job_id = app.job()
     queue.forget(app.redis, job_id, 1)
     assert queue.status(app.redis, job_id, 1).state == "absent"
@@ -174,7 +174,7 @@ def test_a_wish_that_outlived_the_server_is_fulfilled_by_the_next_one(serve: Ser
     wait_for(lambda: app.state(job_id) == "cancelled")
 
 
-def test_two_reapers_at_once_requeue_an_attempt_once(app: Running) -> None:
+def test_two_reapers_at_once_requeue_an_attempt_once(app: ServedApp) -> None:
     job_id = app.job()
     entry = Job.fetch(queue.rq_id(job_id, 1), connection=app.redis, serializer=queue.SERIALIZER)
     registry = queue.open_queue(app.redis).started_job_registry
@@ -193,7 +193,7 @@ def test_two_reapers_at_once_requeue_an_attempt_once(app: Running) -> None:
     assert queue.waiting(app.redis) == {"train": 1}
 
 
-def test_the_reaper_looks_at_unfinished_jobs_alone_and_at_all_of_them(app: Running) -> None:
+def test_the_reaper_looks_at_unfinished_jobs_alone_and_at_all_of_them(app: ServedApp) -> None:
     capture_id = app.capture()
     waiting, ended = app.job(capture_id), app.job(capture_id)
     app.begin(ended)
@@ -210,7 +210,7 @@ def test_the_reaper_looks_at_unfinished_jobs_alone_and_at_all_of_them(app: Runni
 
 
 @pytest.mark.parametrize("change", ["restart", "final"])
-def test_a_verdict_on_what_changed_meanwhile_is_not_given(app: Running, change: str) -> None:
+def test_a_verdict_on_what_changed_meanwhile_is_not_given(app: ServedApp, change: str) -> None:
     job_id = app.job()
     app.begin(job_id)
     old = row.read(app.redis, job_id)

@@ -7,25 +7,24 @@ from pathlib import Path
 
 from splatmill.backplane import layout
 from splatmill.backplane.connection import connect
-
-from .conftest import Running, Serve, problem, redis_process, running, store_model
-from .test_events import brief, follow
+from tests.support.redis_server import empty_redis
+from tests.support.served_app import Serve, ServedApp, problem, served_app, store_model
+from tests.support.server_events import brief, follow
 
 MODEL = "a" * 16
 
 
 def test_stored_things_outlast_redis(serve: Serve, tmp_path: Path) -> None:
     folder = tmp_path / "r"
-    folder.mkdir()
-    with redis_process(folder) as url:
+    with empty_redis(folder) as url:
         settings = serve(redis_url=url).settings
         client = connect(url)
-        with running(settings, client) as app:
+        with served_app(settings, client) as app:
             store_model(app.service, MODEL, "fox")
             capture_id = app.capture()
             app.job(capture_id)
             app.redis = client
-    with running(settings, client) as app:
+    with served_app(settings, client) as app:
         answer = app.http.post("/v1/jobs", json={"capture": capture_id})
         assert problem(answer, 503, "queue_unavailable")["advice"]
         assert answer.headers["retry-after"]
@@ -41,12 +40,12 @@ def test_stored_things_outlast_redis(serve: Serve, tmp_path: Path) -> None:
         assert app.http.get(f"/v1/captures/{capture_id}").json()["id"] == capture_id
         put = app.http.put(f"/v1/captures/{capture_id}/images/c.jpg", content=b"c")
         assert put.status_code == 201
-        with redis_process(folder):
+        with empty_redis(folder):
             check_after_return(app, capture_id)
     client.close()
 
 
-def check_after_return(app: Running, capture_id: str) -> None:
+def check_after_return(app: ServedApp, capture_id: str) -> None:
     """The same address, an empty Redis: the server needs no restart."""
     assert app.http.get("/readyz").status_code == 200
     assert app.http.get("/v1/jobs").json()["jobs"] == []

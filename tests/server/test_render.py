@@ -16,8 +16,8 @@ from fastapi import FastAPI, Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from splatmill.schema import RenderRequest
-
-from .conftest import Running, Serve, problem, store_model, wait_for
+from tests.support.served_app import Serve, ServedApp, problem, store_model
+from tests.support.waiting import wait_for
 
 MODEL = "a" * 16
 EYE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -4], [0, 0, 0, 1]]
@@ -65,13 +65,13 @@ def renderer(tmp_path: Path) -> Iterator[str]:
 
 
 @pytest.fixture
-def app(serve: Serve, renderer: str) -> Running:
+def app(serve: Serve, renderer: str) -> ServedApp:
     running = serve(renderer_url=renderer)
     store_model(running.service, MODEL)
     return running
 
 
-def test_a_picture_is_passed_on_with_what_belongs_to_it(app: Running) -> None:
+def test_a_picture_is_passed_on_with_what_belongs_to_it(app: ServedApp) -> None:
     answer = app.http.post(f"/v1/models/{MODEL}/render", json={"camera": CAMERA, "output": "depth"})
     assert answer.status_code == 200
     assert answer.headers["content-type"] == "image/png"
@@ -88,7 +88,7 @@ def test_a_picture_is_passed_on_with_what_belongs_to_it(app: Running) -> None:
     assert (again.status_code, again.content) == (304, b"")
 
 
-def test_the_cacheable_address_asks_for_the_same_picture(app: Running) -> None:
+def test_the_cacheable_address_asks_for_the_same_picture(app: ServedApp) -> None:
     wish = RenderRequest.model_validate({"camera": CAMERA, "format": "webp", "background": "white"})
     posted = app.http.post(
         f"/v1/models/{MODEL}/render",
@@ -106,7 +106,7 @@ def test_the_cacheable_address_asks_for_the_same_picture(app: Running) -> None:
     problem(app.http.get(f"/v1/models/{MODEL}/render", params=bad), 422, "camera_invalid")
 
 
-def test_a_video_with_and_without_wishes(app: Running) -> None:
+def test_a_video_with_and_without_wishes(app: ServedApp) -> None:
     video = app.http.post(f"/v1/models/{MODEL}/orbit", json={"seconds": 2})
     assert json.loads(video.content.splitlines()[0])["asked"]["seconds"] == 2
     assert app.http.post(f"/v1/models/{MODEL}/orbit").status_code == 200
@@ -135,7 +135,7 @@ SHEARED = [[1, 0.5, 0, 0], [0, 0.87, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     ],
 )
 def test_cameras_that_cannot_be_rendered_from_are_refused(
-    app: Running, change: dict[str, Any], code: str
+    app: ServedApp, change: dict[str, Any], code: str
 ) -> None:
     refused = problem(
         app.http.post(f"/v1/models/{MODEL}/render", json={"camera": CAMERA | change}), 422, code
@@ -144,7 +144,7 @@ def test_cameras_that_cannot_be_rendered_from_are_refused(
     assert app.http.post(f"/v1/models/{MODEL}/render", json={"camera": CAMERA}).status_code == 200
 
 
-def test_numbers_that_are_not_finite_are_refused(app: Running) -> None:
+def test_numbers_that_are_not_finite_are_refused(app: ServedApp) -> None:
     for word in ("NaN", "Infinity", "1e999"):
         body = json.dumps({"camera": CAMERA}).replace("-4", word)
         answer = app.http.post(
@@ -153,7 +153,7 @@ def test_numbers_that_are_not_finite_are_refused(app: Running) -> None:
         problem(answer, 422, "camera_invalid")
 
 
-def test_the_renderers_own_problems_pass_through(app: Running) -> None:
+def test_the_renderers_own_problems_pass_through(app: ServedApp) -> None:
     wish = {"camera": CAMERA, "format": "jpeg"}
     answer = app.http.post(f"/v1/models/{MODEL}/render", json=wish)
     assert (answer.status_code, answer.json()) == (500, {"code": "render_failed"})
@@ -175,7 +175,7 @@ def test_a_renderer_that_hangs_is_given_up(serve: Serve, tmp_path: Path) -> None
         problem(app.http.post(f"/v1/models/{MODEL}/orbit"), 504, "render_timeout")
 
 
-def test_models_that_are_not_there_are_said_so_before_rendering(app: Running) -> None:
+def test_models_that_are_not_there_are_said_so_before_rendering(app: ServedApp) -> None:
     problem(
         app.http.post("/v1/models/0123456789abcdef/render", json={"camera": CAMERA}), 404, "model_not_found"
     )

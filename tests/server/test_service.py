@@ -15,17 +15,17 @@ from splatmill.schema import MAX_PHOTO_PIXELS, MAX_RENDER_PIXELS, TrainOptions
 from splatmill_server import app as app_module
 from splatmill_server.app import create_app
 from splatmill_server.settings import Settings
+from tests.support.served_app import Serve, ServedApp, problem
+from tests.support.waiting import wait_for
 
-from .conftest import Running, Serve, problem, wait_for
 
-
-def test_options_are_those_of_the_schema(app: Running) -> None:
+def test_options_are_those_of_the_schema(app: ServedApp) -> None:
     options = app.http.get("/v1/options").json()["options"]
     assert [option["name"] for option in options] == list(TrainOptions.model_fields)
     assert all(option["help"] for option in options)
 
 
-def test_health_readiness_and_info(app: Running) -> None:
+def test_health_readiness_and_info(app: ServedApp) -> None:
     assert app.http.get("/healthz").json() == {"status": "ok"}
     ready = app.http.get("/readyz")
     assert (ready.status_code, ready.json()["checks"]) == (
@@ -40,7 +40,7 @@ def test_health_readiness_and_info(app: Running) -> None:
     assert info["limits"]["max_render_pixels"] == MAX_RENDER_PIXELS
 
 
-def test_metrics_count_by_route_and_not_by_id(app: Running) -> None:
+def test_metrics_count_by_route_and_not_by_id(app: ServedApp) -> None:
     job_id = app.job()
     for _ in range(3):
         app.http.get(f"/v1/jobs/{job_id}")
@@ -58,7 +58,7 @@ def test_metrics_count_by_route_and_not_by_id(app: Running) -> None:
     assert families["splatmill_redis_up"].samples[0].value == 1
 
 
-def test_addresses_and_methods_that_do_not_exist(app: Running) -> None:
+def test_addresses_and_methods_that_do_not_exist(app: ServedApp) -> None:
     problem(app.http.get("/no/such/page"), 404, "not_found")
     refused = app.http.patch("/v1/jobs")
     problem(refused, 405, "method_not_allowed")
@@ -66,7 +66,7 @@ def test_addresses_and_methods_that_do_not_exist(app: Running) -> None:
     assert problem(app.http.get("/v1/jobs/x"), 404, "job_not_found")["instance"] == "/v1/jobs/x"
 
 
-def test_every_answer_carries_its_request_id(app: Running) -> None:
+def test_every_answer_carries_its_request_id(app: ServedApp) -> None:
     assert app.http.get("/healthz", headers={"X-Request-ID": "abc-1"}).headers["x-request-id"] == "abc-1"
     for given in ("x" * 65, "a\tb", ""):
         made = app.http.get("/healthz", headers={"X-Request-ID": given}).headers["x-request-id"]
@@ -91,7 +91,7 @@ def test_a_key_is_asked_for_in_the_header_and_nowhere_else(serve: Serve) -> None
     problem(answer, 401, "unauthorized")
 
 
-def test_the_document_describes_every_answer_with_examples(app: Running) -> None:
+def test_the_document_describes_every_answer_with_examples(app: ServedApp) -> None:
     document = app.http.get("/openapi.json").json()
     for path, methods in document["paths"].items():
         for method, operation in methods.items():
@@ -129,7 +129,7 @@ def test_importing_the_server_runs_nothing() -> None:
                 pytest.fail(f"{path}:{node.lineno} calls something when imported")
 
 
-def test_a_mistake_of_ours_is_a_problem_with_a_request_id_and_the_next_request_works(app: Running) -> None:
+def test_a_mistake_of_ours_is_a_problem_with_a_request_id_and_the_next_request_works(app: ServedApp) -> None:
     app.service.storage.put("captures/" + "a" * 16 + "/capture.json", b'{"id": 7}')
     answer = app.http.get("/v1/captures/" + "a" * 16)
     assert problem(answer, 500, "internal_error")["advice"]
@@ -138,7 +138,7 @@ def test_a_mistake_of_ours_is_a_problem_with_a_request_id_and_the_next_request_w
     assert app.http.get("/v1/jobs").status_code == 200
 
 
-def test_the_number_of_open_streams_is_known(app: Running) -> None:
+def test_the_number_of_open_streams_is_known(app: ServedApp) -> None:
     job_id = app.job()
 
     def streams() -> str:

@@ -1,7 +1,9 @@
 """A real Redis of a test's own. A conftest.py that imports `redis_server` or `connection` offers them as fixtures."""
 
+import shutil
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -37,6 +39,23 @@ class RedisServer:
             return bool(self.connection.ping())
         except redis.ConnectionError:
             return False
+
+
+@contextmanager
+def empty_redis(folder: Path) -> Iterator[str]:
+    """Run a Redis in `folder`, whose contents are deleted before, and yield its URL.
+
+    The path must be short: that of a unix socket has 107 bytes at most.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    server = RedisServer(folder)
+    server.start()
+    try:
+        yield server.url
+    finally:
+        server.connection.close()
+        server.kill()
 
 
 @pytest.fixture

@@ -61,7 +61,7 @@ def progress_text(progress: Progress) -> str:
 
 
 class Display(Protocol):
-    """What shows the progress and the messages of a job."""
+    """A display of the progress and the messages of a job."""
 
     def __enter__(self) -> Self: ...
 

@@ -1,0 +1,86 @@
+"""A server that answers as a test scripts it: it can drop connections, send half a file, or be busy."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from splatmill.loop import BackgroundLoop
+
+
+@dataclass
+class Seen:
+    """A request that reached the server."""
+
+    method: str
+    path: str
+    headers: dict[str, str]
+    body: bytes
+
+
+@dataclass
+class Reply:
+    """A response. `cut`: number of bytes that are announced but not sent, because the connection is closed."""
+
+    status: int = 200
+    body: bytes = b"{}"
+    headers: dict[str, str] = field(default_factory=dict)
+    cut: int = 0
+    dropped: bool = False  # close the connection without a response
+
+    def encode(self) -> bytes:
+        if self.dropped:
+            return b""
+        headers = {"Content-Length": str(len(self.body)), "Connection": "close"} | self.headers
+        head = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
+        sent = self.body[: len(self.body) - self.cut]
+        return f"HTTP/1.1 {self.status} Scripted\r\n{head}\r\n".encode() + sent
+
+
+@dataclass
+class ScriptedServer:
+    """The server: `answer` makes the response to a request, `seen` are the requests so far."""
+
+    url: str = ""
+    seen: list[Seen] = field(default_factory=list)
+    answer: Callable[[Seen], Reply | Awaitable[Reply]] = lambda _: Reply()
+
+    def script(self, *replies: Reply) -> None:
+        """Answer with these responses, one after another."""
+        rest = iter(replies)
+        self.answer = lambda _: next(rest)
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        head = (await reader.readuntil(b"\r\n\r\n")).decode()
+        first, *lines = head.strip().split("\r\n")
+        method, path, _ = first.split(" ")
+        headers = {name.lower(): value.strip() for name, value in (line.split(":", 1) for line in lines)}
+        body = await reader.readexactly(int(headers.get("content-length", 0)))
+        request = Seen(method, path, headers, body)
+        self.seen.append(request)
+        reply = self.answer(request)
+        try:
+            writer.write((await reply if isinstance(reply, Awaitable) else reply).encode())
+            await writer.drain()
+        finally:
+            writer.close()
+
+
+@contextmanager
+def scripted_server() -> Iterator[ScriptedServer]:
+    """Run a server on a free port; its `url` is set."""
+    loop = BackgroundLoop()
+    peer = ScriptedServer()
+
+    async def start() -> asyncio.Server:
+        return await asyncio.start_server(peer.serve, "127.0.0.1", 0)
+
+    async def stop(server: asyncio.Server) -> None:
+        # Connections that wait for a response are dropped with the loop.
+        server.close()
+
+    server = loop.run(start())
+    peer.url = f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    yield peer
+    loop.run(stop(server))
+    loop.close()
