@@ -33,7 +33,7 @@ _ACCEPTED = {
 def create_capture(
     service: Shared,
     response: Response,
-    request: Annotated[CreateCapture | None, Body(examples=[{"name": "fox"}])] = None,
+    request: Annotated[CreateCapture | None, Body(examples=[{"name": "garden"}])] = None,
 ) -> Capture:
     """Create an empty capture. Its files are uploaded one by one afterwards."""
     capture = service.captures.create(request.name if request is not None else None)

@@ -11,7 +11,7 @@ JOB_ID = "4c7d10aa83f25e96"
 
 CAPTURE_EXAMPLE = {
     "id": CAPTURE_ID,
-    "name": "fox",
+    "name": "garden",
     "created_at": "2026-01-15T09:30:00Z",
     "files": [{"role": "images", "name": "0001.jpg", "size": 183402, "sha256": "5d" * 32}],
 }
