@@ -6,6 +6,8 @@ Whether visible-only steps train as well as dense ones is a measurement (worker/
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -168,9 +170,9 @@ def test_state_of_rarely_seen_rows_neither_underflows_nor_leaps(backend: str) ->
         ({"dtype": torch.float64}, "params"),
     ],
 )
-def test_bad_input_is_named(change: dict[str, object], named: str) -> None:
+def test_bad_input_is_named(change: dict[str, Any], named: str) -> None:
     dtype = change.pop("dtype", torch.float32)
-    x = [torch.zeros(5, 3, dtype=dtype)]  # type: ignore[call-overload]
+    x = [torch.zeros(5, 3, dtype=dtype)]
     arguments = {"step": 1, **change}
     with pytest.raises((TypeError, ValueError), match=f"^{named}"):
-        ops.adam_(x, x, x, x, [0.1], backend="cpu", **arguments)  # type: ignore[arg-type]
+        ops.adam_(x, x, x, x, [0.1], backend="cpu", **arguments)

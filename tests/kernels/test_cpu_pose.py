@@ -31,7 +31,8 @@ def motion(xi: Tensor) -> Tensor:
         torch.stack([-phi[1], phi[0], zero, rho[2]]),
         torch.stack([zero] * 4),
     ]
-    return torch.linalg.matrix_exp(torch.stack(rows))
+    moved: Tensor = torch.linalg.matrix_exp(torch.stack(rows))
+    return moved
 
 
 def slopes(case: Case) -> list[Tensor]:
@@ -42,11 +43,7 @@ def slopes(case: Case) -> list[Tensor]:
 
 def by_ops(case: Case, backend: ops.Backend, dtype: torch.dtype) -> Tensor:
     xi = torch.zeros(6, dtype=dtype, requires_grad=True)
-    viewmat, K = case.camera(dtype)
-    p = ops.project(
-        *case.groups(dtype), motion(xi) @ viewmat, K, case.width, case.height,
-        degree=case.degree, antialias=case.antialias, backend=backend,
-    )  # fmt: skip
+    p = case.project(case.groups(dtype), motion(xi) @ case.viewmat.to(dtype), backend)
     bins = ops.bin(p, case.width, case.height, backend=backend)
     image = ops.composite(p, bins, case.width, case.height, backend=backend)
     torch.autograd.backward(image, [s.to(dtype) for s in slopes(case)])

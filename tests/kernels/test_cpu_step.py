@@ -44,15 +44,7 @@ def slopes(case: Case) -> tuple[Tensor, Tensor, Tensor]:
 def differentiate(case: Case, backend: ops.Backend, dtype: torch.dtype) -> tuple[dict[str, Tensor], Tensor]:
     """Gradients of the separate ops to the parameters and to the 2-D means, for the slopes above."""
     groups = [g.requires_grad_() for g in case.groups(dtype)]
-    projected = ops.project(
-        *groups,
-        *case.camera(dtype),
-        case.width,
-        case.height,
-        degree=case.degree,
-        antialias=case.antialias,
-        backend=backend,
-    )
+    projected = case.project(groups, case.viewmat.to(dtype), backend)
     projected.means2d.retain_grad()
     bins = ops.bin(projected, case.width, case.height, backend=backend)
     image = ops.composite(
@@ -102,14 +94,7 @@ def test_one_step_is_loss_gradient_and_adam() -> None:
     case = scene("train", 120)
     photo, step = photo_of(case), make_step(case)
     groups = [g.requires_grad_() for g in case.groups(torch.float64)]
-    projected = ops.project(
-        *groups,
-        *case.camera(torch.float64),
-        case.width,
-        case.height,
-        degree=3,
-        backend="reference",
-    )
+    projected = case.project(groups, case.viewmat.double(), "reference")
     bins = ops.bin(projected, case.width, case.height, backend="reference")
     color, _, _ = ops.composite(
         projected, bins, case.width, case.height, background=case.background.double(), backend="reference"
@@ -190,14 +175,7 @@ def test_scores_are_what_they_say() -> None:
         atol=1e-3 * float((d_means2d * ndc).norm(dim=1).max()),
     )
 
-    projected = ops.project(
-        *case.groups(torch.float64),
-        *case.camera(torch.float64),
-        case.width,
-        case.height,
-        degree=0,
-        backend="reference",
-    )
+    projected = case.project(case.groups(torch.float64), case.viewmat.double(), "reference")
     bins = ops.bin(projected, case.width, case.height, backend="reference")
     seen = torch.isin(torch.arange(24), bins.ids)
     assert torch.equal(step.visible_count, seen.float())

@@ -77,11 +77,11 @@ def test_launches_pass_the_declared_types(monkeypatch: pytest.MonkeyPatch) -> No
             monkeypatch.setattr(module, name, kernels[name])
     case = scene("types", 6, width=17, height=5)
     groups = [group.to(DEVICE).requires_grad_() for group in case.groups()]
-    viewmat, K = (x.to(DEVICE) for x in case.camera())
+    viewmat = case.viewmat.to(DEVICE).requires_grad_()
     photo = torch.zeros(5, 17, 3, dtype=torch.uint8, device=DEVICE)
     mask = torch.ones(5, 17, dtype=torch.bool, device=DEVICE)
 
-    projected = ops.project(*groups, viewmat.requires_grad_(), K, 17, 5, degree=3, backend="gpu")
+    projected = case.project(groups, viewmat, "gpu")
     bins = ops.bin(projected, 17, 5, backend="gpu")
     color, alpha, depth = ops.composite(
         projected, bins, 17, 5, background=case.background.to(DEVICE), backend="gpu"
@@ -90,15 +90,17 @@ def test_launches_pass_the_declared_types(monkeypatch: pytest.MonkeyPatch) -> No
     loss = ops.loss(color, photo, mask=mask, stats=stats, backend="gpu") + alpha.sum() + depth.sum()
     loss.backward()
     ops.knn(groups[0].detach(), backend="gpu")
-    moments = [[torch.zeros_like(groups[0])] for _ in range(2)]
+    means = groups[0].detach()
+    moments = [torch.zeros_like(means) for _ in range(2)]
     seen, last = (
         torch.ones(6, dtype=torch.bool, device=DEVICE),
         torch.zeros(6, dtype=torch.int32, device=DEVICE),
     )
     ops.adam_(
-        [groups[0].detach()],
-        [groups[0].grad],
-        *moments,
+        [means],
+        [means],
+        moments[:1],
+        moments[1:],
         [1e-3],
         step=1,
         visible=seen,
@@ -107,6 +109,6 @@ def test_launches_pass_the_declared_types(monkeypatch: pytest.MonkeyPatch) -> No
     )
     step = Step(*case.groups(), where=DEVICE)
     step.train(
-        viewmat.detach(), K, photo, degree=0, rates=Rates(0.1, 0.1, 0.1, 0.1, 0.1, 0.1), step=1, mask=mask
+        case.viewmat, case.K, photo, degree=0, rates=Rates(0.1, 0.1, 0.1, 0.1, 0.1, 0.1), step=1, mask=mask
     )
     assert {name for name, kernel in kernels.items() if not kernel.launches} == set()

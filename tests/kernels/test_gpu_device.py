@@ -5,6 +5,7 @@ A card that is too old is played by replacing what torch answers; the memory bud
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -31,7 +32,7 @@ def test_a_card_that_is_too_old_is_named_with_what_is_needed(monkeypatch: pytest
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: (6, 1))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "GeForce GTX 1080")
-    monkeypatch.setattr(device.importlib.util, "find_spec", lambda _: object())
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: object())
     reason = device.absence()
     assert reason is not None
     assert "GeForce GTX 1080" in reason
@@ -42,7 +43,7 @@ def test_a_card_that_is_too_old_is_named_with_what_is_needed(monkeypatch: pytest
 
 
 def test_a_machine_without_triton_is_told_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     reason = device.absence()
     assert reason is not None
     assert "pip install" in reason

@@ -10,8 +10,9 @@ import os
 import socket
 import subprocess
 import sys
+from dataclasses import astuple
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -19,8 +20,9 @@ import torch
 from splatmill_worker.kernels import ops, reference
 from splatmill_worker.splat.engine.parallel import Replicas, join
 from tests.support.kernels import replica
+from tests.support.paths import ROOT
 
-STEPS = 3
+STEPS = {"cpu": 3, "gpu": 2}
 
 
 def free_port() -> int:
@@ -29,19 +31,23 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def together(engine: str, steps: int, out: Path) -> list[dict[str, Any]]:
-    """What each of two processes ended with."""
+@pytest.fixture(scope="module")
+def together(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which two processes left what they ended with, for each engine."""
+    out = tmp_path_factory.mktemp("replicas")
+    runs = [f"{engine}:{steps}" for engine, steps in STEPS.items() if engine == "cpu" or find_spec("triton")]
     shared = {
         "WORLD_SIZE": "2",
         "MASTER_ADDR": "127.0.0.1",
         "MASTER_PORT": str(free_port()),
         "OMP_NUM_THREADS": "1",
+        "TRITON_INTERPRET": "1",
     }
-    shared |= {"TRITON_INTERPRET": "1"} if engine == "gpu" else {}
     running = [
         subprocess.Popen(
-            [sys.executable, "-W", "ignore", replica.__file__, engine, str(steps), str(out)],
+            [sys.executable, "-W", "ignore", "-m", replica.__name__, str(out), *runs],
             env={**os.environ, **shared, "RANK": str(rank)},
+            cwd=ROOT,
             stderr=subprocess.PIPE,
             text=True,
         )
@@ -50,7 +56,7 @@ def together(engine: str, steps: int, out: Path) -> list[dict[str, Any]]:
     for process in running:
         _, complained = process.communicate(timeout=200)
         assert process.returncode == 0, complained
-    return [torch.load(out / f"{rank}.pt") for rank in range(2)]
+    return out
 
 
 def alone(steps: int) -> tuple[dict[str, torch.Tensor], list[float], torch.Tensor]:
@@ -58,9 +64,7 @@ def alone(steps: int) -> tuple[dict[str, torch.Tensor], list[float], torch.Tenso
     start = replica.scene()
     params = [v.double() for v in (start.means, start.log_scales, start.quats, start.logit_opacities)]
     params += [start.sh[:, :1].double(), start.sh[:, 1:].double()]
-    moments = [[torch.zeros_like(p) for p in params] for _ in range(2)]
-    rates = replica.RATES
-    each = [rates.means, rates.log_scales, rates.quats, rates.logit_opacities, rates.sh_dc, rates.sh_rest]
+    exp_avg, exp_avg_sq = ([torch.zeros_like(p) for p in params] for _ in range(2))
     views, losses = replica.views(), []
     scores = torch.zeros(3, start.count, dtype=torch.float64)
     for step in range(1, steps + 1):
@@ -68,10 +72,10 @@ def alone(steps: int) -> tuple[dict[str, torch.Tensor], list[float], torch.Tenso
         total = torch.zeros((), dtype=torch.float64)
         seen = []
         for viewmat, photo in views[2 * ((step - 1) % 2) :][:2]:
+            means, log_scales, quats, logits = leaves[:4]
             fields = ops.project(
-                *leaves[:4], torch.cat(leaves[4:], 1), viewmat.double(), replica.K.double(),
-                replica.WIDTH, replica.HEIGHT,
-                degree=1, backend="reference",
+                means, log_scales, quats, logits, torch.cat(leaves[4:], 1), viewmat.double(), replica.K.double(),
+                replica.WIDTH, replica.HEIGHT, degree=1, backend="reference",
             )  # fmt: skip
             fields.means2d.retain_grad()
             bins = reference.bin(fields, replica.WIDTH, replica.HEIGHT)
@@ -91,8 +95,9 @@ def alone(steps: int) -> tuple[dict[str, torch.Tensor], list[float], torch.Tenso
         reference.adam_(
             params,
             [x.grad if x.grad is not None else torch.zeros_like(x) for x in leaves],
-            *moments,
-            each,
+            exp_avg,
+            exp_avg_sq,
+            astuple(replica.RATES),
             step=step,
         )
         losses.append(total.item() / 2)
@@ -101,13 +106,13 @@ def alone(steps: int) -> tuple[dict[str, torch.Tensor], list[float], torch.Tenso
 
 
 @pytest.mark.parametrize("engine", ["cpu", "gpu"])
-def test_two_processes_take_the_step_of_one(engine: str, tmp_path: Path) -> None:
+def test_two_processes_take_the_step_of_one(engine: str, together: Path) -> None:
     if engine == "gpu":
         pytest.importorskip(
             "triton", reason="Triton comes with torch's GPU builds; pip install triton to prove this here"
         )
-    steps = STEPS if engine == "cpu" else 2
-    first, second = together(engine, steps, tmp_path)
+    steps = STEPS[engine]
+    first, second = (torch.load(together / f"{engine}.{rank}.pt") for rank in range(2))
     parameters, losses, scores = alone(steps)
     for name, truth in parameters.items():
         assert torch.equal(first["parameters"][name], second["parameters"][name]), (

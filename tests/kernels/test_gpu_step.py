@@ -23,7 +23,6 @@ pytest.importorskip(
 from splatmill_worker.kernels import reference
 from splatmill_worker.kernels.gpu import bin as gpu_bin
 from splatmill_worker.kernels.gpu import readback
-from splatmill_worker.kernels.gpu.project import project
 from splatmill_worker.kernels.gpu.record import pack
 from splatmill_worker.kernels.gpu.step import Step
 from splatmill_worker.kernels.records import Rates
@@ -72,15 +71,7 @@ class Exact:
 
     def train(self, viewmat: Tensor, photo: Tensor, step: int, mask: Tensor | None) -> tuple[float, int]:
         leaves = [p.clone().requires_grad_() for p in self.params]
-        fields = reference.project(
-            *leaves[:4],
-            torch.cat(leaves[4:], 1),
-            viewmat.double(),
-            self.case.K.double(),
-            WIDTH,
-            HEIGHT,
-            degree=3,
-        )
+        fields = self.case.project([*leaves[:4], torch.cat(leaves[4:], 1)], viewmat.double(), "reference")
         fields.means2d.retain_grad()
         bins = reference.bin(fields, WIDTH, HEIGHT)
         color, _, _ = reference.composite(
@@ -211,7 +202,7 @@ def test_a_step_over_a_known_view_asks_the_device_for_nothing(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here, photo = engine(case), photos()[0]
-    more = {"degree": 1, "rates": RATES, "background": case.background}
+    more: dict[str, Any] = {"degree": 1, "rates": RATES, "background": case.background}
     here.train(case.viewmat, case.K, photo, step=1, **more)
     # What arrives is looked at outside: on a device by an event that is only polled.
     monkeypatch.setattr(readback.Readback, "post", lambda self, key, values: [])
@@ -220,7 +211,7 @@ def test_a_step_over_a_known_view_asks_the_device_for_nothing(
 
 
 def test_what_does_not_fit_is_the_farthest_and_is_counted(case: Case) -> None:
-    fields = project(*(x.to(DEVICE) for x in (*case.groups(), *case.camera())), WIDTH, HEIGHT, degree=3)
+    fields = case.project([group.to(DEVICE) for group in case.groups()], case.viewmat.to(DEVICE), "gpu")
     records = pack(fields)
     whole = gpu_bin.lists(records, WIDTH, HEIGHT, None)
     total = int(whole.bins.offsets[-1])
@@ -240,7 +231,7 @@ def test_what_does_not_fit_is_the_farthest_and_is_counted(case: Case) -> None:
 
 def test_room_follows_the_view_and_an_overflow_is_counted(case: Case) -> None:
     here, photo = engine(case), photos()[0]
-    more = {"degree": 0, "rates": RATES}
+    more: dict[str, Any] = {"degree": 0, "rates": RATES}
     here.train(case.viewmat, case.K, photo, step=1, **more)
     (key,) = here._rooms
     assert here._rooms[key].pairs >= gpu_bin_pairs(here)

@@ -7,6 +7,7 @@ The order of the definition's gradient is measured in test_reference_order.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -159,12 +160,12 @@ def test_the_definition_is_wangs() -> None:
         ({"mask": torch.zeros(4, 5, dtype=torch.bool)}, "mask"),
     ],
 )
-def test_bad_input_is_named(change: dict[str, Tensor], named: str) -> None:
-    arguments = {
+def test_bad_input_is_named(change: dict[str, Any], named: str) -> None:
+    arguments: dict[str, Any] = {
         "color": torch.zeros(5, 5, 3),
         "photo": torch.zeros(5, 5, 3, dtype=torch.uint8),
         "mask": None,
         **change,
     }
     with pytest.raises((TypeError, ValueError), match=f"^{named}"):
-        ops.loss(arguments["color"], arguments["photo"], mask=arguments["mask"], backend="cpu")
+        ops.loss(**arguments, backend="cpu")

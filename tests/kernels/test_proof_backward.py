@@ -14,7 +14,18 @@ from torch import Tensor
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import Projected
 from tests.support.kernels.cases import CASES, GROUPS, Case
-from tests.support.kernels.proof import EPS, Run, alpha_error, backends, define, margins, run, use
+from tests.support.kernels.proof import (
+    EPS,
+    Run,
+    alpha_error,
+    backends,
+    define,
+    filled,
+    margins,
+    run,
+    use,
+    weighted,
+)
 
 _exact: dict[str, tuple[Run, tuple[Tensor, Tensor, Tensor], dict[str, Tensor]]] = {}
 
@@ -91,15 +102,7 @@ def test_project_alone(name: str, backend: str) -> None:
     def gradients(op: ops.Backend, dtype: torch.dtype) -> dict[str, Tensor]:
         device = "cuda" if op == "gpu" and torch.cuda.is_available() else "cpu"
         leaves = [x.to(device).requires_grad_() for x in (*case.groups(dtype), case.camera(dtype)[0])]
-        p = ops.project(
-            *leaves,
-            case.K.to(device, dtype),
-            case.width,
-            case.height,
-            degree=case.degree,
-            antialias=case.antialias,
-            backend=op,
-        )
+        p = case.project(leaves[:5], leaves[5], op)
         g = torch.Generator().manual_seed(6)
         total = torch.zeros((), dtype=dtype, device=device)
         for field in p[:5]:
@@ -145,22 +148,21 @@ def test_composite_alone(name: str, backend: str) -> None:
     # A conic's smaller eigenvalue, recovered from three float32 numbers, is known to condition * 4 eps.
     error = alpha_error(case, want.projected) + 5.5 * 4 * EPS * condition(rounded.conics)
 
-    def through(op: ops.Backend, dtype: torch.dtype) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+    def through(op: ops.Backend, dtype: torch.dtype) -> tuple[tuple[Tensor, Tensor, Tensor], list[Tensor]]:
         device = "cuda" if op == "gpu" and torch.cuda.is_available() else "cpu"
         fields = [x.to(device, dtype).requires_grad_() for x in rounded[:5]]
-        p = Projected(*fields, rounded.extents.to(device, dtype))
+        p = filled(rounded, fields)
         bins = ops.bin(p, case.width, case.height, backend=op)
         image = ops.composite(p, bins, case.width, case.height, backend=op)
         return image, fields
 
     image, fields = through("reference", torch.float64)
-    near = Run({}, Projected(*fields, rounded.extents.double()), want.bins, *image)
+    near = Run({}, filled(rounded, fields), want.bins, *image)
     weights = image_weights(case, near, error)
-    expected = torch.autograd.grad(sum((x * w).sum() for x, w in zip(image, weights, strict=True)), fields)
+    expected = torch.autograd.grad(weighted(image, weights), fields)
     with use(backend) as op:
         image, fields = through(op, torch.float32)
-        total = sum((x * w.to(x.device)).sum() for x, w in zip(image, weights, strict=True))
-        got = torch.autograd.grad(total, fields)
+        got = torch.autograd.grad(weighted(image, weights), fields)
     relative = 4 * float(error.max()) + 64 * EPS
     for label, x, y in zip(Projected._fields, got, expected, strict=False):
         assert float((x.cpu().double() - y).norm()) <= relative * float(y.norm()) + 1e-12, label

@@ -40,11 +40,10 @@ def along_rays(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_ra
 
 
 def drawn_by_gsplat(case: Case, monkeypatch: pytest.MonkeyPatch) -> tuple[Tensor, Tensor]:
-    from gsplat.cuda import _torch_impl as gs
+    from gsplat.cuda import _torch_impl as gs  # type: ignore[import-untyped]  # it has no types
 
     formulas = ModuleType("nerfacc")
-    formulas.render_weight_from_alpha = weights_from_alpha  # type: ignore[attr-defined]
-    formulas.accumulate_along_rays = along_rays  # type: ignore[attr-defined]
+    vars(formulas).update(render_weight_from_alpha=weights_from_alpha, accumulate_along_rays=along_rays)
     monkeypatch.setitem(sys.modules, "nerfacc", formulas)
 
     means, log_scales, quats, logits, sh = case.groups(torch.float64)

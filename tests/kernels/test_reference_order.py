@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -47,12 +48,9 @@ def whole(case: Case) -> tuple[Function, dict[str, Tensor]]:
         "viewmat": case.camera(torch.float64)[0],
     }
     leaves["background"] = case.background.double()
-    K = case.K.double()
 
     def f(x: dict[str, Tensor]) -> Tensor:
-        p = reference.project(
-            *(x[k] for k in GROUPS), x["viewmat"], K, case.width, case.height, degree=case.degree
-        )
+        p = case.project([x[k] for k in GROUPS], x["viewmat"], "reference")
         bins = reference.bin(p, case.width, case.height)
         return readout(
             *reference.composite(p, bins, case.width, case.height, background=x["background"], _soft_cut=True)
@@ -66,26 +64,21 @@ def projecting(case: Case) -> tuple[Function, dict[str, Tensor]]:
         **dict(zip(GROUPS, case.groups(torch.float64), strict=True)),
         "viewmat": case.camera(torch.float64)[0],
     }
-    K = case.K.double()
 
     def f(x: dict[str, Tensor]) -> Tensor:
-        p = reference.project(
-            *(x[k] for k in GROUPS), x["viewmat"], K, case.width, case.height, degree=case.degree
-        )
+        p = case.project([x[k] for k in GROUPS], x["viewmat"], "reference")
         return readout(p.means2d / 10, *p[1:5])
 
     return f, leaves
 
 
 def compositing(case: Case) -> tuple[Function, dict[str, Tensor]]:
-    p = reference.project(
-        *case.groups(torch.float64), *case.camera(torch.float64), case.width, case.height, degree=case.degree
-    )
+    p = case.project(case.groups(torch.float64), case.viewmat.double(), "reference")
     leaves = {k: x.detach() for k, x in zip(p._fields[:5], p, strict=False)}
     bins = reference.bin(p, case.width, case.height)
 
     def f(x: dict[str, Tensor]) -> Tensor:
-        moved = type(p)(**x, extents=p.extents)
+        moved = p._replace(**x)
         return readout(*reference.composite(moved, bins, case.width, case.height, _soft_cut=True))
 
     return f, leaves
@@ -112,12 +105,13 @@ def problems() -> list[object]:
     return [pytest.param(f, leaves, k, id=f"{name}: {k}") for name, (f, leaves) in made for k in leaves]
 
 
-def direction(leaves: dict[str, Tensor], group: str, degree_rows: int | None = None) -> Tensor:
+def direction(leaves: dict[str, Tensor], group: str) -> Tensor:
     d = torch.randn(leaves[group].shape, generator=torch.Generator().manual_seed(70), dtype=torch.float64)
     if group == "viewmat":
         d = d * 0.1
         d[3] = 0.0
-    return d / d.norm()
+    unit: Tensor = d / d.norm()
+    return unit
 
 
 @pytest.mark.parametrize(("f", "leaves", "group"), problems())
@@ -163,11 +157,9 @@ def test_the_gradient_is_the_finite_difference(f: Function, leaves: dict[str, Te
 def test_antialias_compensation_is_detached() -> None:
     """Scales and rotations get the gradient they would have were the compensation a constant."""
     case = smooth_scene(0)
-    K = case.K.double()
     leaves = [x.requires_grad_() for x in case.groups(torch.float64)]
-    V = case.camera(torch.float64)[0]
-    p = reference.project(*leaves, V, K, case.width, case.height, degree=0, antialias=True)
-    plain = reference.project(*leaves, V, K, case.width, case.height, degree=0)
+    p = replace(case, antialias=True).project(leaves, case.viewmat.double(), "reference")
+    plain = case.project(leaves, case.viewmat.double(), "reference")
     assert (p.opacities < plain.opacities).all()
     grads = torch.autograd.grad(p.opacities.sum(), leaves, allow_unused=True, materialize_grads=True)
     for name, g in zip(GROUPS, grads, strict=True):

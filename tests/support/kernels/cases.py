@@ -6,11 +6,14 @@ Numbers are made in float32, so that float64 and float32 code read exactly the s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
+
+from splatmill_worker.kernels import ops
+from splatmill_worker.kernels.records import Projected
 
 GROUPS = ("means", "log_scales", "quats", "logit_opacities", "sh")
 
@@ -34,9 +37,18 @@ class Case:
     near: float = 0.01
     background: Tensor = field(default_factory=lambda: torch.tensor([0.25, 0.5, 0.125]))
 
-    def groups(self, dtype: torch.dtype = torch.float32) -> tuple[Tensor, ...]:
+    def groups(self, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """The five parameter groups, fresh leaves."""
-        return tuple(getattr(self, name).to(dtype).clone() for name in GROUPS)
+        means, log_scales, quats, logits, sh = (getattr(self, name).to(dtype).clone() for name in GROUPS)
+        return means, log_scales, quats, logits, sh
+
+    def project(self, groups: Sequence[Tensor], viewmat: Tensor, backend: ops.Backend) -> Projected:
+        """Project groups into this case's camera, as it is or moved, in their dtype and on their device."""
+        means, log_scales, quats, logit_opacities, sh = groups
+        return ops.project(
+            means, log_scales, quats, logit_opacities, sh, viewmat, self.K.to(viewmat), self.width, self.height,
+            degree=self.degree, near=self.near, antialias=self.antialias, backend=backend,
+        )  # fmt: skip
 
     def camera(self, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
         """viewmat and K, fresh leaves."""

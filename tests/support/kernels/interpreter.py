@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from types import FunctionType
+from typing import Any
 
 import torch
 
@@ -30,9 +32,9 @@ def _patch_once() -> None:
         none = interpreter._LangPatchScope
     except (ImportError, AttributeError):
         return
-    languages: dict[object, list[object]] = {}
+    languages: dict[FunctionType, list[Any]] = {}
 
-    def once(function: object) -> object:
+    def once(function: FunctionType) -> object:
         if function not in languages:
             seen = function.__globals__.values()
             languages[function] = [value for value in seen if value is tl or value is tl.core]

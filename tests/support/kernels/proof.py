@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -58,12 +58,12 @@ def _build(name: str) -> Iterator[None]:
     modules = [m for k, m in sys.modules.items() if k.startswith(prefix) and hasattr(m, "engine")]
     before = [m.engine for m in modules]
     for m in modules:
-        m.engine = engine
+        vars(m)["engine"] = engine
     try:
         yield
     finally:
         for m, old in zip(modules, before, strict=True):
-            m.engine = old
+            vars(m)["engine"] = old
 
 
 @dataclass
@@ -79,12 +79,7 @@ class Run:
 
     def gradients(self, d_color: Tensor, d_alpha: Tensor, d_depth: Tensor) -> dict[str, Tensor]:
         """Gradients of the weighted sum of the three images to every leaf."""
-        kind = {"dtype": self.color.dtype, "device": self.color.device}
-        total = (
-            (self.color * d_color.to(**kind)).sum()
-            + (self.alpha * d_alpha.to(**kind)).sum()
-            + (self.depth * d_depth.to(**kind)).sum()
-        )
+        total = weighted((self.color, self.alpha, self.depth), (d_color, d_alpha, d_depth))
         grads = torch.autograd.grad(total, list(self.leaves.values()), allow_unused=True)
         pairs = zip(self.leaves.items(), grads, strict=True)
         return {k: torch.zeros_like(x) if g is None else g for (k, x), g in pairs}
@@ -98,22 +93,23 @@ def run(case: Case, backend: ops.Backend, dtype: torch.dtype = torch.float32) ->
     leaves = {
         k: x.detach().clone().to(device, dtype).requires_grad_() for k, x in zip(names, tensors, strict=True)
     }
-    projected = ops.project(
-        *(leaves[k] for k in GROUPS),
-        leaves["viewmat"],
-        case.K.to(device, dtype),
-        case.width,
-        case.height,
-        degree=case.degree,
-        near=case.near,
-        antialias=case.antialias,
-        backend=backend,
-    )
+    projected = case.project([leaves[k] for k in GROUPS], leaves["viewmat"], backend)
     bins = ops.bin(projected, case.width, case.height, backend=backend)
     image = ops.composite(
         projected, bins, case.width, case.height, background=leaves["background"], backend=backend
     )
     return Run(leaves, projected, bins, *image)
+
+
+def filled(projected: Projected, fields: Sequence[Tensor]) -> Projected:
+    """Projected Gaussians with other fields, all but the extents, which follow in dtype and device."""
+    moved = dict(zip(Projected._fields, fields, strict=False))
+    return projected._replace(**moved, extents=projected.extents.to(fields[0]))
+
+
+def weighted(images: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
+    """The sum of images times weights, which may have another dtype and device."""
+    return torch.stack([(x * w.to(x)).sum() for x, w in zip(images, weights, strict=True)]).sum()
 
 
 def define(case: Case) -> Run:

@@ -1,5 +1,6 @@
-"""One of several processes that train the scene of `test_gpu_parallel` together: `python replica.py ENGINE
-STEPS OUT`.
+"""One of several processes that train a scene together.
+
+`python -m tests.support.kernels.replica OUT cpu:3 gpu:2` takes three steps with the CPU's kernels, two with the GPU's.
 """
 
 from __future__ import annotations
@@ -10,9 +11,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import Rates
-from splatmill_worker.splat.engine.parallel import join, open_replica
+from splatmill_worker.splat.engine.parallel import Replicas, join, open_replica
 from splatmill_worker.splat.gaussians import Gaussians
+from tests.support.kernels.interpreter import ask_for_it
 
 WIDTH, HEIGHT = 20, 12
 RATES = Rates(means=1e-3, log_scales=5e-3, quats=1e-3, logit_opacities=5e-2, sh_dc=2.5e-3, sh_rest=1e-4)
@@ -42,9 +45,11 @@ def views() -> list[tuple[Tensor, Tensor]]:
     return found
 
 
-def main(engine: str, steps: int, out: Path) -> None:
-    replicas = join("gloo")
-    step = open_replica(scene(), engine, replicas)  # type: ignore[arg-type]
+def train(engine: ops.Backend, steps: int, replicas: Replicas, out: Path) -> None:
+    """Train the scene for some steps and leave what came out in `out`, in a file per engine and process."""
+    if engine == "gpu":
+        ask_for_it()
+    step = open_replica(scene(), engine, replicas)
     mine = replicas.share(views())
     losses = []
     for number in range(1, steps + 1):
@@ -53,11 +58,17 @@ def main(engine: str, steps: int, out: Path) -> None:
         losses.append(seen.loss)
     replicas.check_same(Gaussians(**step.parameters()))
     scores = torch.stack([step.plain_sum, step.visible_count, step.max_extent])
-    torch.save(
-        {"parameters": step.parameters(), "losses": losses, "scores": scores}, out / f"{replicas.rank}.pt"
-    )
+    found = {"parameters": step.parameters(), "losses": losses, "scores": scores}
+    torch.save(found, out / f"{engine}.{replicas.rank}.pt")
+
+
+def main(out: Path, *runs: str) -> None:
+    replicas = join("gloo")
+    for run in runs:
+        engine, _, steps = run.partition(":")
+        train("gpu" if engine == "gpu" else "cpu", int(steps), replicas, out)
     torch.distributed.destroy_process_group()
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))
+    main(Path(sys.argv[1]), *sys.argv[2:])
