@@ -20,8 +20,9 @@ from splatmill_worker.scene import Normalization, Scene, View
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.gaussians import Gaussians
-from splatmill_worker.splat.plan.decide import decide, loading_size
+from splatmill_worker.splat.plan.decide import decide
 from splatmill_worker.splat.plan.facts import Facts, measure
+from splatmill_worker.splat.plan.photos import loading_size
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.plan_file import read_plan, write_plan
 from splatmill_worker.splat.plan.probe import probe

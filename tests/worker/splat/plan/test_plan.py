@@ -126,7 +126,7 @@ def test_what_is_added_to_start_with_counts_among_the_gaussians() -> None:
     sparse = replace(FACTS, points=900, gap_share=0.5, gap_points=30_000, sightings=90.0)
     plan = planned(sparse, steps=100)
     assert plan.max_gaussians == 30_900
-    assert "30000 Gaussians are put there" in plan.reasons["gaps"]
+    assert "30000 Gaussians are added there" in plan.reasons["gaps"]
     assert planned(sparse, steps=100, gaps="off").max_gaussians < 30_000
     walled = planned(replace(sparse, sky_share=0.12, shell_points=700), steps=100)
     assert walled.max_gaussians == 31_600

@@ -50,7 +50,7 @@ def test_cells_are_covered_by_points_and_their_neighbours() -> None:
 
 def test_cells_point_back_to_where_they_came_from() -> None:
     grid = Cells.of(street(0.7), np.empty((0, 3)))
-    places = grid.at(np.array([[3, 40], [20, 1]]), np.array([5.0, 2.0]))
+    places = grid.unproject(np.array([[3, 40], [20, 1]]), np.array([5.0, 2.0]))
     assert projected(grid.camera, places) == pytest.approx(np.array([[40.5, 3.5, 5.0], [1.5, 20.5, 2.0]]))
 
 
@@ -115,8 +115,8 @@ def test_the_shell_is_far_and_wherever_photos_look() -> None:
         assert (colors[up] == BLUE).all()
         assert (colors[down] == BRICK).all()
         # Beyond the borders too, by a few cells.
-        assert -far_shell.BEYOND - 2 < columns.min() < -3
-        assert 48 + 3 < columns.max() < 48 + far_shell.BEYOND + 2
+        assert -far_shell.BORDER_CELLS - 2 < columns.min() < -3
+        assert 48 + 3 < columns.max() < 48 + far_shell.BORDER_CELLS + 2
 
 
 def test_what_a_photo_shows_outweighs_what_another_continues() -> None:

@@ -63,7 +63,7 @@ def test_training_goes_on_where_the_model_stood(trained: Path, tmp_path: Path) -
     outcome, events = run(trained, tmp_path, start="m.ply", steps=250)
     report = report_of(outcome)
     assert report["plan"]["initial"] == "model"
-    assert f"The {before.count} Gaussians of the model given" in report["plan"]["reasons"]["initial"]
+    assert f"The model given has {before.count} Gaussians" in report["plan"]["reasons"]["initial"]
     assert report["plan"]["schedule"]["resolution"] == [[0, 1]]
     shown = report["facts"]["start"]["psnr"]
     assert shown > report["facts"]["start"]["one_color"] + 1.0
@@ -114,7 +114,9 @@ def spoilt(model: Gaussians) -> Gaussians:
     return model.select(torch.zeros(model.count, dtype=torch.bool))
 
 
-@pytest.mark.parametrize(("change", "says"), [(elsewhere, "not in the world"), (spoilt, "holds no Gaussian")])
+@pytest.mark.parametrize(
+    ("change", "says"), [(elsewhere, "not lie in the world"), (spoilt, "holds no Gaussian")]
+)
 def test_a_model_that_shows_something_else_is_refused(
     trained: Path, tmp_path: Path, change: Callable[[Gaussians], Gaussians], says: str
 ) -> None:

@@ -1,4 +1,4 @@
-"""How much may be spent, and how much of it is: steps or training seconds, whichever ends first."""
+"""The budget of a run: steps or training seconds, whichever is spent first, and the clock that counts the seconds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from dataclasses import dataclass
 
 
 class Clock:
-    """Wall seconds of training; evaluation and whatever else is not training happens inside `stopped()`."""
+    """Wall-clock seconds of training. Evaluation, and all else that is not training, runs inside `stopped()`.
+
+    seconds: those of earlier attempts, from which counting goes on.
+    """
 
     def __init__(self, seconds: float = 0.0) -> None:
         self._before = seconds
@@ -23,7 +26,7 @@ class Clock:
 
     @contextmanager
     def stopped(self) -> Iterator[None]:
-        """Time inside is not counted."""
+        """Do not count the time inside the context."""
         self._before, self._since = self.seconds, None
         try:
             yield
@@ -33,10 +36,13 @@ class Clock:
 
 @dataclass(frozen=True)
 class Budget:
-    """`steps` and `seconds` are limits; at least one is given.
+    """Limits of a run, at least one of which is given.
 
-    With a time budget the share spent is read from the clock, not predicted: whatever a step costs later, rates
-    and stages arrive at their ends together with the last second.
+    steps: number of training steps.
+    seconds: seconds of training.
+
+    Under a time budget, progress is read from the clock and not predicted: whatever later steps cost, learning rates
+    and stages reach their ends with the last second.
     """
 
     steps: int | None
@@ -47,19 +53,19 @@ class Budget:
             raise ValueError("a budget needs steps or seconds; neither was given.")
 
     def progress(self, step: int, seconds: float) -> float:
-        """Share of the budget spent after `step` steps and `seconds` training seconds, 0..1."""
+        """Share of the budget that `step` steps and `seconds` training seconds have spent, 0 to 1."""
         by_steps = 0.0 if self.steps is None else step / self.steps
         by_time = 0.0 if self.seconds is None else seconds / self.seconds
         return min(1.0, max(by_steps, by_time))
 
     def steps_left(self, step: int, seconds: float, each: float) -> float:
-        """Steps that what is left of the budget is worth, at `each` seconds a step."""
+        """Number of steps that the rest of the budget allows, at `each` seconds per step."""
         by_steps = math.inf if self.steps is None else self.steps - step
         by_time = math.inf if self.seconds is None else (self.seconds - seconds) / each
         return max(0.0, min(by_steps, by_time))
 
     def ending_at(self, progress: float, tail: float) -> Budget:
-        """The budget that makes a run at `progress` end after another `tail` of what it has spent so far."""
+        """The budget with which a run at `progress` ends after another share `tail` of what it has spent."""
         share = min(1.0, progress * (1.0 + tail))
         return Budget(
             None if self.steps is None else max(1, round(self.steps * share)),

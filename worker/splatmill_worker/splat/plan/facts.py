@@ -1,4 +1,4 @@
-"""What can be measured about a scene in seconds, before it is decided how to train it."""
+"""Facts about a scene, measured in seconds before the plan is made."""
 
 from __future__ import annotations
 
@@ -23,21 +23,33 @@ from splatmill_worker.splat.start.sky import sky_share
 from splatmill_worker.splat.views import TrainingView
 
 Float = npt.NDArray[np.float64]
-MAX_POINTS = 4000  # enough for a median, and a fraction of a second
-DARK = 4.0  # grey levels: below, ratios are noise
-RESIDUAL_FLOOR = 0.02  # log brightness: sightings nearer to their mean than this agree
+
+MAX_POINTS = 4000
+"""Points whose observations are compared, evenly chosen: enough for a median, in a fraction of a second."""
+
+DARK = 4.0
+"""Grey levels of 255: darker values count as this one, since their ratios are noise."""
+
+RESIDUAL_FLOOR = 0.02
+"""Natural logarithm of brightness: residuals below this floor have the same weight."""
+
 ITERATIONS = 30
+"""Of the reweighted least squares that separates exposures from the brightness of points."""
 
 
 @dataclass(frozen=True)
 class Speed:
-    """Seconds per training step, from a short probe: a part per pixel and a part per Gaussian."""
+    """Time of a training step.
+
+    per_pixel: seconds per pixel of the photo.
+    per_gaussian: seconds per Gaussian of the scene.
+    """
 
     per_pixel: float
     per_gaussian: float
 
     def step(self, pixels: float, gaussians: float) -> float:
-        """Seconds of one step."""
+        """Seconds of a step with so many pixels and Gaussians."""
         return self.per_pixel * pixels + self.per_gaussian * gaussians
 
 
@@ -106,16 +118,16 @@ class Facts:
 
     @property
     def pixels(self) -> int:
-        """Of one photo."""
+        """Pixels of a photo."""
         return self.width * self.height
 
     def as_dict(self) -> dict[str, Any]:
-        """For the report."""
+        """The facts as plain values, for the report."""
         return asdict(self)
 
 
 def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: Speed | None) -> Facts:
-    """Facts of `scene` (in any frame) whose training photos are `views`, in the same frame."""
+    """Facts of `scene`, whose training photos are `views` in the same world, of any origin and unit."""
     sizes = np.array([[view.full.camera.width, view.full.camera.height] for view in views])
     width, height = (int(value) for value in np.median(sizes, axis=0))
     seen = _Observations.of(scene, views)
@@ -144,7 +156,7 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
 
 
 def halving_loss(rgb: torch.Tensor) -> float:
-    """RMS difference in grey levels between a photo uint8 [H, W, 3] and its half-size copy enlarged again."""
+    """RMS difference between a photo uint8 [H, W, 3] and its half-size copy enlarged again, grey levels of 255."""
     planes = rgb.permute(2, 0, 1)[None].float()
     height, width = planes.shape[2:]
     if min(height, width) < 4:
@@ -155,7 +167,7 @@ def halving_loss(rgb: torch.Tensor) -> float:
 
 
 def _coverage(scene: Scene, views: Sequence[TrainingView]) -> dict[str, Any]:
-    """What the points leave open; nothing is known without enough of them, or where photos are transparent."""
+    """The fields of Facts on coverage by points; none without enough points, or where photos are transparent."""
     if len(scene.points) < ENOUGH_POINTS or any(view.full.alpha is not None for view in views):
         return {}
     cells = cells_of(scene, views)
@@ -172,6 +184,7 @@ def _coverage(scene: Scene, views: Sequence[TrainingView]) -> dict[str, Any]:
 
 
 def _extent(scene: Scene, views: Sequence[TrainingView]) -> float:
+    """Radius around the cameras' mean that holds nine points in ten, over that which holds the cameras."""
     centers = np.array([view.full.camera.center for view in views])
     middle = centers.mean(axis=0)
     radius = float(np.linalg.norm(centers - middle, axis=1).max())
@@ -179,7 +192,7 @@ def _extent(scene: Scene, views: Sequence[TrainingView]) -> float:
 
 
 def _reprojection(scene: Scene, longest: int) -> float | None:
-    """Median error of the points, from pixels of the photos that the cameras were recovered from to `longest`."""
+    """Median reprojection error in pixels of a photo that is `longest` long; None without any."""
     errors = np.zeros(0) if scene.point_errors is None else scene.point_errors[: _own_points(scene)]
     known = errors[np.isfinite(errors)]
     if not len(known):
@@ -190,34 +203,39 @@ def _reprojection(scene: Scene, longest: int) -> float | None:
 
 
 def _own_points(scene: Scene) -> int:
-    """How many of the points, the first ones, came with the cameras and not from stereo over them."""
+    """Number of points that came with the cameras: the first ones. Those of stereo follow.
+
+    Stereo points are left out of reprojection and view_angle: the plane sweep restricts their viewing angles and
+    their depths.
+    """
     return int(scene.facts.get("sparse_points", len(scene.points)))
 
 
 def _lens_residual(scene: Scene, longest: int) -> float | None:
-    """The farthest that any photo's distortion moves a pixel on its border, in pixels of a photo `longest` wide."""
+    """Largest displacement of a border pixel by lens distortion, in pixels of a photo that is `longest` long."""
     lenses = {view.lens for view in scene.views if view.lens is not None}
     moves = [distortion(lens) * longest / max(lens.width, lens.height) for lens in lenses]
     return max(moves, default=None)
 
 
 def exposure_spread(seen: _Observations) -> float | None:
-    """Spread between the photos of their log exposures; None with too few sightings."""
+    """Spread of the photos' exposures, natural logarithm; None with too few observations."""
     return _spread(seen, np.log(np.maximum(seen.color.mean(axis=1), DARK)))
 
 
 def tint_spread(seen: _Observations) -> float | None:
-    """Spread between the photos of their white balance: the larger one of red and of blue over green, in logs."""
+    """Spread of the photos' white balance: of red over green or blue over green, the larger, natural logarithm."""
     red, green, blue = np.log(np.maximum(seen.color.astype(np.float64), DARK)).T
     spreads = [_spread(seen, red - green), _spread(seen, blue - green)]
     return max((spread for spread in spreads if spread is not None), default=None)
 
 
 def _spread(seen: _Observations, log: Float) -> float | None:
-    """Spread between the photos of the part that is theirs in `log` (one value per sighting).
+    """Robust standard deviation over photos of the photo's part of `log`, one value per observation.
 
-    Each value is a point's own plus its photo's. Both are solved for by alternating means whose weights fall with
-    what is left over, so that outliers (highlights, occlusions) move little.
+    Each value is the sum of a point's part and a photo's part. Both are solved for by reweighted least squares in
+    alternation. The weights fall with the residual, so that outliers (highlights, occlusions) move little.
+    None where fewer than three photos have ten observations.
     """
     share = np.zeros(seen.photos)
     weight = np.ones(len(log))
@@ -235,7 +253,14 @@ def _spread(seen: _Observations, log: Float) -> float | None:
 
 @dataclass(frozen=True)
 class _Observations:
-    """Which photo shows which point, one row each: indices, colour 0..255, distance over focal length."""
+    """Which photo shows which point: n observations, without those of held-out photos.
+
+    points, photos: number of points of the scene and of photos.
+    point, photo: indices of the observation's point and photo [n].
+    color: colour of the photo there, uint8 [n, 3].
+    footprint: width of a pixel at the point's depth [n], in units of the world.
+    direction: unit vector from the camera to the point [n, 3].
+    """
 
     points: int
     photos: int
@@ -247,7 +272,7 @@ class _Observations:
 
     @staticmethod
     def of(scene: Scene, views: Sequence[TrainingView]) -> _Observations | None:
-        """None without tracks (which photo sees which point), or with too few of them."""
+        """The observations of the scene's tracks in `views`; None without tracks, or with too few of them."""
         if scene.point_views is None or len(scene.points) < 20:
             return None
         number = {view.name: i for i, view in enumerate(views)}
@@ -274,20 +299,20 @@ class _Observations:
         return _Observations(len(scene.points), len(views), *joined)
 
     def view_angle(self, first: int) -> float | None:
-        """Median over the `first` points of the largest angle between two of its views, in degrees; None without."""
+        """Median over the `first` points of the largest angle between two views, degrees; None without any."""
         own = self.point < first
         if not own.any():
             return None
         return float(np.median([_widest(rows) for rows in _by_point(self.point[own], self.direction[own])]))
 
     def distance_ratio(self) -> float:
-        """90th percentile over points of the largest over the smallest footprint of a pixel on it."""
+        """Largest over smallest footprint of a pixel on the same point, 90th percentile over points."""
         ratios = [rows.max() / rows.min() for rows in _by_point(self.point, self.footprint)]
         return float(np.percentile(ratios, 90))
 
 
 def _by_point(point: npt.NDArray[np.int64], values: Float) -> list[Float]:
-    """The values of each point's sightings, of points with at least two where there are any such."""
+    """The values of each point's observations: of points with at least two, or of all where no point has two."""
     order = np.argsort(point, kind="stable")
     starts = np.flatnonzero(np.diff(point[order], prepend=-1))
     groups = np.split(values[order], starts[1:])
@@ -295,6 +320,7 @@ def _by_point(point: npt.NDArray[np.int64], values: Float) -> list[Float]:
 
 
 def _widest(directions: Float) -> float:
+    """Largest angle between two of the unit vectors [n, 3], degrees."""
     return float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0))))
 
 

@@ -1,4 +1,4 @@
-"""What a scene needs beside Gaussians on its points: what stands behind all, gaps filled, better cameras."""
+"""Decisions on parts of the engine that many scenes do without: far shell, gap filling, pose refinement."""
 
 from __future__ import annotations
 
@@ -10,20 +10,26 @@ from splatmill_worker.splat.plan.plan import Kernels
 from splatmill_worker.splat.plan.reasons import Reasons
 
 MUCH_SKY = 0.05
-"""Of all photos; less is a window or a white wall."""
+"""Share of the photos' area: less may be a window or a white wall."""
 
 MANY_GAPS = 0.1
+"""Share of the photos' area, sky excluded: fewer gaps are left to densification."""
 
 FEW_VIEWS = 12
-"""With fewer photos, hardly any other corrects what was guessed: kermit (9 to train on) ends 1.3 dB lower with its gaps
-filled, and 1.2 with a far shell."""
+"""Training photos: fewer do not correct depths that were guessed (decisions: FEW_VIEWS)."""
 
 POSES_OFF = 1.0
-"""Pixels at the training size: below, cameras err by less than the photos resolve."""
+"""Reprojection error, pixels at the training size: the photos do not resolve smaller errors of the cameras."""
 
 
 class Needs(NamedTuple):
-    """Fields of the plan, and the Gaussians that they add before the first step."""
+    """Which of these parts the plan has.
+
+    far_shell: Gaussians behind the scene, wherever photos look.
+    gaps: Gaussians where photos show something that no point describes.
+    pose_refinement: training cameras are corrected.
+    added: number of Gaussians that far shell and gaps add before the first step.
+    """
 
     far_shell: bool
     gaps: bool
@@ -32,87 +38,107 @@ class Needs(NamedTuple):
 
 
 def needs_of(
-    facts: Facts, options: TrainOptions, kernels: Kernels, why: Reasons, *, error_scale: float = 1.0
+    facts: Facts, options: TrainOptions, kernels: Kernels, reasons: Reasons, *, scale: float = 1.0
 ) -> Needs:
-    """The needs that the facts show or the options force, each with its sentence in `why`.
+    """The parts that the facts call for or the options force, each explained in `reasons`.
 
-    error_scale: pixels at the training size for one of the photos as they were loaded.
+    scale: size of the photos in training over their size as they were loaded.
 
-    Raises ValueError, as a sentence, for an option that this scene cannot follow.
+    Raises ValueError, as a sentence, for an option that cannot be followed with this scene or these kernels.
     """
-    added = (("far_shell", options.far_shell), ("gaps", options.gaps))
-    for name, asked in added:
-        if asked is Switch.on and facts.start is not None:
-            raise ValueError(
-                f"{name}=on adds to points; this training starts from a model. Leave it at auto."
-            )
-    shell = why.switch("far_shell", options.far_shell, *_far_shell(facts))
-    gaps = why.switch("gaps", options.gaps, *_gaps(facts))
-    poses = why.switch("pose_refinement", options.pose_refinement, *_poses(facts, kernels, error_scale))
+    _check_seeds(facts, options)
+    far_shell = reasons.switch("far_shell", options.far_shell, *_far_shell(facts))
+    gaps = reasons.switch("gaps", options.gaps, *_gaps(facts))
+    poses = reasons.switch("pose_refinement", options.pose_refinement, *_poses(facts, kernels, scale))
     if poses:
-        why.chosen["pose_refinement"] += (
-            " Held-out cameras stay as they came, so that their score is not flattered."
+        _check_poses(facts, kernels)
+        reasons.chosen["pose_refinement"] += (
+            " Held-out cameras are not corrected: fitting them to their photos would flatter the score."
         )
-    for name, asked in added:
-        if asked is Switch.on and facts.transparent:
+    return Needs(far_shell, gaps, poses, far_shell * facts.shell_points + gaps * facts.gap_points)
+
+
+def _check_seeds(facts: Facts, options: TrainOptions) -> None:
+    """Raise ValueError where an option asks for Gaussians beside points that are not there."""
+    for name, asked in (("far_shell", options.far_shell), ("gaps", options.gaps)):
+        if asked is not Switch.on:
+            continue
+        if facts.start is not None:
             raise ValueError(
-                f"{name}=on is for opaque photos, and {facts.transparent} of these are transparent. Leave it at auto."
+                f"{name}=on adds Gaussians to those made from points, but this training starts from a model. "
+                f"Set {name} to auto."
             )
-        if asked is Switch.on and facts.sightings is None:
+        if facts.transparent:
             raise ValueError(
-                f"{name}=on needs points that the photos show, and there are none. Leave it at auto."
+                f"{name}=on is for opaque photos, and {facts.transparent} of these are transparent. "
+                f"Set {name} to auto."
             )
-    if poses and kernels == "gpu":
+        if facts.sightings is None:
+            raise ValueError(
+                f"{name}=on needs points of the reconstruction that the photos show, and this scene has too few. "
+                f"Set {name} to auto."
+            )
+
+
+def _check_poses(facts: Facts, kernels: Kernels) -> None:
+    """Raise ValueError where cameras cannot be corrected."""
+    if kernels == "gpu":
         raise ValueError(
-            "pose_refinement=on needs the gradient to cameras, which the gpu kernels do not give. Use backend=cpu."
+            "pose_refinement=on needs gradients with respect to the cameras, which the gpu kernels do not compute. "
+            "Set pose_refinement to auto, or backend to cpu."
         )
-    if poses and facts.views < 2:
+    if facts.views < 2:
         raise ValueError(
-            "pose_refinement=on needs at least two photos: one alone shows any error of its camera."
+            "pose_refinement=on needs at least two photos: a model of one photo fits any camera. "
+            "Set pose_refinement to auto, or add photos."
         )
-    return Needs(shell, gaps, poses, shell * facts.shell_points + gaps * facts.gap_points)
 
 
 def _far_shell(facts: Facts) -> tuple[bool, str]:
     if facts.start is not None:
-        return False, "The model given stands for it."
+        return False, "The model given is kept as it is."
     if facts.transparent:
-        return False, f"{facts.transparent} photos are transparent: nothing stands behind the scene."
+        return False, f"{facts.transparent} photos are transparent, so nothing stands behind the scene."
     if facts.sky_share is None:
-        return False, "How far away the scene ends cannot be told without points in the photos."
+        return False, "There are too few points to tell how far the scene extends."
     seen = f"{100 * facts.sky_share:.0f} % of the photos look like sky"
     if facts.views < FEW_VIEWS and facts.sky_share < MUCH_SKY:
-        return False, f"{seen}, and {facts.views} photos are too few to tell what else is that far."
-    return True, f"{seen}: {facts.shell_points} Gaussians stand for it, and behind whatever has holes."
+        return False, f"{seen}, and {facts.views} photos are too few to tell what else is as far away."
+    return (
+        True,
+        f"{seen}: {facts.shell_points} Gaussians on a far shell stand for the sky and show through holes.",
+    )
 
 
 def _gaps(facts: Facts) -> tuple[bool, str]:
     if facts.start is not None:
-        return False, "The model given stands for it."
+        return False, "The model given is kept as it is."
     if facts.gap_share is None:
-        return False, "Where points are missing cannot be told without points in the photos."
+        if facts.transparent:
+            return (
+                False,
+                f"{facts.transparent} photos are transparent: where points are missing, nothing may stand.",
+            )
+        return False, "There are too few points to tell where points are missing."
     seen = f"{100 * facts.gap_share:.0f} % of what the photos show has no point near it"
     if facts.sightings is not None:
-        seen += f" ({facts.sightings:.0f} points a photo)"
+        seen += f" (median of {facts.sightings:.0f} points per photo)"
     if facts.gap_share < MANY_GAPS:
         return False, f"Only {seen}."
     if facts.views < FEW_VIEWS:
-        return False, f"{seen}, but {facts.views} photos are too few to correct depths that are guessed."
-    return True, f"{seen}: {facts.gap_points} Gaussians are put there, as deep as the nearest points."
+        return False, f"{seen}, but {facts.views} photos are too few to correct guessed depths."
+    return True, f"{seen}: {facts.gap_points} Gaussians are added there, at the depth of the nearest points."
 
 
-def _poses(facts: Facts, kernels: Kernels, error_scale: float) -> tuple[bool, str]:
+def _poses(facts: Facts, kernels: Kernels, scale: float) -> tuple[bool, str]:
     if facts.reprojection is None:
-        return False, "The cameras are taken as given: there are no points to test them on."
-    error = error_scale * facts.reprojection
+        return False, "Without reprojection errors of points, the cameras are taken to be exact."
+    error = scale * facts.reprojection
     if facts.views < 2:
-        return False, "One photo alone shows any error of its camera."
-    seen = f"The cameras fit their points to {error:.2f} pixels"
+        return False, "A model of one photo fits any camera."
+    seen = f"The median reprojection error is {error:.2f} pixels"
     if error < POSES_OFF:
-        return False, f"{seen}."
+        return False, f"{seen}; cameras are corrected from {POSES_OFF:g} pixel."
     if kernels == "gpu":
-        return (
-            False,
-            f"{seen}, which would call for correcting them; the gpu kernels give no gradient to cameras.",
-        )
-    return True, f"{seen}: those of training photos are corrected."
+        return False, f"{seen}, which calls for correcting the cameras, but the gpu kernels cannot do so."
+    return True, f"{seen}, so the cameras of training photos are corrected."

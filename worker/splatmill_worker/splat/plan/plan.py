@@ -1,4 +1,4 @@
-"""What a run does and what it leaves out, each with the sentence of the fact that decided it."""
+"""The plan of a run: what it does, what it leaves out, and a sentence of explanation for each."""
 
 from __future__ import annotations
 
@@ -12,17 +12,36 @@ from splatmill_worker.splat.plan.schedule import Schedule
 Kernels = Literal["reference", "cpu", "gpu"]
 
 BYTES_PER_GAUSSIAN = 59 * 4 * 8
-"""Parameters and two moments, twice while they are rewritten, the snapshot, and room for the kernels' records."""
+"""Memory of one Gaussian in training: 59 parameters of 4 bytes, times eight. That is parameters and two moments, twice
+while they are rewritten, the snapshot, and room for the kernels' records."""
+
+BYTES_OF_PROGRAM = 350 * 10**6
+"""Memory of the program and the photos."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The whole course of a run. What is not needed is None or absent.
+    """All decisions of a run. What the scene does not need is None or False.
 
-    image_size: longest side in pixels. background: what is behind Gaussians and transparent photos while training.
-    far_shell: Gaussians stand behind all. gaps: Gaussians are put where photos show what no point describes.
-    pose_refinement: training cameras are corrected. `reasons` has one sentence per field;
-    `left_out` one per thing that this scene does not need; `forced` names the fields that an option fixed.
+    schedule: resolution, degree, densification and rates over the run.
+    image_size: longest side of the photos, pixels.
+    max_gaussians: largest number of Gaussians.
+    densify: Gaussians are added in training.
+    initial: what the first Gaussians are made from: points, random places, or a model given.
+    kernels: the backend of the engine.
+    background: colour behind Gaussians and transparent photos in training.
+    exposure: an affine colour transform is fitted for each photo.
+    antialias: opacities are compensated for the 0.3 pixels by which projection widens every Gaussian.
+    target_psnr: PSNR of the held-out photos at which training ends, dB; None: none.
+    max_memory: limit of the memory in use, bytes; None: none.
+    stops_when_flat: training ends early once the held-out PSNR no longer rises.
+    seed: of all random numbers.
+    far_shell: Gaussians stand behind the scene, wherever photos look.
+    gaps: Gaussians are added where photos show something that no point describes.
+    pose_refinement: the cameras of training photos are corrected.
+    reasons: a sentence for each field of the plan.
+    left_out: a sentence for each thing that this scene does not need.
+    forced: names of what an option fixed.
     """
 
     schedule: Schedule
@@ -46,7 +65,7 @@ class Plan:
     forced: tuple[str, ...] = ()
 
     def as_dict(self, *, whole: bool = False) -> dict[str, Any]:
-        """Plain values for the report and the plan event, what is not done being absent; `whole` to read back."""
+        """The plan as plain values. What is None or False is absent, unless `whole`, which `from_dict` needs."""
         values = asdict(self)
         if whole:
             return values
@@ -54,7 +73,7 @@ class Plan:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Plan:
-        """What `as_dict(whole=True)` gave, after a trip through JSON."""
+        """The plan whose `as_dict(whole=True)` was stored as JSON. Raises KeyError or TypeError for other fields."""
         course = dict(values["schedule"])
         course["budget"] = Budget(**course["budget"])
         course["annealing"] = Annealing(**course["annealing"])
@@ -64,5 +83,5 @@ class Plan:
 
     @staticmethod
     def gaussians_within(memory: int) -> int:
-        """How many Gaussians may be held in `memory` bytes beside the photos and the program itself."""
-        return max(1000, (memory - 350 * 10**6) // BYTES_PER_GAUSSIAN)
+        """Number of Gaussians that `memory` bytes hold beside the photos and the program itself; at least 1000."""
+        return max(1000, (memory - BYTES_OF_PROGRAM) // BYTES_PER_GAUSSIAN)

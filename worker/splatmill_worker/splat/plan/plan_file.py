@@ -1,4 +1,4 @@
-"""The plan of a job on disk: an attempt that goes on keeps the plan that the first one made."""
+"""The plan of a job on disk: an attempt that resumes keeps the plan of the first attempt."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from splatmill_worker.splat.plan.plan import Plan
 
 
 def read_plan(path: Path, options: TrainOptions) -> Plan | None:
-    """The plan that was stored for the same options; None where there is none, or one of another version."""
+    """The plan stored for the same options; None where there is none, or only one of another version."""
     if not path.is_file():
         return None
     stored = json.loads(path.read_text())
@@ -25,6 +25,6 @@ def read_plan(path: Path, options: TrainOptions) -> Plan | None:
 
 
 def write_plan(path: Path, options: TrainOptions, plan: Plan) -> None:
-    """Store `plan` as made for `options`."""
+    """Store `plan`, and the options that it was made for."""
     document = {"options": options.model_dump(mode="json"), "plan": plan.as_dict(whole=True)}
     atomic_write(path, json.dumps(document))

@@ -1,4 +1,4 @@
-"""How fast this machine trains this scene: a few steps that change nothing."""
+"""How fast this machine trains this scene, measured by a few steps with learning rates of zero."""
 
 from __future__ import annotations
 
@@ -13,15 +13,20 @@ from splatmill_worker.splat.plan.facts import Speed
 from splatmill_worker.splat.views import Target, TrainingView
 
 ZERO_RATES = Rates(means=0.0, log_scales=0.0, quats=0.0, logit_opacities=0.0, sh_dc=0.0, sh_rest=0.0)
+"""Steps with these rates change no parameter."""
+
 REPEATS = 3
+"""Timed steps per size, after one that warms up; the fastest counts."""
+
 SMALL = 4
+"""Reduction of the photo of the second measurement."""
 
 
 def probe(engine: Engine, views: Sequence[TrainingView]) -> Speed:
-    """Time steps with zero rates at full size and at a quarter of it; the engine is left as it was.
+    """The time of a step as a part per pixel and a part per Gaussian; the engine is left as it was.
 
-    The small photo's time is mostly the Gaussians' part, the difference is the pixels'. The fastest of a few
-    is taken: what else runs on the machine can only add.
+    Two sizes of the same photo are timed: the difference is the pixels' part, the rest is the Gaussians'. The
+    fastest of a few steps counts, since other programs can only add to the time.
     """
     middle = views[len(views) // 2]
     small, full = middle.reduced(SMALL), middle.full

@@ -1,4 +1,4 @@
-"""Learning rates of one step, per parameter group."""
+"""Learning rates of each parameter group over a run."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from splatmill_worker.kernels.records import Rates
 
 POSITION_START = 1.6e-4
-"""Per unit of scene extent (Kerbl et al. 2023, supplement)."""
+"""Rate of the positions at the first step, per unit of scene extent (Kerbl et al. 2023, supplement)."""
 
 SH_REST = 1.25e-4
 """Rate per step of the spherical harmonics above degree 0, as in the paper."""
@@ -26,15 +26,17 @@ this rate times the root of the number of steps is the same in every run."""
 
 @dataclass(frozen=True)
 class Annealing:
-    """How the rates fall over a run.
+    """How the learning rates fall over a run.
 
-    The position rate falls exponentially from `POSITION_START * extent` by `position_fall`; the others keep
-    theirs until `hold` of the budget is spent, then fall by a half cosine to `rest_fall` of them: with
-    Adam, what is left of the step size at the end is noise in the parameters.
+    The rate of the positions falls exponentially over the whole run. The others stay constant, then fall by half a
+    cosine: with Adam, the last step size remains as noise in the parameters.
 
-    boost: all of them are this many times the paper's (opacities its root, since they saturate; the harmonics above the
-    base colour more, see SH_REST). With Adam a parameter travels at most rate times steps, so a run shorter than the
-    paper's needs longer steps to arrive. None: `boost_of` the steps that a time budget turns out to hold.
+    boost: factor on the paper's rates. A parameter travels at most rate times steps with Adam, so that a shorter run
+        than the paper's needs larger steps. Opacities take the root of the factor, since they saturate; for
+        spherical harmonics above degree 0 see MOST_SH. None: `boost_of` the steps that a time budget allows.
+    position_fall: last rate of the positions over the first.
+    hold: share of the budget for which the other rates stay constant.
+    rest_fall: last value of the other rates over the first.
     """
 
     boost: float | None = 1.0
@@ -44,15 +46,17 @@ class Annealing:
 
 
 def boost_of(steps: int) -> float:
-    """How many times the paper's rates a run of so many steps takes."""
+    """The factor on the paper's rates for a run of so many steps: the root of the ratio, from 1 to MOST_BOOST."""
     return min(MOST_BOOST, max(1.0, math.sqrt(PAPER_STEPS / steps)))
 
 
 @dataclass(frozen=True)
 class RateSchedule:
-    """Rates as functions of the share of the budget that is spent.
+    """Learning rates as a function of progress.
 
-    `scale` shortens every step, which is how a run goes on after a divergence.
+    extent: radius of the scene in the training world, in its units.
+    annealing: how the rates fall.
+    scale: factor on all rates; below 1 where a run resumes after a divergence.
     """
 
     extent: float
@@ -60,17 +64,17 @@ class RateSchedule:
     scale: float = 1.0
 
     def at(self, progress: float) -> Rates:
-        """Rates at `progress` in 0..1. Raises ValueError where the boost is left to a run."""
+        """Rates at `progress`, 0 to 1. Raises ValueError where the boost is None, which only a run can determine."""
         fall = self.annealing
         boost = fall.boost
         if boost is None:
-            raise ValueError("the boost is None, which only a run can fill in; give a number.")
-        long = self.scale * boost
+            raise ValueError("the boost is None, which only a run can determine; give a number.")
+        factor = self.scale * boost
         position = POSITION_START * self.extent * math.exp(math.log(fall.position_fall) * progress)
         late = min(1.0, max(0.0, (progress - fall.hold) / (1.0 - fall.hold)))
-        rest = long * (fall.rest_fall + (1.0 - fall.rest_fall) * 0.5 * (1.0 + math.cos(math.pi * late)))
+        rest = factor * (fall.rest_fall + (1.0 - fall.rest_fall) * 0.5 * (1.0 + math.cos(math.pi * late)))
         return Rates(
-            means=long * position,
+            means=factor * position,
             log_scales=rest * 5e-3,
             quats=rest * 1e-3,
             logit_opacities=rest / math.sqrt(boost) * 5e-2,

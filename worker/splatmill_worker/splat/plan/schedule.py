@@ -1,4 +1,4 @@
-"""What is trained when: resolution, SH degree, densification, rates."""
+"""What is trained when: resolution, degree of the spherical harmonics, densification, learning rates."""
 
 from __future__ import annotations
 
@@ -10,16 +10,21 @@ from splatmill_worker.splat.plan.rates import Annealing
 
 @dataclass(frozen=True)
 class Schedule:
-    """The course of a run, in shares of its budget where not said otherwise.
+    """The course of a run.
 
-    resolution: (first step, reduction) pairs; photos are reduced by 4, then 2, then not at all, because early
-    steps gain as much from a small photo as from a large one. degree: of the spherical harmonics, from the first step.
-    opacity_decay: factor on the opacities of those Gaussians that stay when others are added: what the photos need
-    grows back, what they do not is pruned.
-    decay_within: distance from the origin of the training world beyond which no opacity decays: the far shell is mostly
-    hidden from the photos, and is there for what they do not show. None: everywhere.
-    expected_steps: what the budget is laid out for.
-    densify_from / densify_every in steps, densify_until as a share: after it, positions and colours settle.
+    budget: its limits in steps and seconds.
+    resolution: pairs of first step and reduction. Photos are reduced by 4, then by 2, then not at all, because
+        early steps gain as much from a small photo as from a large one.
+    degree: of the spherical harmonics, from the first step on.
+    densify_from: first step after which Gaussians may be added.
+    densify_every: steps between densifications.
+    densify_until: share of the budget after which none are added, so that positions and colours settle.
+    expected_steps: number of steps that the budget is expected to allow.
+    opacity_decay: factor on the opacities of Gaussians that stay at a densification. Training restores those that the
+        photos need; the others are pruned.
+    decay_within: distance from the origin of the training world, in its units, beyond which no opacity decays: most
+        of the far shell is hidden from the photos, and decay would remove it. None: no such distance.
+    annealing: how the learning rates fall.
     """
 
     budget: Budget
@@ -34,11 +39,11 @@ class Schedule:
     annealing: Annealing = field(default_factory=Annealing)
 
     def reduction(self, step: int) -> int:
-        """By how much photos are reduced at `step` (1-based)."""
+        """The factor by which photos are reduced at `step` (1-based)."""
         return [factor for first, factor in self.resolution if first < step][-1]
 
     def densifies(self, step: int, progress: float) -> bool:
-        """Whether the number of Gaussians may change after `step`."""
+        """Whether Gaussians may be added after `step`, at which the share `progress` of the budget is spent."""
         return (
             step >= self.densify_from
             and progress < self.densify_until

@@ -1,1 +1,1 @@
-"""What training starts from: points, fillings of the gaps between them, a far shell, or a given model."""
+"""The first Gaussians: from points, in gaps between points, on a far shell, at random places, or from a given model."""

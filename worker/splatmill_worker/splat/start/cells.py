@@ -1,4 +1,4 @@
-"""Photos as coarse grids: which cells show a point of the reconstruction, and which do not."""
+"""Photos as coarse grids of cells, and which of the cells show a point of the reconstruction."""
 
 from __future__ import annotations
 
@@ -18,15 +18,18 @@ Flags = npt.NDArray[np.bool_]
 Pixels = npt.NDArray[np.uint8]
 
 CELLS = 48
-"""Cells along a photo's longer side: about as many as SfM has points across a well covered photo."""
+"""Number of cells along a photo's longer side: about as many as SfM has points across a well-covered photo."""
 
 
 @dataclass(frozen=True)
 class Cells:
-    """One photo as a coarse grid [h, w]: the camera at that size, colours [h, w, 3], and what each cell shows.
+    """One photo as a coarse grid of h x w cells.
 
-    covered: a known point lies in the cell or beside it. used: most of the cell's pixels count. `points` [k, 3] are
-    the known points in the photo, as column and row in cells, and depth.
+    camera: the photo's camera for an image of h x w pixels.
+    color: mean colour of each cell, uint8 [h, w, 3].
+    covered: a known point lies in the cell or in one beside it, bool [h, w].
+    used: the mask keeps most of the cell's pixels, bool [h, w].
+    points: the known points that the photo shows [k, 3]: column and row in cells, and depth in units of the world.
     """
 
     camera: Camera
@@ -37,7 +40,7 @@ class Cells:
 
     @staticmethod
     def of(view: TrainingView, points: Float) -> Cells:
-        """The grid of a photo that shows `points` [k, 3], in the same world as its camera."""
+        """The cells of a photo that shows `points` [k, 3], which lie in the same world as its camera."""
         target = view.full
         factor = min(1.0, CELLS / max(target.camera.width, target.camera.height))
         width = max(1, round(target.camera.width * factor))
@@ -53,27 +56,27 @@ class Cells:
         used = np.ones((height, width), bool)
         mean: npt.NDArray[np.floating] = area(rgb)
         if target.mask is not None:
-            # Masked pixels are no part of the colour of what is beside them.
+            # Masked pixels do not count in the mean colour of a cell.
             counted = target.mask[None].float()
             share = area(counted)
             mean = area(rgb * counted) / np.maximum(share, np.float32(1e-6))
             used = share[0] > 0.5
         color = (mean + 0.5).astype(np.uint8).transpose(1, 2, 0)
         seen = projected(camera, points)
-        return Cells(camera, color, marked(seen, (height, width), spread=1), used, seen)
+        return Cells(camera, color, cells_near(seen, (height, width), spread=1), used, seen)
 
-    def at(self, cells: Index, depth: Float) -> Float:
-        """Points [k, 3] in the world at camera depths [k] behind the middles of `cells` [k, 2] (row, column)."""
+    def unproject(self, cells: Index, depth: Float) -> Float:
+        """Points [k, 3] in the world at the centres of `cells` [k, 2] (row, column) and camera depths `depth` [k]."""
         return self.camera.unproject(cells[:, 1] + 0.5, cells[:, 0] + 0.5, depth)
 
 
 def cells_of(scene: Scene, views: Sequence[TrainingView]) -> list[Cells]:
-    """The grid of every view, in the world of `scene`. Without tracks, every point counts in every view."""
-    return [Cells.of(view, points) for view, points in zip(views, points_of(scene, views), strict=True)]
+    """The cells of every view, in the world of `scene`. Without tracks, every point counts in every view."""
+    return [Cells.of(view, points) for view, points in zip(views, visible_points(scene, views), strict=True)]
 
 
-def points_of(scene: Scene, views: Sequence[TrainingView]) -> list[Float]:
-    """The points [k, 3] that each view shows, by the reconstruction's tracks; all of them where it has none."""
+def visible_points(scene: Scene, views: Sequence[TrainingView]) -> list[Float]:
+    """The points [k, 3] that each view shows by the tracks of the reconstruction; all points where it has none."""
     if scene.point_views is None:
         return [scene.points for _ in views]
     tracks = scene.point_views
@@ -92,8 +95,8 @@ def projected(camera: Camera, points: Float) -> Float:
     return inside
 
 
-def marked(seen: Float, shape: tuple[int, int], *, spread: int) -> Flags:
-    """bool [h, w]: cells with one of `seen` (column, row, ...) in them or within `spread` cells."""
+def cells_near(seen: Float, shape: tuple[int, int], *, spread: int) -> Flags:
+    """bool [h, w]: cells that hold a point of `seen` (column, row, ...), or have one at most `spread` cells away."""
     height, width = shape
     marks = np.zeros((height + 2 * spread, width + 2 * spread), bool)
     column, row = seen[:, 0].astype(np.int64), seen[:, 1].astype(np.int64)

@@ -1,4 +1,4 @@
-"""Random Gaussians where cameras look, for scenes without points."""
+"""Random points where cameras look, for scenes without points."""
 
 from __future__ import annotations
 
@@ -18,21 +18,25 @@ Index = npt.NDArray[np.int64]
 Pixels = npt.NDArray[np.uint8]
 
 RANDOM_GAUSSIANS = 20_000
+"""Gaussians that training starts with where a scene has too few points."""
 
 CANDIDATES = 4
-"""Points tried for each one kept."""
+"""Points drawn for each one kept."""
 
 HULL_VIEWS = 32
-"""Photos that are asked about every candidate; more do not change a hull's shape visibly."""
+"""Photos against which every candidate is tested, at least, where there are as many."""
+
+SEEN_THROUGH = 4.0
+"""Weight of a photo that is transparent at a point, over one that shows something there."""
 
 
 def sample_frusta(targets: Sequence[Target], count: int, seed: int) -> tuple[Tensor, Tensor]:
     """Random points [count, 3] and colours uint8 [count, 3] where cameras look, for scenes without points.
 
-    Candidates are drawn along the rays of random pixels, between 0.2 and 1.8 times the distance of what the
-    cameras look at. Those that most cameras see are kept; a camera whose photo is transparent there does not
-    see them, so that an object on a transparent background starts as its visual hull: the box around the
-    candidates that no camera sees through is filled anew. Colours are the means of what the cameras show.
+    Candidates are drawn along the rays of random pixels, at 0.2 to 1.8 times the distance of the point that the cameras
+    look at. Those that most cameras see are kept. A camera whose photo is transparent at a candidate counts against it,
+    so that an object on a transparent background starts as its visual hull: candidates are then drawn again, in the
+    box around those in the hull. The colour of a point is the mean of what the photos show there.
     """
     random = np.random.default_rng(seed)
     some = targets[:: max(1, len(targets) // HULL_VIEWS)]
@@ -40,19 +44,23 @@ def sample_frusta(targets: Sequence[Target], count: int, seed: int) -> tuple[Ten
     centers = np.array([camera.center for camera in cameras])
     target = looked_at(centers, np.array([camera.axis for camera in cameras]))
     points = _along_rays(cameras, median_distance(centers, target), CANDIDATES * count, random)
-    rank, color = _occupancy(some, points)
-    solid = points[rank > 0.5 * rank.max()]
+    score, color = _scored(some, points)
+    solid = points[score > 0.5 * score.max()]
     if any(target.alpha is not None for target in targets) and len(solid) >= ENOUGH_POINTS:
         low, high = solid.min(axis=0), solid.max(axis=0)
         margin = 0.1 * (high - low)
         points = random.uniform(low - margin, high + margin, (CANDIDATES * count, 3))
-        rank, color = _occupancy(some, points)
-    order = np.argsort(-rank - random.uniform(0.0, 0.5, len(rank)), kind="stable")[:count]
+        score, color = _scored(some, points)
+    order = np.argsort(-score - random.uniform(0.0, 0.5, len(score)), kind="stable")[:count]
     return torch.from_numpy(points[order]).float(), torch.from_numpy(color[order])
 
 
-def _occupancy(targets: Sequence[Target], points: Float) -> tuple[Float, Pixels]:
-    """How many photos show something at each point, minus those that see through it, and the mean colour there."""
+def _scored(targets: Sequence[Target], points: Float) -> tuple[Float, Pixels]:
+    """Scores [n] of `points` [n, 3] and their mean colours uint8 [n, 3].
+
+    The score is the number of photos that show something at the point, less SEEN_THROUGH times the number of those that
+    are transparent there: one photo that sees through a point outweighs several that show something near it.
+    """
     seen, missed = np.zeros(len(points)), np.zeros(len(points))
     color = np.zeros((len(points), 3))
     for target in targets:
@@ -63,8 +71,7 @@ def _occupancy(targets: Sequence[Target], points: Float) -> tuple[Float, Pixels]
         color[inside] += cover[:, None] * target.rgb.numpy()[rows, columns]
     mean = color / np.maximum(seen, 1e-9)[:, None]
     mean[seen <= 0] = 128.0
-    # One camera that sees through a point outweighs several that see something there.
-    return seen - 4.0 * missed, mean.clip(0, 255).astype(np.uint8)
+    return seen - SEEN_THROUGH * missed, mean.clip(0, 255).astype(np.uint8)
 
 
 def median_distance(centers: Float, target: Float) -> float:

@@ -1,4 +1,4 @@
-"""A finished model as the start of a training: read, brought into the training world, and judged before it is used."""
+"""A given model to start from: read, moved into the training world, and compared with the photos before it is used."""
 
 from __future__ import annotations
 
@@ -19,22 +19,25 @@ from splatmill_worker.splat.render import render
 from splatmill_worker.splat.views import TrainingView
 
 ASSESSED_VIEWS = 8
-"""Training views that a model is judged on."""
+"""Training views on which a model is assessed: at least so many, where there are."""
 
 DOUBTFUL_MARGIN = 3.0
-"""dB over one colour per photo: a model in the right world shows its photos far better, unless it is hardly trained."""
+"""dB above the baseline of one colour per photo: a trained model in the right world exceeds it by far."""
 
 OWN_PHOTO_MARGIN = 1.0
-"""dB by which a view of a doubtful model must be nearer to its own photo than to another one. On the still
-life bare points of the right world are by 1.3 to 2.9, and the same points moved, turned or scaled by 1.0 at most."""
+"""dB by which the views of a doubtful model have to be nearer to their own photos than to others, or the model lies in
+another world (decisions: OWN_PHOTO_MARGIN)."""
 
 
 @dataclass(frozen=True)
 class GivenModel:
-    """What is known of the model given: its size, SH degree, and how it shows training photos before any step.
+    """What is known of a given model before the first step. Values in dB are medians over some of the training views.
 
-    psnr, one_color, another in dB: medians over some training views of the model's rendering, of each photo's mean
-    colour, which asks for no model at all, and of the rendering against another view's photo.
+    gaussians: number of Gaussians.
+    degree: of the spherical harmonics.
+    psnr: PSNR of the model's views, dB.
+    one_color: PSNR of the baseline, a constant colour per photo, dB.
+    another: PSNR of the model's views against photos of other views, dB; None where no two photos have the same size.
     """
 
     gaussians: int
@@ -45,19 +48,20 @@ class GivenModel:
 
     @property
     def doubtful(self) -> bool:
-        """Whether the model says so little about these photos that its world may be another."""
+        """Whether the model is so near to the baseline that it may be of another scene or lie in another world."""
         return not self.psnr > self.one_color + DOUBTFUL_MARGIN
 
     @property
     def misaligned(self) -> bool:
-        """Whether what the model shows has nothing to do with where the cameras stand."""
+        """Whether the model's views have nothing to do with the cameras: it lies in another world."""
         return self.doubtful and self.another is not None and not self.psnr > self.another + OWN_PHOTO_MARGIN
 
 
-def read_given_model(path: Path, frame: Normalization) -> Gaussians:
-    """The Gaussians of `path` in the training world. Raises StartUnusable where there are none.
+def read_given_model(path: Path, normalization: Normalization) -> Gaussians:
+    """The Gaussians of the .ply file `path`, moved into the training world by `normalization`.
 
-    A model that this program wrote far from its origin says by how much it was moved; that is undone.
+    Far from the origin, export subtracts an offset and stores it in the file; it is added again.
+    Raises StartUnusable where the file cannot be read or holds no Gaussian.
     """
     try:
         offset = ply.offset(path)
@@ -68,45 +72,45 @@ def read_given_model(path: Path, frame: Normalization) -> Gaussians:
         raise StartUnusable(f"{path.name} cannot be opened: {error.strerror or error}.") from error
     if gaussians.count == 0:
         raise StartUnusable(f"{path.name} holds no Gaussian with finite values.")
-    shift = frame.scale * np.array(offset) + frame.translation
-    return gaussians.moved(frame.scale, torch.from_numpy(shift))
+    shift = normalization.scale * np.array(offset) + normalization.translation
+    return gaussians.moved(normalization.scale, torch.from_numpy(shift))
 
 
 def assess(gaussians: Gaussians, views: Sequence[TrainingView]) -> GivenModel:
-    """How `gaussians` show some of `views`. Raises StartUnusable where they show something else."""
+    """How well `gaussians` show some of `views`. Raises StartUnusable where they lie in another world."""
     some = views[:: max(1, len(views) // ASSESSED_VIEWS)]
-    backdrop = benchmark_background(views)
-    shown: list[float] = []
-    plain: list[float] = []
-    other: list[float] = []
+    background = benchmark_background(views)
+    own: list[float] = []
+    baseline: list[float] = []
+    others: list[float] = []
     with torch.no_grad():
         half = len(some) // 2
-        for view, far in zip(some, [*some[half:], *some[:half]], strict=True):
-            target, beyond = view.full, far.full
-            photo = target.over(backdrop)
-            color = render(gaussians, target.camera, background=backdrop).color
-            shown.append(compare(view.name, color, photo, target.mask).psnr)
-            plain.append(compare(view.name, _one_color(photo, target.mask), photo, target.mask).psnr)
-            if beyond.rgb.shape == target.rgb.shape and len(some) > 1:
-                other.append(compare(view.name, color, beyond.over(backdrop), beyond.mask).psnr)
-    start = GivenModel(
+        for view, other in zip(some, [*some[half:], *some[:half]], strict=True):
+            target, wrong = view.full, other.full
+            photo = target.over(background)
+            color = render(gaussians, target.camera, background=background).color
+            own.append(compare(view.name, color, photo, target.mask).psnr)
+            baseline.append(compare(view.name, _one_color(photo, target.mask), photo, target.mask).psnr)
+            if wrong.rgb.shape == target.rgb.shape and len(some) > 1:
+                others.append(compare(view.name, color, wrong.over(background), wrong.mask).psnr)
+    model = GivenModel(
         gaussians.count,
         gaussians.degree,
-        float(np.median(shown)),
-        float(np.median(plain)),
-        float(np.median(other)) if other else None,
+        float(np.median(own)),
+        float(np.median(baseline)),
+        float(np.median(others)) if others else None,
     )
-    if start.misaligned:
+    if model.misaligned:
         raise StartUnusable(
-            f"The model's views are as near to other photos ({start.another:.1f} dB) as to their own "
-            f"({start.psnr:.1f} dB; one colour per photo: {start.one_color:.1f} dB): it is not in the world of these "
-            "cameras."
+            f"The model's views differ from their own photos ({model.psnr:.1f} dB) as much as from other photos "
+            f"({model.another:.1f} dB), and a constant colour per photo gives {model.one_color:.1f} dB: the model does "
+            "not lie in the world of these cameras."
         )
-    return start
+    return model
 
 
 def _one_color(photo: Tensor, mask: Tensor | None) -> Tensor:
-    """The mean colour of a photo's pixels that count, everywhere [H, W, 3]; the photo is uint8."""
+    """A photo [H, W, 3] of one colour, 0 to 1: the mean of `photo`, uint8 [H, W, 3], where `mask` keeps it."""
     values = photo.float() / 255.0
     counted = values.reshape(-1, 3) if mask is None or not bool(mask.any()) else values[mask]
     return counted.mean(dim=0).expand_as(values)

@@ -1,4 +1,4 @@
-"""Gaussians from points: those of structure from motion, or any others."""
+"""Gaussians from points."""
 
 from __future__ import annotations
 
@@ -11,15 +11,18 @@ from splatmill_worker.kernels import ops
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 
 ENOUGH_POINTS = 20
-"""With fewer points, the reconstruction says too little about where surfaces are."""
+"""Fewer points of the reconstruction say too little about where surfaces are; Gaussians then start at random."""
 
 INITIAL_OPACITY = 0.1
+"""Opacity of the first Gaussians (Kerbl et al. 2023)."""
 
 
 def from_points(points: Tensor, colors: Tensor, *, backend: ops.Backend | None = None) -> Gaussians:
-    """One round Gaussian per point [M, 3], as wide as the mean distance to its three nearest neighbours.
+    """One isotropic Gaussian per point [M, 3], as wide as the mean distance to its three nearest neighbours.
 
-    colors uint8 [M, 3]. Duplicate points get the smallest positive width among all, so that none is a spike.
+    colors: uint8 [M, 3].
+
+    Duplicate points get about the smallest positive width of all, so that none has width zero.
     Raises ValueError for fewer than two points.
     """
     points = points.float()
@@ -30,7 +33,10 @@ def from_points(points: Tensor, colors: Tensor, *, backend: ops.Backend | None =
 
 
 def isotropic(points: Tensor, width: Tensor, colors: Tensor) -> Gaussians:
-    """Isotropic Gaussians at `points` [M, 3] with standard deviations `width` [M] and flat colours uint8 [M, 3]."""
+    """Isotropic Gaussians at `points` [M, 3] with standard deviations `width` [M] and colours uint8 [M, 3].
+
+    Colours do not change with the view: all coefficients above degree 0 are zero, up to degree 3.
+    """
     n = points.shape[0]
     quats = torch.zeros(n, 4)
     quats[:, 0] = 1.0

@@ -1,4 +1,4 @@
-"""What is added to the Gaussians made from points before training: the filled gaps and the far shell."""
+"""Seeding: which Gaussians training starts with, beside and beyond those made from points."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def add_seeds(
     max_gaussians: int,
     backend: ops.Backend | None = None,
 ) -> Gaussians:
-    """`gaussians` made from the points of `scene`, with Gaussians in the gaps between them and on a far shell.
+    """`gaussians`, which were made from the points of `scene`, with more in the gaps between them and on a far shell.
 
-    No more than `max_gaussians` result; what does not fit is left out evenly, the gaps before the far shell.
+    No more than `max_gaussians` result. What exceeds them is left out evenly, in the gaps first.
     """
     if not (fill_gaps or add_far_shell):
         return gaussians
@@ -49,7 +49,7 @@ def add_seeds(
         points, colors = _at_most(room, points, colors)
         room -= len(points)
         if len(points) > 1:
-            # As wide as their distance to each other: those of the reconstruction are elsewhere.
+            # Their widths follow from the distances to each other, and not to points of the reconstruction.
             more = from_points(torch.from_numpy(points), torch.from_numpy(colors), backend=backend)
             parts.append(replace(more, logit_opacities=torch.full((more.count,), logit(opacity))))
     return concatenate(*parts)
@@ -64,7 +64,7 @@ def most_opaque(gaussians: Gaussians, limit: int) -> Gaussians:
 
 
 def _at_most(room: int, points: Float, colors: Pixels) -> tuple[Float, Pixels]:
-    """Evenly chosen rows where there are more than `room`."""
+    """The rows, or `room` of them, evenly chosen, where there are more."""
     if len(points) <= room:
         return points, colors
     rows = np.linspace(0, len(points), room, endpoint=False).astype(np.int64)

@@ -1,4 +1,4 @@
-"""The sky: which part of a photo shows it."""
+"""Which part of a photo shows the sky."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ import numpy as np
 from splatmill_worker.splat.start.cells import Cells, Flags, Pixels
 
 BLUE, BLUE_BRIGHT = 8.0, 90.0
-"""Grey levels by which blue exceeds red, and least brightness: a blue sky far from the sun has more."""
+"""Least difference of blue and red, and least brightness, of a blue sky, grey levels of 255."""
 
 GREY, GREY_BRIGHT = 30.0, 150.0
-"""Largest difference between the channels of a cloud, and its least brightness."""
+"""Largest difference between channels, and least brightness, of a cloud, grey levels of 255."""
 
 
 def sky_of(color: Pixels, used: Flags) -> Flags:
-    """bool [h, w] of a coarse photo uint8 [h, w, 3]: bright blue, white or grey, with nothing else above it.
+    """bool [h, w]: the cells of a coarse photo uint8 [h, w, 3] that show the sky.
 
-    Cells that are not `used` [h, w] hide nothing below them, and are no sky. Photos are upright by their EXIF
-    orientation; in one that is not, little is found and nothing is lost.
+    These are bright blue, white or grey, and so are all cells above them. Cells that are not `used` [h, w] are no sky,
+    but sky may continue below them. The photo has to be upright, as its EXIF orientation makes it; in one that is not,
+    less sky is found.
     """
     channels = color.astype(np.float64)
     red, green, blue = (channels[..., i] for i in range(3))
@@ -33,6 +34,6 @@ def sky_of(color: Pixels, used: Flags) -> Flags:
 
 
 def sky_share(cells: Sequence[Cells]) -> float:
-    """Share of all photos that shows sky without a point of the reconstruction on it."""
+    """Share of the photos' area that looks like sky and shows no point of the reconstruction, 0 to 1."""
     sky = sum(int((sky_of(grid.color, grid.used) & ~grid.covered).sum()) for grid in cells)
     return sky / max(1, sum(grid.used.size for grid in cells))

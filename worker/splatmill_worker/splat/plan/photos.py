@@ -1,0 +1,157 @@
+"""Decisions on the photos: their size, what lies behind them, exposure compensation, anti-aliasing."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from splatmill.schema import Background, Preset, TrainOptions
+from splatmill_worker.splat.plan.facts import Facts
+from splatmill_worker.splat.plan.needs import FEW_VIEWS
+from splatmill_worker.splat.plan.plan import Kernels
+from splatmill_worker.splat.plan.reasons import Reasons
+
+PRESET_SIZE: dict[Kernels, dict[Preset, int]] = {
+    "reference": {Preset.draft: 64, Preset.balanced: 64, Preset.quality: 128},
+    "cpu": {Preset.draft: 480, Preset.balanced: 640, Preset.quality: 960},
+    "gpu": {Preset.draft: 640, Preset.balanced: 1280, Preset.quality: 1920},
+}
+"""Longest side of the photos, pixels."""
+
+BLURRED = 1.5
+"""Grey levels of 255: photos that lose less by halving are halved. The noise of a phone's photo is larger."""
+
+HALVED_FROM = 256
+"""Pixels: photos whose longest side is shorter are not halved."""
+
+EXPOSURES_DIFFER = 0.2
+"""Natural logarithm of brightness: exposures that spread more are compensated (decisions: EXPOSURES_DIFFER)."""
+
+TINTS_DIFFER = 0.1
+"""Natural logarithm of red over green, or of blue over green: white balances that spread more are compensated."""
+
+DISTANCES_DIFFER = 4.0
+"""Ratio of the distances from which the same point is seen: above, Gaussians are anti-aliased."""
+
+
+def loading_size(options: TrainOptions, kernels: Kernels) -> int:
+    """Longest side, in pixels, at which photos are loaded before their facts are known."""
+    return options.image_size or PRESET_SIZE[kernels][options.preset]
+
+
+def decide_image_size(facts: Facts, options: TrainOptions, reasons: Reasons) -> int:
+    """Longest side of the photos in training, in pixels: that of the loaded photos, or half of it."""
+    longest = max(facts.width, facts.height)
+    if options.image_size is not None:
+        reasons.option("image_size")
+        return longest
+    if longest < HALVED_FROM:
+        reasons.chosen["image_size"] = f"Photos of {longest} pixels are too small to be halved."
+        return longest
+    if facts.halving_loss < BLURRED:
+        half = (longest + 1) // 2
+        reasons.chosen["image_size"] = (
+            f"Halving the photos changes them by only {facts.halving_loss:.1f} of 255 grey levels, so they are "
+            f"trained at {half} pixels."
+        )
+        return half
+    allowed = (
+        f"the full size of {longest} pixels"
+        if facts.native_longest <= longest
+        else f"{longest} of {facts.native_longest} pixels, as the preset allows"
+    )
+    reasons.chosen["image_size"] = (
+        f"Halving the photos would lose {facts.halving_loss:.1f} of 255 grey levels, so they are trained at {allowed}."
+    )
+    return longest
+
+
+def decide_background(
+    facts: Facts, options: TrainOptions, reasons: Reasons
+) -> Literal["black", "white", "random"]:
+    """The colour behind Gaussians and transparent photos (decisions: random-background)."""
+    if options.background is not Background.auto:
+        reasons.option("background")
+        named: dict[Background, Literal["black", "white", "random"]] = {
+            Background.black: "black",
+            Background.white: "white",
+            Background.random: "random",
+        }
+        return named[options.background]
+    if facts.transparent:
+        reasons.chosen["background"] = (
+            f"{facts.transparent} photos have transparent parts; over a random background, the model has to leave "
+            "the same parts transparent."
+        )
+        return "random"
+    reasons.left_out["alpha"] = "No photo is transparent."
+    if facts.views < FEW_VIEWS:
+        reasons.chosen["background"] = (
+            f"No photo is transparent, and {facts.views} photos are too few to place surfaces in depth by making them "
+            "opaque."
+        )
+        return "black"
+    reasons.chosen["background"] = (
+        "No photo is transparent; a random background keeps training from hiding holes in the surface."
+    )
+    return "random"
+
+
+def decide_exposure(facts: Facts, options: TrainOptions, reasons: Reasons) -> bool:
+    """Whether an affine colour transform is fitted for each photo."""
+    return reasons.switch("exposure", options.exposure, *_exposure(facts))
+
+
+def _exposure(facts: Facts) -> tuple[bool, str]:
+    spread, tint = facts.exposure_spread, facts.tint_spread
+    if spread is None:
+        return (
+            False,
+            "The photos' exposures cannot be compared: it is not known which photos show the same points.",
+        )
+    if spread > EXPOSURES_DIFFER:
+        return (
+            True,
+            f"The same points differ by {100 * spread:.0f} % in brightness between photos, so exposures are fitted.",
+        )
+    if tint is not None and tint > TINTS_DIFFER:
+        return (
+            True,
+            f"The same points differ by {100 * tint:.0f} % in white balance between photos, so exposures are fitted.",
+        )
+    return False, (
+        f"The same points differ by {100 * spread:.1f} % in brightness between photos; exposures are fitted above "
+        f"{100 * EXPOSURES_DIFFER:.0f} %."
+    )
+
+
+def decide_antialias(facts: Facts, options: TrainOptions, reasons: Reasons) -> bool:
+    """Whether opacities are compensated for the 0.3 pixels by which projection widens every Gaussian."""
+    return reasons.switch("antialias", options.antialias, *_antialias(facts))
+
+
+def _antialias(facts: Facts) -> tuple[bool, str]:
+    ratio = facts.distance_ratio
+    if ratio is None:
+        return False, "The distances from which points are seen are not known."
+    if ratio > DISTANCES_DIFFER:
+        return True, (
+            f"One point in ten is seen from distances that differ by a factor of {ratio:.1f} or more, so Gaussians are "
+            "anti-aliased."
+        )
+    return False, (
+        f"Nine points in ten are seen from distances that differ by a factor of {ratio:.1f} at most; anti-aliasing is "
+        f"used above {DISTANCES_DIFFER:.0f}."
+    )
+
+
+def explain_undistortion(facts: Facts, reasons: Reasons) -> None:
+    """Say what loading did about lens distortion, and whether there are masks."""
+    if facts.distorted:
+        by = "" if facts.lens_residual is None else f", by up to {facts.lens_residual:.1f} pixels"
+        reasons.chosen["undistortion"] = (
+            f"The lens distorts {facts.distorted} photos{by}, so they are undistorted."
+        )
+    else:
+        reasons.left_out["undistortion"] = "No photo has lens distortion."
+    if not facts.masked:
+        reasons.left_out["masks"] = "No photo has masked pixels."
