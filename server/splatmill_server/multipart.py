@@ -15,7 +15,7 @@ from splatmill_server.problems import ProblemError, body_cut_off
 
 _MAX_FIELD_BYTES = 1 << 20
 
-Kind = Literal["headers", "data", "end"]
+PartEvent = Literal["headers", "data", "end"]
 
 
 @dataclass
@@ -87,7 +87,7 @@ class _Events:
                 advice="Let the HTTP library set the Content-Type of the form.",
             )
         self._body = request.stream()
-        self._found: list[tuple[Kind, bytes]] = []
+        self._found: list[tuple[PartEvent, bytes]] = []
         self._header, self._value, self._disposition = b"", b"", b""
         self.complete = False
         self._parser = MultipartParser(
@@ -104,7 +104,7 @@ class _Events:
             },
         )
 
-    async def next(self) -> tuple[Kind, bytes] | None:
+    async def next(self) -> tuple[PartEvent, bytes] | None:
         """Return the next event, or None at the end of the body."""
         while not self._found:
             chunk = await anext(self._body, None)

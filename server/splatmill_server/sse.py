@@ -21,14 +21,14 @@ from splatmill.backplane.row import JobRow
 from splatmill.schema import EventRecord, Job, JobState, StateEvent, Time
 from splatmill_server.service import Service
 
-_CURSOR = re.compile(r"(\d{1,19}-\d{1,19})_(\d{1,19}-\d{1,19})_(\d{1,9})")
+_POSITION = re.compile(r"(\d{1,19}-\d{1,19})_(\d{1,19}-\d{1,19})_(\d{1,9})")
 _LINE_ENDS = {0x85: "\\u0085", 0x2028: "\\u2028", 0x2029: "\\u2029"}
 _BLOCK_MS = 500
 """Milliseconds that a read waits for new entries, after which the row is read again."""
 
 
 @dataclass
-class Cursor:
+class Position:
     """A position in the events of a job.
 
     states: id of the last entry read from the states stream.
@@ -41,9 +41,9 @@ class Cursor:
     row_events: int = 0
 
     @classmethod
-    def parse(cls, text: str) -> "Cursor | None":
-        """Return the cursor in a `Last-Event-ID`, or None for any other text."""
-        match = _CURSOR.fullmatch(text)
+    def parse(cls, text: str) -> "Position | None":
+        """Return the position in a `Last-Event-ID`, or None for any other text."""
+        match = _POSITION.fullmatch(text)
         return cls(match[1], match[2], int(match[3])) if match else None
 
     def __str__(self) -> str:
@@ -51,25 +51,25 @@ class Cursor:
 
 
 class Follower:
-    """Reads the events of a job from a cursor on. Raises redis.RedisError if Redis cannot be reached."""
+    """Reads the events of a job from a position on. Raises redis.RedisError if Redis cannot be reached."""
 
-    def __init__(self, service: Service, job_id: str, cursor: Cursor) -> None:
+    def __init__(self, service: Service, job_id: str, position: Position) -> None:
         self.redis = service.redis_async
         self.closing = service.closing
         self.job_id = job_id
-        self.cursor = cursor
+        self.position = position
 
     async def begin(self, row: JobRow) -> bool:
         """Apply the events that the client has already seen; return False if the job had ended by then."""
         self.fold = Fold(row)
-        seen = await self._reply(self.redis.xrange(keys.states(self.job_id), max=self.cursor.states))
+        seen = await self._reply(self.redis.xrange(keys.states(self.job_id), max=self.position.states))
         for stored in events.decode(seen):
             self.fold.apply(stored)
-        if self.cursor.row_events > 2 * row.generation:
+        if self.position.row_events > 2 * row.generation:
             self.fold.close()
         return not self.fold.final
 
-    async def run(self) -> AsyncIterator[EventRecord]:
+    async def records(self) -> AsyncIterator[EventRecord]:
         """Yield the events that count, until the job ends or the server stops."""
         while not self.closing.is_set():
             row = JobRow.of(await self._reply(self.redis.hgetall(keys.job(self.job_id))))
@@ -78,31 +78,31 @@ class Follower:
             if row.generation != self.fold.row.generation:
                 self.fold = Fold(row)
             self.fold.row = row
-            if self.cursor.row_events < 2 * row.generation:
+            if self.position.row_events < 2 * row.generation:
                 yield self._row_event(2 * row.generation, row.queued_at, StateEvent(state=JobState.queued))
             for stored, is_state in await self._read():
                 if is_state:
-                    self.cursor.states = stored.id
+                    self.position.states = stored.id
                 else:
-                    self.cursor.progress = stored.id
+                    self.position.progress = stored.id
                 if self.fold.apply(stored):
-                    yield stored.record(str(self.cursor))
+                    yield stored.record(str(self.position))
             if self.fold.final:
                 return
             verdict = row.verdict
-            if verdict is not None and stream_order(self.cursor.states) >= stream_order(verdict.after):
+            if verdict is not None and stream_order(self.position.states) >= stream_order(verdict.after):
                 event = StateEvent(state=JobState(verdict.state), problem=verdict.problem)
                 yield self._row_event(2 * row.generation + 1, verdict.at, event)
                 return
 
     def _row_event(self, number: int, at: Time, event: StateEvent) -> EventRecord:
-        self.cursor.row_events = number
-        return EventRecord(id=str(self.cursor), attempt=0, at=at, event=event)
+        self.position.row_events = number
+        return EventRecord(id=str(self.position), attempt=0, at=at, event=event)
 
     async def _read(self) -> list[tuple[StoredEvent, bool]]:
         """Return new entries of both streams, sorted by time; wait briefly if there are none."""
         states, progress = keys.states(self.job_id), keys.progress(self.job_id)
-        positions: Any = {states: self.cursor.states, progress: self.cursor.progress}
+        positions: Any = {states: self.position.states, progress: self.position.progress}
         reply = await self._reply(self.redis.xread(positions, block=_BLOCK_MS))
         entries = {name.decode(): events.decode(found) for name, found in reply or []}
         return _merge(entries.get(states, []), entries.get(progress, []))
@@ -128,7 +128,7 @@ def _merge(states: list[StoredEvent], progress: list[StoredEvent]) -> list[tuple
 
 async def event_stream(follower: Follower, heartbeat: float, open_streams: Gauge) -> AsyncIterator[bytes]:
     """Yield the body of a `text/event-stream`, with a comment after every `heartbeat` seconds without an event."""
-    records = follower.run()
+    records = follower.records()
     pending: asyncio.Future[EventRecord] | None = None
     open_streams.inc()
     try:

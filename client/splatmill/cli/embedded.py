@@ -24,7 +24,7 @@ ALL_PARTS = "pip install splatmill splatmill-server[embedded] splatmill-worker"
 
 
 @dataclass(frozen=True)
-class Service:
+class ServiceAddress:
     """The address of the service, and its API key if it requires one."""
 
     url: str
@@ -41,7 +41,7 @@ def require(part: str, needed_for: str) -> None:
 
 
 @contextmanager
-def embedded_service(data: Path) -> Iterator[Service]:
+def embedded_service(data: Path) -> Iterator[ServiceAddress]:
     """Run the service while the context is open. Its files are in the folder `data`, which is removed afterwards.
 
     Raises ServiceFailed, with the end of the service's log, if it does not start.
@@ -101,7 +101,7 @@ def _owned(data: Path) -> Iterator[None]:
             lock_path.unlink(missing_ok=True)
 
 
-def _wait_ready(process: subprocess.Popen[bytes], log: Path) -> Service:
+def _wait_ready(process: subprocess.Popen[bytes], log: Path) -> ServiceAddress:
     assert process.stdout is not None
     deadline = time.monotonic() + START_SECONDS
     line = b""
@@ -121,7 +121,7 @@ def _wait_ready(process: subprocess.Popen[bytes], log: Path) -> Service:
             line += more
     try:
         ready = json.loads(line.splitlines()[0])
-        return Service(ready["url"], ready.get("api_key"))
+        return ServiceAddress(ready["url"], ready.get("api_key"))
     except (ValueError, KeyError) as error:
         raise ServiceFailed(f"The service printed {line[:200]!r} instead of its address.") from error
 

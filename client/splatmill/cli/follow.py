@@ -49,7 +49,7 @@ def follow_job(start: Callable[[], JobHandle], *, verbose: bool) -> ModelHandle:
     inbox: SimpleQueue[Item] = SimpleQueue()
     with _signals_into(inbox):
         job = start()
-        _in_background(lambda: _listen(job, inbox))
+        _in_background(lambda: _read_events(job, inbox))
         with make_display() as display:
             _until_ended(job, inbox, display, verbose)
         return job.result()
@@ -74,7 +74,7 @@ def _until_ended(job: JobHandle, inbox: SimpleQueue[Item], display: Display, ver
             _in_background(lambda: _cancel(job, inbox))
 
 
-def _listen(job: JobHandle, inbox: SimpleQueue[Item]) -> None:
+def _read_events(job: JobHandle, inbox: SimpleQueue[Item]) -> None:
     try:
         for record in job.events():
             inbox.put(record)

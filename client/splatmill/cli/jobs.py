@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from splatmill.cli.servers import Server, open_client
+from splatmill.cli.servers import ServerOption, open_client
 
 if TYPE_CHECKING:
     from splatmill.schema import Job
@@ -13,7 +13,7 @@ JobId = Annotated[str, typer.Argument(metavar="JOB", help="Id of the job.", show
 
 
 def jobs(
-    server: Server = None,
+    server: ServerOption = None,
     limit: Annotated[int, typer.Option("-n", "--limit", min=1, help="Largest number of jobs to list.")] = 20,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line and job.")] = False,
 ) -> None:
@@ -39,7 +39,7 @@ def jobs(
 
 def status(
     job_id: JobId,
-    server: Server = None,
+    server: ServerOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the record of the job as JSON.")] = False,
 ) -> None:
     """Show the state, progress, plan and problem of a job."""
@@ -66,7 +66,7 @@ def status(
         typer.echo(f"plan      {line}")
 
 
-def cancel(job_id: JobId, server: Server = None) -> None:
+def cancel(job_id: JobId, server: ServerOption = None) -> None:
     """Cancel a job, and wait until it has ended."""
     with open_client(server) as client:
         handle = client.job(job_id)

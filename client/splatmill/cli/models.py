@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from splatmill.cli.servers import Server, open_client
+from splatmill.cli.servers import ServerOption, open_client
 
 if TYPE_CHECKING:
     from splatmill.client import ModelHandle
@@ -53,7 +53,7 @@ def download(
     out: Annotated[
         Path, typer.Option("-o", "--out", help="Folder for the files; created if missing.")
     ] = Path("splat"),
-    server: Server = None,
+    server: ServerOption = None,
 ) -> None:
     """Download a finished model with its report."""
     with open_client(server) as client:
@@ -95,7 +95,7 @@ def render(
     background: Annotated[
         Literal["black", "white", "transparent"], typer.Option(help="Colour behind the model.")
     ] = "black",
-    server: Server = None,
+    server: ServerOption = None,
 ) -> None:
     """Render an image of a model."""
     from splatmill.files import atomic_write
@@ -131,7 +131,7 @@ def orbit(
     fps: Annotated[int, typer.Option(min=1, max=60, help="Frames per second.")] = 24,
     width: Annotated[int, typer.Option(min=16, max=3840, help="Width in pixels; must be even.")] = 640,
     height: Annotated[int, typer.Option(min=16, max=2160, help="Height in pixels; must be even.")] = 480,
-    server: Server = None,
+    server: ServerOption = None,
 ) -> None:
     """Render a video that circles the scene."""
     with open_client(server) as client:

@@ -7,7 +7,7 @@ import typer
 if TYPE_CHECKING:
     from splatmill.client import Client
 
-Server = Annotated[
+ServerOption = Annotated[
     str | None,
     typer.Option(
         "--server",

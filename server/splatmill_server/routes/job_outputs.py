@@ -14,7 +14,7 @@ from splatmill_server.problems import ProblemError
 from splatmill_server.routes.jobs import JobId
 from splatmill_server.routes.openapi import answer, binary, problems
 from splatmill_server.service import Service, Shared
-from splatmill_server.sse import Cursor, Follower, event_stream, stored_stream
+from splatmill_server.sse import Follower, Position, event_stream, stored_stream
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
 
@@ -38,8 +38,8 @@ async def follow_events(
     ] = None,
 ) -> Response:
     """Stream the events of a job, from the beginning or after `Last-Event-ID`."""
-    cursor = Cursor.parse(last_event_id) if last_event_id else Cursor()
-    if cursor is None:
+    position = Position.parse(last_event_id) if last_event_id else Position()
+    if position is None:
         raise ProblemError(
             "cursor_invalid",
             "The Last-Event-ID is not one that this service has issued.",
@@ -56,7 +56,7 @@ async def follow_events(
         if last_event_id:
             return Response(status_code=204)
         return StreamingResponse(stored_stream(job), media_type="text/event-stream", headers=headers)
-    follower = Follower(service, job_id, cursor)
+    follower = Follower(service, job_id, position)
     if not await follower.begin(row):
         return Response(status_code=204)
     stream = event_stream(follower, service.settings.heartbeat, service.metrics.streams)
