@@ -108,7 +108,7 @@ def test_a_full_disk_fails_the_job_by_name_and_the_next_one_works(own_service: U
     job_id = own_service.submit(steps=2, gaussians=40_000)
     problem = own_service.ended(job_id)["problem"]
     assert problem["code"] == "storage_full"
-    assert "room" in problem["advice"]
+    assert "space" in problem["advice"]
     assert own_service.http.get(f"/v1/models/{job_id}").status_code == 404
     assert own_service.ended(own_service.submit(steps=2))["state"] == "succeeded"
 

@@ -1,32 +1,38 @@
-"""The errors that end the work on a capture, in one tree.
+"""The errors of the worker that a user can act on, in one tree.
 
     WorkerError              code, message, facts, advice
-    ├── Refusal              the job cannot be done as it was asked for
-    │   ├── NothingUploaded  the capture holds no file
-    │   ├── ModelNotStored   the model to start from is not in storage
-    │   └── StartUnusable    the file to start from is no 3D Gaussian model
+    ├── Refusal              the job cannot be done as it was requested
+    │   ├── EmptyCapture     the capture has no files
+    │   ├── StartNotStored   the model to start from is not in storage
+    │   └── StartUnusable    the file to start from is not a usable 3D Gaussian model
     ├── SfmFailed            structure from motion ended without a usable scene
-    ├── TrainingFailed       the optimisation ended by a numerical failure
-    └── ModelUnreadable      a stored .ply file cannot be read
+    ├── TrainingFailed       training ended with a numerical failure
+    ├── ModelNotFound        there is no finished model with the requested id
+    ├── ModelUnreadable      a .ply file cannot be read as a 3D Gaussian model
+    └── FolderInUse          another process works in the job's folder
 
-    Cancelled                the caller asked to stop; nothing is wrong
+    Cancelled                the caller requested to stop; not a failure
 
-`code` is one of `splatmill.schema.PROBLEMS`, so that each error becomes a problem document without a second table.
+Each code is one of `splatmill.schema.PROBLEMS`. `WorkerError.problem` is the one place that makes a problem document
+from these errors; `service/problems.py` adds those of storage, Redis and the operating system.
 """
 
 from __future__ import annotations
 
 from enum import StrEnum
+from pathlib import Path
 from typing import Any, ClassVar
+
+from splatmill.schema import Problem
 
 
 class WorkerError(Exception):
-    """A failure with everything that a person needs to act on it.
+    """A failure, with all that a user needs to act on it.
 
-    code: stable name, one of `splatmill.schema.PROBLEMS`.
-    message: what happened and what was seen, one sentence.
-    facts: the figures and names behind the message.
-    advice: what to do about it; None where the kind of problem says it all.
+    code: stable name of the kind of failure, one of `splatmill.schema.PROBLEMS`.
+    message: what happened and what was seen, as a sentence.
+    facts: the numbers and names that the message is based on.
+    advice: what to do; None where the kind of failure makes it clear.
     """
 
     def __init__(
@@ -38,41 +44,48 @@ class WorkerError(Exception):
         self.facts = facts or {}
         self.advice = advice
 
+    def problem(self) -> Problem:
+        """Return the problem document for this failure."""
+        return Problem.of(self.code, self.message, facts=self.facts, advice=self.advice)
+
 
 class Refusal(WorkerError):
-    """The job cannot be done as it was asked for: an option, the poses, or a file given with the photos."""
+    """The job cannot be done as it was requested: an option, the poses, or an uploaded file does not permit it."""
 
 
-class NothingUploaded(Refusal):
-    """The capture holds no file."""
+class EmptyCapture(Refusal):
+    """The capture has no files."""
 
     def __init__(self, capture_id: str) -> None:
         super().__init__(
             "no_images",
-            f"The capture {capture_id} holds no files.",
+            f"The capture {capture_id} has no files.",
             advice="Upload the photos to the capture before creating a job.",
         )
 
 
-class ModelNotStored(Refusal):
-    """The model to start from is not, or no longer, in storage."""
+class StartNotStored(Refusal):
+    """The model to start from is not in storage, or was deleted."""
 
     def __init__(self, model_id: str) -> None:
         super().__init__(
             "model_not_found",
-            f"The model {model_id[:80]!r} to start from is not stored.",
-            advice="Start from another model, or leave start out.",
+            f"The model to start from, {model_id[:80]!r}, is not in storage.",
+            advice="Start from another model, or leave out the option start.",
         )
 
 
 class StartUnusable(Refusal):
-    """The file to start from is no 3D Gaussian model, or holds nothing that the cameras show."""
+    """The file to start from is not a 3D Gaussian model, or the cameras see nothing of it."""
 
     def __init__(self, message: str) -> None:
         super().__init__(
             "start_unusable",
             message,
-            advice="Give a 3D Gaussian .ply that was trained on cameras of the same capture, or leave start out.",
+            advice=(
+                "Start from a 3D Gaussian .ply file that was trained on the cameras of this capture, "
+                "or leave out the option start."
+            ),
         )
 
 
@@ -87,7 +100,13 @@ class SfmFailed(WorkerError):
 
 
 class FailureName(StrEnum):
-    """Every way in which training ends without a model that can be trusted."""
+    """The numerical failures that end a training.
+
+    non_finite: the loss or a parameter became infinite or NaN.
+    divergence: the smoothed loss rose to a multiple of its lowest value.
+    empty_scene: no Gaussians were left, or the views saw none of them.
+    memory: too little memory was left to go on.
+    """
 
     non_finite = "non_finite"
     divergence = "divergence"
@@ -96,11 +115,11 @@ class FailureName(StrEnum):
 
 
 class TrainingFailed(WorkerError):
-    """The optimisation stopped at `step` by a numerical failure.
+    """Training ended with a numerical failure.
 
     name: which failure.
-    seen: what was observed, one sentence.
-    step: number of the training step, 1-based.
+    seen: what was observed, as the end of a sentence.
+    step: number of the training step, from 1.
     """
 
     CODES: ClassVar[dict[FailureName, str]] = {
@@ -110,9 +129,13 @@ class TrainingFailed(WorkerError):
         FailureName.memory: "out_of_memory",
     }
     ADVICE: ClassVar[dict[FailureName, str]] = {
-        FailureName.non_finite: "The cameras or points may hold extreme values; look at the reconstruction first.",
-        FailureName.divergence: "The cameras probably do not fit the photos; check their poses, or take more photos.",
-        FailureName.empty_scene: "Nothing that the photos show could be kept; check the masks and the camera poses.",
+        FailureName.non_finite: (
+            "The cameras or points probably have extreme values: check the reconstruction or the given poses."
+        ),
+        FailureName.divergence: (
+            "The cameras probably do not fit the photos: check their poses, or take more photos."
+        ),
+        FailureName.empty_scene: "Check the masks and the camera poses: no Gaussian agreed with the photos.",
         FailureName.memory: "Set a smaller image_size or max_gaussians.",
     }
 
@@ -128,12 +151,30 @@ class TrainingFailed(WorkerError):
         self.step = step
 
 
+class ModelNotFound(WorkerError):
+    """There is no finished model with this id."""
+
+    def __init__(self, model_id: str) -> None:
+        super().__init__("model_not_found", f"There is no finished model {model_id[:80]!r}.")
+
+
 class ModelUnreadable(WorkerError):
-    """A .ply file that is damaged or is no 3D Gaussian scene."""
+    """A .ply file is damaged, or is not a 3D Gaussian model."""
 
     def __init__(self, message: str) -> None:
         super().__init__("model_corrupt", message)
 
 
+class FolderInUse(WorkerError):
+    """Another process works in the job's folder, although the job's lock is free."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(
+            "worker_lost",
+            f"Another process works in the job's folder {folder}.",
+            advice="End the process that was left over on the worker's machine, then restart the job.",
+        )
+
+
 class Cancelled(Exception):
-    """The caller asked to stop. Nothing is wrong, and the work can go on later from what was kept."""
+    """The caller requested to stop. This is not a failure: the work can be resumed from what was stored."""

@@ -1,7 +1,7 @@
 """The job queue between server and worker: RQ, and all settings that differ from its defaults.
 
-An RQ job is one generation of a Splatmill job, and each run of it is an attempt. The server enqueues the worker's
-function by its dotted name, so that it need not import the worker.
+An RQ job is one generation of a Splatmill job, and each run of it is an attempt. The server does not import the worker:
+which function runs an attempt is decided there.
 """
 
 from dataclasses import dataclass

@@ -12,7 +12,7 @@ import redis
 
 from splatmill.backplane import keys
 from splatmill.backplane.process import ProcessIdentity, start_time
-from splatmill_worker.service.lock import STALE_MS, Held, JobLock
+from splatmill_worker.service.lock import STALE_MS, JobLock, LockState
 from tests.support.waiting import wait_for
 
 ME = ProcessIdentity.of(os.getpid())
@@ -27,7 +27,7 @@ def test_a_living_holder_keeps_the_lock_however_silent(connection: redis.Redis) 
     assert first.take(ME, 1)
     connection.hincrby(keys.lock("job00001"), "seen", -100 * STALE_MS)
     assert not second.take(ME, 2)
-    assert first.refresh() is Held.own
+    assert first.refresh() is LockState.held
     second.release()
     assert first.holder() is not None
     first.release()
@@ -44,7 +44,7 @@ def test_a_dead_holder_is_followed_at_once(connection: redis.Redis) -> None:
     # Not waited for yet: a zombie runs nothing and counts as dead.
     wait_for(identity.dead)
     assert second.take(ME, 2)
-    assert first.refresh() is Held.lost
+    assert first.refresh() is LockState.lost
     process.communicate()
 
 

@@ -22,11 +22,11 @@ def test_events_keep_their_order_and_progress_is_thinned(connection: redis.Redis
     outbox.put(LogEvent(message="done"))
     outbox.put(StateEvent(state=JobState.exporting))
     outbox.close()
-    told = [stored.event for stored in events.read_progress(connection, "job00001")]
-    steps = [event.step for event in told if isinstance(event, ProgressEvent)]
+    sent = [stored.event for stored in events.read_progress(connection, "job00001")]
+    steps = [event.step for event in sent if isinstance(event, ProgressEvent)]
     assert len(steps) < 50
     assert steps[-1] == 500
-    assert isinstance(told[-1], LogEvent)
+    assert isinstance(sent[-1], LogEvent)
     states = [stored.event for stored in events.read_states(connection, "job00001")]
     assert [event.state.value for event in states if isinstance(event, StateEvent)] == [
         "training",
@@ -46,8 +46,8 @@ def test_what_is_said_while_redis_is_away_arrives_when_it_is_back(redis_server: 
     redis_server.start()
     outbox.put(LogEvent(message="after"))
     outbox.close(20)
-    told = [stored.event for stored in events.read_progress(connection, "job00001")]
-    assert [event.message for event in told if isinstance(event, LogEvent)] == [
+    sent = [stored.event for stored in events.read_progress(connection, "job00001")]
+    assert [event.message for event in sent if isinstance(event, LogEvent)] == [
         "before",
         "meanwhile",
         "after",

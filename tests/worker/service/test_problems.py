@@ -10,7 +10,7 @@ import redis
 
 from splatmill.backplane.storage import StorageError, StorageFullError
 from splatmill_worker.errors import SfmFailed
-from splatmill_worker.service.problems import Transient, problem_of
+from splatmill_worker.service.problems import is_transient, problem_of
 
 NO_PARALLAX = SfmFailed(
     "sfm_no_parallax", "The camera only turned.", {"parallax_deg": 0.2}, "Walk around the scene."
@@ -30,10 +30,11 @@ NO_PARALLAX = SfmFailed(
         (ZeroDivisionError("division by zero"), "internal_error"),
     ],
 )
-def test_every_mishap_has_a_name_and_advice(error: Exception, code: str) -> None:
+def test_each_failure_has_a_code_and_advice_and_is_final(error: Exception, code: str) -> None:
     problem = problem_of(error)
     assert problem.code == code
     assert problem.advice
+    assert not is_transient(error)
 
 
 def test_a_named_failure_keeps_its_facts() -> None:
@@ -48,7 +49,8 @@ def test_a_named_failure_keeps_its_facts() -> None:
         (redis.TimeoutError("Timeout reading from socket"), "queue_unavailable"),
     ],
 )
-def test_what_is_only_away_is_tried_again(error: Exception, code: str) -> None:
-    with pytest.raises(Transient) as caught:
-        problem_of(error)
-    assert caught.value.problem.code == code
+def test_an_outage_of_storage_or_redis_is_transient(error: Exception, code: str) -> None:
+    assert is_transient(error)
+    problem = problem_of(error)
+    assert problem.code == code
+    assert problem.advice

@@ -1,1 +1,1 @@
-"""The queue worker: takes jobs from Redis, runs an attempt at each, stores what came out."""
+"""The queue worker: takes jobs from Redis, runs each attempt in a process of its own, and stores the models."""

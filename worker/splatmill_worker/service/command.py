@@ -1,7 +1,4 @@
-"""Starts the queue worker: `python -m splatmill_worker train`.
-
-The imports of this process are those of every attempt that it forks: nothing with threads of its own.
-"""
+"""Starts the queue worker: `python -m splatmill_worker train`."""
 
 import sys
 import time
@@ -12,18 +9,18 @@ from splatmill.backplane.connection import connect
 from splatmill_worker import settings
 from splatmill_worker.service.rq_worker import STOP_GRACE, AttemptWorker
 
-REDIS_PATIENCE = 60.0
-"""Seconds a starting worker waits for Redis, which may be starting beside it."""
+REDIS_WAIT = 60.0
+"""Seconds that a starting worker waits for Redis, which may be starting at the same time."""
 
 
 def serve(stop_grace: float | None) -> int:
-    """Take jobs from the queue until told to stop; returns the exit status.
+    """Take jobs from the queue until a signal to stop. Return the exit status.
 
-    stop_grace: seconds an attempt has to save its state when the worker is told to stop; None means STOP_GRACE.
+    stop_grace: seconds that an attempt has to save its state on such a signal; None means STOP_GRACE.
     """
     url = settings.redis_url()
     connection = connect(url)
-    deadline = time.monotonic() + REDIS_PATIENCE
+    deadline = time.monotonic() + REDIS_WAIT
     while True:
         try:
             connection.ping()
@@ -31,7 +28,9 @@ def serve(stop_grace: float | None) -> int:
         except redis.exceptions.ConnectionError as error:
             if time.monotonic() > deadline:
                 print(
-                    f"Redis cannot be reached at {url}: {error}. Start it, or set REDIS_URL.", file=sys.stderr
+                    f"Redis could not be reached at {url} within {REDIS_WAIT:g} s: {error}. "
+                    "Start it there, or set REDIS_URL to the address of a running one.",
+                    file=sys.stderr,
                 )
                 return 1
             time.sleep(0.05)

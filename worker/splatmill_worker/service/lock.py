@@ -1,10 +1,11 @@
-"""The lock on a job: at most one process works on it, whatever the queue says.
+"""The lock on a job, which keeps two processes from working on it at the same time.
 
-The queue may hand a job out twice (a laptop that slept, a Redis that came back from its log). The lock names its
-holder as a process, so that the next attempt need not wait for a time-out when that process is provably dead,
-and never begins while it is provably alive. Only a holder that cannot be seen from here is judged by the age of
-its last sign. An attempt that lost the lock is fenced: its number is lower than the new one's, and the fold
-ignores what it still says.
+The queue may give a job to two workers: after a machine was suspended, or after Redis restarted from its log. The lock
+records the process that holds it. If that process runs on this machine, a new attempt begins at once when it is dead,
+and not before. A process on another machine counts as dead when its last heartbeat is too old.
+
+An attempt that has lost the lock may still write events. Its number is lower than that of the new attempt, so that
+`fold` ignores them.
 """
 
 import json
@@ -19,7 +20,7 @@ from splatmill.backplane.process import ProcessIdentity
 from splatmill.backplane.queue import HEARTBEAT_SLACK, MONITORING_INTERVAL
 
 STALE_MS = (MONITORING_INTERVAL + HEARTBEAT_SLACK) * 1000
-"""Age of the last sign after which a holder on another machine counts as gone: RQ's own patience."""
+"""Age in milliseconds of the last heartbeat at which a holder on another machine counts as dead, as it does for RQ."""
 
 _TAKE = """
 if (redis.call('HGET', KEYS[1], 'token') or '') ~= ARGV[1] then return 0 end
@@ -44,17 +45,28 @@ _RELEASE = (
 )
 
 
-class Held(Enum):
-    """What a look at the lock shows to the one that holds a token: still its own, no lock there, or another's."""
+class LockState(Enum):
+    """State of the lock for the owner of a token.
 
-    own = 1
-    absent = -1
+    held: the lock is held under this token.
+    lost: it is held under another token.
+    absent: nobody holds it.
+    """
+
+    held = 1
     lost = 0
+    absent = -1
 
 
 @dataclass(frozen=True)
 class Holder:
-    """Who holds a lock: its token, the process, the attempt's number and the age of the last sign in ms."""
+    """The holder of a lock.
+
+    token: the token that it took the lock with.
+    process: the process of the attempt.
+    attempt: number of the attempt, 0 until it is counted.
+    age_ms: milliseconds since the last heartbeat.
+    """
 
     token: str
     process: ProcessIdentity
@@ -62,14 +74,14 @@ class Holder:
     age_ms: int
 
     def gone(self) -> bool:
-        """Whether another may take over: the process is provably dead, or out of sight and silent for too long."""
+        """Return whether the process is dead, or on another machine and without a heartbeat for STALE_MS."""
         if self.process.visible():
             return self.process.dead()
         return self.age_ms > STALE_MS
 
 
 class JobLock:
-    """The lock on one job as one attempt sees it. `token` is known to the attempt and to its parent process."""
+    """The lock on one job, as the owner of `token` uses it. An attempt and its parent process share a token."""
 
     def __init__(self, connection: redis.Redis, job_id: str, token: str) -> None:
         self._connection = connection
@@ -77,7 +89,7 @@ class JobLock:
         self.token = token
 
     def holder(self) -> Holder | None:
-        """Who holds the lock now, if anybody."""
+        """Return the present holder, or None when the lock is free."""
         fields = cast(dict[bytes, bytes], self._connection.hgetall(self._key))
         if not fields:
             return None
@@ -90,7 +102,7 @@ class JobLock:
         )
 
     def take(self, process: ProcessIdentity, attempt: int) -> bool:
-        """Take the lock for `process` if it is free, its holder is gone, or it is ours already."""
+        """Take the lock for `process` if it is free, its holder is gone, or our token holds it. Return success."""
         holder = self.holder()
         if holder is not None and holder.token != self.token and not holder.gone():
             return False
@@ -98,12 +110,12 @@ class JobLock:
         taken = self._run(_TAKE, expected, self.token, json.dumps(process.dump()), str(attempt))
         return taken == 1
 
-    def refresh(self) -> Held:
-        """Give a sign of life for the holder."""
-        return Held(self._run(_REFRESH, self.token))
+    def refresh(self) -> LockState:
+        """Record a heartbeat if the lock is held under our token, and return its state."""
+        return LockState(self._run(_REFRESH, self.token))
 
     def release(self) -> None:
-        """Give the lock up; nothing happens when it is not ours."""
+        """Release the lock if it is held under our token."""
         self._run(_RELEASE, self.token)
 
     def _run(self, script: str, *args: str) -> int:

@@ -1,7 +1,7 @@
-"""What an attempt has to say, sent in order by a thread of its own.
+"""A buffer for the events of an attempt, and the thread that sends them to Redis in order.
 
-Training never waits for Redis, and while Redis is away events wait here. Progress comes far more often than
-anybody reads it: only the newest is kept, and sent a few times a second.
+Training never waits for Redis, and the events of an outage are sent after it. Progress events come faster than clients
+can show them: only the newest one is kept, and it is sent every PROGRESS_SECONDS.
 """
 
 import threading
@@ -15,13 +15,18 @@ from splatmill.schema import Event, PlanEvent, ProgressEvent, StateEvent
 from splatmill_worker.service.attempt import Attempt
 
 PROGRESS_SECONDS = 0.25
+"""Seconds between two progress events."""
+
 RETRY_SECONDS = 0.5
-LIMIT = 2000
-"""Events kept while Redis is away; beyond it the oldest log lines and metrics go. States and plans stay."""
+"""Seconds before an event that Redis did not take is sent again."""
+
+MAX_EVENTS = 2000
+"""Number of events that are kept during an outage of Redis. When there are more, the oldest one that is neither a state
+nor a plan is dropped."""
 
 
 class Outbox:
-    """Sends the events put into it as `attempt`, in the order they came. Close it, or use it as a context."""
+    """Sends events as those of `attempt`, in the order in which they were put. It must be closed."""
 
     def __init__(self, attempt: Attempt) -> None:
         self._attempt = attempt
@@ -35,13 +40,13 @@ class Outbox:
         self._thread.start()
 
     def put(self, event: Event) -> None:
-        """Take an event; returns at once."""
+        """Queue an event to be sent, without waiting."""
         with self._changed:
             if isinstance(event, ProgressEvent):
                 self._progress = event
             else:
                 if self._progress is not None:
-                    # What was measured before a change of state must not seem to come after it.
+                    # Progress from before a change of state must not appear to come after it.
                     self._events.append(self._progress)
                     self._progress = None
                 self._events.append(event)
@@ -49,14 +54,14 @@ class Outbox:
             self._changed.notify_all()
 
     def flush(self, seconds: float | None = None) -> bool:
-        """Wait until everything has been sent, however long Redis is away, or at most `seconds`; False then."""
+        """Wait until all events are sent, for at most `seconds` if given. Return whether they are."""
         with self._changed:
             self._progress_at = 0.0
             self._changed.notify_all()
             return self._changed.wait_for(self._empty, seconds)
 
     def close(self, seconds: float | None = None) -> None:
-        """Send what is left, for at most `seconds`, and end the thread."""
+        """Send the remaining events, for at most `seconds` if given, and end the thread."""
         self.flush(seconds)
         with self._changed:
             self._closed = True
@@ -67,7 +72,7 @@ class Outbox:
         return not self._events and self._progress is None and not self._sending
 
     def _trim(self) -> None:
-        if len(self._events) > LIMIT:
+        if len(self._events) > MAX_EVENTS:
             for index, event in enumerate(self._events):
                 if not isinstance(event, StateEvent | PlanEvent):
                     del self._events[index]
@@ -82,7 +87,7 @@ class Outbox:
                 self._changed.notify_all()
 
     def _next(self) -> Event | None:
-        """The next event to send, as soon as there is one that is due; None when closed."""
+        """Wait for the next event that is due and return it; None once the outbox is closed."""
         with self._changed:
             while not self._closed:
                 if self._events:
@@ -102,7 +107,7 @@ class Outbox:
 
     def _sent(self, event: Event) -> bool:
         try:
-            self._attempt.say(event)
+            self._attempt.report(event)
         except (RedisConnectionError, RedisTimeoutError):
             return False
         return True

@@ -1,9 +1,9 @@
-"""The queue worker: RQ's, with what it lacks for hours of native code.
+"""RQ's worker, extended for attempts that spend hours in native code.
 
-RQ forks a process per attempt and keeps the heartbeat in the parent. Added here: that process dies with its
-parent, is asked to save its state before the worker stops, is killed with all it started when its job is
-cancelled, and is never one of two. Importing this must load neither torch nor pycolmap: their threads and
-locks do not survive the fork.
+As in RQ, the parent process sends heartbeats and forks a process for each attempt. That process ends when its parent
+does, is asked to save its state before the worker stops, and is killed with all its children when its job is cancelled.
+
+The parent must import neither torch nor pycolmap: their threads and locks do not survive a fork.
 """
 
 import os
@@ -26,36 +26,45 @@ from rq.utils import now
 
 from splatmill.backplane import queue as backplane
 from splatmill.backplane.process import die_with_parent
-from splatmill_worker.service import attempt, recovery
-from splatmill_worker.service.attempt import Attempt, HandedBack
-from splatmill_worker.service.clean_up import sweep
-from splatmill_worker.service.ending import Ending, oom_kills
-from splatmill_worker.service.job import run_attempt
-from splatmill_worker.service.lock import Held, JobLock
+from splatmill_worker.service import hand_back, recovery
+from splatmill_worker.service.abandoned_folders import remove_abandoned
+from splatmill_worker.service.attempt import Attempt, start_attempt
+from splatmill_worker.service.hand_back import HandedBack
+from splatmill_worker.service.lock import JobLock, LockState
+from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, ProcessExit, oom_kill_count
+from splatmill_worker.service.run_attempt import run_attempt
 
 STOP_GRACE = 15.0
-"""Seconds an attempt has to save its state when the worker is told to stop; then it is killed, and the next
-attempt goes on from the checkpoint before."""
+"""Seconds that an attempt has to save its state when the worker is told to stop. Then it is killed, and the next one
+resumes from the checkpoint before."""
 
-_GONE = (RedisConnectionError, RedisTimeoutError)
+_REDIS_AWAY = (RedisConnectionError, RedisTimeoutError)
 _RETRY_SECONDS = 0.5
-_SWEEP_SECONDS = 3600.0
+_REMOVAL_INTERVAL = 3600.0
 
 
 class AttemptEntry(backplane.QueueEntry):
     """An entry of the queue that runs `run_attempt`, whatever function name and arguments it carries.
 
     RQ imports and calls the function that an entry names. Here nothing that lies in Redis decides what runs, and
-    entries of servers that know the attempt function by another name still run.
+    entries of servers that know the function by another name still run.
+
+    attempt: the attempt at the job, set in its process before it runs.
     """
 
+    attempt: Attempt | None = None
+
     def func(self, *args: object, **kwargs: object) -> None:
-        """Called by RQ in place of the named function, with the entry's arguments."""
-        run_attempt()
+        """Run the attempt. RQ calls this in place of the named function, with the entry's arguments."""
+        assert self.attempt is not None
+        run_attempt(self.attempt, can_retry=self.should_retry)
 
 
 class AttemptWorker(Worker):
-    """A worker on one queue. `stop_grace` as STOP_GRACE, for tests and for operators in a hurry."""
+    """A worker on one queue.
+
+    stop_grace: seconds that an attempt has to save its state when the worker is told to stop.
+    """
 
     max_connection_wait_time = 2.0
 
@@ -73,45 +82,47 @@ class AttemptWorker(Worker):
             job_monitoring_interval=backplane.MONITORING_INTERVAL,
         )
         self._grace = stop_grace
-        self._running: str | None = None
+        self._entry_id: str | None = None
         self._lock: JobLock | None = None
         self._kill_at: float | None = None
-        self._given_away = False
-        self._sweep_at = 0.0
+        self._superseded = False
+        self._remove_at = 0.0
 
-    # Birth and heartbeat
+    # Start, maintenance and heartbeat
 
     def register_birth(self) -> None:
-        super().register_birth()  # type: ignore[no-untyped-call]  # rq's own gap, here and below
-        recovery.sign(self)
-        recovery.adopt(self)
+        super().register_birth()  # type: ignore[no-untyped-call]  # rq lacks types here and below
+        recovery.record_process(self)
+        recovery.requeue_orphans(self)
 
     def run_maintenance_tasks(self) -> None:
         super().run_maintenance_tasks()  # type: ignore[no-untyped-call]
-        if time.monotonic() >= self._sweep_at:
-            self._sweep_at = time.monotonic() + _SWEEP_SECONDS
-            for job_id in sweep(self.connection):
-                self.log.info(
-                    "Worker %s: removed the work folder of job %s, which is gone", self.name, job_id
-                )
+        if time.monotonic() >= self._remove_at:
+            self._remove_at = time.monotonic() + _REMOVAL_INTERVAL
+            for job_id in remove_abandoned(self.connection):
+                self.log.info("Worker %s: removed the folder of the deleted job %s", self.name, job_id)
 
     def get_heartbeat_ttl(self, job: Job) -> int:
         return backplane.MONITORING_INTERVAL + backplane.HEARTBEAT_SLACK
 
-    def _beat(self, job: Job) -> None:
-        """Say that the attempt lives; end it when the queue or the lock was given to another meanwhile."""
+    def _heartbeat(self, job: Job) -> None:
+        """Send the heartbeats of an attempt, or kill it if the queue or the lock has gone to another one meanwhile."""
         try:
             self.maintain_heartbeats(job)
             assert self.execution is not None
             registered = self.connection.zscore(job.started_job_registry.key, self.execution.composite_key)
-            held = self._lock.refresh() if self._lock else Held.own
-        except _GONE as error:
-            # The attempt needs no Redis to compute; what it has to say waits in its outbox.
-            self.log.warning("Worker %s: no heartbeat, Redis cannot be reached: %s", self.name, error)
+            lock = self._lock.refresh() if self._lock else LockState.held
+        except _REDIS_AWAY as error:
+            # The attempt needs no Redis to compute, and its outbox keeps its events.
+            self.log.warning(
+                "Worker %s: Redis cannot be reached, so no heartbeat was sent: %s", self.name, error
+            )
             return
-        if held is Held.lost or registered is None:
-            self.log.warning("Worker %s: job %s was given to another attempt; ending ours", self.name, job.id)
-            self._given_away = True
+        if lock is LockState.lost or registered is None:
+            self.log.warning(
+                "Worker %s: another attempt at job %s has begun; killing this one", self.name, job.id
+            )
+            self._superseded = True
             self.kill_horse()
 
     # Stop requests
@@ -120,13 +131,13 @@ class AttemptWorker(Worker):
         payload = parse_payload(message)
         if payload["command"] != "stop-job":
             super().handle_payload(message)  # type: ignore[no-untyped-call]
-        elif payload.get("job_id") == self._running and self.horse_pid:
-            # RQ asks Redis whether this is the job at hand; the answer is known here, even before it is there.
-            self._stopped_job_id = self._running
+        elif payload.get("job_id") == self._entry_id and self.horse_pid:
+            # RQ compares with the current job in Redis, which is written later than the attempt begins.
+            self._stopped_job_id = self._entry_id
             self.kill_horse()
 
     def kill_horse(self, sig: signal.Signals = signal.SIGKILL) -> None:
-        """Kill the attempt with every process it started."""
+        """Kill the attempt and every process that it started."""
         if self.horse_pid:
             with suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.horse_pid, sig)
@@ -136,17 +147,17 @@ class AttemptWorker(Worker):
         if self.horse_pid:
             self._kill_at = time.monotonic() + self._grace
             with suppress(ProcessLookupError):
-                os.kill(self.horse_pid, attempt.HAND_BACK_SIGNAL)
+                os.kill(self.horse_pid, hand_back.SIGNAL)
 
     def request_force_stop(self, signum: int, frame: FrameType | None) -> None:
-        """A second signal: do not wait for the checkpoint. The job is handed back all the same."""
+        """Kill the attempt on a second signal, without waiting for a checkpoint. The job is still handed back."""
         if self._shutdown_requested_date and (now() - self._shutdown_requested_date).total_seconds() < 1:
-            return  # a terminal and a supervisor may both pass on one Ctrl-C
+            return  # one Ctrl-C may arrive twice, from the terminal and from a supervisor
         self._kill_at = time.monotonic()
         self.kill_horse()
 
     def unsubscribe(self) -> None:
-        """RQ waits a second for its listening thread, which ends with this process anyway."""
+        """Stop listening for commands. RQ would wait a second for the thread, which ends with this process anyway."""
         if self.pubsub_thread:
             self.pubsub_thread.stop()
 
@@ -155,69 +166,73 @@ class AttemptWorker(Worker):
     def execute_job(self, job: Job, queue: Queue) -> None:
         self.prepare_execution(job)
         with self.connection.pipeline() as pipeline:
-            # The registry holds the job from here on. Naming the worker now lets a stop request find it.
+            # From here on the registry holds the job. With the worker's name in it, a stop request finds the worker.
             job.prepare_for_execution(self.name, pipeline=pipeline)
             pipeline.lrem(queue.intermediate_queue_key, 1, job.id)
             pipeline.execute()
-        self._running, self._given_away = job.id, False
+        self._entry_id, self._superseded = job.id, False
         try:
             self.fork_work_horse(job, queue)
             self.monitor_work_horse(job, queue)
         finally:
-            self._running = None
-        self._insist(lambda: self.set_state("idle"))
+            self._entry_id = None
+        self._until_redis_answers(lambda: self.set_state("idle"))
 
     def fork_work_horse(self, job: Job, queue: Queue) -> None:
         job_id, _ = backplane.split_rq_id(job.id)
         self._lock = JobLock(self.connection, job_id, uuid4().hex)
         parent = os.getpid()
-        signals = {signal.SIGTERM, signal.SIGINT, attempt.HAND_BACK_SIGNAL}
-        # A signal between the fork and the child's own handlers would run the worker's in the child.
+        signals = {signal.SIGTERM, signal.SIGINT, hand_back.SIGNAL}
+        # Until the child has set up its own handlers, a signal would run those of the worker in the child.
         signal.pthread_sigmask(signal.SIG_BLOCK, signals)
         child = os.fork()
         if child == 0:
             try:
                 os.setpgid(0, 0)
                 die_with_parent(parent)
-                attempt.install_signal_handlers()
+                hand_back.install_signal_handlers()
                 signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
-                self._attempt(job, queue)
+                self._run_child(job, queue)
             finally:
                 os._exit(1)
         with suppress(OSError):
-            # Both sides set it: whoever comes first, a kill never meets the worker's own group.
+            # Parent and child both set it, so that a kill can at no time hit the worker's own group.
             os.setpgid(child, child)
         self._horse_pid = child
         signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
         if self._stop_requested:
             self.handle_warm_shutdown_request()
 
-    def _attempt(self, job: Job, queue: Queue) -> None:
-        """The child's life, from the lock to its exit status."""
+    def _run_child(self, job: Job, queue: Queue) -> None:
+        """Run the attempt in the forked process, and exit with its status."""
         assert self._lock is not None
+        assert isinstance(job, AttemptEntry)
         try:
-            attempt.begin(self.connection, job.id, self._lock.token)
+            job.attempt = start_attempt(self.connection, job.id, self._lock.token)
             self.main_work_horse(job, queue)
         except HandedBack:
-            os._exit(attempt.HANDED_BACK)
+            os._exit(HANDED_BACK_STATUS)
 
     def setup_work_horse_signals(self) -> None:
-        """Already done before the attempt began."""
+        """Do nothing: the handlers are set up before the attempt begins."""
 
     def monitor_work_horse(self, job: Job, queue: Queue) -> None:
         job.started_at = now()
-        kills = oom_kills()
+        kills = oom_kill_count()
         horse = self.horse_pid
         status, usage = self._wait(job)
-        ending = Ending.of(status, usage, oom_kills() - kills)
-        # Nothing the attempt started may go on without it.
+        process_exit = ProcessExit.of(status, usage, oom_kill_count() - kills)
+        # No process that the attempt started may outlive it.
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(horse, signal.SIGKILL)
         self._horse_pid = 0
-        self._insist(lambda: self._conclude(job, queue, ending))
+        self._until_redis_answers(lambda: self._settle(job, queue, process_exit))
 
     def _wait(self, job: Job) -> tuple[int, Any]:
-        """Wait for the attempt's process to end, with heartbeats, and within the grace once told to stop."""
+        """Wait for the attempt's process, sending heartbeats, and kill it when the grace of a stop is over.
+
+        Returns the wait status and the resource usage of the process.
+        """
         handle = os.pidfd_open(self.horse_pid) if hasattr(os, "pidfd_open") else None
         beat_at = time.monotonic() + backplane.MONITORING_INTERVAL
         try:
@@ -227,7 +242,7 @@ class AttemptWorker(Worker):
                     return status, usage
                 if time.monotonic() >= beat_at:
                     beat_at = time.monotonic() + backplane.MONITORING_INTERVAL
-                    self._beat(job)
+                    self._heartbeat(job)
                 if self._kill_at is not None and time.monotonic() >= self._kill_at:
                     self.kill_horse()
                 if handle is not None:
@@ -238,47 +253,39 @@ class AttemptWorker(Worker):
             if handle is not None:
                 os.close(handle)
 
-    def _conclude(self, job: Job, queue: Queue, ending: Ending) -> None:
-        """Settle with the queue what the process could not settle itself."""
+    def _settle(self, job: Job, queue: Queue, process_exit: ProcessExit) -> None:
+        """Report the end of an attempt, and update its entry, as far as its process has not done so."""
         assert self._lock is not None
-        told = self._told(job)
+        holder = self._lock.holder()
+        ours = holder if holder and holder.token == self._lock.token else None
+        ended = recovery.ended_attempt(self.connection, job.id, self._lock, ours)
         self._lock.release()
-        if ending.clean or self._given_away or not Job.exists(job.id, self.connection):
+        if process_exit.clean or self._superseded or not Job.exists(job.id, self.connection):
             return
-        if ending.withdrawn:
+        if process_exit.withdrawn:
             self._stopped_job_id = job.id
         if self._stopped_job_id == job.id:
-            # The server says `cancelled` once it reads this status: no process is left.
+            # The server reports `cancelled` once it reads this status: no process is left.
             self.handle_job_failure(job, queue, exc_string="Stopped on request.")
         elif job.get_status() is not JobStatus.STARTED:
-            return  # it told the queue how it ended, and died after that
-        elif ending.handed_back or self._stop_requested:
-            attempt.requeued(told, "The worker is being stopped; the job goes back to the queue.")
-            recovery.hand_back(self, job, queue)
+            return  # the process died after it had updated its entry
+        elif process_exit.handed_back or self._stop_requested:
+            ended.report_requeued("The worker is stopping. The job was put back at the head of the queue.")
+            recovery.requeue_first(self, job, queue)
         elif job.should_retry:
-            tries = job.retries_left
-            attempt.requeued(told, f"The job's process {ending.cause}; trying again ({tries} tries left).")
-            self.handle_job_failure(job, queue, exc_string=f"The process {ending.cause}.")
+            left = f"{job.retries_left} {'retry is' if job.retries_left == 1 else 'retries are'} left"
+            ended.report_requeued(f"The job's process {process_exit.cause}. It is tried again: {left}.")
+            self.handle_job_failure(job, queue, exc_string=f"The process {process_exit.cause}.")
         else:
-            attempt.failed(told, ending.problem(attempts=backplane.MAX_RETRIES + 1))
-            self.handle_job_failure(job, queue, exc_string=f"The process {ending.cause}.")
+            ended.report_failed(process_exit.problem(attempts=backplane.MAX_RETRIES + 1))
+            self.handle_job_failure(job, queue, exc_string=f"The process {process_exit.cause}.")
 
-    def _told(self, job: Job) -> Attempt:
-        """The attempt that just ended, to speak in its name."""
-        assert self._lock is not None
-        job_id, generation = backplane.split_rq_id(job.id)
-        holder = self._lock.holder()
-        number = holder.attempt if holder and holder.token == self._lock.token else 0
-        return Attempt(
-            self.connection, job_id, generation, number or recovery.attempts(self, job_id), self._lock
-        )
-
-    def _insist(self, action: Callable[[], None]) -> None:
-        """Do what must be done, however long Redis stays away."""
+    def _until_redis_answers(self, action: Callable[[], None]) -> None:
+        """Repeat `action` until Redis can be reached."""
         while True:
             try:
                 action()
                 return
-            except _GONE as error:
+            except _REDIS_AWAY as error:
                 self.log.warning("Worker %s: waiting for Redis: %s", self.name, error)
                 time.sleep(_RETRY_SECONDS)

@@ -1,4 +1,4 @@
-"""Removes the work folders of deleted jobs. The server that deletes a job may run on another machine."""
+"""Removes the job folders of deleted jobs, which the server cannot do when it runs on another machine."""
 
 import shutil
 import time
@@ -6,16 +6,16 @@ import time
 import redis
 
 from splatmill.backplane import keys, layout
-from splatmill_worker.service.workspace import in_use
+from splatmill_worker.service.job_folder import in_use
 from splatmill_worker.settings import data_folder
 
 KEEP_SECONDS = 24 * 3600
-"""A folder is kept this long after its last attempt even when its job is unknown: the job may be known to another
-Redis, which this worker was not meant to be pointed away from."""
+"""Seconds since its last attempt for which the folder of an unknown job is kept. The worker may have been pointed to
+another Redis by mistake, which does not know the jobs of the usual one."""
 
 
-def sweep(connection: redis.Redis) -> list[str]:
-    """Remove every folder whose job is gone, whose last attempt is a day old and in which nobody works."""
+def remove_abandoned(connection: redis.Redis) -> list[str]:
+    """Remove the folders of unknown jobs that are unused and older than KEEP_SECONDS. Return the ids of these jobs."""
     removed = []
     work = data_folder() / "work"
     for folder in sorted(work.iterdir()) if work.is_dir() else ():

@@ -6,7 +6,7 @@ Does not prove that the names of the models tell different settings apart: tests
 from pathlib import Path
 
 from splatmill.backplane.storage import Storage
-from splatmill_worker.service import shared_cameras as reconstruction
+from splatmill_worker.service import sfm_cache
 
 CAPTURE = "capture1"
 
@@ -19,13 +19,13 @@ def test_recovered_cameras_serve_the_next_job_on_the_capture(remote: Storage, tm
         for name in names:
             (folder / name).write_text(name)
     (first / "sfm/photos/database.db").write_text("only of use while the cameras are being recovered")
-    assert reconstruction.fetch(remote, CAPTURE, second) == 0
-    assert reconstruction.share(remote, CAPTURE, first) == 1
-    assert reconstruction.share(remote, CAPTURE, first) == 0
-    assert reconstruction.fetch(remote, CAPTURE, second) == 1
-    assert reconstruction.fetch(remote, CAPTURE, second) == 0
+    assert sfm_cache.fetch(remote, CAPTURE, second) == 0
+    assert sfm_cache.store(remote, CAPTURE, first) == 1
+    assert sfm_cache.store(remote, CAPTURE, first) == 0
+    assert sfm_cache.fetch(remote, CAPTURE, second) == 1
+    assert sfm_cache.fetch(remote, CAPTURE, second) == 0
     files = [path.relative_to(second).as_posix() for path in second.rglob("*") if path.is_file()]
     assert sorted(files) == [f"sfm/photos/model-1/{name}" for name in ("a.bin", "facts.json", "points3D.bin")]
     # A copy that broke off before its last file is no model, and is completed by the next.
     (second / "sfm/photos/model-1/facts.json").unlink()
-    assert reconstruction.fetch(remote, CAPTURE, second) == 1
+    assert sfm_cache.fetch(remote, CAPTURE, second) == 1

@@ -1,0 +1,169 @@
+"""The local folder of a job: its photos, its checkpoints, and the model to be stored.
+
+    work/{job}/capture/{images,masks,poses}/...   the capture, linked or downloaded
+    work/{job}/run/...                            what the pipeline writes: checkpoints, cameras, out/
+    work/{job}/lock                               locked by the attempt's process, independently of Redis
+
+The folder outlives an attempt, so that the next one resumes. `mirror` copies what it needs to storage as well, where
+storage is not a folder of this machine.
+"""
+
+import fcntl
+import os
+import shutil
+import time
+from pathlib import Path
+
+from splatmill.backplane import layout
+from splatmill.backplane.storage import Storage
+from splatmill.files import replacing
+from splatmill_worker.errors import FolderInUse, StartNotStored
+from splatmill_worker.settings import work_folder
+
+LOCK_SECONDS = 10.0
+"""Seconds to wait for the folder's lock, which a process that is being killed still holds for a moment."""
+
+START, FILM, CHECKPOINTS = "start.ply", "film", "checkpoints"
+"""Names in the run folder: the model to start from, the frames of the progress film, and the checkpoints."""
+
+_CAMERAS = "sfm"
+
+
+class JobFolder:
+    """The folder of one job, locked for this process until it is closed or the process ends.
+
+    storage: where the capture lies and the model goes.
+    path: the folder.
+    capture, run: the two folders that the pipeline is given.
+
+    Raises FolderInUse when another process holds the lock for longer than LOCK_SECONDS.
+    """
+
+    def __init__(self, storage: Storage, job_id: str, capture_id: str) -> None:
+        self.storage = storage
+        self.job_id = job_id
+        self.capture_id = capture_id
+        self.path = work_folder(job_id)
+        self.path.mkdir(parents=True, exist_ok=True)
+        self.capture = self.path / "capture"
+        self.run = self.path / "run"
+        self._lock = _locked(self.path / "lock")
+
+    def stage_capture(self) -> int:
+        """Make the capture folder equal to the stored capture, by links where storage is local. Return its files."""
+        prefix = layout.capture_files(self.capture_id)
+        entries = list(self.storage.entries(prefix))
+        wanted = {entry.path[len(prefix) + 1 :]: entry for entry in entries}
+        for path in self.capture.rglob("*") if self.capture.is_dir() else ():
+            if not path.is_dir() and path.relative_to(self.capture).as_posix() not in wanted:
+                path.unlink()
+        for name, entry in wanted.items():
+            target = self.capture / name
+            if target.is_file() and target.stat().st_size == entry.size:
+                continue
+            source = self.storage.local_path(entry.path)
+            if source is None:
+                self.storage.download(entry.path, target)
+            else:
+                _link_or_symlink(source, target)
+        return len(entries)
+
+    def stage_start(self, model_id: str) -> None:
+        """Make a stored model available as run/start.ply. Raises StartNotStored when there is no such model."""
+        target = self.run / START
+        if target.is_file():
+            return
+        path = layout.model_file(model_id, "model.ply") if layout.is_id(model_id) else None
+        if path is None or self.storage.head(path) is None:
+            raise StartNotStored(model_id)
+        source = self.storage.local_path(path)
+        if source is None:
+            self.storage.download(path, target)
+        else:
+            _link_or_copy(source, target)
+
+    def restore(self) -> list[str]:
+        """Fetch what an attempt on another machine stored, if this machine has nothing. Return the names.
+
+        Without a checkpoint the training begins anew. Film frames of the earlier training are then deleted from
+        storage.
+        """
+        if self.storage.root is not None:
+            return []
+        stored = layout.job_work(self.job_id)
+        own = self.run.is_dir()
+        if own:
+            resumes = (self.run / CHECKPOINTS).is_dir()
+        else:
+            resumes = any(True for _ in self.storage.entries(f"{stored}/{CHECKPOINTS}"))
+        if not resumes:
+            self.storage.delete_prefix(f"{stored}/{FILM}")
+        return [] if own else self.storage.download_prefix(stored, self.run)
+
+    def close(self) -> None:
+        """Release the lock and keep the folder."""
+        os.close(self._lock)
+
+    def remove(self) -> None:
+        """Delete the folder, and what was stored for other machines: the job has ended."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        self._delete_stored()
+
+    def reset(self) -> None:
+        """Delete all that led to a failure, so that a restarted job trains anew. The recovered cameras stay."""
+        for path in self.run.iterdir() if self.run.is_dir() else ():
+            if path.name != _CAMERAS:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        self._delete_stored()
+
+    def _delete_stored(self) -> None:
+        if self.storage.root is None:
+            self.storage.delete_prefix(layout.job_work(self.job_id))
+
+
+def in_use(folder: Path) -> bool:
+    """Return whether a process holds the lock of a job's folder."""
+    try:
+        with (folder / "lock").open("a") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except FileNotFoundError:
+        return False
+    return False
+
+
+def _locked(path: Path) -> int:
+    """Lock a file exclusively and return its descriptor. The lock ends when that is closed, also by a kill."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
+    path.touch()  # its modification time is the begin of the last attempt
+    deadline = time.monotonic() + LOCK_SECONDS
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return descriptor
+        except BlockingIOError:
+            if time.monotonic() > deadline:
+                os.close(descriptor)
+                raise FolderInUse(path.parent) from None
+            time.sleep(0.05)
+
+
+def _link_or_symlink(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    try:
+        # A hard link stays readable when the capture is deleted while the job runs.
+        os.link(source, target)
+    except OSError:
+        target.symlink_to(source)
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    """Link `source` to `target`, or copy it where no hard link can be made: later attempts need it if it is deleted."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        with replacing(target) as part:
+            shutil.copy2(source, part)

@@ -1,0 +1,68 @@
+"""Copies the checkpoints of a running job to storage, for an attempt that may follow on another machine."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from splatmill.backplane import layout
+from splatmill.backplane.storage import StorageError
+from splatmill_worker.service.job_folder import CHECKPOINTS, FILM, START, JobFolder
+
+INTERVAL = 15.0
+"""Seconds between two looks for new files. A machine that dies loses this much more than its last checkpoint."""
+
+MIRRORED = (START, CHECKPOINTS, "plan.json", "stages.json", FILM)
+"""Files and folders of `run` that are copied. The recovered cameras are not among them: `sfm_cache` stores those."""
+
+
+class Mirror:
+    """The thread that copies new files of `folder.run` to storage while the pipeline runs.
+
+    Without work where storage is a folder of this machine. A failed copy is reported to `warn` and tried again.
+    """
+
+    def __init__(self, folder: JobFolder, warn: Callable[[str], None]) -> None:
+        self._folder = folder
+        self._warn = warn
+        self._copied: dict[Path, tuple[int, int]] = {}
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        if folder.storage.root is None:
+            self._thread = threading.Thread(target=self._loop, name="mirror", daemon=True)
+            self._thread.start()
+
+    def close(self, copy: bool) -> None:
+        """End the thread. With `copy`, bring storage up to date first."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            if copy:
+                self._copy()
+
+    def _loop(self) -> None:
+        while not self._stop.wait(INTERVAL):
+            self._copy()
+
+    def _copy(self) -> None:
+        run, storage = self._folder.run, self._folder.storage
+        for path in _files_in([run / name for name in MIRRORED]):
+            try:
+                state = path.stat()
+            except FileNotFoundError:
+                continue
+            version = (state.st_mtime_ns, state.st_size)
+            if path.name.startswith(".") or self._copied.get(path) == version:
+                continue  # names with a leading dot are of files that are still being written
+            name = path.relative_to(run).as_posix()
+            try:
+                storage.put(f"{layout.job_work(self._folder.job_id)}/{name}", path)
+            except (StorageError, FileNotFoundError) as error:
+                self._warn(f"{name} could not be copied to storage and will be tried again: {error}")
+            else:
+                self._copied[path] = version
+
+
+def _files_in(paths: list[Path]) -> list[Path]:
+    """Return the files among `paths` and below them, sorted."""
+    below = [child for path in paths if path.is_dir() for child in path.rglob("*")]
+    return sorted(path for path in (*paths, *below) if path.is_file())

@@ -1,0 +1,213 @@
+"""One attempt at a job: stages the capture, runs the pipeline, reports its events and stores the model.
+
+It runs in a process of its own (see rq_worker). Each failure becomes a named problem, and one that would happen again
+is not retried. When the process is killed, its parent reports that.
+"""
+
+import importlib
+import logging
+import os
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn, Protocol, cast
+
+from splatmill.backplane import events, layout
+from splatmill.backplane import row as rows
+from splatmill.backplane.fold import fold
+from splatmill.backplane.row import JobRow
+from splatmill.backplane.storage import Storage, StorageError
+from splatmill.schema import Event, JobState, LogEvent, PreviewEvent, StateEvent, TrainOptions
+from splatmill_worker.errors import EmptyCapture
+from splatmill_worker.service import hand_back, publish, sfm_cache
+from splatmill_worker.service.attempt import LONGEST_MESSAGE, Attempt
+from splatmill_worker.service.hand_back import HandedBack
+from splatmill_worker.service.job_folder import JobFolder
+from splatmill_worker.service.lock import LockState
+from splatmill_worker.service.mirror import Mirror
+from splatmill_worker.service.outbox import Outbox
+from splatmill_worker.service.problems import is_transient, problem_of
+from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, WITHDRAWN_STATUS
+from splatmill_worker.settings import storage_url
+
+PIPELINE = os.environ.get("SPLATMILL_PIPELINE", "splatmill_worker.pipeline")
+"""The module whose `run` does the work. The service's tests put a stand-in in its place."""
+
+RETRY_SECONDS = 5.0
+"""Seconds between a transient failure and the end of its attempt, after which the queue tries again."""
+
+FLUSH_SECONDS = 5.0
+"""Seconds that an attempt which is handed back may spend on sending its last events."""
+
+
+class PipelineResult(Protocol):
+    """What a pipeline returns. `ended` is "succeeded", or "cancelled" when it was asked to stop."""
+
+    @property
+    def ended(self) -> str: ...
+
+
+Pipeline = Callable[[Path, Path, TrainOptions, Callable[[Event], None], Callable[[], bool]], PipelineResult]
+"""Arguments: capture folder, run folder, options, what takes the events, and what tells whether to stop."""
+
+log = logging.getLogger("splatmill_worker")
+
+
+def run_attempt(attempt: Attempt, can_retry: bool) -> None:
+    """Run an attempt to the end, in a process forked for it.
+
+    can_retry: whether the queue tries again when this raises.
+
+    Reports the job's final state, or exits the process with HANDED_BACK_STATUS or WITHDRAWN_STATUS. Raises a transient
+    failure while the queue can retry.
+    """
+    row = _row_to_run(attempt)
+    if row is not None:
+        outbox = Outbox(attempt)
+        try:
+            _run(attempt, row, outbox, can_retry)
+        except HandedBack:
+            outbox.flush(FLUSH_SECONDS)
+            os._exit(HANDED_BACK_STATUS)
+        finally:
+            outbox.close()
+    attempt.lock.release()
+
+
+def _row_to_run(attempt: Attempt) -> JobRow | None:
+    """Return the job's row; None when the job was deleted or restarted meanwhile, or has ended."""
+    row = rows.read(attempt.connection, attempt.job_id)
+    if row is None or row.generation != attempt.generation:
+        return None
+    if fold(row, events.read_states(attempt.connection, attempt.job_id)).state.final:
+        return None
+    if row.cancel_requested_at is not None:
+        os._exit(WITHDRAWN_STATUS)
+    return row
+
+
+def _run(attempt: Attempt, row: JobRow, outbox: Outbox, can_retry: bool) -> None:
+    handler = _LogEventHandler(outbox)
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        outbox.put(StateEvent(state=JobState.preparing))
+        storage = Storage(storage_url())
+        if not publish.is_published(storage, attempt):
+            _train_and_publish(attempt, row, storage, outbox)
+        outbox.put(StateEvent(state=JobState.succeeded))
+    except Exception as error:  # the one place where a failure of a job becomes a problem
+        if hand_back.requested():
+            raise HandedBack from error
+        _report_failure(error, outbox, can_retry)
+    finally:
+        log.removeHandler(handler)
+
+
+def _train_and_publish(attempt: Attempt, row: JobRow, storage: Storage, outbox: Outbox) -> None:
+    folder = JobFolder(storage, attempt.job_id, row.capture)
+    restored = folder.restore()
+    if restored:
+        log.info("Resuming from %d files that an attempt on another machine stored.", len(restored))
+    if not folder.stage_capture():
+        raise EmptyCapture(row.capture)
+    if sfm_cache.fetch(storage, row.capture, folder.run):
+        log.info("Using the cameras that an earlier job recovered from this capture.")
+    if row.options.start_model is not None:
+        folder.stage_start(row.options.start_model)
+    mirror = Mirror(folder, log.warning)
+    try:
+        run = cast(Pipeline, importlib.import_module(PIPELINE).run)
+        result = run(
+            folder.capture,
+            folder.run,
+            row.options,
+            lambda event: _forward(event, folder, outbox),
+            hand_back.requested,
+        )
+    except BaseException as error:
+        mirror.close(copy=hand_back.requested())
+        if isinstance(error, Exception) and not hand_back.requested() and not is_transient(error):
+            folder.reset()
+        raise
+    handed_back = result.ended == "cancelled"
+    mirror.close(copy=handed_back)
+    if handed_back:
+        raise HandedBack
+    if attempt.lock.refresh() is LockState.lost:
+        _exit_superseded()
+    publish.publish(storage, attempt, row, folder.run / "out")
+    folder.remove()
+
+
+def _forward(event: Event, folder: JobFolder, outbox: Outbox) -> None:
+    """Send an event of the pipeline, with what belongs to it.
+
+    A preview is stored before it is announced. When training begins, the recovered cameras are stored for other jobs.
+    Final states are dropped: the service reports them once the model is stored.
+    """
+    if isinstance(event, StateEvent) and event.state.final:
+        return
+    if isinstance(event, PreviewEvent):
+        target = layout.model_file(folder.job_id, "preview.jpg")
+        try:
+            folder.storage.put(target, (folder.run / event.path).read_bytes())
+        except (StorageError, OSError) as error:
+            outbox.put(LogEvent(level="warning", message=f"A preview could not be stored: {error}"))
+            return
+        event = PreviewEvent(path=target, step=event.step)
+    outbox.put(event)
+    if isinstance(event, StateEvent) and event.state is JobState.training:
+        try:
+            sfm_cache.store(folder.storage, folder.capture_id, folder.run)
+        except StorageError as error:
+            # The job itself does not need them there.
+            message = f"The recovered cameras could not be stored for other jobs on this capture: {error}"
+            outbox.put(LogEvent(level="warning", message=message))
+
+
+def _report_failure(error: Exception, outbox: Outbox, can_retry: bool) -> None:
+    """Report the failure of the job, or raise a transient one again while the queue can retry."""
+    trace = "".join(traceback.format_exception(error))
+    print(trace, flush=True)
+    problem = problem_of(error)
+    if is_transient(error):
+        outbox.flush()  # waits until Redis is back, if its absence was the failure
+        if can_retry:
+            outbox.put(LogEvent(level="warning", message=f"{problem.detail} The job is tried again."))
+            outbox.put(StateEvent(state=JobState.queued))
+            outbox.flush()
+            _wait(RETRY_SECONDS)
+            raise error
+    if problem.code == "internal_error":
+        outbox.put(LogEvent(level="error", message=trace[-LONGEST_MESSAGE:]))
+    outbox.put(LogEvent(level="error", message=problem.sentence[:LONGEST_MESSAGE]))
+    outbox.put(StateEvent(state=JobState.failed, problem=problem))
+    outbox.flush()
+
+
+def _wait(seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if hand_back.requested():
+            raise HandedBack
+        time.sleep(0.1)
+
+
+def _exit_superseded() -> NoReturn:
+    """End without publishing: another attempt has the job's lock. The parent notices at its next heartbeat too."""
+    print("Another attempt holds the job's lock; this one ends without storing its model.", flush=True)
+    os._exit(1)
+
+
+class _LogEventHandler(logging.Handler):
+    """Sends Python log records as log events of the job."""
+
+    def __init__(self, outbox: Outbox) -> None:
+        super().__init__(logging.INFO)
+        self._outbox = outbox
+
+    def emit(self, record: logging.LogRecord) -> None:
+        level = cast(Any, "error" if record.levelno >= 40 else "warning" if record.levelno >= 30 else "info")
+        self._outbox.put(LogEvent(level=level, message=self.format(record)[:LONGEST_MESSAGE]))

@@ -1,0 +1,43 @@
+"""A cache in storage of recovered cameras, so that all jobs on a capture share them, on any machine.
+
+`sfm` writes its models to `run/sfm/<photos>/model-<settings>`. These names are digests of the inputs, so that a model
+of the same name is the same model. The cache holds the same tree under `captures/{id}/sfm`.
+"""
+
+from pathlib import Path
+
+from splatmill.backplane import layout
+from splatmill.backplane.storage import Storage
+
+_FOLDER = "sfm"
+_LAST_FILE = "facts.json"
+"""The file of a model that is copied last, in both directions: a folder without it is incomplete and is not used."""
+
+
+def fetch(storage: Storage, capture_id: str, run: Path) -> int:
+    """Copy the cached models of a capture that the `run` folder lacks into it. Return their number."""
+    prefix = layout.capture_sfm(capture_id)
+    names = [entry.path[len(prefix) + 1 :] for entry in storage.entries(prefix)]
+    fetched = 0
+    for last in (name for name in names if name.endswith(f"/{_LAST_FILE}")):
+        folder = last.removesuffix(_LAST_FILE)
+        if (run / _FOLDER / last).is_file():
+            continue
+        for name in [*(n for n in names if n.startswith(folder) and n != last), last]:
+            storage.download(f"{prefix}/{name}", run / _FOLDER / name)
+        fetched += 1
+    return fetched
+
+
+def store(storage: Storage, capture_id: str, run: Path) -> int:
+    """Copy the models of the `run` folder that the cache lacks into it. Return their number."""
+    prefix = layout.capture_sfm(capture_id)
+    stored = 0
+    for last in sorted((run / _FOLDER).glob(f"*/model-*/{_LAST_FILE}")):
+        target = f"{prefix}/{last.parent.relative_to(run / _FOLDER).as_posix()}"
+        if storage.exists(f"{target}/{_LAST_FILE}"):
+            continue
+        for path in [*(p for p in sorted(last.parent.iterdir()) if p.is_file() and p != last), last]:
+            storage.put(f"{target}/{path.name}", path)
+        stored += 1
+    return stored
