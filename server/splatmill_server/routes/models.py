@@ -40,7 +40,7 @@ _CAMERA_QUERY = [
         "required": True,
         "description": "The 16 numbers of the matrix, row by row, separated by commas.",
         "schema": {"type": "string"},
-        "example": ",".join(str(x) for row in CAMERA["camera_to_world"] for x in row),  # type: ignore[attr-defined]  # the values of CAMERA have different types
+        "example": ",".join(str(x) for row in CAMERA["camera_to_world"] for x in row),
     },
     *(
         {"name": name, "in": "query", "required": name in ("width", "height"), "schema": {"type": kind}}

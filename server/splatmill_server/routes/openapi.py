@@ -22,7 +22,7 @@ JOB_REQUESTS = {
         "value": {"capture": CAPTURE_ID, "options": {"time_budget": "5m", "max_gaussians": 300_000}},
     },
 }
-CAMERA = {
+CAMERA: dict[str, Any] = {
     "camera_to_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -4], [0, 0, 0, 1]],
     "width": 640,
     "height": 480,

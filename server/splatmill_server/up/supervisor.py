@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from types import FrameType
+from typing import Any
 
 from splatmill_server.up import redis_server
 from splatmill_server.up.child import Child
@@ -53,8 +54,8 @@ class Supervisor:
         if own_redis:
             environment["REDIS_URL"] = f"unix://{folder.redis_socket}"
 
-        def child(name: str, command: list[str], stop_seconds: float, **more: object) -> Child:
-            return Child(name, command, environment, lambda: folder.log(name), stop_seconds, **more)  # type: ignore[arg-type]  # more: the optional fields of Child
+        def child(name: str, command: list[str], stop_seconds: float, **more: Any) -> Child:
+            return Child(name, command, environment, lambda: folder.log(name), stop_seconds, **more)
 
         python = sys.executable
         self.worker = child("worker", [python, "-m", WORKER, "train"], _WORKER_STOP_SECONDS)
