@@ -1,11 +1,12 @@
-"""Arguments of the ops: a wrong one is a sentence that names it, before any kernel sees it."""
+"""Checks of arguments, made before any kernel reads them. Every error names the argument."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-LARGEST_SIDE = 32768  # pixels
+LARGEST_SIDE = 32768
+"""Largest width or height of an image in pixels."""
 
 
 def tensor(
@@ -17,7 +18,10 @@ def tensor(
     device: str = "cpu",
     contiguous: bool = False,
 ) -> None:
-    """Raise TypeError or ValueError unless value is a tensor of this shape (None: any length), dtype and device."""
+    """Raise TypeError or ValueError unless value is a tensor of this shape, dtype and device.
+
+    shape: a side of None may have any length. dtype: None admits any. device: its type, "cpu" or "cuda".
+    """
     if not isinstance(value, Tensor):
         raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}")
     wanted = "[" + ", ".join("*" if n is None else str(n) for n in shape) + "]"
@@ -44,12 +48,12 @@ def gaussians(
     dtype: torch.dtype = torch.float32,
     device: str = "cpu",
 ) -> None:
-    """The five parameter groups of one scene, all with as many rows as means."""
+    """Check the five parameter groups of one scene: they have as many rows as means, fewer than 2^31."""
     tensor("means", means, (None, 3), dtype=dtype, device=device)
     assert isinstance(means, Tensor)
     n = len(means)
     if n >= 2**31:
-        raise ValueError(f"means: {n} Gaussians, but ids are 32 bits wide; 2147483647 at most")
+        raise ValueError(f"means: expected at most 2147483647 Gaussians (ids have 32 bits), got {n}")
     tensor("log_scales", log_scales, (n, 3), dtype=dtype, device=device)
     tensor("quats", quats, (n, 4), dtype=dtype, device=device)
     tensor("logit_opacities", logit_opacities, (n,), dtype=dtype, device=device)
@@ -68,7 +72,7 @@ def camera(
     dtype: torch.dtype = torch.float32,
     device: str = "cpu",
 ) -> None:
-    """A camera and the size, degree and background to render with."""
+    """Check a camera, and the image size, SH degree, near plane and background to render with."""
     tensor("viewmat", viewmat, (4, 4), dtype=dtype, device=device)
     tensor("K", K, (3, 3), dtype=dtype, device=device)
     image_size(width, height)
@@ -81,7 +85,7 @@ def camera(
 
 
 def image_size(width: int, height: int) -> None:
-    """Sides between 1 and LARGEST_SIDE pixels."""
+    """Check that both sides are between 1 and LARGEST_SIDE pixels."""
     for name, side in (("width", width), ("height", height)):
         if not 1 <= side <= LARGEST_SIDE:
             raise ValueError(f"{name}: expected 1 to {LARGEST_SIDE} pixels, got {side}")

@@ -1,7 +1,7 @@
-"""The one surface of the kernels: each op once, on the backend that was asked for or that suits the tensors.
+"""The public functions of the kernels: every op once, on the backend asked for or, by default, the tensors' own.
 
-Backends are `reference` (plain torch, any dtype, the definition), `cpu` (C++, float32) and `gpu` (Triton, float32). A
-backend that lacks an op is an error; nothing falls back in silence.
+Backends are `reference` (plain torch in any dtype, which defines the ops), `cpu` (C++, float32) and `gpu` (Triton,
+float32). A backend without an op raises NotImplementedError; none is replaced by another.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Backend = Literal["reference", "cpu", "gpu"]
 
 
 def backend_for(tensor: Tensor) -> Backend:
-    """The backend that ops choose for this tensor when not told."""
+    """Return the backend that ops use for this tensor by default: `gpu` on CUDA devices, else `cpu`."""
     return "gpu" if tensor.device.type == "cuda" else "cpu"
 
 
@@ -57,8 +57,9 @@ def project(
     """Project Gaussians into one pinhole camera (EWA splatting, Zwicker et al. 2002; Kerbl et al. 2023).
 
     means [N,3] world; log_scales [N,3]; quats [N,4] wxyz of any norm > 0; logit_opacities [N]; sh [N, (degree+1)^2 to
-    16, 3]; viewmat [4,4] world to camera, OpenCV axes; K [3,3] pixels without skew. Gradients reach the five groups and
-    viewmat. Raises TypeError or ValueError naming the argument.
+    16, 3]; viewmat [4,4] world to camera, OpenCV axes; K [3,3] pixels without skew; near: the smallest depth that is
+    drawn, world units; antialias: scale opacities by the compensation of the blur (Yu et al. 2024). Differentiable in
+    the five groups and viewmat. Raises TypeError or ValueError that names the argument.
     """
     name = _backend(backend, means)
     kind = _kind(name, means)
@@ -87,7 +88,7 @@ def project(
 
 
 def bin(projected: Projected, width: int, height: int, *, backend: Backend | None = None) -> Bins:
-    """List for every 16x16 tile the Gaussians whose 1/255 ellipse reaches it, front to back, ties by index."""
+    """List for every 16x16 tile the Gaussians whose 1/255 ellipse reaches it, front to back, equal depths by index."""
     name = _backend(backend, projected.means2d)
     _check_projected(projected, name)
     checks.image_size(width, height)
@@ -106,8 +107,8 @@ def composite(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Blend front to back into color [H,W,3], alpha [H,W] and depth [H,W] = sum of weight times z, not over alpha.
 
-    background [3] shows through what transmittance is left (None: black). Differentiable in every field of projected
-    but the extents, and in the background.
+    background [3]: its colour is weighted by the transmittance left; None is black. Differentiable in the background
+    and in every field of projected but the extents.
     """
     name = _backend(backend, projected.means2d)
     kind = _check_projected(projected, name)
@@ -132,10 +133,10 @@ def loss(
     stats: Any = None,
     backend: Backend | None = None,
 ) -> Tensor:
-    """(1 - w) mean|color - photo/255| + w (1 - mean SSIM).
+    """Return (1 - w) mean|color - photo/255| + w (1 - mean SSIM) with w = dssim_weight; differentiable in color.
 
-    color [H,W,3], photo uint8 [H,W,3], mask [H,W] nonzero = used. SSIM with an 11-tap Gaussian
-    window of sigma 1.5 and zero padding (Wang et al. 2004); stats from `photo_stats`.
+    color [H,W,3]; photo uint8 [H,W,3]; mask [H,W], nonzero where a pixel is used; stats from `photo_stats` of the same
+    photo, mask and backend. SSIM has an 11-tap Gaussian window of sigma 1.5 and zero padding (Wang et al. 2004).
     """
     name = _backend(backend, color)
     kind = _kind(name, color)
@@ -149,7 +150,7 @@ def loss(
 
 
 def photo_stats(photo: Tensor, *, mask: Tensor | None = None, backend: Backend | None = None) -> Any:
-    """What `loss` needs of a photo alone; worth keeping for photos that are visited often."""
+    """Return what `loss` computes from photo and mask alone, to be kept for photos that are used often."""
     name = _backend(backend, photo)
     checks.tensor("photo", photo, (None, None, 3), dtype=torch.uint8, device=photo.device.type)
     _check_mask(mask, photo.shape[0], photo.shape[1], photo.device.type)
@@ -168,9 +169,10 @@ def adam_(
     last_step: Tensor | None = None,
     backend: Backend | None = None,
 ) -> int:
-    """One Adam step in place on groups [N, ...]; dense, or for the visible rows with catch-up.
+    """Take one Adam step in place on groups [N, ...] with a rate each; return how many gradient values were refused.
 
-    Returns how many gradient values were refused as not finite. See `reference.adam_`.
+    step counts from 1. With visible [N] (bool) only those rows move, and first make up for the steps since last_step
+    (int32 [N]), which is updated. `reference.adam_` has the definition.
     """
     if not len(params) == len(grads) == len(exp_avg) == len(exp_avg_sq) == len(rates):
         raise ValueError("params, grads, exp_avg, exp_avg_sq, rates: one of each per group")
@@ -212,7 +214,7 @@ def adam_(
 
 
 def knn(points: Tensor, *, backend: Backend | None = None) -> Tensor:
-    """Mean distance [N] from each of points [N,3] to its three nearest others."""
+    """Return the mean distance [N] from each of points [N,3] to its three nearest others."""
     name = _backend(backend, points)
     checks.tensor("points", points, (None, 3), **_kind(name, points))
     return cast(Tensor, _op(name, "knn")(points))
@@ -227,7 +229,7 @@ def _backend(asked: Backend | None, tensor: object) -> Backend:
 
 
 def _op(backend: Backend, stem: str, function: str | None = None) -> Callable[..., Any]:
-    """The function of that stem in the backend's package."""
+    """Return the function of that stem in the backend's package; raises NotImplementedError where there is none."""
     module = f"{__package__}.{backend}.{stem}"
     try:
         found = getattr(importlib.import_module(module), function or stem)
@@ -238,14 +240,14 @@ def _op(backend: Backend, stem: str, function: str | None = None) -> Callable[..
             raise GpuUnavailable(absence() or str(error)) from None
         if error.name is not None and module.startswith(error.name):
             raise NotImplementedError(
-                f"The {backend} backend has no op '{stem}'; choose backend='reference' or another that has it."
+                f"The {backend} backend has no op '{stem}'; use backend='reference', which has all."
             ) from None
         raise
     return cast(Callable[..., Any], found)
 
 
 def _kind(backend: Backend, like: object) -> dict[str, Any]:
-    """Which dtype and device the op's tensors must have: the reference takes any, as long as they agree."""
+    """Return the dtype and device that the op's tensors must have; the reference takes any that all of them share."""
     if backend == "cpu":
         return {"dtype": torch.float32, "device": "cpu"}
     if not isinstance(like, Tensor):

@@ -1,6 +1,6 @@
 """The CPU engine: C++ kernels in one build per instruction set, chosen when this package is imported."""
 
-import torch  # noqa: F401  # first, so that the engine shares torch's OpenMP threads instead of starting its own
+import torch  # noqa: F401  # first, so that the engine shares torch's OpenMP runtime instead of loading another
 
 from . import isa
 

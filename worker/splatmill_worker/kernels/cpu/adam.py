@@ -1,4 +1,4 @@
-"""Adam over all parameter groups on the CPU, in one parallel pass."""
+"""adam_ on the CPU: all parameter groups in one parallel pass."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def adam_(
     visible: Tensor | None = None,
     last_step: Tensor | None = None,
 ) -> int:
-    """One Adam step in place; the definition, and what is returned, are `reference.adam_`'s. float32, contiguous."""
+    """Take one Adam step in place, as `reference.adam_` defines it, on contiguous float32 tensors."""
 
     def rows(tensors: Sequence[Tensor]) -> list[Tensor]:
         return [t.detach().unsqueeze(1).flatten(1) for t in tensors]

@@ -1,4 +1,4 @@
-"""bin on the CPU: the exact ellipse-tile lists by radix sort."""
+"""bin on the CPU: exact tile lists, sorted by depth with a radix sort, then by tile."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from . import engine
 
 
 def bin(projected: Projected, width: int, height: int) -> Bins:
-    """List for every tile the Gaussians that reach it, front to back; the definition is `reference.bin`'s."""
+    """List for every tile the Gaussians that reach it, front to back, as `reference.bin` defines it."""
     p = Projected(*(field.detach().contiguous() for field in projected))
     frame = engine.Frame()
     pairs = engine.bin(

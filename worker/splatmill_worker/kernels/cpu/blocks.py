@@ -1,31 +1,35 @@
-"""The engine's layout of a scene: blocks of sixteen Gaussians, [blocks, 59, 16], one lane each."""
+"""The CPU engine's layout of a scene: blocks [blocks, 59, 16] of sixteen Gaussians, one lane each."""
 
 from __future__ import annotations
+
+from itertools import accumulate
 
 import torch
 from torch import Tensor
 
+from splatmill_worker.kernels.records import GROUPS, PARAMETERS
+
 from . import engine
 
-LANES, ROWS = 16, 59
-# First row of each parameter group; the columns of the plain [N, 59] form have the same order.
-FIRST = {"means": 0, "log_scales": 3, "quats": 6, "logit_opacities": 10, "sh": 11}
-WIDTH = {"means": 3, "log_scales": 3, "quats": 4, "logit_opacities": 1, "sh": 48}
+LANES = 16
+"""Gaussians in a block."""
+
+FIRST = {name: end - GROUPS[name] for name, end in zip(GROUPS, accumulate(GROUPS.values()), strict=True)}
+"""First row of each parameter group in a block; the columns of the plain [N, 59] form have the same order."""
 
 
 def empty(count: int) -> Tensor:
-    """Zeroed blocks for `count` Gaussians."""
-    blocks = torch.zeros(-(-count // LANES), ROWS, LANES)
-    engine.wish_huge_pages(
-        blocks
-    )  # before the first touch: zeros of this size come untouched from the system
+    """Return zeroed blocks for `count` Gaussians."""
+    blocks = torch.zeros(-(-count // LANES), PARAMETERS, LANES)
+    # Before the memory is first touched: the system hands out zeros of this size without touching them.
+    engine.wish_huge_pages(blocks)
     return blocks
 
 
 def pack(groups: dict[str, Tensor], count: int, threads: int) -> Tensor:
-    """Blocks holding the groups [count, ...]; sh may have fewer than 16 coefficients, the rest are 0.
+    """Return blocks that hold the groups [count, ...]; coefficients of sh that are not given are 0.
 
-    Unused lanes stay all zero: a quaternion of 0 is never visible, and rests under Adam.
+    Unused lanes are all 0: with a quaternion of 0 a Gaussian is never visible, and Adam leaves it where it is.
     """
     blocks = empty(count)
     flat = [g.detach().unsqueeze(1).flatten(1).contiguous() for g in groups.values()]
@@ -34,22 +38,22 @@ def pack(groups: dict[str, Tensor], count: int, threads: int) -> Tensor:
 
 
 def unpack(blocks: Tensor, shapes: dict[str, torch.Size], count: int, threads: int) -> dict[str, Tensor]:
-    """Plain tensors of the given shapes [count, ...]."""
+    """Return the groups in blocks as plain tensors of the given shapes [count, ...]."""
     groups = {name: torch.empty(shape) for name, shape in shapes.items()}
-    flat = [g.unsqueeze(1).flatten(1) for g in groups.values()]  # views: what is written shows in groups
+    flat = [g.unsqueeze(1).flatten(1) for g in groups.values()]  # views of `groups`
     engine.unpack(flat, [FIRST[name] for name in groups], blocks, count, threads)
     return groups
 
 
 def pack_rows(rows: Tensor, threads: int) -> Tensor:
-    """Blocks holding plain rows [N, 59] (moments)."""
+    """Return blocks that hold plain rows [N, 59], such as moments."""
     blocks = empty(len(rows))
     engine.pack([rows.detach().contiguous()], [0], blocks, len(rows), threads)
     return blocks
 
 
 def unpack_rows(blocks: Tensor, count: int, threads: int) -> Tensor:
-    """Plain rows [count, 59] of blocks."""
-    rows = torch.empty(count, ROWS)
+    """Return the plain rows [count, 59] of blocks."""
+    rows = torch.empty(count, PARAMETERS)
     engine.unpack([rows], [0], blocks, count, threads)
     return rows

@@ -1,4 +1,4 @@
-"""composite on the CPU: sixteen pixels a vector, only the 4x4 blocks of pixels that an ellipse reaches."""
+"""composite on the CPU: sixteen pixels to a vector, and only the 4x4-pixel blocks that an ellipse reaches."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from . import engine
 def composite(
     projected: Projected, bins: Bins, width: int, height: int, *, background: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Blend the lists into color [H,W,3], alpha [H,W], depth [H,W]; the definition is `reference.composite`'s."""
+    """Blend the lists into color [H,W,3], alpha [H,W] and depth [H,W], as `reference.composite` defines it."""
     if background is None:
         background = torch.zeros(3)
     image = _Composite.apply(  # type: ignore[no-untyped-call]
@@ -74,11 +74,11 @@ class _Composite(torch.autograd.Function):
         n = ctx.count
         d = [torch.zeros(n, *shape) for shape in ((2,), (3,), (), (3,), ())]
         engine.composite_backward(ctx.frame, image, gradient, *d, engine.default_threads())
-        left = 1.0 - image[3, :height, :width]  # of the background, at each pixel
+        left = 1.0 - image[3, :height, :width]  # transmittance: the background's weight
         d_background = torch.einsum("hw,hwc->c", left, d_color)
         return (*d, None, None, None, d_background, None, None)
 
 
 def empty_planes(planes: int, width: int, height: int) -> Tensor:
-    """Planes padded to whole tiles, [planes, rows, columns]."""
+    """Return zeroed planes [planes, rows, columns], padded to whole tiles."""
     return torch.zeros(planes, -(-height // TILE) * TILE, -(-width // TILE) * TILE)

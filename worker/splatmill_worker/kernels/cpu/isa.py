@@ -1,20 +1,23 @@
-"""Which build of the engine runs here: the best one that the processor supports, or the one that was asked for."""
+"""Choice of the CPU engine's build: the best that the processor supports, or the one asked for."""
 
 import importlib
 import os
 from types import ModuleType
 
 ISAS = ("avx512", "avx2", "baseline")
+"""Instruction sets that the engine is built for, best first."""
+
 VARIABLE = "SPLATMILL_CPU_ISA"
+"""Environment variable that names the build to use."""
 
 
 def supported() -> tuple[str, ...]:
-    """Instruction sets of this processor that the engine has a build for, best first."""
+    """Return the builds that this processor can run, best first."""
     return tuple(importlib.import_module(f"{__package__}._cpu_baseline").supported())
 
 
 def load(isa: str) -> ModuleType:
-    """The engine's extension module for `isa`; raises RuntimeError when the processor cannot run it."""
+    """Return the extension module built for `isa`. Raises RuntimeError where it does not exist or cannot run here."""
     if isa not in ISAS:
         raise RuntimeError(
             f"{VARIABLE}={isa!r} is not a build of the CPU engine; choose one of {', '.join(ISAS)}."
@@ -29,5 +32,5 @@ def load(isa: str) -> ModuleType:
 
 
 def chosen() -> str:
-    """`SPLATMILL_CPU_ISA` where it is set, else the best build that this processor supports."""
+    """Return the value of SPLATMILL_CPU_ISA or, where it is not set, the best build that this processor can run."""
     return os.environ.get(VARIABLE) or supported()[0]

@@ -1,4 +1,4 @@
-"""Mean distance to the three nearest other points on the CPU, through a k-d tree."""
+"""knn on the CPU, through a k-d tree."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..reference.knn import check_points
 
 
 def knn(points: Tensor) -> Tensor:
-    """Mean distance [N] from each of points [N,3] to its three nearest others; exact, as `reference.knn`."""
+    """Return the mean distance [N] from each of points [N,3] to its three nearest others, as `reference.knn` does."""
     check_points(points)
     distances = torch.empty(points.shape[0])
     if points.shape[0]:

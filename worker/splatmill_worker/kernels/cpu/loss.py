@@ -1,4 +1,4 @@
-"""L1 + D-SSIM on the CPU: one fused sweep gives the value and the gradient."""
+"""loss on the CPU: one sweep over the image gives the value and the gradient."""
 
 from __future__ import annotations
 
@@ -8,25 +8,32 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import cpu
-
-TILE = 16
+from splatmill_worker.kernels.records import TILE
 
 
 class PhotoStats(NamedTuple):
-    """A photo as the fused loss reads it; made once by `photo_stats`. The stride is the width in whole tiles."""
+    """A photo and its part of SSIM, in planes as the engine reads them; `photo_stats` makes it.
 
-    pixels: Tensor  # uint8 [3, height, stride], zero where a pixel is not used
-    used: Tensor  # uint8 [height, stride], 1 where a pixel counts
-    mean: Tensor  # float32 [3, height, stride] windowed mean
-    variance: Tensor  # float32 [3, height, stride] windowed variance
+    pixels: uint8 [3, height, stride], 0 where a pixel is not used; the stride is the width in whole tiles.
+    used: uint8 [height, stride], 1 where a pixel is used.
+    mean: float32 [3, height, stride], windowed mean.
+    variance: float32 [3, height, stride], windowed variance.
+    width: of the photo, pixels.
+    weight: number of used pixels.
+    """
+
+    pixels: Tensor
+    used: Tensor
+    mean: Tensor
+    variance: Tensor
     width: int
-    weight: float  # pixels that count
+    weight: float
 
 
 def photo_stats(photo: Tensor, *, mask: Tensor | None = None) -> PhotoStats:
-    """Planes and SSIM statistics of a photo (uint8 [H,W,3]) under a mask (uint8 or bool [H,W], nonzero = used).
+    """Return the planes and SSIM statistics of a photo (uint8 [H,W,3]) under a mask ([H,W], nonzero where used).
 
-    About 28 bytes a pixel; worth keeping for every photo that is visited often.
+    They take 28 bytes a pixel. The mask is uint8 or bool.
     """
     height, width = photo.shape[:2]
     stride = whole_tiles(width)
@@ -46,9 +53,9 @@ def loss(
     mask: Tensor | None = None,
     stats: PhotoStats | None = None,
 ) -> Tensor:
-    """(1 - w) mean|color - photo/255| + w (1 - mean SSIM) of color [H,W,3], differentiable in color.
+    """Return (1 - w) mean|color - photo/255| + w (1 - mean SSIM), differentiable in color, as `reference.loss` does.
 
-    The definition is `reference.loss`; stats, from `photo_stats` with the same mask, saves a third of the time.
+    stats, from `photo_stats` of the same photo and mask, saves a third of the time.
     """
     if stats is None:
         stats = photo_stats(photo, mask=mask)
@@ -84,7 +91,7 @@ class _Loss(torch.autograd.Function):
 
 
 def to_planes(image: Tensor) -> Tensor:
-    """[H,W,3] to the engine's [3, rows, columns], both padded with zeros to whole tiles."""
+    """Return an image [H,W,3] as planes [3, rows, columns], padded with zeros to whole tiles."""
     height, width = image.shape[:2]
     planes = image.new_zeros(3, whole_tiles(height), whole_tiles(width))
     planes[:, :height, :width] = image.detach().permute(2, 0, 1)
@@ -92,5 +99,5 @@ def to_planes(image: Tensor) -> Tensor:
 
 
 def whole_tiles(pixels: int) -> int:
-    """Pixels rounded up to whole tiles."""
+    """Return a side in pixels rounded up to whole tiles."""
     return -(-pixels // TILE) * TILE

@@ -1,4 +1,4 @@
-"""project on the CPU: sixteen Gaussians a vector, differentiable in all five groups and in the viewmat."""
+"""project on the CPU: sixteen Gaussians to a vector; differentiable in the five groups and the viewmat."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def project(
     near: float = 0.01,
     antialias: bool = False,
 ) -> Projected:
-    """Project Gaussians into one pinhole camera; the definition is `reference.project`'s. float32."""
+    """Project Gaussians into one pinhole camera, as `reference.project` defines it; float32."""
     rows = _Project.apply(  # type: ignore[no-untyped-call]
         means, log_scales, quats, logit_opacities, sh, viewmat, K, width, height, degree, near, antialias
     )

@@ -1,4 +1,4 @@
-"""The fused training step: one scene's parameters, moments and scores in the engine's layout, and the step."""
+"""The training step on the CPU: a scene in the engine's layout, and the passes fused into one call."""
 
 from __future__ import annotations
 
@@ -8,36 +8,53 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import checks
-from splatmill_worker.kernels.records import TILE, Rates
+from splatmill_worker.kernels.records import PARAMETERS, TILE, Rates
 
 from . import blocks, engine
 from .loss import PhotoStats, photo_stats
 
 
 class Visibility(NamedTuple):
-    """What the last rendering found."""
+    """What the last rendering counted.
 
-    visible: int  # Gaussians that reach a pixel
-    pairs: int  # (tile, Gaussian) pairs
+    visible: Gaussians that reach a 4x4-pixel block of the image.
+    pairs: (tile, Gaussian) pairs.
+    """
+
+    visible: int
+    pairs: int
 
 
 class StepResult(NamedTuple):
-    """What one training step saw, before it moved anything."""
+    """What one training step measured before it moved the Gaussians.
 
-    loss: float  # (1 - w) l1 + w (1 - ssim)
+    loss: (1 - w) l1 + w (1 - ssim).
+    l1, ssim: means over the pixels used.
+    visible: Gaussians that reach a 4x4-pixel block of the image.
+    pairs: (tile, Gaussian) pairs.
+    refused: gradient values that were not finite and were left out of the update.
+    """
+
+    loss: float
     l1: float
     ssim: float
     visible: int
     pairs: int
-    refused: int  # gradient values that were not finite, and were left out of the update
+    refused: int
 
 
 class Step:
-    """A scene under training on the CPU. Not for use from two threads at once.
+    """Parameters, Adam moments and densification scores of one scene on the CPU, and the training step over them.
 
-    `blocks`, `exp_avg` and `exp_avg_sq` are float32 [ceil(N/16), 59, 16]; rows: means 0-2, log_scales 3-5, quats 6-9,
-    logit_opacities 10, sh 11-58 by coefficient, then channel. Dense Adam: every step moves every Gaussian, also those
-    that were not in view.
+    Adam is dense: every step moves every Gaussian, those that were not in view by their moments. Not for use from two
+    threads at once.
+
+    threads: how many the passes use; results do not depend on it.
+    count: number of Gaussians.
+    keep_scores: whether steps add to the densification scores.
+    visibility: what the last rendering counted.
+    pose_gradient: the camera's gradient of the last update; see `backward_update`.
+    blocks, exp_avg, exp_avg_sq: parameters and moments, float32 [ceil(N/16), 59, 16] (`blocks`).
     """
 
     def __init__(
@@ -50,7 +67,11 @@ class Step:
         *,
         threads: int | None = None,
     ) -> None:
-        """means [N,3], log_scales [N,3], quats [N,4], logit_opacities [N], sh [N,16,3], all float32 on the CPU."""
+        """Take means [N,3], log_scales [N,3], quats [N,4], logit_opacities [N] and sh [N,16,3], float32 on the CPU.
+
+        threads: None is the affinity mask's and OMP_NUM_THREADS' number. Raises TypeError or ValueError that names the
+        argument.
+        """
         self.threads = threads or engine.default_threads()
         if self.threads < 1:
             raise ValueError(f"threads: expected at least 1, got {threads}")
@@ -77,16 +98,16 @@ class Step:
     # ---- state
 
     def replace(self, params: dict[str, Tensor], exp_avg: Tensor | None, exp_avg_sq: Tensor | None) -> None:
-        """Take other Gaussians (after densification, relocation or a roll-back), with moments [N, 59] or zeros.
+        """Take other Gaussians, as after densification or a roll-back, with moments [N, 59] or zeros; zero the scores.
 
-        Zeros the scores.
+        params [N, ...] by group, as in the constructor. Raises TypeError or ValueError that names the argument.
         """
         ordered = {name: params[name] for name in blocks.FIRST}
         checks.gaussians(*ordered.values(), coefficients=16)
         count = len(ordered["means"])
         for name, moment in (("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
             if moment is not None:
-                checks.tensor(name, moment, (count, blocks.ROWS))
+                checks.tensor(name, moment, (count, PARAMETERS))
         self.count = count
         self.blocks = blocks.pack(ordered, count, self.threads)
         self.exp_avg = blocks.empty(count) if exp_avg is None else blocks.pack_rows(exp_avg, self.threads)
@@ -97,7 +118,7 @@ class Step:
         self._rendered = False
 
     def parameters(self) -> dict[str, Tensor]:
-        """Copies of the parameters, [N, ...] each, under the names of the constructor."""
+        """Return copies of the parameters, [N, ...] each, under the names of the constructor."""
         n = self.count
         shapes = {
             "means": (n, 3),
@@ -109,32 +130,32 @@ class Step:
         return blocks.unpack(self.blocks, {k: torch.Size(s) for k, s in shapes.items()}, n, self.threads)
 
     def moments(self) -> tuple[Tensor, Tensor]:
-        """Copies of Adam's two moments, [N, 59] each; columns in the order of the block's rows."""
+        """Return copies of Adam's first and second moments, [N, 59] each; columns in the order of `records.GROUPS`."""
         return (
             blocks.unpack_rows(self.exp_avg, self.count, self.threads),
             blocks.unpack_rows(self.exp_avg_sq, self.count, self.threads),
         )
 
-    # Densification scores, views [N] that add up over steps until `replace` or `clear_scores`. Lengths are in NDC units
-    # (the image is 2 wide and 2 high), the units of the published thresholds.
+    # Densification scores: views [N] that add up over steps until `replace` or `clear_scores`. The norm of the gradient
+    # is in NDC units (the image is 2 wide and 2 high), as published thresholds are.
 
     @property
     def plain_sum(self) -> Tensor:
-        """Sum over views of |dL/d mean2d|."""
+        """Sum over views of |dL/d mean2d| in NDC units (Kerbl et al. 2023)."""
         return self._scores[0, : self.count]
 
     @property
     def visible_count(self) -> Tensor:
-        """Views in which the Gaussian reached a pixel."""
+        """Number of views in which the Gaussian reached a 4x4-pixel block of the image."""
         return self._scores[2, : self.count]
 
     @property
     def max_extent(self) -> Tensor:
-        """Largest half side over the views of its 1/255 ellipse's box, in halves of the image's longer side."""
+        """Largest half side, over views, of the box around the 1/255 ellipse, over half the image's longer side."""
         return self._scores[3, : self.count]
 
     def clear_scores(self) -> None:
-        """Start the scores anew."""
+        """Set the scores to 0."""
         self._scores.zero_()
 
     # ---- the step
@@ -151,10 +172,10 @@ class Step:
         antialias: bool = False,
         near: float = 0.01,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Render color [H,W,3], alpha [H,W], depth [H,W] = sum of weight times z.
+        """Render color [H,W,3], alpha [H,W] and depth [H,W] = sum of weight times z.
 
-        These are views on buffers that the next call overwrites, and not to be written to. viewmat [4,4] world to
-        camera, K [3,3] pixels, float32. `visibility` tells what was seen.
+        viewmat [4,4] world to camera, K [3,3] pixels, background [3] (None: black), float32. The images are views of
+        buffers that the next call overwrites; do not write to them.
         """
         self._render(viewmat, K, width, height, degree, background, antialias, near, planes=5)
         inside = self._image[:, :height, :width]
@@ -170,14 +191,15 @@ class Step:
         step: int,
         pose_gradient: bool = False,
     ) -> int:
-        """Differentiate the last `forward` and move everything by Adam's step number `step`, from 1.
+        """Differentiate the last `forward` and move every Gaussian by Adam's step number `step`, from 1.
 
-        Returns how many gradient values were refused as not finite.
-        d_color [H,W,3], d_alpha [H,W], d_depth [H,W]: the loss's gradient to what `forward` gave.
-        pose_gradient: leave the camera's gradient in `self.pose_gradient`, float32 [6] = (rho, phi): that of the
-        loss with the camera at exp(xi^) viewmat, xi = (rho, phi), at xi = 0. A point p in camera space then moves by
-        rho + phi x p; rho is in world units, phi in radians. Not finite where gradient values were refused. When not
-        asked for, `self.pose_gradient` is None.
+        d_color [H,W,3], d_alpha [H,W] and d_depth [H,W] are the loss's gradients to what `forward` returned; None
+        counts as 0. Returns how many gradient values were refused as not finite. Raises RuntimeError without a
+        `forward` since the last update.
+
+        pose_gradient: also set `self.pose_gradient` (else None) to the camera's gradient, float32 [6]: that of the loss
+        with the camera at exp(xi^) viewmat, xi = (rho, phi), at xi = 0. A point p in camera space then moves by rho +
+        phi x p; rho is in world units, phi in radians. It need not be finite where gradient values were refused.
         """
         gradient = self._take_gradient(d_color, d_alpha, d_depth)
         return self._update(gradient, rates, step, pose_gradient)
@@ -185,7 +207,7 @@ class Step:
     def gradients(
         self, d_color: Tensor, d_alpha: Tensor | None = None, d_depth: Tensor | None = None
     ) -> dict[str, Tensor]:
-        """Gradients of the last `forward` to the parameters, [N, ...] each; nothing moves and no score is kept."""
+        """Return the gradients of the last `forward` to the parameters, [N, ...] each, and change nothing."""
         gradient = self._take_gradient(d_color, d_alpha, d_depth)
         out = torch.empty_like(self.blocks)
         engine.gradients(self._frame, self.blocks, self._degree, self._image, gradient, out, self.threads)
@@ -209,11 +231,10 @@ class Step:
         near: float = 0.01,
         pose_gradient: bool = False,
     ) -> StepResult:
-        """One step on one photo: render, L1 + D-SSIM, gradients, scores, Adam.
+        """Take one step on one photo: render, L1 + D-SSIM, gradients, scores, Adam.
 
-        photo uint8 [H,W,3] with mask [H,W] (nonzero = used), or photo_stats made of both by `loss.photo_stats` (then
-        photo and mask may be None): keep those, making them costs as much as the loss. step counts from 1.
-        pose_gradient: as in `backward_update`.
+        photo uint8 [H,W,3] and mask [H,W], nonzero where a pixel is used; or photo_stats, which `loss.photo_stats`
+        makes of both at the cost of the loss itself. step counts from 1. pose_gradient as in `backward_update`.
         """
         stats = _stats(photo, mask) if photo_stats is None else photo_stats
         height, width = stats.pixels.shape[1], stats.width
@@ -261,7 +282,9 @@ class Step:
 
     def _take_gradient(self, d_color: Tensor, d_alpha: Tensor | None, d_depth: Tensor | None) -> Tensor:
         if not self._rendered or len(self._image) != 5:
-            raise RuntimeError("Nothing to differentiate: call forward first, after every replace or train.")
+            raise RuntimeError(
+                "There is nothing to differentiate; call forward first, and again after every update, train or replace."
+            )
         height, width = self._size
         checks.tensor("d_color", d_color, (height, width, 3), contiguous=False)
         planes = 3 if d_alpha is None and d_depth is None else 5
@@ -294,13 +317,13 @@ class Step:
             self.threads,
             self.pose_gradient,
         )
-        self._rendered = False  # what was rendered is of the Gaussians before they moved
+        self._rendered = False  # the rendering shows the Gaussians before they moved
         return refused
 
 
 def _stats(photo: Tensor | None, mask: Tensor | None) -> PhotoStats:
     if photo is None:
-        raise ValueError("photo: give a photo, or photo_stats made of it")
+        raise ValueError("photo: expected a photo, or photo_stats made of it, got neither")
     checks.tensor("photo", photo, (None, None, 3), dtype=torch.uint8, contiguous=False)
     if mask is not None:
         checks.tensor("mask", mask, tuple(photo.shape[:2]), dtype=None, contiguous=False)

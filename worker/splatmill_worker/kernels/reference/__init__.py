@@ -1,5 +1,4 @@
-"""The definition of every op in plain torch, in any dtype; slow, differentiated by autograd, and what all
-backends are held to."""
+"""The definition of every op in plain torch: any dtype, gradients by autograd, slow. Other backends agree with it."""
 
 from .adam import adam_, catch_up_
 from .bin import bin

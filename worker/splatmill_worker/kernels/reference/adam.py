@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
-MEMORY = 256  # steps of drift a catch-up replays: (0.9 / sqrt 0.999)^256 = 2e-12, below float32's resolution
+MEMORY = 256
+"""Missed steps whose drift is computed: the terms of later ones are below (0.9 / sqrt 0.999)^256 = 2e-12."""
 
 
 @torch.no_grad()
@@ -24,17 +25,15 @@ def adam_(
     visible: Tensor | None = None,
     last_step: Tensor | None = None,
 ) -> int:
-    """One Adam step in place (Kingma & Ba 2015; betas 0.9, 0.999, eps 1e-15) on groups [N, ...] with a rate
-    each.
+    """Take one Adam step in place (Kingma & Ba 2015; betas 0.9, 0.999, eps 1e-15) on groups [N, ...] with a rate each.
 
-    step counts from 1. With visible [N] (bool) only those rows move; last_step int32 [N] says up to which
-    step each row is current, and a row that missed steps is first brought to what dense Adam with zero
-    gradients would have left (`catch_up_`). A gradient that is not finite, or whose square is not, leaves its
-    entry as it was; the number of such entries is returned, so that the caller can name the failure.
+    step counts from 1. With visible [N] (bool) only those rows move; last_step int32 [N] is the step up to which each
+    row is current, and a row that missed steps is first brought to where dense Adam with zero gradients would have
+    left it (`catch_up_`). An entry whose gradient, or the gradient's square, is not finite stays as it is. Returns the
+    number of such entries. Raises ValueError for visible without last_step.
 
-    float32 state does not underflow: eps dominates the root of the second moment below 1e-15, that is v <
-    1e-30, while float32 holds v down to 1e-38. A gradient whose square vanishes moves its parameter by less
-    than rate * 1e-3.
+    float32 state does not underflow: eps outweighs the root of the second moment v where v < 1e-30, while float32 holds
+    v down to 1e-38. A gradient whose square is 0 in float32 moves its parameter by less than rate * 1e-3.
     """
     if visible is not None:
         if last_step is None:
@@ -70,11 +69,10 @@ def catch_up_(
     rows: Tensor,
     last_step: Tensor,
 ) -> None:
-    """Bring rows [N] (bool) from their last_step to step as dense Adam with zero gradients would have.
+    """Bring rows [N] (bool) from their last_step to step, as dense Adam with zero gradients would have done.
 
-    Moments decay by powers of the betas. The parameter drifts by rate * m / sqrt(v) times a sum that depends
-    on the two step numbers only (`drift`), so it is a table look-up; eps is left out of it, which changes
-    nothing while sqrt(v) >> 1e-15.
+    Moments decay by powers of the betas. The parameter drifts by rate * m / sqrt(v) times a sum that depends on the two
+    step numbers alone (`drift`). eps is left out, which changes nothing while sqrt(v) >> 1e-15.
     """
     missed = torch.where(rows, step - last_step, 0).clamp_min(0)
     table = {int(k): drift(step - int(k), step) for k in torch.unique(missed)}
@@ -89,8 +87,7 @@ def catch_up_(
 
 
 def drift(last: int, step: int) -> float:
-    """Sum over steps s = last + j, last < s <= step, of beta1^j / (1 - beta1^s) * sqrt((1 - beta2^s) /
-    beta2^j)."""
+    """Return the sum over steps s = last + j <= step of beta1^j / (1 - beta1^s) * sqrt((1 - beta2^s) / beta2^j)."""
     total = 0.0
     for j in range(1, min(step - last, MEMORY) + 1):
         s = last + j

@@ -1,4 +1,4 @@
-"""Exact ellipse-tile lists, sorted front to back."""
+"""Exact tile lists, sorted front to back."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ..records import TILE, Bins, Projected
 def bin(projected: Projected, width: int, height: int) -> Bins:
     """List for every 16x16 tile the Gaussians that reach it, front to back, equal depths by index.
 
-    A pair is listed when the smallest value of the quadratic form over the rectangle spanned by the tile's
-    pixel centres is within the 1/255 level 2 ln(255 o), so no pair that could pass the alpha cut is missing.
+    A pair is listed when the smallest value of d^T C d over the rectangle of the tile's pixel centres is at most
+    2 ln(255 o), where alpha is 1/255: no pair with a pixel above the cut is missing.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
     tiles = columns * rows
@@ -21,8 +21,7 @@ def bin(projected: Projected, width: int, height: int) -> Bins:
     order = visible[torch.argsort(projected.depths[visible], stable=True)]
     center, extent = projected.means2d[order], projected.extents[order]
 
-    # Tiles whose pixel centres 16 i + 0.5 .. 16 i + 15.5 meet the box; bounded by the image before turning
-    # into integers.
+    # Tiles whose pixel centres 16 i + 0.5 .. 16 i + 15.5 meet the box, bounded by the image while still floats.
     limit = torch.tensor([columns, rows], dtype=center.dtype, device=center.device)
     zero = torch.zeros_like(limit)
     first = torch.floor((center - extent - 0.5) / TILE).clamp(zero, limit).long()
@@ -46,8 +45,7 @@ def bin(projected: Projected, width: int, height: int) -> Bins:
 
 
 def _least(conics: Tensor, center: Tensor, column: Tensor, row: Tensor) -> Tensor:
-    """The smallest d^T C d over the rectangle of a tile's pixel centres; convex, so on an edge unless the
-    centre is inside."""
+    """Return the smallest d^T C d over the rectangle of a tile's pixel centres: 0 inside, else on an edge."""
     a, b, c = conics.unbind(1)
     x0, y0 = column * TILE + 0.5 - center[:, 0], row * TILE + 0.5 - center[:, 1]
     x1, y1 = x0 + (TILE - 1), y0 + (TILE - 1)

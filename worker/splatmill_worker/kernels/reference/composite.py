@@ -1,4 +1,4 @@
-"""Front-to-back alpha compositing of a tile's list, per pixel."""
+"""Front-to-back alpha compositing of the tile lists."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ def composite(
     background: Tensor | None = None,
     _soft_cut: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Blend the lists into color [H,W,3], alpha [H,W] and depth [H,W] = sum of weight times z, not divided by
-    alpha.
+    """Blend the lists into color [H,W,3], alpha [H,W] and depth [H,W] = sum of weight times z, not divided by alpha.
 
-    Per pixel centre p, front to back: alpha = min(0.999, o exp(-d^T C d / 2)), d = p - mean2d; skipped below
-    1/255; not blended, and the pixel done, if the transmittance would come to 1e-4 or below. The background
-    [3] shows through what transmittance is left. `_soft_cut` replaces the jump at 1/255 by a twice
-    differentiable ramp on [1/255, 2/255] and leaves the stop out, for tests of the gradient's order only.
+    At each pixel centre p, front to back: alpha = min(0.999, o exp(-d^T C d / 2)) with d = p - mean2d. A splat with
+    alpha below 1/255 is skipped; one that would bring the transmittance to 1e-4 or below is not blended and ends the
+    pixel. The background [3] is weighted by the transmittance left. `_soft_cut` replaces the jump at 1/255 by a twice
+    differentiable ramp on [1/255, 2/255] and leaves the end out, for tests of the gradient's order only.
     """
     columns = -(-width // TILE)
     payload = torch.cat(
@@ -50,7 +49,7 @@ def composite(
 def _weights(
     projected: Projected, ids: Tensor, left: int, top: int, w: int, h: int, soft_cut: bool
 ) -> Tensor:
-    """Blending weights [w*h, len(ids)] of one tile's list at its pixel centres."""
+    """Return the blending weights [w*h, len(ids)] of one tile's list at its pixel centres."""
     means2d, conics, opacities = projected.means2d[ids], projected.conics[ids], projected.opacities[ids]
     y, x = torch.meshgrid(
         torch.arange(top, top + h, device=ids.device, dtype=means2d.dtype) + 0.5,
@@ -71,7 +70,7 @@ def _weights(
             after = torch.cumprod(torch.where(taken, 1 - alphas, 1.0), 1)
             taken &= (
                 after > TRANSMITTANCE_MIN
-            )  # falls along the list, so the first stop stops all that follow
+            )  # it falls along the list, so the first end excludes all that follow
         alphas = torch.where(taken, alphas, 0.0)
     before = torch.cumprod(torch.cat([torch.ones_like(alphas[:, :1]), 1 - alphas[:, :-1]], 1), 1)
     return alphas * before[:, : alphas.shape[1]]

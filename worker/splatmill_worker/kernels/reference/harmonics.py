@@ -1,4 +1,4 @@
-"""Real spherical harmonics to degree 3, with the signs and order of the splat file format."""
+"""Real spherical harmonics to degree 3, with the signs and order of splat files."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from torch import Tensor
 
 
 def sh_basis(direction: Tensor, degree: int) -> Tensor:
-    """Values [N, (degree+1)^2] of the basis at unit directions [N,3] (Sloan 2008; order and signs as in 3DGS
-    files)."""
+    """Return the values [N, (degree+1)^2] of the basis at unit directions [N,3] (Sloan 2008)."""
     x, y, z = direction.unbind(1)
     basis = [torch.full_like(x, 0.28209479177387814)]
     if degree > 0:

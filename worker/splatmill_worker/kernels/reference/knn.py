@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 
 NEIGHBORS = 3
+"""Nearest other points whose distances are averaged."""
 
 
 @torch.no_grad()
 def knn(points: Tensor) -> Tensor:
-    """Mean distance [N] from each of points [N,3] to the three nearest other points, by trying every pair.
+    """Return the mean distance [N] from each of points [N,3] to its three nearest others, by trying every pair.
 
     Duplicates are other points at distance 0. With fewer than four points the mean is over those there are.
     Raises ValueError for a single point, which has no neighbour, and for points that are not finite.
@@ -28,7 +29,7 @@ def knn(points: Tensor) -> Tensor:
 
 
 def check_points(points: Tensor) -> None:
-    """Name what is wrong with points: shape, dtype, a lone point, a value that is not finite."""
+    """Raise ValueError for a wrong shape or dtype, a single point, or a coordinate that is not finite."""
     if points.dim() != 2 or points.shape[1] != 3:
         raise ValueError(f"points: expected shape [N, 3], got {list(points.shape)}")
     if not points.is_floating_point():

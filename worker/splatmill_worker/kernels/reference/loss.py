@@ -13,10 +13,14 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 class PhotoStats(NamedTuple):
-    """A photo's own part of SSIM; depends on photo and mask only, so it is computed once and kept."""
+    """The part of SSIM that depends on the photo and its mask alone.
 
-    mean: Tensor  # [H,W,3] windowed mean
-    variance: Tensor  # [H,W,3] windowed variance
+    mean: [H,W,3] windowed mean.
+    variance: [H,W,3] windowed variance.
+    """
+
+    mean: Tensor
+    variance: Tensor
 
 
 def loss(
@@ -27,19 +31,18 @@ def loss(
     mask: Tensor | None = None,
     stats: PhotoStats | None = None,
 ) -> Tensor:
-    """(1 - w) mean|color - photo/255| + w (1 - mean SSIM), the means over the used pixels and three channels.
+    """Return (1 - w) mean|color - photo/255| + w (1 - mean SSIM), means over the used pixels and three channels.
 
     color [H,W,3]; photo uint8 [H,W,3]; mask uint8 or bool [H,W], nonzero where a pixel is used; stats from
-    `photo_stats`. SSIM (Wang et al. 2004) with an 11-tap separable Gaussian window of sigma 1.5 and zero
-    padding. Under a mask both images are set to zero outside it first, so an unused pixel reaches neither the
-    value nor the gradient, and the edge of a mask is treated as the edge of an image. With no used pixel the
-    loss is 0.
+    `photo_stats`. SSIM (Wang et al. 2004) has an 11-tap separable Gaussian window of sigma 1.5 and zero padding. Under
+    a mask both images are first set to 0 at unused pixels, which therefore reach neither the value nor the gradient:
+    the edge of a mask is treated like the edge of an image. Without a used pixel the loss is 0.
     """
     used = None if mask is None else (mask != 0).to(color.dtype)[..., None]
     seen = photo.to(color.dtype) / 255
     count = float(color[..., 0].numel())
     if used is not None:
-        # where(), not a product: a NaN outside the mask must not get in.
+        # where() in place of a product, so that a NaN at an unused pixel stays out.
         color, seen = torch.where(used > 0, color, 0.0), seen * used
         count = float(used.sum())
     if count == 0:
@@ -60,7 +63,7 @@ def loss(
 def photo_stats(
     photo: Tensor, *, mask: Tensor | None = None, dtype: torch.dtype = torch.float32
 ) -> PhotoStats:
-    """Windowed mean and variance of a photo (uint8 [H,W,3]) under a mask, each [H,W,3]."""
+    """Return the windowed mean and variance of a photo (uint8 [H,W,3]) under a mask, each [H,W,3]."""
     seen = photo.to(dtype) / 255
     if mask is not None:
         seen = seen * (mask != 0).to(dtype)[..., None]
@@ -69,7 +72,7 @@ def photo_stats(
 
 
 def _window(image: Tensor) -> Tensor:
-    """The 11-tap Gaussian window over [H,W,3], separable, zeros outside the image."""
+    """Apply the 11-tap Gaussian window to an image [H,W,3], with zeros outside."""
     x = torch.arange(WINDOW, dtype=image.dtype, device=image.device) - WINDOW // 2
     taps = torch.exp(-x * x / (2 * SIGMA * SIGMA))
     taps = taps / taps.sum()

@@ -27,13 +27,12 @@ def project(
     """Project Gaussians into one pinhole camera (EWA splatting, Zwicker et al. 2002; Kerbl et al. 2023).
 
     means [N,3] world; log_scales [N,3]; quats [N,4] wxyz of any norm > 0; logit_opacities [N]; sh [N, >=
-    (degree+1)^2, 3]; viewmat [4,4] world to camera with OpenCV axes; K [3,3] pixels, without skew. Gradients
-    reach all of them but K.
+    (degree+1)^2, 3]; viewmat [4,4] world to camera with OpenCV axes; K [3,3] pixels, without skew. Gradients reach all
+    of them but K.
 
-    A Gaussian is culled, and gets exactly zero gradient, unless: every number of it that is read is finite,
-    its quaternion is not zero, z > near, its opacity exceeds 1/255, its projected covariance is finite in
-    this dtype, and the box of its 1/255 ellipse reaches the image. Every guard is a comparison that NaN
-    fails.
+    A Gaussian is culled, with every field and gradient exactly 0, unless every parameter that is read is finite, its
+    quaternion is not 0, z > near, its opacity exceeds 1/255, its projected covariance and colour are finite in this
+    dtype, and the box of its 1/255 ellipse reaches the image. Every test is a comparison that NaN fails.
     """
     used = (degree + 1) ** 2
     groups = (means, log_scales, quats, logit_opacities, sh[:, :used])
@@ -70,8 +69,7 @@ def _project_all(
     u, v = points[:, 0] / z, points[:, 1] / z
     means2d = torch.stack([fx * u + cx, fy * v + cy], 1)
 
-    # Far off-axis the linearised projection stretches without bound; it is taken at most 15 % outside the
-    # image.
+    # Far off-axis the linearised projection stretches without bound; it is evaluated at most 15 % outside the image.
     uc = u.clamp(-(0.15 * width + cx) / fx, (1.15 * width - cx) / fx)
     vc = v.clamp(-(0.15 * height + cy) / fy, (1.15 * height - cy) / fy)
     row0 = (fx / z)[:, None] * (W[0] - uc[:, None] * W[2])  # first row of J W
@@ -82,15 +80,14 @@ def _project_all(
 
     tr0, tr1 = (m0 * m0).sum(1), (m1 * m1).sum(1)
     a, b, c = tr0 + BLUR, (m0 * m1).sum(1), tr1 + BLUR
-    # Cauchy-Binet on the factor: a*c - b*b loses every digit for needles, the sum of squared minors loses
-    # none.
+    # Cauchy-Binet on the factor: a*c - b*b loses every digit for needles, the sum of squared minors loses none.
     sharp = (torch.linalg.cross(m0, m1) ** 2).sum(1)
     det = sharp + BLUR * (tr0 + tr1) + BLUR * BLUR
     conics = torch.stack([c / det, -b / det, a / det], 1)
 
     opacities = torch.sigmoid(logit_opacities)
     if antialias:
-        # Detached: through det the gradient explodes where a splat degenerates, and makes more of those.
+        # Detached: through det, the gradient explodes for splats that degenerate, and drives others there.
         opacities = opacities * torch.sqrt((sharp / det).detach().clamp_min(COMPENSATION_MIN))
     reach = torch.sqrt(2.0 * torch.log(opacities.detach() / ALPHA_MIN).clamp_min(0.0))  # standard deviations
     extents = reach[:, None] * torch.sqrt(torch.stack([a, c], 1).detach())
@@ -116,8 +113,10 @@ def _kept(groups: tuple[Tensor, ...], p: Projected, width: int, height: int, nea
 
 
 def rotation(quats: Tensor) -> Tensor:
-    """Rotation matrices [N,3,3] of quaternions wxyz [N,4] of any norm > 0; a zero quaternion gives NaN."""
-    largest = quats.detach().abs().amax(1, keepdim=True)  # scaled first: the square of 1e-30 is 0 in float32
+    """Return the rotation matrices [N,3,3] of quaternions wxyz [N,4] of any norm > 0; NaN for a zero quaternion."""
+    largest = (
+        quats.detach().abs().amax(1, keepdim=True)
+    )  # scaled first, because the square of 1e-30 is 0 in float32
     scaled = quats / largest
     w, x, y, z = (scaled / torch.linalg.vector_norm(scaled, dim=1, keepdim=True)).unbind(1)
     rows = [
