@@ -52,7 +52,7 @@ def main(argv: list[str] | None = None) -> int:
 
         return serve(chosen.stop_grace)
     if chosen.program == "renderer":
-        from splatmill_worker.render_service.renderer import serve as serve_renders
+        from splatmill_worker.render_service.command import serve as serve_renders
 
         return serve_renders(chosen.host, chosen.port, chosen.uds, chosen.backend)
     if chosen.program == "fit-image":

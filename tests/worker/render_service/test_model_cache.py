@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from splatmill.backplane.storage import Storage
-from splatmill_worker.render_service.model_cache import ModelCache, NoModelError
+from splatmill_worker.errors import ModelNotFound
+from splatmill_worker.render_service.model_cache import ModelCache
 from tests.support.ball import store_ball
 
 
@@ -21,5 +22,5 @@ def test_the_cache_keeps_to_its_bytes(tmp_path: Path) -> None:
     cache.get("cached02")
     assert cache.bytes == 2 * one
     assert cache.get("cached00") is first, "the one used last must stay"
-    with pytest.raises(NoModelError):
+    with pytest.raises(ModelNotFound):
         cache.get("../../etc")

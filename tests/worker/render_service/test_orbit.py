@@ -21,7 +21,7 @@ def ring(first: float, last: float, count: int = 12) -> tuple[np.ndarray, np.nda
 
 
 def test_the_orbit_circles_where_photos_were_taken_all_around() -> None:
-    path = orbit.path_through(*ring(0, 330))
+    path = orbit.fit_path(*ring(0, 330))
     assert path.target == pytest.approx([5.0, 0.0, 0.0], abs=1e-6)
     assert path.radius == pytest.approx(3.0)
     assert path.height == pytest.approx(1.0)
@@ -32,7 +32,7 @@ def test_the_orbit_circles_where_photos_were_taken_all_around() -> None:
 
 
 def test_the_orbit_stays_on_the_side_that_was_seen() -> None:
-    path = orbit.path_through(*ring(-40, 40))
+    path = orbit.fit_path(*ring(-40, 40))
     eyes = np.array([path.eye(share) for share in np.linspace(0, 1, 37)])
     azimuths = np.degrees(np.arctan2(eyes[:, 1], eyes[:, 0] - 5.0))
     assert azimuths.min() == pytest.approx(-40, abs=1)
@@ -40,9 +40,9 @@ def test_the_orbit_stays_on_the_side_that_was_seen() -> None:
 
 
 def test_orbit_cameras_look_at_the_target() -> None:
-    wish = OrbitRequest(seconds=0.5, fps=12, width=64, height=48)
-    path = orbit.path_through(*ring(0, 330))
-    for camera in orbit.cameras_along(path, wish, 50.0):
+    request = OrbitRequest(seconds=0.5, fps=12, width=64, height=48)
+    path = orbit.fit_path(*ring(0, 330))
+    for camera in orbit.cameras_along(path, request, 50.0):
         rotation = camera.viewmat[:3, :3]
         assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-9)
         seen = camera.project(path.target[None])

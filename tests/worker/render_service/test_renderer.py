@@ -1,7 +1,7 @@
-"""The renderer process over real HTTP on a unix socket: formats, depth, ETag, refusals, its bounds, the orbit's path.
+"""Proves what the renderer answers over HTTP on a unix socket: image formats, depth, ETags, refusals and videos.
 
-The model is a ball, red on the side of +x and blue on the other, whose picture is known. That the kernels render
-right is proven in tests/kernels.
+The model is a ball, red on the side of +x and blue on the other, so that its images are known. That the kernels render
+correctly is proved in tests/kernels.
 """
 
 import io
@@ -59,9 +59,9 @@ def http(storage: Storage) -> Iterator[httpx.Client]:
     process.wait(20)
 
 
-def picture(http: httpx.Client, wish: RenderRequest, **headers: str) -> httpx.Response:
+def picture(http: httpx.Client, body: RenderRequest, **headers: str) -> httpx.Response:
     return http.post(
-        rendering.render_path(BALL), content=wish.model_dump_json(exclude_none=True), headers=headers
+        rendering.render_path(BALL), content=body.model_dump_json(exclude_none=True), headers=headers
     )
 
 
@@ -109,9 +109,9 @@ def test_depth_as_floats_and_as_sixteen_bits(http: httpx.Client) -> None:
 
 
 def test_the_same_picture_is_not_sent_twice(http: httpx.Client) -> None:
-    wish = RenderRequest(camera=FRONT)
-    first = picture(http, wish)
-    again = picture(http, wish, **{"If-None-Match": first.headers["etag"]})
+    body = RenderRequest(camera=FRONT)
+    first = picture(http, body)
+    again = picture(http, body, **{"If-None-Match": first.headers["etag"]})
     assert again.status_code == 304
     assert again.content == b""
     assert again.headers["etag"] == first.headers["etag"]
@@ -123,10 +123,10 @@ def test_the_same_picture_is_not_sent_twice(http: httpx.Client) -> None:
 
 
 def test_a_replaced_model_is_read_anew(http: httpx.Client, storage: Storage, tmp_path: Path) -> None:
-    wish = RenderRequest(camera=FRONT, output=Output.alpha)
-    before = picture(http, wish)
+    body = RenderRequest(camera=FRONT, output=Output.alpha)
+    before = picture(http, body)
     store_ball(storage, tmp_path, count=30)
-    after = picture(http, wish)
+    after = picture(http, body)
     store_ball(storage, tmp_path)
     assert after.headers["etag"] != before.headers["etag"]
     assert int(pixels(after).sum()) < int(pixels(before).sum())
@@ -152,18 +152,18 @@ def test_refusals_have_their_codes(http: httpx.Client, storage: Storage) -> None
 def test_an_orbit_is_a_video_that_shows_both_sides(http: httpx.Client) -> None:
     import av
 
-    wish = OrbitRequest(seconds=1, fps=8, width=64, height=48)
-    answer = http.post(rendering.orbit_path(BALL), content=wish.model_dump_json(exclude_none=True))
+    body = OrbitRequest(seconds=1, fps=8, width=64, height=48)
+    answer = http.post(rendering.orbit_path(BALL), content=body.model_dump_json(exclude_none=True))
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "video/mp4"
     with av.open(io.BytesIO(answer.content), "r") as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    assert len(frames) == wish.frames
+    assert len(frames) == body.frames
     leanings = [int(frame[..., 0].sum()) - int(frame[..., 2].sum()) for frame in frames]
     assert max(leanings) > 0 > min(leanings)
     etag = {"If-None-Match": answer.headers["etag"]}
     again = http.post(
-        rendering.orbit_path(BALL), content=wish.model_dump_json(exclude_none=True), headers=etag
+        rendering.orbit_path(BALL), content=body.model_dump_json(exclude_none=True), headers=etag
     )
     assert again.status_code == 304
 

@@ -1,1 +1,1 @@
-"""The HTTP renderer of stored models."""
+"""The renderer: an HTTP process that renders images and videos of stored models."""

@@ -1,4 +1,4 @@
-"""Stored models in memory, the longest unused ones dropped when they exceed a bound in bytes."""
+"""Stored models in memory, of which the least recently used ones are dropped when they exceed a number of bytes."""
 
 from __future__ import annotations
 
@@ -12,19 +12,23 @@ from typing import TYPE_CHECKING, Any
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage
+from splatmill_worker.errors import ModelNotFound
 
 if TYPE_CHECKING:
     from splatmill_worker.splat.gaussians import Gaussians
 
 
-class NoModelError(LookupError):
-    """There is no finished model with this id."""
-
-
 @dataclass(frozen=True)
-class StoredModel:
-    """A model as it is rendered. `etag` changes with its bytes, `antialias` is how it was trained, `backend`
-    what renders it (None: the kernels of the device that its tensors are on)."""
+class LoadedModel:
+    """A model in memory, as it is rendered.
+
+    id: id of the model.
+    etag: storage's tag of model.ply, which changes with its contents.
+    gaussians: its parameters, on the device that renders them.
+    antialias: whether it was trained with compensation for the pixel filter, and must be rendered with it.
+    bytes: memory of its parameters.
+    backend: the kernels that render it; None means those of the parameters' device.
+    """
 
     id: str
     etag: str
@@ -35,47 +39,49 @@ class StoredModel:
 
 
 class ModelCache:
-    """Models by id, read from storage when first asked for, and anew when they changed there."""
+    """The models that were used last, by id. One that has changed in storage is read again.
+
+    storage: where the models are.
+    max_bytes: bound on the memory of all models; a single larger one is kept nevertheless.
+    backend: the kernels that the models are loaded for, as in LoadedModel.
+    """
 
     def __init__(self, storage: Storage, max_bytes: int, backend: str | None = None) -> None:
         self._storage = storage
         self._max_bytes = max_bytes
         self._backend = backend
-        self._models: OrderedDict[str, StoredModel] = OrderedDict()
+        self._models: OrderedDict[str, LoadedModel] = OrderedDict()
         self._lock = threading.Lock()
 
     @property
     def bytes(self) -> int:
-        """What the models in memory take."""
+        """Memory of all models in the cache."""
         return sum(model.bytes for model in self._models.values())
 
     def etag(self, model_id: str) -> str:
-        """The present version of a model, without reading it. Raises NoModelError."""
+        """Return storage's present tag of a model, without reading it. Raises ModelNotFound."""
         entry = None
         if layout.is_id(model_id) and self._storage.exists(layout.job_record(model_id)):
             entry = self._storage.head(layout.model_file(model_id, "model.ply"))
         if entry is None:
-            raise NoModelError(model_id)
+            raise ModelNotFound(model_id)
         return entry.etag
 
-    def get(self, model_id: str) -> StoredModel:
-        """The model as stored now. Raises NoModelError, and ModelUnreadable for a damaged file.
-
-        A model larger than the bound is still served; it is then the only one kept.
-        """
+    def get(self, model_id: str) -> LoadedModel:
+        """Return the model as it is stored now. Raises ModelNotFound, and ModelUnreadable for a damaged file."""
         etag = self.etag(model_id)
         with self._lock:
-            known = self._models.get(model_id)
-            if known is None or known.etag != etag:
+            model = self._models.get(model_id)
+            if model is None or model.etag != etag:
                 self._models.pop(model_id, None)
-                known = self._read(model_id, etag)
-                self._models[model_id] = known
+                model = self._load(model_id, etag)
+                self._models[model_id] = model
                 while self.bytes > self._max_bytes and len(self._models) > 1:
                     self._models.popitem(last=False)
             self._models.move_to_end(model_id)
-            return known
+            return model
 
-    def _read(self, model_id: str, etag: str) -> StoredModel:
+    def _load(self, model_id: str, etag: str) -> LoadedModel:
         from splatmill_worker.splat import ply
 
         path = layout.model_file(model_id, "model.ply")
@@ -89,13 +95,13 @@ class ModelCache:
         if self._backend == "gpu":
             gaussians = gaussians.map(lambda tensor: tensor.cuda())
         size = sum(t.numel() * t.element_size() for t in gaussians)
-        return StoredModel(model_id, etag, gaussians, self._antialias(model_id), size, self._backend)
+        return LoadedModel(model_id, etag, gaussians, self._antialias(model_id), size, self._backend)
 
     def _antialias(self, model_id: str) -> bool:
-        """Whether training compensated for the pixel filter; a view of such a model must do so as well."""
+        """Return what the plan in the model's report says of antialiasing; False without a report or a plan."""
         try:
             report: Any = json.loads(self._storage.get(layout.model_file(model_id, "report.json")))
-            decided = report["plan"]["antialias"]
+            decision = report["plan"]["antialias"]
         except (FileNotFoundError, ValueError, KeyError, TypeError):
-            return False  # a model from elsewhere, or from before the plan was recorded
-        return bool(decided["value"] if isinstance(decided, dict) else decided)
+            return False
+        return bool(decision["value"] if isinstance(decision, dict) else decision)

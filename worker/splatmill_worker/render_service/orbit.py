@@ -1,4 +1,4 @@
-"""The camera path of an orbit video, laid through where the photos were taken."""
+"""The camera path of an orbit video, fitted to the positions from which the photos were taken."""
 
 from __future__ import annotations
 
@@ -15,18 +15,25 @@ from splatmill_worker.scene import Camera, looked_at, viewmat_of
 Float = npt.NDArray[np.float64]
 
 FULL_CIRCLE = math.radians(220)
-"""Photos that cover less than this are of one side: the camera then swings to and fro before that side, for
-behind it nothing was ever seen."""
+"""Radians of azimuth that photos must cover for a full circle. If they cover less, the camera swings to and fro within
+the arc of the photos, because nothing was seen from outside of it."""
 
 DEFAULT_FOV = 50.0
+"""Vertical field of view in degrees where neither the request nor the photos give one."""
+
 _SWING_RISE = 0.15
+"""Rise and fall of a swinging camera, as a share of the path's radius."""
 
 
 @dataclass(frozen=True)
-class Path3:
-    """A closed path around `target`: `radius` and `height` along `up`, azimuths middle +- half from `right`.
+class OrbitPath:
+    """A closed camera path around a target.
 
-    All lengths in world units; right, up and front are orthonormal.
+    target: the point that the camera looks at, [3], in world units.
+    right, front, up: orthonormal axes, [3] each; azimuths are measured from `right` towards `front`.
+    radius: distance from the vertical axis through the target, in world units.
+    height: height above the target along `up`, in world units.
+    middle, half: the arc of the camera: middle and half of its width in radians; a half of pi is a full circle.
     """
 
     target: Float
@@ -39,7 +46,7 @@ class Path3:
     half: float
 
     def eye(self, share: float) -> Float:
-        """The camera's position at a share 0..1 of the video."""
+        """Return the position [3] of the camera at a share of the video, 0 to 1."""
         turn = 2 * math.pi * share
         if self.half >= math.pi:
             azimuth, height = self.middle + turn, self.height
@@ -50,11 +57,11 @@ class Path3:
         return self.target + self.radius * around + height * self.up
 
 
-def path_through(centers: Float, forwards: Float, ups: Float) -> Path3:
-    """The path that fits cameras: positions [N,3], viewing directions [N,3] and upward directions [N,3].
+def fit_path(centers: Float, forwards: Float, ups: Float) -> OrbitPath:
+    """Return the path that fits cameras: their positions, viewing directions and upward directions, [N,3] each.
 
-    The target is the point nearest to all optical axes (least squares); where the axes are as good as parallel,
-    it lies before the cameras at their own spread.
+    The target is the point nearest to all optical axes (least squares). Where these are almost parallel, or meet behind
+    the cameras, it lies in front of the cameras' mean position, at three times their mean distance from there.
     """
     up = _unit(ups.mean(axis=0), np.array([0.0, 0.0, 1.0]))
     target = _nearest_to_axes(centers, forwards)
@@ -68,36 +75,46 @@ def path_through(centers: Float, forwards: Float, ups: Float) -> Path3:
     if 2 * half >= FULL_CIRCLE:
         half = math.pi
     radius = float(np.median(np.linalg.norm(flat, axis=1)))
-    return Path3(target, right, front, up, radius, float(np.median(heights)), middle, half)
+    return OrbitPath(target, right, front, up, radius, float(np.median(heights)), middle, half)
 
 
-def path_around(points: Float) -> Path3:
-    """The path around a model without cameras: points [N,3] with z up, seen from two and a half radii."""
+def path_around(points: Float) -> OrbitPath:
+    """Return a full circle around points [N,3] with z up, for a model without cameras.
+
+    Its radius is 2.5 times the distance from the median point within which 80 % of the points lie.
+    """
     target = np.median(points, axis=0)
     reach = float(np.quantile(np.linalg.norm(points - target, axis=1), 0.8)) or 1.0
     x, y, z = np.eye(3)
-    return Path3(target, x, y, z, 2.5 * reach, 0.5 * reach, 0.0, math.pi)
+    return OrbitPath(target, x, y, z, 2.5 * reach, 0.5 * reach, 0.0, math.pi)
 
 
-def cameras_along(path: Path3, wish: OrbitRequest, fov_y_deg: float) -> Iterable[Camera]:
-    """One engine camera per frame, looking at the target."""
-    focal = 0.5 * wish.height / math.tan(math.radians(fov_y_deg) / 2)
-    for index in range(wish.frames):
-        eye = path.eye(index / wish.frames)
+def cameras_along(path: OrbitPath, request: OrbitRequest, fov_y_deg: float) -> Iterable[Camera]:
+    """Yield one camera per frame, looking at the path's target. fov_y_deg: vertical field of view in degrees."""
+    focal = 0.5 * request.height / math.tan(math.radians(fov_y_deg) / 2)
+    for index in range(request.frames):
+        eye = path.eye(index / request.frames)
         forward = _unit(path.target - eye, path.front)
         right = _unit(np.cross(forward, path.up), path.right)
         rotation = np.stack([right, np.cross(forward, right), forward])
         viewmat = viewmat_of(rotation, eye)
-        yield Camera(wish.width, wish.height, focal, focal, wish.width / 2, wish.height / 2, viewmat)
+        yield Camera(
+            request.width, request.height, focal, focal, request.width / 2, request.height / 2, viewmat
+        )
 
 
-def of_model(stored: ModelCameras | None, points: Float, wish: OrbitRequest) -> Iterable[Camera]:
-    """The cameras of a video of a model whose photos were taken by `stored`, around `points` [N,3] without."""
+def orbit_cameras(stored: ModelCameras | None, points: Float, request: OrbitRequest) -> Iterable[Camera]:
+    """Return the cameras of an orbit video of a model.
+
+    stored: the cameras of its photos; None, or fewer than two, gives a circle around the points.
+    points: the means of its Gaussians, [N,3], in world units.
+    request: number and size of the frames, and the field of view if given.
+    """
     if stored is None or len(stored.cameras) < 2:
-        return cameras_along(path_around(points), wish, wish.fov_y_deg or DEFAULT_FOV)
+        return cameras_along(path_around(points), request, request.fov_y_deg or DEFAULT_FOV)
     poses = np.array([camera.camera.opencv_to_world() for camera in stored.cameras])
-    path = path_through(poses[:, :3, 3], poses[:, :3, 2], -poses[:, :3, 1])
-    return cameras_along(path, wish, wish.fov_y_deg or _field_of_view(stored, wish))
+    path = fit_path(poses[:, :3, 3], poses[:, :3, 2], -poses[:, :3, 1])
+    return cameras_along(path, request, request.fov_y_deg or _field_of_view(stored, request))
 
 
 def _nearest_to_axes(centers: Float, forwards: Float) -> Float:
@@ -105,7 +122,7 @@ def _nearest_to_axes(centers: Float, forwards: Float) -> Float:
     alignment = np.linalg.eigvalsh(forwards.T @ forwards / len(forwards))[-1]  # 1 for parallel axes
     if alignment < 1.0 - 1e-3:
         nearest = looked_at(centers, forwards, ridge=0.0)
-        # Axes that only seem to meet do so behind the cameras or far out.
+        # Where the axes do not really meet, the nearest point lies behind the cameras.
         if np.median(np.einsum("nj,nj->n", nearest - centers, forwards)) > 0.1 * spread:
             return nearest
     middle: Float = centers.mean(axis=0)
@@ -113,7 +130,7 @@ def _nearest_to_axes(centers: Float, forwards: Float) -> Float:
 
 
 def _arc(azimuths: Float) -> tuple[float, float]:
-    """Middle and half width of the smallest arc that holds all azimuths (radians)."""
+    """Return middle and half width of the smallest arc that holds all azimuths, in radians."""
     ordered = np.sort(azimuths)
     gaps = np.diff(np.append(ordered, ordered[0] + 2 * math.pi))
     widest = int(np.argmax(gaps))
@@ -122,14 +139,14 @@ def _arc(azimuths: Float) -> tuple[float, float]:
     return start + half, half
 
 
-def _field_of_view(stored: ModelCameras, wish: OrbitRequest) -> float:
-    """Vertical angle in degrees that shows about what the photos show, in width and height."""
+def _field_of_view(stored: ModelCameras, request: OrbitRequest) -> float:
+    """Return the vertical field of view in degrees that shows at least what the median photo shows."""
     tangents = []
     for camera in stored.cameras:
         fx, fy, _, _ = camera.camera.pinhole()
         tangents.append((camera.camera.width / (2 * fx), camera.camera.height / (2 * fy)))
     wide, high = np.median(np.array(tangents), axis=0)
-    return math.degrees(2 * math.atan(max(float(high), float(wide) * wish.height / wish.width)))
+    return math.degrees(2 * math.atan(max(float(high), float(wide) * request.height / request.width)))
 
 
 def _unit(vector: Float, otherwise: Float) -> Float:

@@ -3,12 +3,12 @@
 import asyncio
 import threading
 
-from splatmill_worker.render_service.renderer import Busy, Turns
+from splatmill_worker.render_service.render_queue import QueueFull, RenderQueue
 
 
 def test_more_requests_than_may_wait_are_sent_away() -> None:
     async def crowd() -> tuple[int, int, int]:
-        turns, release, inside, most = Turns(waiting=2), threading.Event(), 0, 0
+        queue, release, inside, most = RenderQueue(max_waiting=2), threading.Event(), 0, 0
 
         def work() -> None:
             nonlocal inside, most
@@ -19,9 +19,9 @@ def test_more_requests_than_may_wait_are_sent_away() -> None:
 
         async def visit() -> bool:
             try:
-                async with turns.admitted():
-                    await turns.run(work)
-            except Busy:
+                async with queue.admitted():
+                    await queue.run(work)
+            except QueueFull:
                 return False
             return True
 

@@ -1,0 +1,216 @@
+"""The HTTP endpoints of the renderer. The API forwards requests to them (paths in splatmill.backplane.rendering).
+
+Torch and the kernels are loaded with the first image, so that an idle renderer is small.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import traceback
+from collections.abc import Awaitable, Callable
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import BaseModel, ValidationError
+from starlette.applications import Starlette
+from starlette.background import BackgroundTask
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Route
+
+from splatmill.backplane import layout, rendering
+from splatmill.backplane.storage import Storage, StorageError
+from splatmill.schema import PROBLEM_MEDIA_TYPE, ModelCameras, OrbitRequest, Problem, RenderRequest
+from splatmill_worker.errors import ModelNotFound, ModelUnreadable
+from splatmill_worker.render_service.model_cache import LoadedModel, ModelCache
+from splatmill_worker.render_service.render_queue import QueueFull, RenderQueue
+from splatmill_worker.scene import Camera
+
+MAX_WAITING = 8
+"""Number of requests that may wait while one is rendered. An image takes a fraction of a second, and a browser requests
+a few at a time."""
+
+RETRY_AFTER = 2
+"""Seconds after which a client may repeat a request that found the queue full."""
+
+_ENCODING_VERSION = b"1"
+"""Part of each ETag, to be raised when the same request gives other bytes than before."""
+
+Body = TypeVar("Body", bound=BaseModel)
+
+
+class RenderApp:
+    """The endpoints for the models of one storage.
+
+    cache_bytes: bound on the memory of cached models.
+    backend: the kernels to render with; None means those of the CPU.
+    """
+
+    def __init__(self, storage: Storage, cache_bytes: int, backend: str | None = None) -> None:
+        self._storage = storage
+        self._cache = ModelCache(storage, cache_bytes, backend)
+        self._queue = RenderQueue(MAX_WAITING)
+
+    def asgi(self) -> Starlette:
+        """Return the ASGI application."""
+        return Starlette(
+            routes=[
+                Route(rendering.HEALTH, self.health),
+                Route(rendering.render_path("{model_id}"), self.render, methods=["POST"]),
+                Route(rendering.orbit_path("{model_id}"), self.orbit, methods=["POST"]),
+            ]
+        )
+
+    async def health(self, request: Request) -> Response:
+        """Respond that the process is alive."""
+        return JSONResponse({"status": "ok"})
+
+    async def render(self, request: Request) -> Response:
+        """Respond with an image."""
+        return await self._respond(request, RenderRequest, self._image)
+
+    async def orbit(self, request: Request) -> Response:
+        """Respond with a video."""
+        return await self._respond(request, OrbitRequest, self._video)
+
+    async def _respond(
+        self,
+        request: Request,
+        kind: type[Body],
+        make: Callable[[Request, str, Body, dict[str, str]], Awaitable[Response]],
+    ) -> Response:
+        """Parse the body, compare ETags, wait for a place in the queue, and turn each error into a problem."""
+        model_id = request.path_params["model_id"]
+        try:
+            body = kind.model_validate_json(await request.body() or b"{}")
+            etag = await run_in_threadpool(self._etag, model_id, body)
+            headers = {"ETag": etag, "Cache-Control": "private, max-age=0, must-revalidate"}
+            if _matches(request.headers.get("if-none-match"), etag):
+                return Response(status_code=304, headers=headers)
+            async with self._queue.admitted():
+                return await make(request, model_id, body, headers)
+        except ValidationError as error:
+            return _problem_response(_problem_of_validation(error))
+        except ModelNotFound as error:
+            return _problem_response(error.problem())
+        except ModelUnreadable as error:
+            advice = f"Restart the job {model_id}."
+            return _problem_response(Problem.of(error.code, error.message, advice=advice))
+        except QueueFull:
+            problem = Problem.of(
+                "renderer_unavailable",
+                f"The renderer is busy, and {MAX_WAITING} requests are already waiting.",
+                advice=f"Try again in {RETRY_AFTER} seconds.",
+            )
+            return _problem_response(problem, {"Retry-After": str(RETRY_AFTER)})
+        except StorageError as error:
+            advice = "Check SPLATMILL_STORAGE and try again."
+            return _problem_response(Problem.of("storage_unavailable", str(error), advice=advice))
+        except (
+            Exception
+        ) as error:  # whatever it is, the client gets a problem document and the log a traceback
+            traceback.print_exception(error)
+            return _problem_response(_problem_of_unexpected(error))
+
+    def _etag(self, model_id: str, body: BaseModel) -> str:
+        content = body.canonical() if isinstance(body, RenderRequest) else body.model_dump_json().encode()
+        separator = b"\0"
+        parts = [_ENCODING_VERSION, model_id.encode(), self._cache.etag(model_id).encode(), content]
+        return f'"{hashlib.sha256(separator.join(parts)).hexdigest()[:32]}"'
+
+    async def _image(
+        self, request: Request, model_id: str, body: RenderRequest, headers: dict[str, str]
+    ) -> Response:
+        def work() -> Response:
+            from splatmill_worker.render_service.encoding import render_image
+
+            image = render_image(self._cache.get(model_id), body)
+            return Response(image.data, media_type=image.media_type, headers=headers | dict(image.headers))
+
+        return await self._queue.run(work)
+
+    async def _video(
+        self, request: Request, model_id: str, body: OrbitRequest, headers: dict[str, str]
+    ) -> Response:
+        """Render frame by frame, so that images can be rendered in between and a client that has left is noticed."""
+        from splatmill_worker.film import Film
+        from splatmill_worker.render_service.encoding import render_frame
+
+        model = await self._queue.run(lambda: self._cache.get(model_id))
+        cameras = await run_in_threadpool(self._orbit_cameras, model, body)
+        descriptor, name = tempfile.mkstemp(prefix="splatmill-orbit-", suffix=".mp4")
+        os.close(descriptor)
+        path = Path(name)
+        try:
+            film = Film(path, body.width, body.height, body.fps)
+
+            def add(camera: Camera) -> None:
+                film.add(render_frame(model, camera, body.background))
+
+            try:
+                for camera in cameras:
+                    if await request.is_disconnected():
+                        break
+                    await self._queue.run(partial(add, camera))
+            finally:
+                await run_in_threadpool(film.close)
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+        remove = BackgroundTask(path.unlink, missing_ok=True)
+        return FileResponse(path, media_type="video/mp4", headers=headers, background=remove)
+
+    def _orbit_cameras(self, model: LoadedModel, body: OrbitRequest) -> list[Camera]:
+        from splatmill_worker.render_service.orbit import orbit_cameras
+
+        try:
+            text = self._storage.get(layout.model_file(model.id, "cameras.json"))
+            stored = ModelCameras.model_validate_json(text)
+        except (FileNotFoundError, ValidationError):
+            stored = None
+        return list(orbit_cameras(stored, model.gaussians.means.double().cpu().numpy(), body))
+
+
+def _matches(header: str | None, etag: str) -> bool:
+    """Return whether an `If-None-Match` header names this ETag (weak comparison, RFC 9110, section 13.1.2)."""
+    if header is None:
+        return False
+    known = {tag.strip().removeprefix("W/") for tag in header.split(",")}
+    return etag in known or "*" in known
+
+
+def _problem_response(problem: Problem, headers: dict[str, str] | None = None) -> Response:
+    return Response(
+        problem.model_dump_json(exclude_none=True),
+        status_code=problem.status,
+        media_type=PROBLEM_MEDIA_TYPE,
+        headers=headers,
+    )
+
+
+def _problem_of_validation(error: ValidationError) -> Problem:
+    errors = error.errors(include_url=False, include_input=False, include_context=False)
+    first = errors[0]
+    where = ".".join(str(part) for part in first["loc"]) or "the body"
+    of_camera = bool(first["loc"]) and first["loc"][0] == "camera"
+    of_size = first["loc"][-1:] in (("width",), ("height",))
+    code = "size_out_of_range" if of_size else "camera_invalid" if of_camera else "invalid_request"
+    message = first["msg"].removeprefix("Value error, ").rstrip(".")
+    return Problem.of(
+        code,
+        f"The request does not match the schema, at {where}: {message}.",
+        facts={"errors": [dict(each) for each in errors]},
+    )
+
+
+def _problem_of_unexpected(error: Exception) -> Problem:
+    lines = str(error).strip().splitlines() or ["no message"]
+    return Problem.of(
+        "render_failed",
+        f"The image could not be rendered: {type(error).__name__}: {lines[0][:300]}",
+        advice="Request a smaller image, or look for the cause in the renderer's log.",
+    )

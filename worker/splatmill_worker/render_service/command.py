@@ -1,0 +1,46 @@
+"""Starts the renderer: `python -m splatmill_worker renderer`."""
+
+import os
+import sys
+from pathlib import Path
+
+import uvicorn
+
+from splatmill.backplane.storage import Storage, StorageError
+from splatmill_worker.render_service.app import RenderApp
+from splatmill_worker.settings import storage_url
+
+MAX_CACHE_BYTES = 1 << 30
+"""Largest default for the memory of cached models; machines with little memory use an eighth of it."""
+
+
+def serve(host: str, port: int, uds: Path | None, backend: str | None = None) -> int:
+    """Serve until a signal to stop. Return the exit status.
+
+    host, port: the address to listen on; `uds`, the path of a unix socket, takes its place.
+    backend: the kernels to render with; None means those of the CPU.
+
+    SPLATMILL_RENDER_CACHE, in bytes, limits the memory of cached models.
+    """
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    cache_bytes = int(os.environ.get("SPLATMILL_RENDER_CACHE") or min(MAX_CACHE_BYTES, memory // 8))
+    try:
+        app = RenderApp(Storage(storage_url()), cache_bytes, backend)
+    except StorageError as error:
+        print(error, file=sys.stderr)
+        return 1
+    config = uvicorn.Config(
+        app.asgi(),
+        host=host,
+        port=port,
+        uds=str(uds) if uds else None,
+        log_level="warning",
+        access_log=False,
+        timeout_graceful_shutdown=2,
+        lifespan="off",
+    )
+    if uds is not None:
+        uds.unlink(missing_ok=True)
+    server = uvicorn.Server(config)
+    server.run()
+    return 0 if server.started else 1
