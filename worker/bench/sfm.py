@@ -42,9 +42,10 @@ from splatmill_worker import pipeline, sfm, synthetic
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images import prepare
 from splatmill_worker.scene import Camera, Scene
-from splatmill_worker.sfm import pairs, posed
-from splatmill_worker.sfm.files import ImageFiles
+from splatmill_worker.sfm import posed
+from splatmill_worker.sfm.matching import pairs
 from splatmill_worker.sfm.posed import colmap_model
+from splatmill_worker.sfm.posed.files import ImageFiles
 from splatmill_worker.synthetic import textures
 
 Float = npt.NDArray[np.float64]
@@ -168,7 +169,7 @@ def gps_error(scene: Scene, images: Path, workdir: Path) -> dict[str, float]:
     """Median distance in metres to the GPS positions of the photos; empty where they have none."""
     photos = {photo.name: photo for photo in prepare(images, None, workdir).photos}
     views = [view for view in scene.views if view.name in photos]
-    places = pairs.positions([photos[view.name] for view in views])
+    places = pairs.gps_positions([photos[view.name] for view in views])
     if len(views) < 4 or not np.isfinite(places).all():
         return {}
     places[:, 2] = 0.0  # heights are too noisy to compare with

@@ -26,7 +26,7 @@ def cameras_of(
     """The posed scene: the cameras that came with the photos, or those recovered from them.
 
     `capture` holds images/, and masks/ and poses/ where given (or is a data set's own folder). Raises Refusal
-    for poses that cannot be used, and what `posed.completed` and `sfm.reconstruct` raise.
+    for poses that cannot be used, and what `posed.with_stereo_points` and `sfm.reconstruct` raise.
     """
     given = posed.find(capture)
     if given is not None:
@@ -38,7 +38,7 @@ def cameras_of(
                 str(error),
                 advice="Correct the poses, or leave them out to have the cameras recovered from the photos.",
             ) from error
-        return posed.completed(scene, workdir, on_progress, cancelled)
+        return posed.with_stereo_points(scene, workdir, on_progress, cancelled)
     images = capture / "images"
     masks = capture / "masks"
     wanted = sfm.SfmOptions(

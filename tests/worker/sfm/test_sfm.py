@@ -16,12 +16,14 @@ import numpy as np
 import pytest
 
 from splatmill_worker import sfm, synthetic
+from splatmill_worker.errors import Cancelled
 from splatmill_worker.images import exif
 from splatmill_worker.images.prepare import Usable
 from splatmill_worker.scene import Camera, Scene
-from splatmill_worker.sfm import cameras, pairs
+from splatmill_worker.sfm import cameras
 from splatmill_worker.sfm.features import Features
-from splatmill_worker.sfm.matching import MAX_ANGLE, MAX_RATIO, Matcher
+from splatmill_worker.sfm.matching import pairs
+from splatmill_worker.sfm.matching.matcher import MAX_ANGLE, MAX_RATIO, Matcher
 from tests.support.paths import DATA
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the shared data folder is not beside the project")
@@ -107,7 +109,7 @@ def test_cancelling_ends_it_and_a_restart_goes_on(
         seen.append(stage)
 
     lean = sfm.SfmOptions(effort="lean")  # a raised effort would look for features again
-    with pytest.raises(sfm.Cancelled):
+    with pytest.raises(Cancelled):
         sfm.reconstruct(still_life[0], None, tmp_path, lean, watch, lambda: "matching" in seen)
     assert "mapping" not in seen
     before = len(seen)
@@ -205,7 +207,7 @@ def test_gps_neighbours_are_the_nearest_ones() -> None:
     # A walk along a meridian, 11 metres a step, across the date line's other side for good measure.
     photos = [usable(str(k), latitude=10.0 + 1e-4 * k, longitude=180.0 - 1e-9) for k in range(6)]
     photos.append(usable("nowhere"))
-    places = pairs.positions(photos)
+    places = pairs.gps_positions(photos)
     assert np.linalg.norm(places[1] - places[0]) == pytest.approx(11.1, rel=0.01)
     assert np.isnan(places[6, :2]).all()
     two = pairs.spatial(places, 2)
@@ -217,14 +219,14 @@ def test_gps_neighbours_are_the_nearest_ones() -> None:
 
 def test_numbered_photos_are_followed_in_order() -> None:
     names = [f"walk/IMG_{k}.jpg" for k in (10, 9, 8, 11, 12)] + ["other.jpg", "IMG_1.jpg"]
-    assert pairs.bursts([usable(name) for name in names]) == [[2, 1, 0, 3, 4]]
+    assert pairs.numbered_runs([usable(name) for name in names]) == [[2, 1, 0, 3, 4]]
     assert pairs.sequential([2, 1, 0, 3, 4], (1,)) == {(1, 2), (0, 1), (0, 3), (3, 4)}
 
 
-def test_a_broken_view_graph_is_bridged_by_the_likeliest_pairs() -> None:
-    parts = pairs.components(6, [(0, 1), (1, 2), (3, 4)])
-    assert parts == [[0, 1, 2], [3, 4], [5]]
-    more = pairs.bridges(parts, {(2, 3): 9, (0, 4): 5, (1, 5): 3}, {(0, 3)}, per_photo=1)
+def test_components_of_the_view_graph_are_connected_by_the_likeliest_pairs() -> None:
+    components = pairs.connected_components(6, [(0, 1), (1, 2), (3, 4)])
+    assert components == [[0, 1, 2], [3, 4], [5]]
+    more = pairs.connecting_pairs(components, {(2, 3): 9, (0, 4): 5, (1, 5): 3}, {(0, 3)}, per_photo=1)
     assert more == {(2, 3), (0, 4), (1, 5)}
 
 

@@ -11,24 +11,25 @@ import pytest
 
 from splatmill_worker import sfm, synthetic
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.sfm import features, pairs
-from splatmill_worker.sfm.features import Workspace
+from splatmill_worker.sfm import features
+from splatmill_worker.sfm.features import FeatureStore
+from splatmill_worker.sfm.matching import pairs
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+def store(tmp_path_factory: pytest.TempPathFactory) -> FeatureStore:
     folder = tmp_path_factory.mktemp("effort")
     synthetic.capture(folder / "images", 8, 240, 180, samples=1)
     options = sfm.SfmOptions(effort="lean", stereo=False)
     with suppress(sfm.SfmFailed):  # small photos may not be placed; their features and pairs are there
         sfm.reconstruct(folder / "images", None, folder / "work", options, lambda *_: None, lambda: False)
-    return Workspace(next((folder / "work").rglob("database.db")).parent)
+    return FeatureStore(next((folder / "work").rglob("database.db")).parent)
 
 
-def test_only_the_doubtful_photos_lose_their_features_and_pairs(place: Workspace, tmp_path: Path) -> None:
-    target = Workspace(tmp_path / "next")
-    features.carry_over(place, target, {2, 5})
-    old, new = pycolmap.Database.open(place.database), pycolmap.Database.open(target.database)
+def test_only_the_doubtful_photos_lose_their_features_and_pairs(store: FeatureStore, tmp_path: Path) -> None:
+    target = FeatureStore(tmp_path / "next")
+    features.carry_over(store, target, {2, 5})
+    old, new = pycolmap.Database.open(store.database), pycolmap.Database.open(target.database)
     try:
         ids = {features.photo_index(image.name): image.image_id for image in new.read_all_images()}
         assert ids == {features.photo_index(image.name): image.image_id for image in old.read_all_images()}
@@ -50,19 +51,19 @@ def test_only_the_doubtful_photos_lose_their_features_and_pairs(place: Workspace
         new.close()
 
 
-def test_what_is_there_is_not_started_again(place: Workspace, tmp_path: Path) -> None:
-    target = Workspace(tmp_path / "next")
-    features.carry_over(place, target, {0})
+def test_what_is_there_is_not_started_again(store: FeatureStore, tmp_path: Path) -> None:
+    target = FeatureStore(tmp_path / "next")
+    features.carry_over(store, target, {0})
     stamp = target.database.stat().st_mtime_ns
-    features.carry_over(place, target, {1, 2, 3})
+    features.carry_over(store, target, {1, 2, 3})
     assert target.database.stat().st_mtime_ns == stamp
 
 
 def test_the_likeliest_partners_come_first() -> None:
     scores = {(0, 1): 5, (0, 2): 9, (1, 2): 30, (0, 3): 7}
-    assert pairs.likeliest(scores, 4, [0], 2) == {(0, 2), (0, 3)}
-    assert pairs.likeliest(scores, 4, [0, 1], 1) == {(0, 2), (1, 2)}
-    assert pairs.likeliest(scores, 4, [], 2) == set()
+    assert pairs.best_pairs_of([0], scores, 4, 2) == {(0, 2), (0, 3)}
+    assert pairs.best_pairs_of([0, 1], scores, 4, 1) == {(0, 2), (1, 2)}
+    assert pairs.best_pairs_of([], scores, 4, 2) == set()
 
 
 def test_another_seed_and_another_matcher_do_not_read_what_was_matched_before(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ import pytest
 
 from splatmill_worker import sfm, synthetic
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.sfm import mapping
-from splatmill_worker.sfm.merge import merged
+from splatmill_worker.sfm.mapping import mapper
+from splatmill_worker.sfm.mapping.merge import merge
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def test_two_halves_that_share_photos_become_the_whole(
     assert count >= 12
     left, right = part(model, 0, 9, tmp_path / "left"), moved(part(model, 5, count, tmp_path / "right"))
     assert (left.num_images(), right.num_images()) == (9, count - 5)
-    whole, joined = merged([left, right])
+    whole, joined = merge([left, right])
     assert joined == [1]
     assert left.num_reg_images() == 9  # the model given is left as it was
     assert whole.num_reg_images() == count
@@ -73,17 +73,17 @@ def test_models_that_cannot_be_joined_stay_as_they_are(
         # COLMAP's own words: no pair of models is known that it says them of.
         model.images[model.reg_image_ids()[0]].points2D = pycolmap.Point2DList()
 
-    monkeypatch.setattr(mapping, "merged", refuse)
-    models, joined, notes = mapping.together([left, right])
+    monkeypatch.setattr(mapper, "merge", refuse)
+    models, joined, notes = mapper.merge_models([left, right])
     assert [id(each) for each in models] == [id(left), id(right)]
     assert joined == 0
-    assert "could not be joined" in notes[0]
+    assert "merging them failed" in notes[0]
     assert "Check failed" in notes[0]
 
 
 def test_parts_that_share_too_few_photos_stay_apart(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
     count = model.num_reg_images()
     left, right = part(model, 0, 8, tmp_path / "left"), moved(part(model, 6, count, tmp_path / "right"))
-    whole, joined = merged([left, right])
+    whole, joined = merge([left, right])
     assert joined == []
     assert whole is left

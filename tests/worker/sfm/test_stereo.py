@@ -14,10 +14,11 @@ from PIL import Image
 from splatmill.schema import TrainOptions
 from splatmill_worker import synthetic
 from splatmill_worker.capture import cameras_of
+from splatmill_worker.errors import Cancelled
 from splatmill_worker.images import load_views
 from splatmill_worker.scene import Lens, Scene, View
-from splatmill_worker.sfm import Cancelled, posed, stereo
-from splatmill_worker.sfm.plane_sweep import Shot, sweep
+from splatmill_worker.sfm import posed, stereo
+from splatmill_worker.sfm.stereo.plane_sweep import GreyView, sweep
 from tests.support import still_life
 
 WIDTH, HEIGHT = 320, 240
@@ -33,8 +34,8 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def added(bare: Scene) -> stereo.Added:
-    return stereo.find(bare)
+def added(bare: Scene) -> stereo.StereoPoints:
+    return stereo.find_points(bare)
 
 
 def depth_errors(scene: Scene, points: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -50,7 +51,9 @@ def depth_errors(scene: Scene, points: np.ndarray, seen: np.ndarray) -> np.ndarr
     return np.concatenate(errors)
 
 
-def test_points_are_found_on_the_surfaces_without_any_to_begin_with(bare: Scene, added: stereo.Added) -> None:
+def test_points_are_found_on_the_surfaces_without_any_to_begin_with(
+    bare: Scene, added: stereo.StereoPoints
+) -> None:
     assert not added.given_up
     assert len(added.points) > 500
     errors = depth_errors(bare, added.points, added.seen)
@@ -62,7 +65,7 @@ def test_points_are_found_on_the_surfaces_without_any_to_begin_with(bare: Scene,
     assert added.errors.max() <= 1.0
 
 
-def test_colours_are_those_of_the_photos(bare: Scene, added: stereo.Added) -> None:
+def test_colours_are_those_of_the_photos(bare: Scene, added: stereo.StereoPoints) -> None:
     camera = bare.views[0].camera
     own = np.flatnonzero(added.seen[:, 0])
     x, y, _, inside = camera.project(added.points[own])
@@ -71,7 +74,7 @@ def test_colours_are_those_of_the_photos(bare: Scene, added: stereo.Added) -> No
     assert np.median(np.abs(there - added.colors[own][inside])) < 12
 
 
-def test_known_points_stay_and_empty_places_are_filled(bare: Scene, added: stereo.Added) -> None:
+def test_known_points_stay_and_empty_places_are_filled(bare: Scene, added: stereo.StereoPoints) -> None:
     few = replace(
         added,
         points=added.points[::3],
@@ -80,7 +83,7 @@ def test_known_points_stay_and_empty_places_are_filled(bare: Scene, added: stere
         seen=added.seen[::3],
     )
     first = stereo.add(bare, few)
-    more = stereo.find(first)
+    more = stereo.find_points(first)
     assert 200 < len(more.points) < len(added.points)
     both = stereo.add(first, more)
     np.testing.assert_array_equal(both.points[: len(few.points)], few.points)
@@ -97,11 +100,11 @@ def test_masked_places_get_no_points(bare: Scene, tmp_path: Path) -> None:
     mask[:, : WIDTH // 2] = 0
     Image.fromarray(mask).save(tmp_path / "mask.png")
     views = [replace(view, mask=tmp_path / "mask.png") for view in bare.views[:3]]
-    shots = [Shot.of(photo) for photo in load_views(views, WIDTH)]
-    found = sweep(1, shots[1], [(0, shots[0]), (2, shots[2])], bare.points, 3, 1.5, 12.0)
+    grey = [GreyView.of(photo) for photo in load_views(views, WIDTH)]
+    found = sweep(1, grey[1], [(0, grey[0]), (2, grey[2])], bare.points, 3, 1.5, 12.0)
     assert found.tried > 50
     assert len(found.points) > 20
-    assert shots[1].camera.project(found.points).columns.min() >= WIDTH // 2
+    assert grey[1].camera.project(found.points).columns.min() >= WIDTH // 2
 
 
 def of_noise(scene: Scene, count: int, folder: Path) -> Scene:
@@ -115,22 +118,22 @@ def of_noise(scene: Scene, count: int, folder: Path) -> Scene:
 
 
 def test_photos_without_a_common_scene_are_given_up(bare: Scene, tmp_path: Path) -> None:
-    found = stereo.find(of_noise(bare, len(bare.views), tmp_path))
+    found = stereo.find_points(of_noise(bare, len(bare.views), tmp_path))
     assert found.given_up
     assert len(found.points) == 0
     assert stereo.add(bare, found).facts["stereo_points"] == 0
 
 
 def test_posed_captures_without_points_get_them_once(bare: Scene, tmp_path: Path) -> None:
-    first = posed.completed(bare, tmp_path)
+    first = posed.with_stereo_points(bare, tmp_path)
     assert len(first.points) > 500
     stored = list((tmp_path / "sfm").iterdir())
     assert len(stored) == 1
-    again = posed.completed(bare, tmp_path)
+    again = posed.with_stereo_points(bare, tmp_path)
     np.testing.assert_array_equal(again.points, first.points)
     lens = Lens("OPENCV", (250.0, 250.0, 160.0, 120.0, 0.0, 0.0, 0.0, 0.0), WIDTH, HEIGHT)
     other = replace(bare, views=tuple(replace(view, lens=lens) for view in bare.views))
-    posed.completed(other, tmp_path)
+    posed.with_stereo_points(other, tmp_path)
     assert len(list((tmp_path / "sfm").iterdir())) == 2
 
 
@@ -141,7 +144,7 @@ def test_other_points_and_masks_are_searched_anew(bare: Scene, tmp_path: Path) -
     stages: list[str] = []
     scenes = [few, replace(few, points=np.full((5, 3), 0.2)), replace(few, views=masked), few]
     for done, scene in enumerate(scenes):
-        posed.completed(scene, tmp_path / "work", lambda stage, *_: stages.append(stage))
+        posed.with_stereo_points(scene, tmp_path / "work", lambda stage, *_: stages.append(stage))
         assert len(list((tmp_path / "work" / "sfm").iterdir())) == min(done + 1, 3)
     assert stages == ["stereo"] * 9  # three photos, three times; the fourth time all is there
 
@@ -163,26 +166,26 @@ def test_scenes_with_enough_points_or_transparent_surroundings_are_left_as_they_
 ) -> None:
     middle = np.random.default_rng(0).normal(0.0, 0.2, (2000, 3))
     full = replace(bare, points=middle, colors=np.zeros((2000, 3), np.uint8))
-    assert stereo.sightings_per_view(full) > 1900
-    assert posed.completed(full, tmp_path) is full
+    assert stereo.observations_per_view(full) > 1900
+    assert posed.with_stereo_points(full, tmp_path) is full
     blender = replace(bare, source="blender")
-    assert posed.completed(blender, tmp_path) is blender
+    assert posed.with_stereo_points(blender, tmp_path) is blender
 
 
 def test_cancelling_ends_the_search(bare: Scene) -> None:
     with pytest.raises(Cancelled):
-        stereo.find(bare, cancelled=lambda: True)
+        stereo.find_points(bare, cancelled=lambda: True)
 
 
 def test_cancelling_reaches_the_loading_of_photos(bare: Scene, tmp_path: Path) -> None:
     asked = iter([False, False, True])
     gone = [replace(view, image=tmp_path / "gone.png") for view in bare.views[6:]]
     with pytest.raises(Cancelled):  # and not OSError: the photos that are gone are not waited for
-        stereo.find(replace(bare, views=(*bare.views[:6], *gone)), cancelled=lambda: next(asked))
+        stereo.find_points(replace(bare, views=(*bare.views[:6], *gone)), cancelled=lambda: next(asked))
 
 
 def test_three_photos_are_judged_as_well(bare: Scene, tmp_path: Path) -> None:
-    found = stereo.find(of_noise(bare, 3, tmp_path))
+    found = stereo.find_points(of_noise(bare, 3, tmp_path))
     assert found.given_up
     assert len(found.points) == 0
 
@@ -195,7 +198,7 @@ def test_photos_held_out_by_the_data_set_take_no_part(bare: Scene, tmp_path: Pat
         else replace(view, split="train")
         for i, view in enumerate(bare.views)
     )
-    found = stereo.find(replace(bare, views=views))
+    found = stereo.find_points(replace(bare, views=views))
     assert len(found.points) > 300
     assert found.seen.shape == (len(found.points), len(views))
     assert not found.seen[:, tests].any()
@@ -203,7 +206,9 @@ def test_photos_held_out_by_the_data_set_take_no_part(bare: Scene, tmp_path: Pat
     assert np.median(depth_errors(bare, found.points, found.seen)) < 0.01
 
 
-def test_points_without_tracks_are_not_said_to_be_seen_by_no_photo(bare: Scene, added: stereo.Added) -> None:
+def test_points_without_tracks_are_not_said_to_be_seen_by_no_photo(
+    bare: Scene, added: stereo.StereoPoints
+) -> None:
     own = np.random.default_rng(0).normal(0.0, 0.2, (30, 3))
     both = stereo.add(replace(bare, points=own, colors=np.zeros((30, 3), np.uint8)), added)
     assert len(both.points) == 30 + len(added.points)
@@ -214,5 +219,5 @@ def test_points_without_tracks_are_not_said_to_be_seen_by_no_photo(bare: Scene, 
     np.testing.assert_array_equal(both.point_errors[30:], added.errors)
 
 
-def test_without_any_points_the_sentence_says_so(bare: Scene, added: stereo.Added) -> None:
-    assert "no points" in stereo.add(bare, added).notes[-1]
+def test_without_any_points_the_sentence_says_so(bare: Scene, added: stereo.StereoPoints) -> None:
+    assert "without points" in stereo.add(bare, added).notes[-1]

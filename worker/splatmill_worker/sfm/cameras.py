@@ -1,4 +1,4 @@
-"""Which photos were taken by the same camera, and where its focal length starts."""
+"""Photos grouped by the camera that took them, and each camera's initial focal length."""
 
 from __future__ import annotations
 
@@ -9,15 +9,22 @@ from dataclasses import dataclass
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.prepare import Usable
 
-# Without EXIF: COLMAP's guess, about a phone's main camera.
-DEFAULT_FOCAL = 1.2  # of the longest side
-# What lenses do, as focal length over the longest side: 8 mm fisheye to 300 mm on full frame.
+DEFAULT_FOCAL = 1.2
+"""Focal length over the longest side where EXIF gives none; COLMAP's default, about a phone's main camera."""
+
 FOCAL_BOUNDS = 0.2, 9.0
+"""Focal lengths over the longest side that lenses have: from an 8 mm fisheye to 300 mm on full frame."""
 
 
 @dataclass(frozen=True)
-class Group:
-    """Photos (by index) that share one camera; `focal` over the longest side, `known` where EXIF gave it."""
+class CameraGroup:
+    """Photos that share one camera.
+
+    photos: their indices.
+    width, height: their size in pixels.
+    focal: initial focal length, over the longest side.
+    known: whether EXIF gave the focal length.
+    """
 
     photos: tuple[int, ...]
     width: int
@@ -26,11 +33,11 @@ class Group:
     known: bool
 
 
-def group(photos: Sequence[Usable]) -> list[Group]:
-    """One camera for photos that agree in size, make, model, lens and focal length.
+def group(photos: Sequence[Usable]) -> list[CameraGroup]:
+    """One camera for all photos that agree in size, make, model, lens and focal length.
 
-    Photos without EXIF share a camera where their sizes agree: a zoom in between costs less than a focal
-    length that a single photo cannot determine.
+    Photos without EXIF share a camera when their sizes agree. A change of zoom among them costs less than one focal
+    length per photo, which a single photo does not determine.
     """
     groups: dict[tuple[object, ...], list[int]] = {}
     for index, photo in enumerate(photos):
@@ -48,16 +55,19 @@ def group(photos: Sequence[Usable]) -> list[Group]:
     return [_group(tuple(members), photos[members[0]]) for members in groups.values()]
 
 
-def _group(members: tuple[int, ...], photo: Usable) -> Group:
+def _group(members: tuple[int, ...], photo: Usable) -> CameraGroup:
     focal = _focal(photo)
     known = focal is not None and FOCAL_BOUNDS[0] <= focal <= FOCAL_BOUNDS[1]
-    return Group(
+    return CameraGroup(
         members, photo.width, photo.height, focal if focal is not None and known else DEFAULT_FOCAL, known
     )
 
 
 def _focal(photo: Usable) -> float | None:
-    """The focal length over the longest side: from the 35 mm equivalent, else from COLMAP's table of sensors."""
+    """The focal length over the longest side, by EXIF; None when EXIF does not give it.
+
+    From the 35 mm equivalent, else from the focal length and COLMAP's table of sensors.
+    """
     longest = max(photo.width, photo.height)
     if photo.exif.focal_in_diagonals is not None:
         return photo.exif.focal_in_diagonals * math.hypot(photo.width, photo.height) / longest
@@ -66,8 +76,3 @@ def _focal(photo: Usable) -> float | None:
     bitmap = pycolmap.Bitmap.read(photo.path, as_rgb=False)
     focal = bitmap.exif_focal_length() if bitmap is not None else None
     return None if bitmap is None or focal is None else float(focal) / max(bitmap.width, bitmap.height)
-
-
-def shares_one(groups: Sequence[Group]) -> bool:
-    """Whether a single camera took all photos."""
-    return len(groups) == 1

@@ -1,4 +1,4 @@
-"""The colours of sparse points, read from the photos that see them."""
+"""Colours of the sparse points, read from the photos that observe them."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.decode import decode
 from splatmill_worker.scene import View
 
-SIDE = (
-    320  # pixels of the longest side that are at least decoded: a point's colour is that of its surroundings
-)
+SIDE = 320
+"""Pixels of the longest side that a photo is decoded at, at least; a pixel is then the mean of its surroundings."""
 
 
-def paint(model: pycolmap.Reconstruction, views: dict[int, View], pool: ThreadPoolExecutor) -> None:
-    """Gives each point the mean colour of the photos it was found in, in place."""
+def color_points(model: pycolmap.Reconstruction, views: dict[int, View], pool: ThreadPoolExecutor) -> None:
+    """Set the colour of each point to the mean over the photos that observe it, in place.
+
+    views: by COLMAP's image id.
+    """
     sums: dict[int, npt.NDArray[np.float64]] = {}
-    for point_ids, colors in pool.map(lambda item: _seen(model, *item), views.items()):
+    for point_ids, colors in pool.map(lambda item: _observed(model, *item), views.items()):
         for point_id, color in zip(point_ids, colors, strict=True):
             entry = sums.setdefault(point_id, np.zeros(4))
             entry[:3] += color
@@ -29,13 +31,14 @@ def paint(model: pycolmap.Reconstruction, views: dict[int, View], pool: ThreadPo
         model.points3D[point_id].color = np.round(entry[:3] / entry[3]).astype(np.uint8)
 
 
-def _seen(
+def _observed(
     model: pycolmap.Reconstruction, image_id: int, view: View
 ) -> tuple[list[int], npt.NDArray[np.uint8]]:
+    """Ids of the points that a photo observes, and the photo's colours [n,3] there."""
     image = model.images[image_id]
     camera = model.cameras[image.camera_id]
-    seen = [point for point in image.points2D if point.has_point3D()]
-    if not seen:
+    observed = [point for point in image.points2D if point.has_point3D()]
+    if not observed:
         return [], np.zeros((0, 3), np.uint8)
     factor = min(1.0, SIDE / max(camera.width, camera.height))
     least = max(1, int(camera.width * factor)), max(1, int(camera.height * factor))
@@ -43,7 +46,7 @@ def _seen(
         warnings.simplefilter("ignore")
         photo = np.asarray(decode(view.image, at_least=least).convert("RGB"))
     height, width = photo.shape[:2]
-    places = np.array([point.xy for point in seen]) * (width / camera.width, height / camera.height)
-    x = np.clip(places[:, 0].astype(int), 0, width - 1)
-    y = np.clip(places[:, 1].astype(int), 0, height - 1)
-    return [point.point3D_id for point in seen], photo[y, x]
+    pixels = np.array([point.xy for point in observed]) * (width / camera.width, height / camera.height)
+    x = np.clip(pixels[:, 0].astype(int), 0, width - 1)
+    y = np.clip(pixels[:, 1].astype(int), 0, height - 1)
+    return [point.point3D_id for point in observed], photo[y, x]

@@ -1,4 +1,4 @@
-"""Features, pairs, matches and mapping at one effort."""
+"""Structure from motion at one effort: features, pairs, matches and mapping."""
 
 from __future__ import annotations
 
@@ -6,226 +6,259 @@ import numpy as np
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
-from splatmill_worker.sfm import checks, features, geometry, mapping, pairs
-from splatmill_worker.sfm.features import Workspace
+from splatmill_worker.sfm import checks, features
+from splatmill_worker.sfm.features import FeatureStore
+from splatmill_worker.sfm.mapping import mapper
+from splatmill_worker.sfm.matching import pairs, two_view
 from splatmill_worker.sfm.options import LEAN, Effort
-from splatmill_worker.sfm.run import VERSION, Progress, Run, digest
+from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest
 
-REPAIR_ROUNDS = 2
-ENOUGH = 0.9  # of the photos surely placed: below, more effort is spent
-PARTNERS_AGAIN = 4  # of a photo without a sure place, that are looked at harder together with it
-NEARLY_ALL = 0.8  # of the photos: then all are
-GLOBAL_FROM = 400  # photos: from here on the global mapper goes first where the view graph is dense
+CONNECTING_ROUNDS = 2
+"""Times that more pairs are matched to connect the components of the view graph."""
+
+ENOUGH_REGISTERED = 0.9
+"""Share of the photos, reliably registered, from which neither another mapper nor a higher effort is tried."""
+
+RETRY_PARTNERS = 4
+"""Likely partners of a photo without a reliable pose whose features are extracted anew together with its own."""
+
+RETRY_ALL = 0.8
+"""Share of photos to be extracted anew above which all of them are."""
+
+GLOBAL_MIN_PHOTOS = 400
+"""Photos from which the global mapper is tried first, where the view graph is dense."""
+
+GLOBAL_MIN_DEGREE = 5
+"""Verified pairs per photo from which a view graph counts as dense."""
 
 
-def attempt(run: Run, effort: Effort, earlier: Progress | None) -> Progress:
-    """Features, pairs, matches and mapping at one effort; photos left over get matched with more partners.
+def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> EffortResult:
+    """Find features, match pairs and map the photos at one effort.
 
-    What is sure from `earlier` is kept where the photos are looked at in the same size.
+    The features and pairs of photos that `earlier` registered reliably are kept when both efforts use photos of the
+    same size. Raises SfmFailed when the photos have too few features, OSError when COLMAP cannot read the reduced
+    photos, and Cancelled.
     """
-    doubtful = _in_doubt(run, earlier) if earlier is not None and earlier.effort.side == effort.side else None
+    retried = _retried(run, earlier) if earlier is not None and earlier.effort.side == effort.side else None
     key = digest(
         VERSION,
         effort,
         run.options.matcher,
         run.options.seed,
-        run.model,
+        run.camera_model,
         [group.focal for group in run.groups],
-        sorted(doubtful or ()),
+        sorted(retried or ()),
     )
-    progress = Progress(effort, Workspace(run.folder / f"{effort.name}-{key}"))
+    result = EffortResult(effort, FeatureStore(run.folder / f"{effort.name}-{key}"))
     with run.clock("features"):
-        if earlier is not None and doubtful is not None:
-            features.carry_over(earlier.place, progress.place, doubtful)
+        if earlier is not None and retried is not None:
+            features.carry_over(earlier.store, result.store, retried)
         features.extract(
             run.prepared.photos,
             run.groups,
             effort,
-            run.model,
-            progress.place,
+            run.camera_model,
+            result.store,
             run.threads,
             run.on_progress,
             run.cancelled,
         )
-    database = pycolmap.Database.open(progress.place.database)
+    database = pycolmap.Database.open(result.store.database)
     try:
         with run.clock("features"):
-            progress.ids, progress.features = features.load(database)
-        if len(progress.ids) < run.count:
+            result.ids, result.features = features.load(database)
+        if len(result.ids) < run.count:
             raise OSError(
-                f"COLMAP could read only {len(progress.ids)} of the {run.count} reduced photos in "
-                f"{progress.place.images}. Is the disk full?"
+                f"COLMAP could read only {len(result.ids)} of the {run.count} reduced photos in "
+                f"{result.store.images}. Check whether the disk is full."
             )
-        _require_features(run, progress)
-        chosen = _choose(run, progress)
-        _match(run, progress, chosen, database)
-        for _ in range(REPAIR_ROUNDS):
-            parts = pairs.components(run.count, edges(progress))
-            more = (
-                pairs.bridges(parts, run.scores, set(progress.verified), effort.partners)
-                if len(parts) > 1
-                else set()
-            )
-            if not more:
-                break
-            _match(run, progress, more, database)
-        if not edges(progress):
-            return progress
-        progress.mapped = _map(run, progress)
-        left = _unregistered(run, progress)
-        if left and _match_left_over(run, progress, left, database):
-            again, before = _map(run, progress), progress.mapped
-            if (checks.trusted(again.largest), again.registered) > (
-                checks.trusted(before.largest),
-                before.registered,
-            ):
-                progress.mapped = again
+        _require_features(run, result)
+        _match(run, result, _select_pairs(run, result), database)
+        _connect(run, result, database)
+        if not verified_pairs(result):
+            return result
+        result.mapped = _map(run, result)
+        left = _unregistered(run, result)
+        if left and _match_unregistered(run, result, left, database):
+            again = _map(run, result)
+            if registered_counts(again) > registered_counts(result.mapped):
+                result.mapped = again
     finally:
         database.close()
-    return progress
+    return result
 
 
-def _in_doubt(run: Run, progress: Progress) -> set[int] | None:
-    """Photos without a sure place, and the likeliest partners of each; None where that is nearly all of them."""
-    model = progress.mapped.largest if progress.mapped is not None else None
-    sure = (
+def verified_pairs(result: EffortResult) -> list[pairs.Pair]:
+    """The edges of the view graph: pairs with enough inliers."""
+    return [pair for pair, found in result.matched.items() if found.inliers >= two_view.MIN_INLIERS]
+
+
+def registered_counts(mapped: mapper.Mapped | None) -> tuple[int, int]:
+    """Number of photos registered reliably in the largest model, and number of all those registered in it."""
+    if mapped is None:
+        return 0, 0
+    return len(checks.reliably_registered(mapped.largest)), mapped.registered
+
+
+def registered_photos(model: pycolmap.Reconstruction) -> set[int]:
+    """Indices of the photos that a model has registered."""
+    return {features.photo_index(model.images[i].name) for i in model.reg_image_ids()}
+
+
+def _retried(run: SfmRun, result: EffortResult) -> set[int] | None:
+    """Photos without a reliable pose and the likely partners of each; None when those are nearly all photos."""
+    model = result.mapped.largest if result.mapped is not None else None
+    reliable = (
         set()
         if model is None
-        else {features.photo_index(model.images[i].name) for i in checks.trusted_images(model)}
+        else {features.photo_index(model.images[i].name) for i in checks.reliably_registered(model)}
     )
-    doubtful = set(range(run.count)) - sure
-    if not run.scores or len(doubtful) > NEARLY_ALL * run.count:
+    unreliable = set(range(run.count)) - reliable
+    if not run.scores or len(unreliable) > RETRY_ALL * run.count:
         return None
-    chosen = pairs.likeliest(run.scores, run.count, doubtful, PARTNERS_AGAIN)
-    both = doubtful.union(*chosen)
-    return None if len(both) > NEARLY_ALL * run.count else both
+    chosen = pairs.best_pairs_of(unreliable, run.scores, run.count, RETRY_PARTNERS)
+    both = unreliable.union(*chosen)
+    return None if len(both) > RETRY_ALL * run.count else both
 
 
-def _require_features(run: Run, progress: Progress) -> None:
-    counts = [len(found.scales) for found in progress.features]
-    if progress.effort.name != LEAN.name and float(np.median(counts)) < 2 * geometry.MIN_INLIERS:
+def _require_features(run: SfmRun, result: EffortResult) -> None:
+    """Raise SfmFailed when half of the photos have too few features; the lean effort is followed by others."""
+    median = float(np.median([len(found.scales) for found in result.features]))
+    least = 2 * two_view.MIN_INLIERS
+    if result.effort.name != LEAN.name and median < least:
         raise SfmFailed(
             "sfm_no_features",
-            f"Half of the {run.count} photos have fewer than {int(np.median(counts)) + 1} features.",
-            {"photos": run.count, "features_per_photo": float(np.median(counts))},
-            "Plain walls, blur and darkness leave nothing to match: take sharp photos of something with texture.",
+            f"Half of the {run.count} photos have at most {int(median)} features; at least {least} are needed.",
+            {"photos": run.count, "features_per_photo": median},
+            "Plain walls, blur and darkness have no features: take sharp photos of things with texture.",
         )
 
 
-def _choose(run: Run, progress: Progress) -> set[pairs.Pair]:
-    """The pairs to match in full, by the options or by what the photos are."""
-    photos, partners = run.prepared.photos, progress.effort.partners
+def _select_pairs(run: SfmRun, result: EffortResult) -> set[pairs.Pair]:
+    """The pairs to match in full, by the options, the order of the photos, GPS and preemptive matching."""
+    photos, partners = run.prepared.photos, result.effort.partners
     matcher = run.options.matcher
-    places = pairs.positions(photos)
-    has_gps = bool(np.isfinite(places).all(axis=1).mean() > 0.5)
+    positions = pairs.gps_positions(photos)
+    has_gps = bool(np.isfinite(positions).all(axis=1).mean() > 0.5)
     if matcher == "spatial" and not has_gps:
-        run.notes.append("Neighbours by GPS were asked for, but most photos have no place in their EXIF.")
+        run.notes.append(
+            "matcher=spatial has no effect: most photos have no GPS position in their EXIF. Pairs are chosen by "
+            "their features instead."
+        )
     if matcher == "exhaustive" or (matcher == "auto" and run.count <= pairs.EXHAUSTIVE_UP_TO):
         return set(pairs.exhaustive(run.count))
-    runs = pairs.sequences(photos)
+    orders = pairs.video_sequences(photos)
     if matcher == "sequential":
-        runs = [list(range(run.count))]
-    likely = {pair for order in runs for pair in pairs.sequential(order)}
+        orders = [list(range(run.count))]
+    likely = {pair for order in orders for pair in pairs.sequential(order)}
     if matcher == "auto":
         likely |= {
-            pair for order in pairs.bursts(photos) for pair in pairs.sequential(order, pairs.BURST_STEPS)
+            pair
+            for order in pairs.numbered_runs(photos)
+            for pair in pairs.sequential(order, pairs.NUMBERED_STEPS)
         }
     if has_gps and matcher in ("auto", "spatial"):
-        likely |= pairs.spatial(places, partners if matcher == "spatial" else partners // 2)
+        likely |= pairs.spatial(positions, partners if matcher == "spatial" else partners // 2)
     with run.clock("pairs"):
         if not run.scores:
-            run.scores = pairs.quick_look(
-                progress.features,
+            run.scores = pairs.preemptive_matches(
+                result.features,
                 likely,
                 run.pool,
-                lambda done, total: run.on_progress(
-                    "pairs", done, total, "a quick look at which photos overlap"
-                ),
+                lambda done, total: run.on_progress("pairs", done, total, "pairs compared for overlap"),
                 run.cancelled,
             )
-    forced = matcher in ("sequential", "spatial") and bool(likely)
-    # A forced order still gets the best few by looks, which close loops.
-    return likely | pairs.best_partners(run.scores, run.count, pairs.SURE_PARTNERS if forced else partners)
+    given_order = matcher in ("sequential", "spatial") and bool(likely)
+    # With a given order, the best few pairs of each photo still close loops.
+    return likely | pairs.best_partners(
+        run.scores, run.count, pairs.CERTAIN_PARTNERS if given_order else partners
+    )
 
 
-def _match(run: Run, progress: Progress, chosen: set[pairs.Pair], database: pycolmap.Database) -> None:
-    total = len(progress.verified) + len(chosen)
-    before = len(progress.verified)
+def _match(run: SfmRun, result: EffortResult, chosen: set[pairs.Pair], database: pycolmap.Database) -> None:
+    """Match the `chosen` pairs and add their outcomes to the result."""
+    total = len(result.matched) + len(chosen)
+    before = len(result.matched)
     with run.clock("matching"):
-        progress.verified |= geometry.match_pairs(
+        result.matched |= two_view.match_pairs(
             chosen,
-            progress.features,
-            progress.ids,
+            result.features,
+            result.ids,
             database,
-            progress.effort.features,
+            result.effort.features,
             run.options.seed,
             run.pool,
-            lambda done, _: run.on_progress("matching", before + done, total, "pairs"),
+            lambda done, _: run.on_progress("matching", before + done, total, "pairs matched"),
             run.cancelled,
         )
 
 
-def edges(progress: Progress) -> list[pairs.Pair]:
-    """Pairs of photos that hold."""
-    return [pair for pair, found in progress.verified.items() if found.inliers >= geometry.MIN_INLIERS]
+def _connect(run: SfmRun, result: EffortResult, database: pycolmap.Database) -> None:
+    """Match more pairs between the components of the view graph, while there are several."""
+    for _ in range(CONNECTING_ROUNDS):
+        components = pairs.connected_components(run.count, verified_pairs(result))
+        if len(components) == 1:
+            return
+        more = pairs.connecting_pairs(components, run.scores, set(result.matched), result.effort.partners)
+        if not more:
+            return
+        _match(run, result, more, database)
 
 
-def _map(run: Run, progress: Progress) -> mapping.Mapped:
-    """Maps by the mapper the photos speak for, then by the other or with relaxed settings where that falls short."""
+def _map(run: SfmRun, result: EffortResult) -> mapper.Mapped:
+    """The best of up to three mappings: with the likelier mapper, with the other one, and with relaxed settings."""
     asked = run.options.mapper
-    first: mapping.Mapper = "incremental"
+    first: mapper.Mapper = "incremental"
     if asked != "auto":
         first = asked
     elif run.best_mapper is not None:
         first = run.best_mapper
-    elif run.count >= GLOBAL_FROM and len(edges(progress)) >= 5 * run.count:
+    elif run.count >= GLOBAL_MIN_PHOTOS and len(verified_pairs(result)) >= GLOBAL_MIN_DEGREE * run.count:
         first = "global"
-    trials: list[tuple[mapping.Mapper, bool]] = [(first, False)]
+    trials: list[tuple[mapper.Mapper, bool]] = [(first, False)]
     if asked == "auto":
         trials.append(("global" if first == "incremental" else "incremental", False))
     if asked != "global":
         trials.append(("incremental", True))
-    best: mapping.Mapped | None = None
-    most = 0
+    best: mapper.Mapped | None = None
+    best_rank = 0, 0
     with run.clock("mapping"):
-        for mapper, relaxed in trials:
-            result = mapping.run(
-                mapper,
-                progress.place.database,
+        for name, relaxed in trials:
+            mapped = mapper.run(
+                name,
+                result.store.database,
                 run.count,
                 run.threads,
                 run.options.seed,
                 relaxed=relaxed,
-                on_progress=lambda done, total: run.on_progress("mapping", done, total, "photos placed"),
+                on_progress=lambda done, total: run.on_progress("mapping", done, total, "photos registered"),
                 cancelled=run.cancelled,
             )
-            sure = checks.trusted(result.largest)
-            if best is None or (sure, result.registered) > (most, best.registered):
-                best, most = result, sure
-            if most >= ENOUGH * run.count:
+            rank = registered_counts(mapped)
+            if best is None or rank > best_rank:
+                best, best_rank = mapped, rank
+            if best_rank[0] >= ENOUGH_REGISTERED * run.count:
                 break
     assert best is not None  # there is at least one trial
     run.best_mapper = best.mapper
     return best
 
 
-def _unregistered(run: Run, progress: Progress) -> list[int]:
-    largest = progress.mapped.largest if progress.mapped is not None else None
-    placed = photos_of(largest) if largest is not None else set()
-    return [index for index in range(run.count) if index not in placed]
+def _unregistered(run: SfmRun, result: EffortResult) -> list[int]:
+    """Indices of the photos that the largest model has not registered."""
+    largest = result.mapped.largest if result.mapped is not None else None
+    registered = registered_photos(largest) if largest is not None else set()
+    return [index for index in range(run.count) if index not in registered]
 
 
-def _match_left_over(run: Run, progress: Progress, left: list[int], database: pycolmap.Database) -> bool:
-    """Matches photos without a place with more of those that have one; whether that held any new pair."""
+def _match_unregistered(
+    run: SfmRun, result: EffortResult, left: list[int], database: pycolmap.Database
+) -> bool:
+    """Match the unregistered photos `left` with more of the others; returns whether any new pair was verified."""
     parts = [[index for index in range(run.count) if index not in left], left]
-    more = pairs.bridges(parts, run.scores, set(progress.verified), 2 * progress.effort.partners)
+    more = pairs.connecting_pairs(parts, run.scores, set(result.matched), 2 * result.effort.partners)
     if not more:
         return False
-    before = len(edges(progress))
-    _match(run, progress, more, database)
-    return len(edges(progress)) > before
-
-
-def photos_of(model: pycolmap.Reconstruction) -> set[int]:
-    """The photos that have a place in a model."""
-    return {features.photo_index(model.images[i].name) for i in model.reg_image_ids()}
+    before = len(verified_pairs(result))
+    _match(run, result, more, database)
+    return len(verified_pairs(result)) > before

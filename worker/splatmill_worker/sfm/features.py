@@ -1,4 +1,4 @@
-"""SIFT features of every photo, kept in a COLMAP database beside the reduced photos they were found on."""
+"""SIFT features of every photo, in a COLMAP database beside the reduced photos on which they were found."""
 
 from __future__ import annotations
 
@@ -14,21 +14,30 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from splatmill.files import replacing
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.decode import decode
 from splatmill_worker.images.load import training_size
 from splatmill_worker.images.prepare import Usable
-from splatmill_worker.sfm.cameras import Group
-from splatmill_worker.sfm.cancellation import native_token, stop_if
+from splatmill_worker.sfm.callbacks import OnProgress, native_token, stop_if
+from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.options import Effort
 
-PAIR_IDS = 2147483647  # COLMAP's largest number of images
-BATCH = 8  # photos per native call: progress is told between two of them
+MAX_IMAGES = 2147483647
+"""COLMAP's kMaxNumImages: it numbers the pair of images a < b as MAX_IMAGES * a + b."""
+
+BATCH = 8
+"""Photos per native call; progress is reported, and a cancelled run ends, between two calls."""
 
 
 @dataclass(frozen=True)
 class Features:
-    """Features of one photo: points [n,2] in pixels of the reduced photo, scales [n], descriptors uint8 [n,128]."""
+    """SIFT features of one photo.
+
+    points: positions [n,2] in pixels of the reduced photo.
+    scales: [n], in pixels of the reduced photo.
+    descriptors: uint8 [n,128].
+    """
 
     points: npt.NDArray[np.float64]
     scales: npt.NDArray[np.float32]
@@ -36,75 +45,81 @@ class Features:
 
 
 @dataclass(frozen=True)
-class Workspace:
-    """Where the reduced photos and the database of one set of photos at one effort lie."""
+class FeatureStore:
+    """The folder with the reduced photos, their masks, and COLMAP's database of one effort."""
 
     folder: Path
 
     @property
     def images(self) -> Path:
+        """Folder of the reduced photos."""
         return self.folder / "images"
 
     @property
     def masks(self) -> Path:
+        """Folder of the reduced masks."""
         return self.folder / "masks"
 
     @property
     def database(self) -> Path:
+        """COLMAP's database: cameras, images, features, matches and two-view geometries."""
         return self.folder / "database.db"
 
 
 def reduced_name(group: int, photo: int) -> str:
-    """The reduced photo's name in the database; a folder per camera."""
+    """The name of a photo in the database, by the indices of its camera and of the photo."""
     return f"camera{group}/{photo:06d}.png"
 
 
 def photo_index(name: str) -> int:
-    """The photo a name of `reduced_name` stands for."""
+    """The index of the photo whose name in the database is `name`."""
     return int(Path(name).stem)
 
 
 def extract(
     photos: Sequence[Usable],
-    groups: Sequence[Group],
+    groups: Sequence[CameraGroup],
     effort: Effort,
-    model: str,
-    place: Workspace,
+    camera_model: str,
+    store: FeatureStore,
     threads: int,
-    on_progress: Callable[[str, int, int, str], None],
+    on_progress: OnProgress,
     cancelled: Callable[[], bool],
 ) -> None:
-    """Fills the database with cameras, images and features; what is there already is not made again."""
+    """Fill the store's database with cameras, images and features.
+
+    Photos that the database has features of are left as they are. Raises Cancelled between two batches.
+    """
     names = {
         index: reduced_name(number, index) for number, group in enumerate(groups) for index in group.photos
     }
-    done = _extracted(place.database)
-    told = len(done)
+    extracted = _extracted(store.database)
+    done = len(extracted)
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = model
+    reader.camera_model = camera_model
     if any(photo.mask is not None for photo in photos):
-        place.masks.mkdir(parents=True, exist_ok=True)
-        reader.mask_path = place.masks
+        store.masks.mkdir(parents=True, exist_ok=True)
+        reader.mask_path = store.masks
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = threads
     options.sift.max_num_features = effort.features
     options.sift.first_octave = effort.first_octave
     options.sift.max_num_orientations = effort.orientations
-    place.images.mkdir(parents=True, exist_ok=True)
+    store.images.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(threads) as pool:
         for group in groups:
-            missing = [index for index in group.photos if names[index] not in done]
+            missing = [index for index in group.photos if names[index] not in extracted]
             for start in range(0, len(missing), BATCH):
                 batch = missing[start : start + BATCH]
                 stop_if(cancelled)
-                list(pool.map(lambda index: _reduce(photos[index], effort.side, place, names[index]), batch))
-                # Each call would otherwise start a camera of its own for its batch.
-                reader.existing_camera_id = _camera_of(group, names, place.database)
+                list(pool.map(lambda index: _reduce(photos[index], effort.side, store, names[index]), batch))
+                # Without it, each call would create a camera of its own for its batch.
+                reader.existing_camera_id = _camera_of(group, names, store.database)
                 with native_token(cancelled) as token:
                     pycolmap.extract_features(
-                        place.database,
-                        place.images,
+                        store.database,
+                        store.images,
                         [names[index] for index in batch],
                         pycolmap.CameraMode.SINGLE,
                         reader,
@@ -112,39 +127,53 @@ def extract(
                         pycolmap.Device.cpu,
                         token,
                     )
-                told += len(batch)
-                on_progress("features", told, len(photos), photos[batch[-1]].name)
-    _set_cameras(groups, names, place.database)
+                done += len(batch)
+                on_progress("features", done, len(photos), photos[batch[-1]].name)
+    _set_cameras(groups, names, store.database)
 
 
-def carry_over(source: Workspace, target: Workspace, again: set[int]) -> None:
-    """Starts `target` with all that `source` has, but for the photos whose features are to be found `again`.
+def carry_over(source: FeatureStore, target: FeatureStore, again: set[int]) -> None:
+    """Copy the database of `source` to `target`, without the features and pairs of the photos `again`.
 
-    Both look at the photos at one size. Pairs with such a photo are forgotten with it; what other pairs gave stays.
-    Photos keep their ids. A target that is there already is left as it is.
+    Both stores must have reduced photos of the same size. Photos keep their ids. A database that `target` already has
+    is left as it is.
     """
     if target.database.is_file():
         return
-    target.folder.mkdir(parents=True, exist_ok=True)
-    part = target.database.with_suffix(".part")
-    part.unlink(missing_ok=True)
-    with closing(sqlite3.connect(source.database)) as old, closing(sqlite3.connect(part)) as new:
+    with (
+        replacing(target.database) as part,
+        closing(sqlite3.connect(source.database)) as old,
+        closing(sqlite3.connect(part)) as new,
+    ):
         old.backup(new)
-        ids = {photo_index(name): number for number, name in new.execute("SELECT image_id, name FROM images")}
+        images = new.execute("SELECT image_id, name FROM images")
+        ids = {photo_index(name): number for number, name in images}
         gone = {ids[photo] for photo in again if photo in ids}
-        # COLMAP numbers a pair of images a < b by PAIR_IDS * a + b.
         for table in ("matches", "two_view_geometries"):
             pairs = [number for (number,) in new.execute(f"SELECT pair_id FROM {table}")]
-            lost = [(number,) for number in pairs if gone & {number // PAIR_IDS, number % PAIR_IDS}]
+            lost = [(number,) for number in pairs if gone & {number // MAX_IMAGES, number % MAX_IMAGES}]
             new.executemany(f"DELETE FROM {table} WHERE pair_id = ?", lost)
         for table in ("keypoints", "descriptors"):
             new.executemany(f"DELETE FROM {table} WHERE image_id = ?", [(number,) for number in gone])
         new.commit()
-    part.replace(target.database)
 
 
-def _camera_of(group: Group, names: dict[int, str], path: Path) -> int:
-    """The database's id of the group's camera; -1 before any of its photos is in."""
+def load(database: pycolmap.Database) -> tuple[dict[int, int], list[Features]]:
+    """COLMAP's image id of each photo, and the photos' features in order of their indices."""
+    ids = {photo_index(image.name): image.image_id for image in database.read_all_images()}
+    found = []
+    for index in sorted(ids):
+        keypoints = np.asarray(database.read_keypoints(ids[index]), np.float32).reshape(-1, 6)
+        x_y, affine = keypoints[:, :2], keypoints[:, 2:].reshape(-1, 2, 2)
+        # The determinant of the affine shape a11, a12, a21, a22 is the square of the scale.
+        scales = np.sqrt(np.abs(affine[:, 0, 0] * affine[:, 1, 1] - affine[:, 0, 1] * affine[:, 1, 0]))
+        descriptors = np.asarray(database.read_descriptors(ids[index]).data, np.uint8).reshape(-1, 128)
+        found.append(Features(x_y.astype(np.float64), scales, descriptors))
+    return ids, found
+
+
+def _camera_of(group: CameraGroup, names: dict[int, str], path: Path) -> int:
+    """The database's id of the group's camera; -1 while the database has none of its photos."""
     if not path.is_file():
         return -1
     database = pycolmap.Database.open(path)
@@ -155,20 +184,8 @@ def _camera_of(group: Group, names: dict[int, str], path: Path) -> int:
         database.close()
 
 
-def load(database: pycolmap.Database) -> tuple[dict[int, int], list[Features]]:
-    """COLMAP's image id of each photo, and the photos' features in the same order."""
-    ids = {photo_index(image.name): image.image_id for image in database.read_all_images()}
-    found = []
-    for index in sorted(ids):
-        keypoints = np.asarray(database.read_keypoints(ids[index]), np.float32).reshape(-1, 6)
-        # x, y and the affine shape a11, a12, a21, a22, whose determinant is the squared scale.
-        scales = np.sqrt(np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4]))
-        descriptors = np.asarray(database.read_descriptors(ids[index]).data, np.uint8).reshape(-1, 128)
-        found.append(Features(keypoints[:, :2].astype(np.float64), scales, descriptors))
-    return ids, found
-
-
 def _extracted(path: Path) -> set[str]:
+    """Names of the photos that the database has features of."""
     if not path.is_file():
         return set()
     database = pycolmap.Database.open(path)
@@ -179,9 +196,9 @@ def _extracted(path: Path) -> set[str]:
         database.close()
 
 
-def _reduce(photo: Usable, side: int, place: Workspace, name: str) -> None:
-    """Writes the photo (and its mask) in grey at the size features are found on."""
-    target = place.images / name
+def _reduce(photo: Usable, side: int, store: FeatureStore, name: str) -> None:
+    """Write the photo and its mask in grey, with a longest side of at most `side` pixels."""
+    target = store.images / name
     target.parent.mkdir(parents=True, exist_ok=True)
     size = training_size(photo.width, photo.height, side)
     with warnings.catch_warnings():
@@ -192,25 +209,25 @@ def _reduce(photo: Usable, side: int, place: Workspace, name: str) -> None:
     grey.save(target, compress_level=1)
     if photo.mask is not None:
         mask = decode(photo.mask).convert("L").resize(size, Image.Resampling.BOX)
-        place_of_mask = place.masks / f"{name}.png"
-        place_of_mask.parent.mkdir(parents=True, exist_ok=True)
-        mask.point(lambda value: 255 if value >= 128 else 0).save(place_of_mask, compress_level=1)
+        mask_path = store.masks / f"{name}.png"
+        mask_path.parent.mkdir(parents=True, exist_ok=True)
+        mask.point(lambda value: 255 if value >= 128 else 0).save(mask_path, compress_level=1)
 
 
-def _set_cameras(groups: Sequence[Group], names: dict[int, str], path: Path) -> None:
-    """The reduced files have no EXIF: each group's camera gets its focal length here."""
+def _set_cameras(groups: Sequence[CameraGroup], names: dict[int, str], path: Path) -> None:
+    """Set the initial focal length of each group's camera, as the reduced photos have no EXIF."""
     database = pycolmap.Database.open(path)
     try:
         for group in groups:
             image = database.read_image_with_name(names[group.photos[0]])
             if image is None:
-                continue  # its file did not decode a second time; it is told apart as unregistered
+                continue  # COLMAP could not read the reduced photo; `solve_at` checks that all were read
             camera = database.read_camera(image.camera_id)
             params = np.array(camera.params)
             params[camera.focal_length_idxs()] = group.focal * max(camera.width, camera.height)
             camera.params = params.tolist()
-            # EXIF is where the focal length starts, never what matches are judged by: a cropped photo or a
-            # wrong tag would rule out the true ones.
+            # EXIF initialises the focal length but is not used to verify matches: with a cropped photo or a wrong
+            # tag, the correct ones would fail (decisions: EXIF_FOCAL).
             camera.has_prior_focal_length = False
             database.update_camera(camera)
     finally:

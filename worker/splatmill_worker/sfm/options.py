@@ -1,4 +1,4 @@
-"""What can be asked of structure from motion; `auto` is decided from the photos and from what was measured."""
+"""Options of structure from motion, and the three efforts that `auto` chooses from."""
 
 from __future__ import annotations
 
@@ -8,10 +8,18 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class SfmOptions:
-    """`side`, `features`: longest side in pixels and features per photo; None leaves them to the effort.
+    """What can be asked of structure from motion; `auto` is decided from the photos and from what was measured.
 
-    `frames`: how many frames are taken from a video. `camera_model`: COLMAP's name. `stereo`: look for more points
-    where there are few. `threads` None: all cores.
+    effort: how thoroughly features are searched for and matched; `auto` starts lean and raises it where needed.
+    matcher: how pairs of photos are chosen.
+    mapper: which of COLMAP's mappers estimates the poses.
+    side: longest side of the photos that features are found on, in pixels; None: by the effort.
+    features: features per photo, at most; None: by the effort.
+    camera_model: COLMAP's name of the lens model.
+    frames: number of frames taken from a video.
+    stereo: whether stereo adds points where there are few.
+    seed: of every random choice.
+    threads: CPU threads; None: one per core.
     """
 
     effort: Literal["auto", "lean", "standard", "high"] = "auto"
@@ -28,10 +36,15 @@ class SfmOptions:
 
 @dataclass(frozen=True)
 class Effort:
-    """How hard the photos are looked at.
+    """How thoroughly features are searched for and matched.
 
-    `side` pixels; at most `features` a photo; `first_octave` -1 doubles the photo first (four times the time,
-    three times the features); `orientations` a feature may have; each photo is matched with `partners` others.
+    name: stable name.
+    side: longest side of the photos that features are found on, in pixels.
+    features: features per photo, at most.
+    first_octave: of SIFT's scale space. -1 doubles the photo's size first, which gives three times the features in
+        four times the time.
+    orientations: orientations per feature, at most.
+    partners: number of other photos that each photo is matched with.
     """
 
     name: str
@@ -46,11 +59,12 @@ LEAN = Effort("lean", 800, 1500, 0, 1, 10)
 STANDARD = Effort("standard", 800, 2500, -1, 1, 10)
 HIGH = Effort("high", 1400, 6000, -1, 2, 16)
 EFFORTS = {effort.name: effort for effort in (LEAN, STANDARD, HIGH)}
-# Photos this small give too few features at their own size and cost little at twice it.
+
 SMALL_SIDE = 700
+"""Pixels of the longest side up to which photos are doubled at any effort: they have few features, and it is cheap."""
 
 
 def fitted(effort: Effort, longest_side: int) -> Effort:
-    """The effort for photos with this longest side, in pixels."""
+    """The effort adapted to photos whose longest side has `longest_side` pixels."""
     small = effort.first_octave == 0 and min(effort.side, longest_side) <= SMALL_SIDE
     return replace(effort, first_octave=-1) if small else effort

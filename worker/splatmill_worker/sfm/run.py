@@ -1,4 +1,4 @@
-"""One call of `reconstruct`: what it was given, what it has found so far, and what that is kept under."""
+"""The state of one call of `reconstruct`."""
 
 from __future__ import annotations
 
@@ -13,51 +13,78 @@ from pathlib import Path
 import torch
 
 from splatmill_worker.images.prepare import Prepared
-from splatmill_worker.sfm import geometry, mapping, pairs
-from splatmill_worker.sfm.cameras import Group
-from splatmill_worker.sfm.features import Features, Workspace
+from splatmill_worker.sfm.callbacks import OnProgress
+from splatmill_worker.sfm.cameras import CameraGroup
+from splatmill_worker.sfm.features import Features, FeatureStore
+from splatmill_worker.sfm.mapping import mapper
+from splatmill_worker.sfm.matching.pairs import Pair
+from splatmill_worker.sfm.matching.two_view import TwoView
 from splatmill_worker.sfm.options import Effort, SfmOptions
 
-OnProgress = Callable[[str, int, int, str], None]
-VERSION = 4  # of what is cached; another one means the cache of an older program is not read
+VERSION = 4
+"""Version of everything that is cached; a cache with another version is not read."""
 
 
 @dataclass
-class Progress:
-    """What one effort has found so far."""
+class EffortResult:
+    """What one effort has found so far.
+
+    effort: which effort.
+    store: where its features and matches lie.
+    ids: COLMAP's image id of each photo.
+    features: of each photo.
+    matched: outcome of each pair that was matched.
+    mapped: the models; None before mapping.
+    """
 
     effort: Effort
-    place: Workspace
+    store: FeatureStore
     ids: dict[int, int] = field(default_factory=dict)
     features: list[Features] = field(default_factory=list)
-    verified: dict[pairs.Pair, geometry.Verified] = field(default_factory=dict)
-    mapped: mapping.Mapped | None = None
+    matched: dict[Pair, TwoView] = field(default_factory=dict)
+    mapped: mapper.Mapped | None = None
 
 
 @dataclass
-class Run:
-    """One call of `reconstruct`: its inputs, its threads, its clocks, and what carries over between efforts."""
+class SfmRun:
+    """One call of `reconstruct`: its inputs, and what carries over from one effort to the next.
+
+    prepared: the photos.
+    groups: the photos by camera.
+    camera_model: COLMAP's name of the lens model that mapping uses.
+    options: as they were given.
+    folder: where the efforts keep their features and matches.
+    threads: number of CPU threads.
+    pool: with that many threads.
+    on_progress, cancelled: the caller's callbacks.
+    scores: number of preemptive matches of each candidate pair; empty until some effort needs them.
+    seconds: time spent so far, by stage.
+    notes: sentences for the user.
+    best_mapper: the mapper that registered the most photos so far.
+    """
 
     prepared: Prepared
-    groups: list[Group]
-    model: str
+    groups: list[CameraGroup]
+    camera_model: str
     options: SfmOptions
     folder: Path
     threads: int
     pool: ThreadPoolExecutor
     on_progress: OnProgress
     cancelled: Callable[[], bool]
-    scores: dict[pairs.Pair, int] = field(default_factory=dict)
+    scores: dict[Pair, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    best_mapper: mapping.Mapper | None = None  # that did best on what was matched so far
+    best_mapper: mapper.Mapper | None = None
 
     @property
     def count(self) -> int:
+        """Number of photos."""
         return len(self.prepared.photos)
 
     @contextmanager
     def clock(self, stage: str) -> Iterator[None]:
+        """Add the time that the block takes to `seconds[stage]`."""
         started = time.perf_counter()
         try:
             yield
@@ -67,7 +94,7 @@ class Run:
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """`count` threads for each torch call."""
+    """Let each torch call within the block use `count` threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -77,5 +104,5 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 def digest(*values: object) -> str:
-    """A short name for what was computed from `values`."""
+    """A name of 16 hexadecimal digits for the result computed from `values`, by their `repr`."""
     return hashlib.sha256(repr(values).encode()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""From usable photos to a Scene: lean first, more effort only where what was measured asks for it."""
+"""From usable photos to a scene: a lean effort first, and higher ones when too few photos are registered."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from splatmill_worker.errors import SfmFailed
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.scene import Scene
 from splatmill_worker.sfm import cameras, checks, stereo
-from splatmill_worker.sfm.cancellation import stop_if
-from splatmill_worker.sfm.effort import ENOUGH, attempt, edges
+from splatmill_worker.sfm.callbacks import OnProgress, stop_if
+from splatmill_worker.sfm.effort import ENOUGH_REGISTERED, registered_counts, solve_at, verified_pairs
+from splatmill_worker.sfm.final_model import final_model
+from splatmill_worker.sfm.model_store import is_stored, load_model, store_model
 from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions, fitted
-from splatmill_worker.sfm.run import VERSION, OnProgress, Progress, Run, digest, torch_threads
-from splatmill_worker.sfm.stored_model import read, store
+from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest, torch_threads
 
 
 def reconstruct(
@@ -30,14 +31,16 @@ def reconstruct(
     on_progress: OnProgress,
     cancelled: Callable[[], bool],
 ) -> Scene:
-    """Recovers the cameras of the photos under `images` (and in videos and zips there).
+    """Recover the cameras of the photos under `images`, and of those in its videos and zips.
 
-    `on_progress(stage, done, total, note)` is told of images, features, pairs, matching, mapping and, where
-    points are few, stereo. The same photos with the same options are read back from `workdir`; a restart goes on
-    where the last one stopped.
+    The model is kept in `workdir`: the same photos with the same options are read back from there, and a run that was
+    interrupted continues from what it had stored.
 
-    Raises SfmFailed with facts and advice, and Cancelled within a fraction of a second of `cancelled()` turning
-    true (the global mapper and a single bundle adjustment finish first).
+    on_progress: called with the stages images, features, pairs, matching, mapping and, where points are few, stereo.
+    cancelled: polled; Cancelled is raised within a fraction of a second of it turning true, except that the global
+        mapper and a bundle adjustment that are running finish first.
+
+    Raises SfmFailed with facts and advice when no usable model is found, and Cancelled.
     """
     prepared = prepare(
         images, masks, workdir, frames=options.frames, on_progress=on_progress, cancelled=cancelled
@@ -52,23 +55,24 @@ def reconstruct_photos(
     on_progress: OnProgress = lambda stage, done, total, note: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Scene:
-    """`reconstruct` for photos that were looked through already."""
+    """`reconstruct` for photos that `images.prepare` has examined."""
     _require_photos(prepared)
     stop_if(cancelled)
     folder = workdir / "sfm" / prepared.key[:24]
     stored = folder / f"model-{digest(VERSION, stereo.VERSION, pycolmap.__version__, options)}"
-    if not (stored / "facts.json").is_file():
+    if not is_stored(stored):
         threads = options.threads or os.cpu_count() or 1
         groups = cameras.group(prepared.photos)
         model = options.camera_model if options.camera_model != "auto" else "SIMPLE_RADIAL"
-        # One thread for each torch call: the pairs themselves run side by side.
+        # Several pairs are matched at the same time, so that each torch call gets one thread.
         with ThreadPoolExecutor(threads) as pool, torch_threads(1):
-            run = Run(prepared, groups, model, options, folder, threads, pool, on_progress, cancelled)
-            store(run, _solve(run), stored)
-    return read(prepared, stored)
+            run = SfmRun(prepared, groups, model, options, folder, threads, pool, on_progress, cancelled)
+            store_model(run, final_model(run, _solve(run)), stored)
+    return load_model(prepared, stored)
 
 
 def _require_photos(prepared: Prepared) -> None:
+    """Raise SfmFailed when there are too few photos for structure from motion."""
     count = len(prepared.photos)
     facts = {"photos": count, "skipped": [f"{name}: {reason}" for name, reason in prepared.skipped]}
     if count == 0:
@@ -78,17 +82,18 @@ def _require_photos(prepared: Prepared) -> None:
             facts,
             "Give JPEG, PNG, WebP, TIFF or HEIC photos, a video, or a zip of photos.",
         )
-    if count < checks.MIN_REGISTERED:
+    if count < checks.MIN_PHOTOS:
         raise SfmFailed(
             "too_few_images",
-            f"There {'is' if count == 1 else 'are'} {count} usable photo{'s' if count > 1 else ''}.",
+            f"There {'is' if count == 1 else 'are'} {count} usable photo{'s' if count > 1 else ''}; at least "
+            f"{checks.MIN_PHOTOS} are needed.",
             facts,
-            "Take at least 3 from different places, better 20 or more.",
+            "Take photos from different places, 20 or more for a good result.",
         )
 
 
 def _efforts(options: SfmOptions, longest_side: int) -> list[Effort]:
-    """What to try, in order; a forced effort, size or number of features is not raised."""
+    """The efforts to try, in order; one that was asked for, by name, size or number of features, is the only one."""
     chosen = [LEAN, STANDARD, HIGH] if options.effort == "auto" else [EFFORTS[options.effort]]
     if options.side is not None or options.features is not None:
         chosen = chosen[:1]
@@ -99,28 +104,24 @@ def _efforts(options: SfmOptions, longest_side: int) -> list[Effort]:
     return [fitted(effort, longest_side) for effort in forced]
 
 
-def _solve(run: Run) -> Progress:
-    """The best result over the efforts that were needed; raises SfmFailed where none is usable."""
-    best: Progress | None = None
+def _solve(run: SfmRun) -> EffortResult:
+    """The best result of the efforts that were needed."""
+    best: EffortResult | None = None
+    best_counts = 0, 0
     longest = int(np.median([max(photo.width, photo.height) for photo in run.prepared.photos]))
     for effort in _efforts(run.options, longest):
         if best is not None:
             run.notes.append(
-                f"With {best.effort.name} effort {_placed(best)[0]} of {run.count} photos surely found their place."
+                f"{best_counts[0]} of {run.count} photos were registered reliably with {best.effort.name} effort; "
+                f"{effort.name} effort was tried next."
             )
-        progress = attempt(run, effort, best)
-        if best is None or _placed(progress) > _placed(best):
-            best = progress
-        if _placed(best)[0] >= ENOUGH * run.count:
+        result = solve_at(run, effort, best)
+        counts = registered_counts(result.mapped)
+        if best is None or counts > best_counts:
+            best, best_counts = result, counts
+        if best_counts[0] >= ENOUGH_REGISTERED * run.count:
             break
-        if effort.name != LEAN.name and not edges(progress):
-            break  # not one pair matched on three times the features: more of them only take longer
-    assert best is not None  # _efforts gives at least one
+        if effort.name != LEAN.name and not verified_pairs(result):
+            break  # no pair matched with three times the features, and still more would not change that
+    assert best is not None  # _efforts returns at least one
     return best
-
-
-def _placed(progress: Progress) -> tuple[int, int]:
-    """Photos surely placed, and placed at all."""
-    if progress.mapped is None:
-        return 0, 0
-    return checks.trusted(progress.mapped.largest), progress.mapped.registered

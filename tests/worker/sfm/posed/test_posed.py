@@ -134,7 +134,7 @@ def test_points_are_read_from_within_the_capture_alone(tmp_path: Path) -> None:
     for name in ("../../outside.ply", str(tmp_path / "outside.ply"), "link.ply"):
         count, notes = points_named(name)
         assert count == 0
-        assert "leads out of the capture" in notes[0]
+        assert "lies outside the capture" in notes[0]
 
 
 def test_a_blender_set_keeps_its_own_split(tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ def test_a_broken_model_and_missing_photos_are_named(tmp_path: Path) -> None:
     colmap_model().write_binary(folder)
     found = posed.find(tmp_path)
     assert found is not None
-    with pytest.raises(ValueError, match="none of them is here"):
+    with pytest.raises(ValueError, match="the capture has none of them"):
         found.load()
 
 

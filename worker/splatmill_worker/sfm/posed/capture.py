@@ -1,4 +1,4 @@
-"""Captures that bring their cameras: a COLMAP model, nerfstudio or instant-ngp transforms, or a Blender set."""
+"""Finds the cameras that a capture brings, in the layouts of COLMAP, nerfstudio, instant-ngp and Blender."""
 
 from __future__ import annotations
 
@@ -9,22 +9,29 @@ from pathlib import Path
 
 from splatmill_worker.scene import Scene, Source
 from splatmill_worker.sfm import stereo
-from splatmill_worker.sfm.files import ImageFiles
+from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.sfm.posed import colmap_model, transforms
-from splatmill_worker.sfm.run import OnProgress
+from splatmill_worker.sfm.posed.files import ImageFiles
 
 MODEL_FILES = ("cameras.bin", "cameras.txt")
-# Where tools put things; the first folder that has a model wins.
+"""Files of which a folder with a COLMAP model has one."""
+
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "0", "")
+"""Folders in which tools put COLMAP models; the first that has one is used."""
+
 POSE_FOLDERS = ("poses", "")
+"""Folders of a capture in which cameras are looked for, in order."""
 
 
 @dataclass(frozen=True)
 class PosedInput:
-    """Cameras found beside the photos; `load` reads them.
+    """Cameras found beside the photos.
 
-    `model`: the folder of a COLMAP model, or None. `transforms`: transforms*.json files. `notes`: what was
-    found as well and is not used.
+    directory: the capture.
+    source: the kind of cameras.
+    model: folder of the COLMAP model; None for the other kinds.
+    transforms: the transforms*.json files; empty for a COLMAP model.
+    notes: sentences for the user about files that are not used.
     """
 
     directory: Path
@@ -36,8 +43,8 @@ class PosedInput:
     def load(self) -> Scene:
         """The scene with the cameras as they were given.
 
-        Photos that the cameras name but that are not there are listed in `left_out`, and so are photos
-        without a camera. Raises ValueError (with the file and what is wrong) where nothing usable is left.
+        `left_out` of the scene lists cameras whose photo is missing, and photos without a camera. Raises ValueError,
+        naming the file and the fault, when no usable view is left.
         """
         files = ImageFiles.under(self.directory)
         if self.model is not None:
@@ -45,40 +52,10 @@ class PosedInput:
         return transforms.load(self.transforms, self.source, files, self.directory, self.notes)
 
 
-def completed(
-    scene: Scene,
-    workdir: Path,
-    on_progress: OnProgress = lambda stage, done, total, note: None,
-    cancelled: Callable[[], bool] = lambda: False,
-) -> Scene:
-    """The scene with points found over its cameras where it brings few or none; kept in `workdir`.
-
-    What stands on a transparent background is left as it is: its silhouettes say where it can be. Raises what
-    `stereo.find` raises.
-    """
-    if scene.source == "blender" or not stereo.wanted(scene):
-        return scene
-    stored = workdir / "sfm" / f"posed-{_digest(scene)}.npz"
-    return stereo.completed(scene, stored, on_progress, cancelled)
-
-
-def _digest(scene: Scene) -> str:
-    """A name for what the points are found from: the method, the cameras, the known points, and the masks."""
-    digest = hashlib.sha256(repr((stereo.VERSION, scene.points.shape)).encode())
-    digest.update(scene.points.tobytes())
-    for view in scene.views:
-        camera = view.camera
-        digest.update(repr((view.name, view.lens, view.split, camera.width, camera.height)).encode())
-        digest.update(camera.viewmat.tobytes() + camera.K.tobytes())
-        if view.mask is not None:
-            digest.update(hashlib.sha256(view.mask.read_bytes()).digest())
-    return digest.hexdigest()[:24]
-
-
 def find(directory: Path) -> PosedInput | None:
-    """Looks for cameras in `directory` (poses/ first, then the folder itself); None where there are none.
+    """The cameras in `directory`, in poses/ first; None when there are none.
 
-    A COLMAP model wins over transforms.json, since it brings the sparse points as well.
+    A COLMAP model is preferred to transforms.json, because it has sparse points as well.
     """
     for base in (directory / folder for folder in POSE_FOLDERS):
         json_files = tuple(sorted(base.glob("transforms*.json"))) if base.is_dir() else ()
@@ -95,7 +72,38 @@ def find(directory: Path) -> PosedInput | None:
     return None
 
 
+def with_stereo_points(
+    scene: Scene,
+    workdir: Path,
+    on_progress: OnProgress = lambda stage, done, total, note: None,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> Scene:
+    """The scene with stereo points where it has few or none; they are kept in `workdir`.
+
+    Blender data sets are returned as they are: training starts them from the visual hull of their transparent photos.
+    Raises what `stereo.find_points` raises.
+    """
+    if scene.source == "blender" or not stereo.has_few_points(scene):
+        return scene
+    stored = workdir / "sfm" / f"posed-{_digest(scene)}.npz"
+    return stereo.with_stereo_points(scene, stored, on_progress, cancelled)
+
+
+def _digest(scene: Scene) -> str:
+    """A name for everything that the stereo points depend on: the method, cameras, known points and masks."""
+    digest = hashlib.sha256(repr((stereo.VERSION, scene.points.shape)).encode())
+    digest.update(scene.points.tobytes())
+    for view in scene.views:
+        camera = view.camera
+        digest.update(repr((view.name, view.lens, view.split, camera.width, camera.height)).encode())
+        digest.update(camera.viewmat.tobytes() + camera.K.tobytes())
+        if view.mask is not None:
+            digest.update(hashlib.sha256(view.mask.read_bytes()).digest())
+    return digest.hexdigest()[:24]
+
+
 def _model_under(base: Path) -> Path | None:
+    """The first of MODEL_FOLDERS under `base` with a COLMAP model."""
     for folder in MODEL_FOLDERS:
         place = base / folder
         if any((place / name).is_file() for name in MODEL_FILES):

@@ -1,8 +1,7 @@
-"""A COLMAP reconstruction (text or binary files, or one just made) as a Scene."""
+"""Scenes from COLMAP models: from files, text or binary, or from memory."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,21 +13,24 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.decode import upright_size
 from splatmill_worker.images.lens import lens_of, pinhole, without_distortion
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
-from splatmill_worker.sfm.files import ImageFiles
+from splatmill_worker.sfm.posed.files import ImageFiles
+
+MAX_ASPECT_ERROR = 0.02
+"""Relative difference of aspect ratios up to which a camera fits a photo: sizes are rounded to whole pixels."""
 
 
 def load(folder: Path, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
-    """Reads the model in `folder` and finds its photos among `files`.
+    """The scene of the model in `folder`, with its photos among `files`.
 
-    Intrinsics made from photos of another size are scaled to the files. Raises ValueError where the model
-    cannot be read or none of its photos is there.
+    Cameras are scaled to the size of the files. Raises ValueError when the model cannot be read, and when none of its
+    photos is among the files.
     """
     try:
         model = pycolmap.Reconstruction(folder)
     except (RuntimeError, ValueError, OSError, IndexError) as error:
         raise ValueError(
-            f"The COLMAP model in {folder.name}/ could not be read ({_first_line(error)}). "
-            "It needs cameras, images and points3D, all as .bin or all as .txt."
+            f"The COLMAP model in {folder.name}/ could not be read: {_last_line(error)}. "
+            "Give the files cameras, images and points3D, all as .bin or all as .txt."
         ) from error
     views: dict[int, View] = {}
     missing: list[tuple[str, str]] = []
@@ -36,20 +38,24 @@ def load(folder: Path, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
         image = model.images[image_id]
         found = files.photo(image.name)
         if found is None:
-            missing.append((image.name, "the model has a camera for it, but the photo is not here"))
+            missing.append(
+                (image.name, "the COLMAP model has a camera for it, but the capture has no such photo")
+            )
             continue
         name, path = found
         views[image_id] = posed_view(model, image_id, name, path, files.mask(name))
     if not views:
         raise ValueError(
-            f"The COLMAP model names {len(missing)} photos (such as {missing[0][0]!r}) and none of them is here. "
-            "Give the photos under the names the model uses."
+            f"The COLMAP model names {len(missing)} photos (such as {missing[0][0]!r}), and the capture has none of "
+            "them. Give the photos the names that the model uses."
             if missing
-            else "The COLMAP model has no registered photo. Leave it out, or give one that has."
+            else "The COLMAP model has no registered photo. Give one that has, or leave it out."
         )
     used = {view.image for view in views.values()}
     without = [
-        (name, "the model has no camera for it") for name, path in files.photos.items() if path not in used
+        (name, "the COLMAP model has no camera for it")
+        for name, path in files.photos.items()
+        if path not in used
     ]
     return scene_of(model, views, source="colmap", left_out=(*missing, *without), notes=notes)
 
@@ -57,7 +63,7 @@ def load(folder: Path, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
 def posed_view(
     model: pycolmap.Reconstruction, image_id: int, name: str, path: Path, mask: Path | None
 ) -> View:
-    """The view of a registered image, its camera scaled to the size of the file at `path`."""
+    """The view of a registered image; its camera is scaled to the size of the file at `path`."""
     image = model.images[image_id]
     viewmat = np.eye(4)
     viewmat[:3] = image.cam_from_world().matrix()
@@ -65,7 +71,7 @@ def posed_view(
 
 
 def camera_and_lens(camera: pycolmap.Camera, viewmat: npt.NDArray[np.float64]) -> tuple[Camera, Lens | None]:
-    """The pinhole camera, and the lens where the photo has one."""
+    """The pinhole camera of the undistorted photo, and the lens of the photo itself; None for a pinhole."""
     lens = lens_of(camera)
     if lens is not None:
         return pinhole(lens, viewmat), lens
@@ -73,19 +79,19 @@ def camera_and_lens(camera: pycolmap.Camera, viewmat: npt.NDArray[np.float64]) -
 
 
 def fit_to_file(posed: tuple[Camera, Lens | None], name: str, path: Path, mask: Path | None) -> View:
-    """A view whose camera is at the size of the file; whether the EXIF orientation counts follows from the shape.
+    """A view with its camera at the size of the file at `path`.
 
-    Tools that ignore the orientation gave a camera for the pixels as stored; those that apply it, for the
-    upright photo. Where both shapes fit, pixels are taken as stored, as most tools do.
+    Whether the camera describes the photo before or after its EXIF orientation is applied depends on the tool that
+    made it, and is decided by the aspect ratio. Where both fit, it is the photo as stored, as with most tools.
     """
     camera, lens = posed
     with Image.open(path) as image:
         stored, upright = image.size, upright_size(image)
     aspect = camera.width / camera.height
-    stored_fits = abs(stored[0] / stored[1] / aspect - 1.0) < 0.02
+    stored_fits = abs(stored[0] / stored[1] / aspect - 1.0) < MAX_ASPECT_ERROR
     turned = not stored_fits and stored != upright
     width, height = upright if turned else stored
-    # The lens keeps its own pixels: the loader looks it up in shares of the photo's size.
+    # The lens stays in its own pixels: the loader scales its look-up to the photo.
     return View(name, camera.scaled_to(width, height), path, mask, lens, None, turned)
 
 
@@ -96,16 +102,15 @@ def scene_of(
     source: Source,
     left_out: tuple[tuple[str, str], ...] = (),
     notes: tuple[str, ...] = (),
-    keep: Callable[[pycolmap.Point3D], bool] | None = None,
 ) -> Scene:
-    """The views and the model's points that at least one of them sees."""
+    """The scene of `views`, by COLMAP's image id, with the model's points that at least one of them observes."""
     order = {image_id: index for index, image_id in enumerate(views)}
     points, colors, errors, rows = [], [], [], []
     for point in model.points3D.values():
         row = sorted(
             {order[element.image_id] for element in point.track.elements if element.image_id in order}
         )
-        if row and np.isfinite(point.xyz).all() and (keep is None or keep(point)):
+        if row and np.isfinite(point.xyz).all():
             points.append(point.xyz)
             colors.append(point.color)
             errors.append(point.error)
@@ -127,5 +132,5 @@ def scene_of(
     )
 
 
-def _first_line(error: Exception) -> str:
+def _last_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[-1][:200]

@@ -1,6 +1,6 @@
-"""transforms.json of nerfstudio and instant-ngp, and the transforms_{train,test}.json of Blender data sets.
+"""Scenes from transforms.json of nerfstudio and instant-ngp, and transforms_{train,test}.json of Blender data sets.
 
-Both give camera-to-world matrices with OpenGL axes (x right, y up, z backward).
+Both hold camera-to-world matrices with OpenGL axes (x right, y up, z backward).
 """
 
 from __future__ import annotations
@@ -18,47 +18,53 @@ from plyfile import PlyData, PlyParseError
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
-from splatmill_worker.sfm.files import ImageFiles
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
+from splatmill_worker.sfm.posed.files import ImageFiles
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-MAX_SHEAR = 1e-2  # of R^T R from the identity, once its scale is taken out
+"""Turns the axes of a camera-to-world matrix from OpenGL's to OpenCV's."""
+
+MAX_SHEAR = 1e-2
+"""Largest element of R^T R - 1, for the rotation part R with its scale taken out, that counts as rounding."""
+
+MIN_DETERMINANT = 1e-12
+"""Determinant of the rotation part up to which a matrix counts as singular or mirrored."""
 
 
 def load(
     paths: tuple[Path, ...], source: Source, files: ImageFiles, capture: Path, notes: tuple[str, ...] = ()
 ) -> Scene:
-    """Reads the cameras of all `paths`; Blender's own split is kept, its validation set left out.
+    """The scene of the cameras in all `paths`; Blender's split is kept, and its validation set is left out.
 
-    Points and masks that a file names are read from within the folder `capture` alone: the files are uploads.
-    Raises ValueError, naming the file and the frame, for what cannot be a camera, and where no photo is there.
+    The files are uploads of strangers: points and masks that they name are read only when they lie in `capture`.
+    Raises ValueError, naming the file and the frame, for an invalid camera, and when no photo is among `files`.
     """
     views: dict[str, View] = {}
     left_out: list[tuple[str, str]] = []
-    said = list(notes)
+    messages = list(notes)
     points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     for path in paths:
         document = _read(path)
         split = _split_of(path)
         if split == "val":
-            said.append(f"{path.name} is a validation set; its photos are not used.")
+            messages.append(f"{path.name} is not used: it is a validation set.")
             continue
         tests = set(document.get("test_filenames", ()))
         for index, frame in enumerate(document["frames"]):
             name, view = _view(path, index, document, frame, files, capture)
             if view is None:
-                left_out.append((name, f"{path.name} has a camera for it, but the photo is not here"))
+                left_out.append((name, f"{path.name} has a camera for it, but the capture has no such photo"))
                 continue
             own = split or (("test" if frame["file_path"] in tests else "train") if tests else None)
             views[view.name] = replace(view, split=own)
         if document.get("ply_file_path"):
             points, note = _sparse_points(path.parent / str(document["ply_file_path"]), capture)
-            said += [note] if note else []
+            messages += [note] if note else []
     if not views:
         first = f" (such as {left_out[0][0]!r})" if left_out else ""
         raise ValueError(
-            f"{', '.join(path.name for path in paths)} gives {len(left_out)} cameras{first} and none of the photos "
-            "is here. Give the photos under the names in file_path."
+            f"{', '.join(path.name for path in paths)} has {len(left_out)} cameras{first}, and the capture has none "
+            "of their photos. Give the photos the names in file_path."
         )
     used = {view.image for view in views.values()}
     left_out += [
@@ -70,7 +76,7 @@ def load(
         colors=points[1],
         source=source,
         left_out=tuple(left_out),
-        notes=tuple(said),
+        notes=tuple(messages),
     )
 
 
@@ -81,22 +87,27 @@ def _read(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path.name} is not readable JSON: {error}.") from error
     if not isinstance(document, dict) or not isinstance(document.get("frames"), list):
         raise ValueError(
-            f"{path.name} has no list of frames; a transforms file has one entry per photo in it."
+            f"{path.name} has no list `frames`. Give a transforms file with one entry in `frames` per photo."
         )
     return document
 
 
 def _split_of(path: Path) -> Literal["train", "test", "val"] | None:
-    name = path.stem.removeprefix("transforms").lstrip("_")
-    return {"train": "train", "test": "test", "val": "val"}.get(name)  # type: ignore[return-value]
+    """The split that a Blender data set names in the file name."""
+    match path.stem.removeprefix("transforms").lstrip("_"):
+        case "train" | "test" | "val" as split:
+            return split
+    return None
 
 
 def _view(
     path: Path, index: int, document: dict[str, Any], frame: Any, files: ImageFiles, capture: Path
 ) -> tuple[str, View | None]:
-    """The name a frame gives and its view; None where the photo is not there."""
+    """The file_path of a frame, and its view; None when the capture has no such photo."""
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-        raise ValueError(f"Frame {index} of {path.name} has no file_path.")
+        raise ValueError(
+            f"Frame {index} of {path.name} has no file_path; each frame needs the name of its photo."
+        )
     name = frame["file_path"]
     found = files.photo(name)
     if found is None:
@@ -119,20 +130,24 @@ def _view(
 def world_to_camera(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """The OpenCV world-to-camera matrix [4,4] of an OpenGL camera-to-world matrix [4,4] or [3,4].
 
-    A scale in the rotation part is taken out. Raises ValueError for what is not finite, is singular or shears.
+    A uniform scale of the rotation part is taken out. Raises ValueError for a matrix that is not finite, is singular or
+    mirrored, or shears.
     """
     if matrix.shape not in ((4, 4), (3, 4)):
-        raise ValueError(f"transform_matrix has the shape {matrix.shape}; it must be 4 x 4.")
+        raise ValueError(f"transform_matrix has the shape {matrix.shape}; it must be 4 x 4 or 3 x 4.")
     if not np.isfinite(matrix).all():
         raise ValueError("transform_matrix has values that are not finite.")
     rotation = matrix[:3, :3]
     determinant = float(np.linalg.det(rotation))
-    if not determinant > 1e-12:
-        raise ValueError(f"transform_matrix has the determinant {determinant:.3g}; a rotation has 1.")
+    if not determinant > MIN_DETERMINANT:
+        raise ValueError(
+            f"the rotation part of transform_matrix has the determinant {determinant:.3g}; it must be positive, "
+            "and is 1 for a rotation."
+        )
     rotation = rotation / np.cbrt(determinant)
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > MAX_SHEAR:
         raise ValueError(
-            "transform_matrix is not a rigid motion: its axes are not at right angles or not equally long."
+            "transform_matrix is not a rigid motion: its axes are not at right angles, or not equally long."
         )
     u, _, v = np.linalg.svd(rotation)
     camera_to_world = np.eye(4)
@@ -143,14 +158,14 @@ def world_to_camera(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 def _colmap_camera(values: dict[str, Any], photo: Path) -> pycolmap.Camera:
-    """The intrinsics of a frame; its size is the file's where none is given."""
+    """The camera of a frame; its size is that of the file when w and h are missing."""
     if "w" in values and "h" in values:
         width, height = int(values["w"]), int(values["h"])
     else:
         with Image.open(photo) as image:
             width, height = image.size
     if width < 1 or height < 1:
-        raise ValueError(f"w and h are {width} and {height}; they must be at least 1.")
+        raise ValueError(f"w and h are {width} and {height} pixels; they must be at least 1.")
     if "fl_x" in values or "fl_y" in values:
         fx = float(values.get("fl_x", values.get("fl_y", 0.0)))
         fy = float(values.get("fl_y", fx))
@@ -164,42 +179,41 @@ def _colmap_camera(values: dict[str, Any], photo: Path) -> pycolmap.Camera:
     else:
         raise KeyError("fl_x nor camera_angle_x")
     cx, cy = float(values.get("cx", 0.5 * width)), float(values.get("cy", 0.5 * height))
-    distortion = {key: float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
-    if not all(map(math.isfinite, (fx, fy, cx, cy, *distortion.values()))) or fx <= 0 or fy <= 0:
-        raise ValueError(f"the focal lengths are {fx} and {fy} pixels; they must be positive and finite.")
-    d = distortion
+    k1, k2, k3, k4, p1, p2 = (float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if not all(map(math.isfinite, (fx, fy, cx, cy, k1, k2, k3, k4, p1, p2))) or fx <= 0 or fy <= 0:
+        raise ValueError(
+            f"the focal lengths are {fx} and {fy} pixels; they must be positive, and all intrinsics finite."
+        )
     if values.get("camera_model") == "OPENCV_FISHEYE" or values.get("is_fisheye"):
-        model, extra = "OPENCV_FISHEYE", [d["k1"], d["k2"], d["k3"], d["k4"]]
-    elif d["k3"] or d["k4"]:
-        model, extra = "FULL_OPENCV", [d["k1"], d["k2"], d["p1"], d["p2"], d["k3"], d["k4"], 0.0, 0.0]
+        model, extra = "OPENCV_FISHEYE", [k1, k2, k3, k4]
+    elif k3 or k4:
+        model, extra = "FULL_OPENCV", [k1, k2, p1, p2, k3, k4, 0.0, 0.0]
     else:
-        model, extra = "OPENCV", [d["k1"], d["k2"], d["p1"], d["p2"]]
+        model, extra = "OPENCV", [k1, k2, p1, p2]
     return pycolmap.Camera(model=model, width=width, height=height, params=[fx, fy, cx, cy, *extra])
 
 
 def _within(path: Path, capture: Path) -> bool:
-    """Whether a path, with its links followed, lies in the capture's folder."""
+    """Whether a path lies in the capture's folder once symbolic links are resolved."""
     return path.resolve().is_relative_to(capture.resolve())
 
 
 def _sparse_points(
     path: Path, capture: Path
 ) -> tuple[tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]], str | None]:
-    """Points of nerfstudio's sparse .ply (in the world of the transforms), and a note where it is not usable."""
+    """Positions and colours of nerfstudio's sparse .ply in the world of the transforms; a note when it is unusable."""
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not _within(path, capture):
-        return nothing, f"The points in {path.name} are not used: ply_file_path leads out of the capture."
+        return nothing, f"The points in {path.name} are not used: ply_file_path lies outside the capture."
     try:
-        vertex = PlyData.read(path)["vertex"]  # plyfile has no types
+        vertex = PlyData.read(path)["vertex"]
         points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
         names = {name.name for name in vertex.properties}
-        grey = np.full(points.shape, 128, np.uint8)
         channels = ("red", "green", "blue")
-        colors = (
-            np.stack([np.asarray(vertex[c], np.uint8) for c in channels], 1)
-            if names >= set(channels)
-            else grey
-        )
+        if names >= set(channels):
+            colors = np.stack([np.asarray(vertex[channel], np.uint8) for channel in channels], 1)
+        else:
+            colors = np.full(points.shape, 128, np.uint8)
     except (OSError, PlyParseError, KeyError, ValueError) as error:
         return nothing, f"The points in {path.name} are not used: {error}."
     finite = np.isfinite(points).all(axis=1)

@@ -1,7 +1,7 @@
-"""Which features of two photos look alike: all dot products at once, the ratio test, and mutual agreement.
+"""Feature matching by exhaustive comparison, with the ratio test and a cross-check.
 
-Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", 2004. One matrix product per pair on the
-BLAS of torch, an order of magnitude faster here than an approximate index per photo.
+Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 2004. All dot products of a pair of photos are
+one matrix product in torch's BLAS (decisions: EXHAUSTIVE_MATCHING).
 """
 
 from __future__ import annotations
@@ -15,24 +15,34 @@ import torch
 
 from splatmill_worker.sfm.features import Features
 
-MAX_RATIO = 0.8  # of the angle to the best over the angle to the second best
-MAX_ANGLE = 0.7  # radians
-ROWS = 256  # of the products at once: they stay in the cache between the passes over them
-KEPT = 256  # photos whose descriptors are kept as floats
+MAX_RATIO = 0.8
+"""Largest angle to the nearest descriptor, as a share of the angle to the second nearest (Lowe's ratio test)."""
+
+MAX_ANGLE = 0.7
+"""Radians between the descriptors of a match; COLMAP's default."""
+
+ROWS = 256
+"""Rows of the matrix of dot products that are computed at a time, so that they stay in the cache."""
+
+CACHED_PHOTOS = 256
+"""Photos whose descriptors are kept as normalised floats."""
 
 Matches = npt.NDArray[np.uint32]
 
 
 class Matcher:
-    """Matches pairs of photos by index; `strongest` keeps only that many features of each, the largest ones."""
+    """Matches photos, given by their index in `features`.
 
-    def __init__(self, features: Sequence[Features], strongest: int | None = None) -> None:
+    max_features: use only this many features of each photo, those with the largest scale. None uses all.
+    """
+
+    def __init__(self, features: Sequence[Features], max_features: int | None = None) -> None:
         self._features = features
-        self._strongest = strongest
-        self._directions = lru_cache(KEPT)(self._directions_of)
+        self._max_features = max_features
+        self._directions = lru_cache(CACHED_PHOTOS)(self._directions_of)
 
     def match(self, first: int, second: int) -> Matches:
-        """Pairs of feature indices [m,2] of photos `first` and `second`."""
+        """Indices [m,2] of the matching features of photos `first` and `second`."""
         kept_a, a = self._directions(first)
         kept_b, b = self._directions(second)
         if len(a) < 2 or len(b) < 2:
@@ -52,15 +62,15 @@ class Matcher:
             second_value[rows] = products.max(axis=1)
         mutual = value == best_of_column[best]
         angle = np.arccos(np.clip(value, -1.0, 1.0))
-        clear = angle < MAX_RATIO * np.arccos(np.clip(second_value, -1.0, 1.0))
-        good = np.flatnonzero(mutual & clear & (angle < MAX_ANGLE))
+        distinct = angle < MAX_RATIO * np.arccos(np.clip(second_value, -1.0, 1.0))
+        good = np.flatnonzero(mutual & distinct & (angle < MAX_ANGLE))
         return np.stack([kept_a[good], kept_b[best[good]]], axis=1).astype(np.uint32)
 
     def _directions_of(self, photo: int) -> tuple[npt.NDArray[np.int64], torch.Tensor]:
-        """Indices of the features used, and their descriptors [n,128] at unit length."""
+        """Indices [n] of the features used, and their descriptors [n,128] as unit vectors."""
         features = self._features[photo]
         kept = np.arange(len(features.scales))
-        if self._strongest is not None and len(kept) > self._strongest:
-            kept = np.sort(np.argpartition(-features.scales, self._strongest)[: self._strongest])
+        if self._max_features is not None and len(kept) > self._max_features:
+            kept = np.sort(np.argpartition(-features.scales, self._max_features)[: self._max_features])
         descriptors = torch.from_numpy(features.descriptors[kept].astype(np.float32))
         return kept, torch.nn.functional.normalize(descriptors, dim=1)

@@ -1,4 +1,4 @@
-"""Full matching of chosen pairs, and the two-view geometry that says which matches can be true."""
+"""Matches of chosen pairs of photos, verified by two-view geometry, in COLMAP's database."""
 
 from __future__ import annotations
 
@@ -9,27 +9,44 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.sfm.cancellation import stop_if
+from splatmill_worker.sfm.callbacks import stop_if
 from splatmill_worker.sfm.features import Features
-from splatmill_worker.sfm.matching import Matcher, Matches
-from splatmill_worker.sfm.pairs import Pair
+from splatmill_worker.sfm.matching.matcher import Matcher, Matches
+from splatmill_worker.sfm.matching.pairs import Pair
 
-MIN_INLIERS = 15  # COLMAP's floor for a pair to count
-# A pair that needs more trials than this is one where chance matches prevail: it costs ten times as much as a
-# good one and the mapper gains nothing from it.
-MAX_TRIALS = 500
-MAX_ERROR_SHARE = 4.0 / 1000.0  # of the longest side: COLMAP's 4 pixels at its usual size
-Config = pycolmap.TwoViewGeometryConfiguration
-TURNED_ONLY = (int(Config.PANORAMIC), int(Config.PLANAR_OR_PANORAMIC), int(Config.PLANAR))
+MIN_INLIERS = 15
+"""Inliers from which a pair counts as verified; COLMAP's default."""
+
+MAX_RANSAC_TRIALS = 500
+"""RANSAC trials for a pair, at most (decisions: MAX_RANSAC_TRIALS)."""
+
+MAX_ERROR_SHARE = 4.0 / 1000.0
+"""Largest epipolar error of an inlier, as a share of the longest side: COLMAP's 4 pixels for photos of 1000."""
+
+MIN_MAX_ERROR = 2.0
+"""Pixels: the largest epipolar error is never smaller than this, however small the photos are."""
+
+_Configuration = pycolmap.TwoViewGeometryConfiguration
+ROTATION_CONFIGURATIONS = (
+    int(_Configuration.PANORAMIC),
+    int(_Configuration.PLANAR_OR_PANORAMIC),
+    int(_Configuration.PLANAR),
+)
+"""COLMAP's kinds of two-view geometry that a homography explains: a turning camera, or a flat scene."""
 
 
 @dataclass(frozen=True)
-class Verified:
-    """What matching a pair gave: matches, those that fit one geometry, and COLMAP's kind of geometry."""
+class TwoView:
+    """Outcome of matching one pair.
+
+    matches: number of feature matches.
+    inliers: number of them that fit the two-view geometry.
+    configuration: COLMAP's kind of two-view geometry.
+    """
 
     matches: int
     inliers: int
-    config: int
+    configuration: int
 
 
 def match_pairs(
@@ -37,27 +54,30 @@ def match_pairs(
     features: Sequence[Features],
     ids: dict[int, int],
     database: pycolmap.Database,
-    strongest: int,
+    max_features: int,
     seed: int,
     pool: ThreadPoolExecutor,
     on_progress: Callable[[int, int], None],
     cancelled: Callable[[], bool],
-) -> dict[Pair, Verified]:
-    """Matches and verifies `chosen` pairs of photos and stores them; pairs stored before are only counted.
+) -> dict[Pair, TwoView]:
+    """Match and verify the `chosen` pairs of photos, and store the results in `database`.
 
-    `strongest`: features of a photo that are matched. COLMAP keeps whole octaves and gives up to twice what was
-    asked for, which would make matching four times as slow.
+    Pairs that the database has already are read, not matched again.
+
+    ids: COLMAP's image id of each photo.
+    max_features: features of a photo that are matched. COLMAP's extraction keeps whole octaves and returns up to
+        twice the number asked for, which would make matching four times as slow.
     """
     cameras = {index: database.read_camera(database.read_image(ids[index]).camera_id) for index in ids}
     options = pycolmap.TwoViewGeometryOptions()
     options.min_num_inliers = MIN_INLIERS
-    options.ransac.max_num_trials = MAX_TRIALS
+    options.ransac.max_num_trials = MAX_RANSAC_TRIALS
     options.ransac.random_seed = seed
     longest = max((max(camera.width, camera.height) for camera in cameras.values()), default=1000)
-    options.ransac.max_error = max(2.0, MAX_ERROR_SHARE * longest)
-    matcher = Matcher(features, strongest)
+    options.ransac.max_error = max(MIN_MAX_ERROR, MAX_ERROR_SHARE * longest)
+    matcher = Matcher(features, max_features)
     ordered = sorted(chosen)
-    found: dict[Pair, Verified] = {}
+    found: dict[Pair, TwoView] = {}
     fresh: list[Pair] = []
     for pair in ordered:
         stored = _stored(database, ids, pair)
@@ -80,21 +100,24 @@ def match_pairs(
     for done, (pair, (matches, geometry)) in enumerate(zip(fresh, pool.map(work, fresh), strict=True), 1):
         stop_if(cancelled)
         first, second = ids[pair[0]], ids[pair[1]]
-        if not database.exists_matches(first, second):  # there if an earlier run was killed between the two
+        if not database.exists_matches(
+            first, second
+        ):  # they exist when a run was killed between the two writes
             database.write_matches(first, second, matches)
         if geometry is None:
             geometry = pycolmap.TwoViewGeometry()
         database.write_two_view_geometry(first, second, geometry)
-        found[pair] = Verified(len(matches), len(geometry.inlier_matches), int(geometry.config))
+        found[pair] = TwoView(len(matches), len(geometry.inlier_matches), int(geometry.config))
         if done % 16 == 0 or done == len(fresh):
             on_progress(len(found), len(ordered))
     return found
 
 
-def _stored(database: pycolmap.Database, ids: dict[int, int], pair: Pair) -> Verified | None:
+def _stored(database: pycolmap.Database, ids: dict[int, int], pair: Pair) -> TwoView | None:
+    """The outcome of a pair that was matched before."""
     first, second = ids[pair[0]], ids[pair[1]]
     if not database.exists_two_view_geometry(first, second):
         return None
     geometry = database.read_two_view_geometry(first, second)
     matches = len(database.read_matches(first, second))
-    return Verified(matches, len(geometry.inlier_matches), int(geometry.config))
+    return TwoView(matches, len(geometry.inlier_matches), int(geometry.config))

@@ -1,4 +1,4 @@
-"""Carries a caller's wish to stop into COLMAP's native calls."""
+"""The caller's callbacks: reports of progress, and requests to cancel, which also reach COLMAP's native calls."""
 
 from __future__ import annotations
 
@@ -9,12 +9,19 @@ from contextlib import contextmanager
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import Cancelled
 
+OnProgress = Callable[[str, int, int, str], None]
+"""Called as (stage, done, total, note); the note names the file or the things that are counted."""
+
 POLL_SECONDS = 0.1
+"""Seconds between two calls of `cancelled` while native code runs."""
 
 
 @contextmanager
 def native_token(cancelled: Callable[[], bool]) -> Iterator[pycolmap.CancellationToken]:
-    """A token that is cancelled within 0.1 s of `cancelled()` turning true; raises Cancelled on the way out."""
+    """Yield a token that is cancelled within POLL_SECONDS of `cancelled()` turning true.
+
+    Raises Cancelled at the end of the block when `cancelled()` is true.
+    """
     token = pycolmap.CancellationToken()
     over = threading.Event()
 
@@ -35,6 +42,6 @@ def native_token(cancelled: Callable[[], bool]) -> Iterator[pycolmap.Cancellatio
 
 
 def stop_if(cancelled: Callable[[], bool]) -> None:
-    """Raises Cancelled where the caller asked to stop."""
+    """Raise Cancelled when the caller has asked to stop."""
     if cancelled():
         raise Cancelled("Recovering the cameras was cancelled.")

@@ -1,4 +1,4 @@
-"""Finds the photo that a camera file means, whatever folders its author kept it in."""
+"""Finds the photo that a camera file names, whatever folders its author kept it in."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from splatmill_worker.images.masks import mask_of, masks_under
 
 @dataclass(frozen=True)
 class ImageFiles:
-    """The photos of a capture by relative name, and the masks beside them."""
+    """The photos and masks of a capture.
+
+    root: folder of the photos.
+    photos: paths by name relative to `root`.
+    masks: paths by name relative to the folder of the masks.
+    """
 
     root: Path
     photos: dict[str, Path]
@@ -19,7 +24,7 @@ class ImageFiles:
 
     @staticmethod
     def under(directory: Path) -> ImageFiles:
-        """All photos under `directory`/images, or under `directory` itself where there is no such folder."""
+        """The files under `directory`/images, or under `directory` itself when it has no such folder."""
         root = directory / "images" if (directory / "images").is_dir() else directory
         masks = next((directory / name for name in MASK_FOLDERS if (directory / name).is_dir()), None)
         found = {
@@ -33,10 +38,10 @@ class ImageFiles:
         return ImageFiles(root, found, masks_under(masks) if masks is not None else {})
 
     def photo(self, name: str) -> tuple[str, Path] | None:
-        """The photo meant by `name` (its relative name here, and its path); None where it is not there.
+        """Relative name and path of the photo that `name` refers to; None when there is none, or no single one.
 
-        Matched on as many trailing path components as agree; a name without extension matches any image
-        type. A name that fits several photos equally well means none of them.
+        It is the photo with the most trailing path components in common, the file name at least. When no file name
+        agrees, the suffix may be missing or differ.
         """
         wanted = [
             part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in (".", "..", "/")
@@ -58,10 +63,11 @@ class ImageFiles:
         return (best[0], self.photos[best[0]]) if len(best) == 1 else None
 
     def mask(self, name: str) -> Path | None:
-        """The mask of the photo with this relative name; None where it has none."""
+        """The mask of the photo with this relative name; None when it has none."""
         return mask_of(name, self.masks)
 
     def _by_last_part(self, last: str) -> list[str]:
+        """Names of the photos whose file name is `last`; when there are none, of those with the same stem."""
         names = [name for name in self.photos if PurePosixPath(name).name == last]
         if not names:
             stem = (

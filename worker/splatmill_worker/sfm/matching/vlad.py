@@ -1,7 +1,7 @@
-"""One small descriptor per photo, to tell which photos may show the same things.
+"""One global descriptor per photo, whose cosine similarity tells which photos may overlap.
 
-VLAD (Jegou et al., "Aggregating local descriptors into a compact image representation", CVPR 2010): the
-residuals of the photo's SIFT descriptors to a codebook learnt on the capture itself.
+VLAD (Jégou et al., "Aggregating local descriptors into a compact image representation", CVPR 2010): sums of the
+residuals of a photo's SIFT descriptors to the centres of a codebook, which is trained on the capture itself.
 """
 
 from __future__ import annotations
@@ -15,13 +15,20 @@ import torch
 from splatmill_worker.sfm.features import Features
 
 WORDS = 32
-SAMPLE = 20_000  # descriptors the codebook is learnt on
-ROUNDS = 8
-PER_PHOTO = 512  # the largest features of each photo
+"""Centres of the codebook; a photo's descriptor has 128 components for each."""
+
+CODEBOOK_SAMPLE = 20_000
+"""Descriptors on which the codebook is trained: evenly spaced ones, fewer than twice this number."""
+
+KMEANS_ITERATIONS = 8
+"""Iterations of k-means."""
+
+PHOTO_FEATURES = 512
+"""Features of a photo that are used, those with the largest scale."""
 
 
 def similarities(features: Sequence[Features]) -> npt.NDArray[np.float32]:
-    """Cosines [n,n] between the photos' descriptors."""
+    """Cosine similarities [n,n] of the photos' VLAD descriptors."""
     largest = [_largest(photo) for photo in features]
     codebook = _codebook(torch.cat(largest))
     vectors = torch.stack([_vlad(photo, codebook) for photo in largest])
@@ -29,17 +36,17 @@ def similarities(features: Sequence[Features]) -> npt.NDArray[np.float32]:
 
 
 def _largest(photo: Features) -> torch.Tensor:
-    """The descriptors [n,128] of the photo's largest features at unit length."""
-    kept = np.argsort(-photo.scales, kind="stable")[:PER_PHOTO]
+    """Descriptors [n,128], as unit vectors, of the photo's features with the largest scale."""
+    kept = np.argsort(-photo.scales, kind="stable")[:PHOTO_FEATURES]
     return torch.nn.functional.normalize(torch.from_numpy(photo.descriptors[kept].astype(np.float32)), dim=1)
 
 
 def _codebook(descriptors: torch.Tensor) -> torch.Tensor:
-    """k-means centres [WORDS,128]; evenly spaced samples and starts, so that it is the same every time."""
-    step = max(1, len(descriptors) // SAMPLE)
+    """Centres [WORDS,128] by k-means; samples and initial centres are evenly spaced, so that runs agree."""
+    step = max(1, len(descriptors) // CODEBOOK_SAMPLE)
     sample = descriptors[::step]
     centers = sample[:: max(1, len(sample) // WORDS)][:WORDS].clone()
-    for _ in range(ROUNDS):
+    for _ in range(KMEANS_ITERATIONS):
         word = (sample @ centers.T - 0.5 * centers.square().sum(1)).argmax(1)
         sums = torch.zeros_like(centers).index_add_(0, word, sample)
         counts = torch.bincount(word, minlength=len(centers)).unsqueeze(1)
@@ -48,7 +55,7 @@ def _codebook(descriptors: torch.Tensor) -> torch.Tensor:
 
 
 def _vlad(descriptors: torch.Tensor, centers: torch.Tensor) -> torch.Tensor:
-    """[words * 128]: residuals summed per word, each word at unit length, then the whole."""
+    """The photo's descriptor [WORDS * 128]: residuals summed per word, each word normalised, then the whole."""
     word = (descriptors @ centers.T - 0.5 * centers.square().sum(1)).argmax(1)
     sums = torch.zeros_like(centers).index_add_(0, word, descriptors - centers[word])
     return torch.nn.functional.normalize(torch.nn.functional.normalize(sums, dim=1).flatten(), dim=0)

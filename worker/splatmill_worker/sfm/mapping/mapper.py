@@ -1,0 +1,158 @@
+"""COLMAP's two mappers: incremental, which registers one photo after another, and global (GLOMAP)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from splatmill_worker.colmap import pycolmap
+from splatmill_worker.sfm.callbacks import stop_if
+from splatmill_worker.sfm.mapping.merge import merge
+
+Mapper = Literal["incremental", "global"]
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """Models that a mapper reconstructed from one view graph.
+
+    mapper: which of the two.
+    models: those with more registered photos first.
+    merged: number of models that were merged into the first one and are no longer listed.
+    notes: sentences for the user.
+    """
+
+    mapper: Mapper
+    models: tuple[pycolmap.Reconstruction, ...]
+    merged: int
+    notes: tuple[str, ...] = ()
+
+    @property
+    def largest(self) -> pycolmap.Reconstruction | None:
+        """The model with the most registered photos; None when no model was found."""
+        return self.models[0] if self.models else None
+
+    @property
+    def registered(self) -> int:
+        """Number of photos registered in the largest model."""
+        return self.models[0].num_reg_images() if self.models else 0
+
+
+def run(
+    mapper: Mapper,
+    database_path: Path,
+    count: int,
+    threads: int,
+    seed: int,
+    *,
+    relaxed: bool = False,
+    fixed_intrinsics: bool = False,
+    on_progress: Callable[[int, int], None],
+    cancelled: Callable[[], bool],
+) -> Mapped:
+    """Map the `count` photos in COLMAP's database.
+
+    relaxed: accept smaller triangulation angles and fewer inliers (incremental mapper only).
+    fixed_intrinsics: keep focal lengths and distortion as they are in the database.
+    on_progress: called as (photos registered, count), by the incremental mapper only.
+
+    Raises Cancelled: between two photos in the incremental mapper, at the end in the global one.
+    """
+    stop_if(cancelled)
+    database = pycolmap.Database.open(database_path)
+    try:
+        manager = pycolmap.ReconstructionManager()
+        if mapper == "incremental":
+            options = _incremental_options(threads, seed, relaxed, fixed_intrinsics)
+            incremental = pycolmap.IncrementalPipeline(options, database, manager)
+            registered = 0
+
+            def report() -> None:
+                nonlocal registered
+                registered = min(registered + 1, count)
+                on_progress(registered, count)
+                stop_if(cancelled)
+
+            callback = pycolmap.IncrementalPipelineCallback
+            incremental.add_callback(callback.INITIAL_IMAGE_PAIR_REG_CALLBACK, report)
+            incremental.add_callback(callback.NEXT_IMAGE_REG_CALLBACK, report)
+            incremental.run()
+        else:
+            pycolmap.GlobalPipeline(_global_options(threads, seed, fixed_intrinsics), database, manager).run()
+    finally:
+        database.close()
+    stop_if(cancelled)
+    models = [manager.get(index) for index in range(manager.size())]
+    models.sort(key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    models, merged, notes = merge_models(models)
+    return Mapped(mapper, tuple(models), merged, notes)
+
+
+def merge_models(
+    models: list[pycolmap.Reconstruction],
+) -> tuple[list[pycolmap.Reconstruction], int, tuple[str, ...]]:
+    """Merge into the first model all that share enough photos with it.
+
+    Returns the models that are left, the number of those merged into the first, and notes for the user. When COLMAP
+    fails to merge them, they are returned as they were: the first one may be good without the others.
+    """
+    if len(models) < 2:
+        return models, 0, ()
+    try:
+        first, merged = merge(models)
+    except (RuntimeError, ValueError, LookupError) as error:
+        reason = (str(error).strip().splitlines() or ["no message"])[0][:200]
+        note = (
+            f"The photos form {len(models)} separate models, and merging them failed "
+            f"({type(error).__name__}: {reason}). Only the largest model is used."
+        )
+        return models, 0, (note,)
+    apart = [model for index, model in enumerate(models) if index > 0 and index not in merged]
+    return [first, *apart], len(merged), ()
+
+
+def _incremental_options(
+    threads: int, seed: int, relaxed: bool, fixed_intrinsics: bool
+) -> pycolmap.IncrementalPipelineOptions:
+    """COLMAP's defaults with fewer and shorter bundle adjustments (decisions: BUNDLE_ADJUSTMENT).
+
+    `adjust.bundle_adjust` runs the last one to convergence.
+    """
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = threads
+    options.random_seed = seed
+    options.extract_colors = False
+    options.min_model_size = 3
+    options.max_num_models = 8
+    options.init_num_trials = 50
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
+    options.ba_global_max_refinements = 2
+    options.ba_local_max_refinements = 1
+    options.ba_global_function_tolerance = 1e-4
+    options.ba_local_function_tolerance = 1e-3
+    options.ba_min_num_residuals_for_cpu_multi_threading = 5000
+    if relaxed:
+        options.mapper.init_min_num_inliers = 40
+        options.mapper.init_min_tri_angle = 5.0
+        options.mapper.abs_pose_min_num_inliers = 18
+        options.mapper.abs_pose_min_inlier_ratio = 0.15
+    if fixed_intrinsics:
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    return options
+
+
+def _global_options(threads: int, seed: int, fixed_intrinsics: bool) -> pycolmap.GlobalPipelineOptions:
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = threads
+    # Each step has a generator of its own; with one of them at its default seed, no two runs agree.
+    options.random_seed = options.mapper.random_seed = seed
+    options.mapper.global_positioning.random_seed = options.mapper.rotation_averaging.random_seed = seed
+    options.mapper.global_positioning.use_gpu = False
+    options.mapper.bundle_adjustment.ceres.use_gpu = False
+    if fixed_intrinsics:
+        options.mapper.bundle_adjustment.refine_focal_length = False
+        options.mapper.bundle_adjustment.refine_extra_params = False
+    return options

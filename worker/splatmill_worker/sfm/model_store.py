@@ -1,0 +1,80 @@
+"""The stored model of a capture: COLMAP's files, the stereo points and facts.json in one folder."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from splatmill_worker.colmap import pycolmap
+from splatmill_worker.images.prepare import Prepared
+from splatmill_worker.scene import Scene, View
+from splatmill_worker.sfm import features, stereo
+from splatmill_worker.sfm.colors import color_points
+from splatmill_worker.sfm.final_model import FinalModel
+from splatmill_worker.sfm.posed.colmap_model import posed_view, scene_of
+from splatmill_worker.sfm.run import SfmRun, torch_threads
+
+STEREO = "stereo.npz"
+FACTS = "facts.json"
+
+
+def is_stored(folder: Path) -> bool:
+    """Whether `folder` holds a complete model."""
+    return (folder / FACTS).is_file()
+
+
+def store_model(run: SfmRun, final: FinalModel, folder: Path) -> None:
+    """Colour the points, add stereo points where there are few, and store all of it in `folder`, atomically."""
+    with run.clock("colors"):
+        views = _views(run.prepared, final.model)
+        color_points(final.model, views, run.pool)
+    partial = folder.with_name(f"{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    final.model.write_binary(partial)
+    scene = scene_of(final.model, views, source="sfm")
+    if run.options.stereo and stereo.has_few_points(scene):
+        # Photos are swept one after the other, so that each torch call gets all threads.
+        with run.clock("stereo"), torch_threads(run.threads):
+            stereo.with_stereo_points(scene, partial / STEREO, run.on_progress, run.cancelled)
+    document = {
+        "facts": final.facts
+        | {"seconds": {stage: round(seconds, 3) for stage, seconds in run.seconds.items()}},
+        "left_out": {run.prepared.photos[index].name: reason for index, reason in final.left_out.items()},
+        "notes": list(final.notes),
+    }
+    (partial / FACTS).write_text(json.dumps(document, indent=1), "utf-8")
+    shutil.rmtree(folder, ignore_errors=True)
+    partial.rename(folder)
+
+
+def load_model(prepared: Prepared, folder: Path) -> Scene:
+    """The scene of the model that `store_model` wrote to `folder`, with the photos where they are now."""
+    model = pycolmap.Reconstruction(folder)
+    document: dict[str, Any] = json.loads((folder / FACTS).read_text("utf-8"))
+    scene = scene_of(
+        model,
+        _views(prepared, model),
+        source="sfm",
+        left_out=(*prepared.skipped, *document["left_out"].items()),
+        notes=(*prepared.notes, *document["notes"]),
+    )
+    scene = replace(scene, facts=document["facts"])
+    if not (folder / STEREO).is_file():
+        return scene
+    return stereo.add(scene, stereo.StereoPoints.load(folder / STEREO))
+
+
+def _views(prepared: Prepared, model: pycolmap.Reconstruction) -> dict[int, View]:
+    """The view of each registered image by its id, in order of the photos' names."""
+    by_photo = {features.photo_index(model.images[i].name): i for i in model.reg_image_ids()}
+    views = {}
+    for index in sorted(by_photo):
+        photo = prepared.photos[index]
+        view = posed_view(model, by_photo[index], photo.name, photo.path, photo.mask)
+        camera = view.camera.scaled_to(photo.width, photo.height)
+        views[by_photo[index]] = replace(view, camera=camera, upright=True)
+    return views

@@ -1,0 +1,182 @@
+"""The search for points over known cameras: each photo is swept against a few neighbours.
+
+It fills what structure from motion leaves empty, which finds features and not surfaces, and it gives points to captures
+that bring cameras alone (decisions: STEREO_POINTS).
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from splatmill_worker.images import load_view
+from splatmill_worker.scene import Scene, View, looked_at
+from splatmill_worker.sfm.callbacks import OnProgress, stop_if
+from splatmill_worker.sfm.stereo.plane_sweep import MIN_AGREEING, GreyView, SweepResult, sweep
+from splatmill_worker.sfm.stereo.points import StereoPoints, add, observations_per_view
+
+Float = npt.NDArray[np.float64]
+
+VERSION = 2
+"""Version of the method; points stored under another version are searched for anew."""
+
+ENOUGH_OBSERVATIONS = 1000
+"""Known points that a photo shows on average, from which no more are searched for (decisions: STEREO_POINTS)."""
+
+MIN_VIEWS = 3
+"""Photos without which there is no search."""
+
+SIDE = 320
+"""Pixels of the longest side of the photos that are compared."""
+
+NEIGHBOURS = 3
+"""Neighbours that a photo is compared with, at most."""
+
+ANGLES = 3.0, 25.0
+"""Degrees between the rays of a photo and of a neighbour to the same point: smallest and largest."""
+
+BEST_ANGLE = 9.0
+"""Degrees between the rays at which a neighbour is preferred."""
+
+MIN_AXES_COSINE = 0.7
+"""Cosine between the optical axes of neighbours, at least: others show a patch at their border or not at all."""
+
+DEPTH_MARGIN = 1.3
+"""Factor by which depths are searched nearer and farther than the known points of a photo."""
+
+MIN_KNOWN = 8
+"""Known points that a photo must show for its range of depths to be taken from them."""
+
+DEFAULT_DEPTHS = 0.3, 3.0
+"""Range of depths of the other photos, in distances to the point that all cameras look at."""
+
+TRIAL_PHOTOS = 4
+"""Photos, evenly spread over the capture, after which the search is given up if their yield is too small."""
+
+MIN_YIELD = 0.1
+"""Points per patch compared, below which the search is given up: of so few, most match by chance."""
+
+LOADERS = 4
+"""Photos decoded at a time; a request to cancel waits for these."""
+
+
+def has_few_points(scene: Scene) -> bool:
+    """Whether the scene has photos for stereo, and so few points that searching for more pays."""
+    return len(_used(scene)) >= MIN_VIEWS and observations_per_view(scene) < ENOUGH_OBSERVATIONS
+
+
+def with_stereo_points(
+    scene: Scene,
+    path: Path,
+    on_progress: OnProgress = lambda stage, done, total, note: None,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> Scene:
+    """The scene with stereo points where it has few; they are stored at `path` and read from there the next time.
+
+    Raises what `find_points` raises.
+    """
+    if not has_few_points(scene):
+        return scene
+    if not path.is_file():
+        find_points(scene, on_progress, cancelled).save(path)
+    return add(scene, StereoPoints.load(path))
+
+
+def find_points(
+    scene: Scene,
+    on_progress: OnProgress = lambda stage, done, total, note: None,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> StereoPoints:
+    """Search for points between those of the scene.
+
+    The search is given up, without points, when the first few photos show that hardly any patch is found in their
+    neighbours: cameras that move along their optical axis, and thin or moving things.
+
+    Photos that a data set itself holds out for tests take no part. Those that the rule of every n-th photo holds out
+    do, as in structure from motion, which uses all photos.
+
+    on_progress: called with the stage "stereo" and numbers of photos.
+
+    Raises OSError when a photo does not decode, ValueError when it has another shape than its camera, and Cancelled
+    when the caller has asked to stop.
+    """
+    started = time.perf_counter()
+    used = _used(scene)
+    views = [scene.views[index] for index in used]
+    count = len(views)
+    grey = _grey_views(views, cancelled)
+    centers, axes = scene.centers[used], np.array([view.camera.axis for view in views])
+    target = looked_at(centers, axes)
+    points, batches = scene.points, list[SweepResult]()
+    trial = np.unique(np.linspace(0, count - 1, min(TRIAL_PHOTOS, count)).round().astype(int))
+    others = np.setdiff1d(np.arange(count), trial)
+    given_up = False
+    for done, index in enumerate([*trial, *others], 1):
+        stop_if(cancelled)
+        on_progress("stereo", done - 1, count, "photos searched for more points")
+        known = grey[index].camera.project(points)
+        if known.inside.sum() >= MIN_KNOWN:
+            depths = known.depths[known.inside]
+            near, middle, far = np.percentile(depths, [1, 50, 99]) * (1.0 / DEPTH_MARGIN, 1.0, DEPTH_MARGIN)
+        else:
+            middle = float(np.linalg.norm(target - centers[index]))
+            near, far = DEFAULT_DEPTHS[0] * middle, DEFAULT_DEPTHS[1] * middle
+        neighbours = _neighbours(index, float(middle), centers, axes)
+        if len(neighbours) >= MIN_AGREEING and 0.0 < near < far:
+            found = sweep(index, grey[index], [(k, grey[k]) for k in neighbours], points, count, near, far)
+            batches.append(found)
+            points = np.concatenate([points, found.points])
+        if done == len(trial) and _yield(batches) < MIN_YIELD:
+            given_up, points, batches = True, scene.points, []
+            break
+    longest = max((max(view.camera.width, view.camera.height) for view in views), default=SIDE)
+    seen = np.zeros((len(points) - len(scene.points), len(scene.views)), bool)
+    seen[:, used] = np.concatenate([np.zeros((0, count), bool), *(batch.seen for batch in batches)])
+    return StereoPoints(
+        points[len(scene.points) :],
+        np.concatenate([np.zeros((0, 3), np.uint8), *(batch.colors for batch in batches)]),
+        np.concatenate([np.zeros(0), *(batch.errors for batch in batches)]) * max(1.0, longest / SIDE),
+        seen,
+        time.perf_counter() - started,
+        given_up,
+    )
+
+
+def _used(scene: Scene) -> npt.NDArray[np.int64]:
+    """Indices of the views that take part: all but those that the data set holds out."""
+    return np.array([i for i, view in enumerate(scene.views) if view.split != "test"], np.int64)
+
+
+def _grey_views(views: Sequence[View], cancelled: Callable[[], bool]) -> list[GreyView]:
+    """The views' photos at the size of the comparison; requests to cancel are met between two photos."""
+    pool = ThreadPoolExecutor(min(LOADERS, os.cpu_count() or 1))
+    try:
+        loaded = []
+        for view in pool.map(lambda view: GreyView.of(load_view(view, SIDE)), views):
+            stop_if(cancelled)
+            loaded.append(view)
+        return loaded
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _yield(batches: list[SweepResult]) -> float:
+    """Points per patch compared."""
+    return sum(len(batch.points) for batch in batches) / max(1, sum(batch.tried for batch in batches))
+
+
+def _neighbours(index: int, depth: float, centers: Float, axes: Float) -> list[int]:
+    """The views to compare view `index` with, best first: those that see its centre at `depth` from a small angle."""
+    target = centers[index] + depth * axes[index]
+    rays = centers - target
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    angle = np.degrees(np.arccos(np.clip(rays @ rays[index], -1.0, 1.0)))
+    usable = (axes @ axes[index] > MIN_AXES_COSINE) & (angle >= ANGLES[0]) & (angle <= ANGLES[1])
+    rank = np.where(usable, np.abs(np.log(np.maximum(angle, 1e-6) / BEST_ANGLE)), np.inf)
+    return [int(k) for k in np.argsort(rank, kind="stable")[:NEIGHBOURS] if usable[k]]
