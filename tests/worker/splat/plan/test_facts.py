@@ -5,14 +5,16 @@ On rendered photos whose answers are known. Does not prove that thresholds on th
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import torch
 
-from splatmill_worker.scene import Lens, PointViews, Scene
-from splatmill_worker.splat.plan.facts import Facts, measure
+from splatmill_worker.scene import Lens, Normalization, PointViews, Scene
+from splatmill_worker.splat.plan.facts import Facts, halving_loss, measure
 from splatmill_worker.splat.views import TrainingView
 from tests.support import still_life
 from tests.support.training import sparse_scene
@@ -128,3 +130,59 @@ def test_nothing_is_said_where_nothing_can_be_known() -> None:
     seen = facts(bare, views)
     assert (seen.exposure_spread, seen.tint_spread, seen.gap_share, seen.sky_share) == (None,) * 4
     assert facts(world, still_life.training_views(alpha=True)).gap_share is None
+
+
+def tracked(gains: npt.NDArray[np.float64]) -> tuple[Scene, list[TrainingView]]:
+    """The still life with every point tracked in the photos that show it, exposures multiplied by `gains`."""
+    world = still_life.scene()
+    views = still_life.training_views()
+    offsets, track = [0], []
+    for point in world.points:
+        for i, (camera, _, depth) in enumerate(still_life.pictures()):
+            (column,), (row,), (z,), (inside,) = camera.project(point[None])
+            if inside and abs(depth[int(row), int(column)] - z) < 0.05 * z:
+                track.append(i)
+        offsets.append(len(track))
+    for view, gain in zip(views, gains, strict=True):
+        view.full.rgb.copy_((view.full.rgb.float() * gain).to(torch.uint8))
+    scene = replace(world, point_views=PointViews(np.array(offsets), np.array(track, dtype=np.int32)))
+    return Normalization.of(scene).apply(scene), list(views)
+
+
+def test_equal_exposures_agree_and_unequal_ones_do_not() -> None:
+    count = len(still_life.scene().views)
+    spreads = []
+    for gains in (np.ones(count), np.where(np.arange(count) % 2, 0.6, 1.0)):
+        scene, views = tracked(gains)
+        spreads.append(measure(scene, views, 0, None).exposure_spread)
+    assert spreads[0] is not None
+    assert spreads[1] is not None
+    assert spreads[0] < 0.04
+    # Half of the photos differ from the other half by ln 0.6 = 0.51; the robust spread of two equal heaps is large.
+    assert spreads[1] > 0.2
+
+
+def test_geometry_is_measured() -> None:
+    scene, views = tracked(np.ones(len(still_life.scene().views)))
+    seen = measure(scene, views, 2, None)
+    assert seen.view_angle is not None
+    assert 20.0 < seen.view_angle < 180.0
+    assert seen.distance_ratio is not None
+    assert 1.0 <= seen.distance_ratio < 4.0
+    assert (seen.views, seen.held_out, seen.width, seen.height) == (14, 2, 96, 72)
+    without = measure(still_life.scene(), still_life.training_views(), 0, None)
+    assert without.exposure_spread is None
+    assert without.view_angle is None
+
+
+def test_a_blurred_photo_loses_nothing_by_halving() -> None:
+    random = torch.Generator().manual_seed(0)
+    sharp = torch.randint(0, 256, (40, 56, 3), generator=random, dtype=torch.uint8)
+    small = torch.nn.functional.interpolate(
+        sharp.permute(2, 0, 1)[None].float(), scale_factor=0.1, mode="area"
+    )
+    soft = torch.nn.functional.interpolate(small, size=sharp.shape[:2], mode="bicubic").clamp(0, 255)
+    blurred = soft[0].permute(1, 2, 0).to(torch.uint8)
+    assert halving_loss(sharp) > 40
+    assert halving_loss(blurred) < 2
+    assert halving_loss(sharp[:2, :2]) == math.inf

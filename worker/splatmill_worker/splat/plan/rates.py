@@ -20,8 +20,8 @@ MOST_BOOST = 8.0
 """Largest factor on the paper's rates (decisions: MOST_BOOST)."""
 
 MOST_SH, SH_SHARE = 2.0, 2.0 / 3.0
-"""The factor on SH_REST is SH_SHARE times the boost, at most MOST_SH (decisions: SH_REST). From 3300 to 30,000 steps,
-this rate times the root of the number of steps is the same in every run."""
+"""Beside the boost, SH_REST has a factor of its own: SH_SHARE times the boost, at most MOST_SH (decisions: SH_REST).
+From 3300 to 30,000 steps, the product of this rate and the number of steps is then the same in every run."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Annealing:
     cosine: with Adam, the last step size remains as noise in the parameters.
 
     boost: factor on the paper's rates. A parameter travels at most rate times steps with Adam, so that a shorter run
-        than the paper's needs larger steps. Opacities take the root of the factor, since they saturate; for
-        spherical harmonics above degree 0 see MOST_SH. None: `boost_of` the steps that a time budget allows.
+        than the paper's needs larger steps. Opacities take the root of the factor, since they saturate; spherical
+        harmonics above degree 0 take more (see MOST_SH). None: `boost_of` the steps that a time budget allows.
     position_fall: last rate of the positions over the first.
     hold: share of the budget for which the other rates stay constant.
     rest_fall: last value of the other rates over the first.

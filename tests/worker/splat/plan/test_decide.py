@@ -1,0 +1,175 @@
+"""Proves that a plan follows from facts and options alone, survives JSON, explains itself, and that each option forces
+the field that it names.
+
+Does not prove that the thresholds are the best ones: `splatmill bench train --configs all` measures what each decision
+is worth.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import pytest
+
+from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.plan.rates import Annealing
+from splatmill_worker.splat.start.given_model import GivenModel
+from tests.support.facts import FACTS, changed, planned
+
+COVERED = {"sightings": 80.0, "sky_share": 0.01, "gap_share": 0.3, "gap_points": 5000, "shell_points": 800}
+VARIANTS: list[dict[str, Any]] = [
+    {},
+    COVERED,
+    {**COVERED, "views": 9},
+    {"transparent": 43, "distorted": 0, "masked": 3},
+    {"points": 3, "view_angle": None, "exposure_spread": None, "distance_ratio": None, "reprojection": None},
+    {"exposure_spread": 0.3, "distance_ratio": 9.0, "reprojection": 2.5, "lens_residual": 4.0},
+    {"tint_spread": 0.2, "halving_loss": 0.5, "points": 900_000},
+    {"width": 60, "height": 80, "native_longest": 80},
+    {"start": GivenModel(700, 3, 27.0, 12.0, 11.0)},
+]
+WITHOUT_NUMBER = {
+    "No photo is transparent.",
+    "No photo has masked pixels.",
+    "No photo has lens distortion.",
+    "No photo is transparent; a random background keeps training from hiding holes in the surface.",
+    "The model given is kept as it is.",
+    "The model given is trained already; reduced photos would blur it.",
+    "The distances from which points are seen are not known.",
+    "The angles between the views of a point are not known.",
+    "The photos' exposures cannot be compared: it is not known which photos show the same points.",
+    "Without reprojection errors of points, the cameras are taken to be exact.",
+    "There are too few points to tell how far the scene extends.",
+    "There are too few points to tell where points are missing.",
+}
+
+
+def test_the_plan_is_pure_and_survives_json() -> None:
+    first, second = planned(), planned()
+    assert first == second
+    assert Plan.from_dict(json.loads(json.dumps(first.as_dict(whole=True)))) == first
+
+
+@pytest.mark.parametrize("change", VARIANTS)
+def test_every_reason_is_a_sentence_with_the_number_that_decided(change: dict[str, Any]) -> None:
+    plan = planned(changed(**change))
+    for sentence in (*plan.reasons.values(), *plan.left_out.values()):
+        assert sentence[0].isupper() or sentence[0].isdigit()
+        assert sentence.endswith(".")
+        assert sentence in WITHOUT_NUMBER or any(letter.isdigit() for letter in sentence), sentence
+
+
+@pytest.mark.parametrize("change", VARIANTS)
+def test_a_thing_is_either_chosen_or_left_out(change: dict[str, Any]) -> None:
+    plan = planned(changed(**change))
+    assert not set(plan.reasons) & set(plan.left_out)
+    told = plan.as_dict()
+    for name in ("far_shell", "gaps", "pose_refinement", "exposure", "antialias"):
+        assert (name in told) == (name in plan.reasons) == (name not in plan.left_out)
+    for name in ("budget", "schedule", "image_size", "max_gaussians", "initial", "background", "sh_degree"):
+        assert name in plan.reasons
+
+
+@pytest.mark.parametrize(
+    ("asked", "field", "value"),
+    [
+        ({"exposure": "on"}, "exposure", True),
+        ({"antialias": "on"}, "antialias", True),
+        ({"pose_refinement": "on"}, "pose_refinement", True),
+        ({"gaps": "off"}, "gaps", False),
+        ({"far_shell": "off"}, "far_shell", False),
+        ({"densify": "on"}, "densify", True),
+        ({"densify": "off"}, "densify", False),
+        ({"background": "white"}, "background", "white"),
+        ({"max_gaussians": 7000}, "max_gaussians", 7000),
+    ],
+)
+def test_options_force(asked: dict[str, object], field: str, value: object) -> None:
+    plan = planned(FACTS, "cpu", **asked)
+    assert getattr(plan, field) == value
+    assert field in plan.forced
+    assert {**plan.reasons, **plan.left_out}[field].startswith("Set by an option.")
+
+
+def test_the_seed_and_the_degree_are_those_asked_for() -> None:
+    plan = planned(seed=5, sh_degree=1)
+    assert plan.seed == 5
+    assert plan.schedule.degree == 1
+    assert "sh_degree" in plan.forced
+
+
+def test_without_enough_points_gaussians_start_at_random() -> None:
+    assert planned(changed(points=20)).initial == "points"
+    plan = planned(changed(points=19))
+    assert plan.initial == "random"
+    assert "19 points" in plan.reasons["initial"]
+
+
+@pytest.mark.parametrize(("angle", "degree"), [(2.0, 1), (9.0, 2), (40.0, 3), (None, 3)])
+def test_the_degree_follows_from_the_angles_between_views(angle: float | None, degree: int) -> None:
+    assert planned(changed(view_angle=angle)).schedule.degree == degree
+
+
+def test_short_runs_take_longer_steps() -> None:
+    boosts = [planned(steps=steps).schedule.annealing.boost for steps in (300, 600, 3000, 30_000, 100_000)]
+    assert boosts == pytest.approx([8.0, math.sqrt(50), math.sqrt(10), 1.0, 1.0])
+
+
+def test_a_time_budget_leaves_the_length_of_steps_to_the_run() -> None:
+    plan = planned(time_budget=60)
+    assert plan.schedule.annealing.boost is None
+    assert f"{plan.schedule.expected_steps} steps" in plan.reasons["rates"]
+
+
+def test_small_photos_are_not_reduced() -> None:
+    assert planned().schedule.resolution == ((0, 4), (200, 2), (500, 1))
+    assert planned(changed(width=150, height=200)).schedule.resolution == ((0, 2), (500, 1))
+    small = planned(changed(width=60, height=80))
+    assert small.schedule.resolution == ((0, 1),)
+    assert "80 pixels" in small.left_out["coarse_to_fine"]
+
+
+def test_the_far_shell_keeps_its_opacities() -> None:
+    backed = changed(sky_share=0.2, shell_points=700, shell_distance=20.0)
+    assert planned(backed).schedule.decay_within == 10.0
+    assert planned(backed, far_shell="off").schedule.decay_within is None
+
+
+def test_opacities_decay_only_where_gaussians_are_added() -> None:
+    assert planned().schedule.opacity_decay == 0.9
+    assert planned(densify="off").schedule.opacity_decay == 1.0
+
+
+def test_a_given_model_is_trained_at_full_size_with_the_papers_rates() -> None:
+    model = GivenModel(700, 2, psnr=27.0, one_color=12.0, another=11.0)
+    plan = planned(changed(start=model, view_angle=2.0), steps=600)
+    assert plan.initial == "model"
+    assert "initial" in plan.forced
+    assert "27.0 dB" in plan.reasons["initial"]
+    assert plan.schedule.resolution == ((0, 1),)
+    assert plan.schedule.annealing == Annealing(boost=1.0)
+    assert not plan.far_shell
+    assert not plan.gaps
+
+
+def test_a_given_model_keeps_its_degree_unless_another_is_asked_for() -> None:
+    model = GivenModel(700, 2, psnr=27.0, one_color=12.0, another=11.0)
+    narrow = changed(start=model, view_angle=2.0)
+    assert planned(narrow).schedule.degree == 2
+    assert planned(changed(start=model, view_angle=40.0)).schedule.degree == 3
+    assert planned(narrow, sh_degree=0).schedule.degree == 0
+
+
+def test_only_a_run_without_budget_stops_when_its_curve_is_flat() -> None:
+    assert planned().stops_when_flat
+    assert not planned(steps=600).stops_when_flat
+    assert not planned(time_budget=10).stops_when_flat
+
+
+def test_facts_as_plain_values_hold_the_speed_and_the_model() -> None:
+    model = GivenModel(700, 2, psnr=27.0, one_color=12.0, another=None)
+    told = changed(FACTS, start=model).as_dict()
+    assert told["speed"] == {"per_pixel": 2.6e-8, "per_gaussian": 9e-8}
+    assert told["start"] == {"gaussians": 700, "degree": 2, "psnr": 27.0, "one_color": 12.0, "another": None}
