@@ -146,7 +146,7 @@ class TrainingRun:
         self.recoveries += 1
         if failure.name is FailureName.memory:
             self.max_gaussians = max(1, int(MEMORY_SHRINK * self.engine.count))
-            self.last_good = most_opaque(self.last_good, self.max_gaussians)
+            self.last_good = self.last_good.most_opaque(self.max_gaussians)
             measure = f"with at most {self.max_gaussians} Gaussians"
         else:
             self.rate_scale *= 0.5
@@ -300,15 +300,3 @@ class TrainingRun:
         if self.engine.count == 0:
             seen = "every Gaussian became transparent and was removed."
             raise TrainingFailed(FailureName.empty_scene, seen, step=self.step)
-
-
-def most_opaque(snapshot: Snapshot, count: int) -> Snapshot:
-    """The snapshot with its `count` most opaque Gaussians, in the same order."""
-    order = torch.argsort(snapshot.parameters["logit_opacities"], descending=True, stable=True)
-    kept = torch.sort(order[:count]).values
-    return replace(
-        snapshot,
-        parameters={name: value[kept] for name, value in snapshot.parameters.items()},
-        exp_avg=snapshot.exp_avg[kept],
-        exp_avg_sq=snapshot.exp_avg_sq[kept],
-    )

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from splatmill_worker.splat.plan.budget import Budget
@@ -59,3 +60,14 @@ class Snapshot:
     def progress(self) -> float:
         """Share of the budget that was spent, 0 to 1."""
         return self.budget.progress(self.step, self.seconds)
+
+    def most_opaque(self, limit: int) -> Snapshot:
+        """The same with the `limit` most opaque Gaussians alone, in their order."""
+        order = torch.argsort(self.parameters["logit_opacities"], descending=True, stable=True)
+        kept = torch.sort(order[:limit]).values
+        return replace(
+            self,
+            parameters={name: value[kept] for name, value in self.parameters.items()},
+            exp_avg=self.exp_avg[kept],
+            exp_avg_sq=self.exp_avg_sq[kept],
+        )
