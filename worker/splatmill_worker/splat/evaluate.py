@@ -1,4 +1,4 @@
-"""How near rendered views are to photos that were not trained on: PSNR and SSIM."""
+"""How close rendered views are to photos: PSNR and SSIM."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.kernels.reference.loss import C1, C2, SIGMA, WINDOW
 from splatmill_worker.splat.views import Target, TrainingView
 
 Renderer = Callable[[Target, Tensor], Tensor]
@@ -19,7 +18,13 @@ Renderer = Callable[[Target, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Error of one view: mean squared error of values in 0..1, PSNR in dB, SSIM (Wang et al. 2004)."""
+    """Error of one rendered view against its photo, over the pixels that count.
+
+    name: of the photo.
+    mse: mean squared error of colours in 0 to 1.
+    psnr: dB.
+    ssim: structural similarity (Wang et al. 2004), 1 for identical images.
+    """
 
     name: str
     mse: float
@@ -29,25 +34,28 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Score:
-    """Means over views, as the field reports them: the mean of PSNRs, not the PSNR of the mean error."""
+    """Scores of views and their means, as the field reports them: the mean of PSNRs, not the PSNR of the mean error."""
 
     views: tuple[ViewScore, ...]
 
     @property
     def psnr(self) -> float:
+        """Mean over the views, dB."""
         return sum(view.psnr for view in self.views) / len(self.views)
 
     @property
     def ssim(self) -> float:
+        """Mean over the views."""
         return sum(view.ssim for view in self.views) / len(self.views)
 
     @property
     def mse(self) -> float:
+        """Mean over the views, of colours in 0 to 1."""
         return sum(view.mse for view in self.views) / len(self.views)
 
 
 def evaluate(render: Renderer, views: Sequence[TrainingView], background: Tensor) -> Score:
-    """Score of every view at full training resolution, over `background` [3] where photos are transparent."""
+    """Score of every view at full training resolution, over the RGB `background` [3] where photos are transparent."""
     scores = []
     for view in views:
         target = view.full
@@ -61,9 +69,9 @@ def benchmark_background(views: Sequence[TrainingView]) -> Tensor:
 
 
 def compare(name: str, color: Tensor, photo: Tensor, mask: Tensor | None = None) -> ViewScore:
-    """Score of a rendered image [H, W, 3] against a photo uint8 [H, W, 3]; only `mask` [H, W] pixels count.
+    """Score of a rendered image [H, W, 3] against a photo uint8 [H, W, 3], over the pixels where `mask` [H, W] is true.
 
-    What is masked reaches no window of SSIM either: the edge of a mask is one of the image, as in the loss.
+    Windows of SSIM leave out masked pixels too: the edge of a mask counts as an edge of the image, as in the loss.
     """
     image = color.detach().float().clamp(0.0, 1.0)
     truth = photo.to(image.device).float() / 255.0
@@ -71,7 +79,7 @@ def compare(name: str, color: Tensor, photo: Tensor, mask: Tensor | None = None)
     counted = mask.to(image.device) if mask is not None and bool(mask.any()) else None
     if counted is not None:
         squares = squares[counted]
-    # The kernel's value of `ssim_map`, many times as fast: curves are measured every few seconds.
+    # The kernels' SSIM, which the loss is made of: a curve is evaluated every few seconds, and plain torch is too slow.
     similarity = 1.0 - float(
         ops.loss(image, photo.to(image.device).contiguous(), mask=counted, dssim_weight=1.0)
     )
@@ -80,33 +88,5 @@ def compare(name: str, color: Tensor, photo: Tensor, mask: Tensor | None = None)
 
 
 def psnr(mse: float) -> float:
-    """dB of a mean squared error of values in 0..1; identical images are reported as 100 dB."""
+    """PSNR in dB of a mean squared error of colours in 0 to 1; 100 dB for images that are identical."""
     return 100.0 if mse < 1e-10 else -10.0 * math.log10(mse)
-
-
-def ssim_map(image: Tensor, truth: Tensor) -> Tensor:
-    """SSIM per pixel and channel [H, W, 3]: an 11-tap Gaussian window of sigma 1.5, zeros outside the image."""
-    a, b = image.permute(2, 0, 1), truth.permute(2, 0, 1)
-    maps = torch.cat([a, b, a * a, b * b, a * b])
-    mean_a, mean_b, aa, bb, ab = _blurred(maps).chunk(5)
-    variance_a, variance_b, covariance = aa - mean_a**2, bb - mean_b**2, ab - mean_a * mean_b
-    top = (2 * mean_a * mean_b + C1) * (2 * covariance + C2)
-    bottom = (mean_a**2 + mean_b**2 + C1) * (variance_a + variance_b + C2)
-    similar: Tensor = top / bottom
-    return similar.permute(1, 2, 0)
-
-
-def _blurred(planes: Tensor) -> Tensor:
-    """Planes [C, H, W] under the window, as two banded matrix products (far faster than a depthwise convolution)."""
-    height, width = planes.shape[1:]
-    return _band(height, planes) @ planes @ _band(width, planes)
-
-
-def _band(size: int, like: Tensor) -> Tensor:
-    """The symmetric matrix [size, size] that applies the window along one axis, with zeros outside."""
-    place = torch.arange(size, device=like.device)
-    distance = place[:, None] - place[None, :]
-    reach = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
-    total = float(torch.exp(-reach.square() / (2 * SIGMA * SIGMA)).sum())
-    weight = torch.exp(-distance.double().square() / (2 * SIGMA * SIGMA)) / total
-    return torch.where(distance.abs() <= WINDOW // 2, weight, torch.zeros_like(weight)).to(like.dtype)
