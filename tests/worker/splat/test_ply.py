@@ -103,7 +103,7 @@ def test_any_order_of_properties_and_extra_ones_are_read(tmp_path: Path) -> None
         (b"hello", "could not be read"),
         (
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n",
-            "lacks the properties",
+            "rot_3 are missing",
         ),
         (b"ply\nformat ascii 1.0\nelement face 0\nproperty float x\nend_header\n", "no vertex element"),
         (

@@ -18,7 +18,7 @@ from torch import Tensor
 from splatmill_worker.errors import FailureName, TrainingFailed
 from splatmill_worker.kernels.records import Rates
 from splatmill_worker.scene import Camera
-from splatmill_worker.splat.engine.cpu import FusedStep
+from splatmill_worker.splat.engine.cpu import CpuEngine
 from splatmill_worker.splat.engine.open import gaussians_of
 from splatmill_worker.splat.evaluate import ViewScore, compare
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
@@ -124,7 +124,7 @@ class _Fit:
         full = view.full
         self.pixel = 1.0 / full.camera.fx
         first = max(1, round(FIRST_SHARE * most))
-        self.engine = FusedStep(self._stacked(self._placed(_detail(full), first)))
+        self.engine = CpuEngine(self._stacked(self._placed(_detail(full), first)))
         self.engine.keep_scores = False
         self.step = 0
         self.events = list(GROWN_AT)

@@ -1,1 +1,1 @@
-"""Gaussian splats: parameters, rendering, training, evaluation, files. Knows kernels and scenes only."""
+"""Gaussian splatting: parameters, rendering, training, evaluation, files, report."""

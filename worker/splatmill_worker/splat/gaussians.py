@@ -19,9 +19,13 @@ REST_COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
 class Gaussians:
     """N Gaussians as unconstrained parameters (Kerbl et al. 2023, section 4).
 
-    means [N, 3] in world units; log_scales [N, 3] natural logarithm of the standard deviations along the
-    own axes; quats [N, 4] as wxyz with any norm above zero; logit_opacities [N]; sh [N, (degree + 1)^2, 3]
-    with the DC coefficient first. All five share one dtype and device.
+    means: [N, 3] centres, world units.
+    log_scales: [N, 3] natural logarithm of the standard deviations along the Gaussian's axes, world units.
+    quats: [N, 4] rotations as wxyz, of any norm above zero.
+    logit_opacities: [N].
+    sh: [N, (degree + 1)^2, 3] spherical harmonics by coefficient, then channel; the DC coefficient comes first.
+
+    All five share one dtype and device. Raises ValueError for other shapes.
     """
 
     means: Tensor
@@ -82,7 +86,7 @@ class Gaussians:
         return keep
 
     def padded(self, degree: int) -> Gaussians:
-        """The same Gaussians with room for `degree`: zero coefficients are added, or higher ones cut off."""
+        """The same Gaussians at SH degree `degree`: coefficients of zero are added, or higher ones cut off."""
         wanted = (degree + 1) ** 2
         have = self.sh.shape[1]
         if wanted <= have:
@@ -94,8 +98,8 @@ class Gaussians:
     def moved(self, scale: float, translation: Tensor) -> Gaussians:
         """The scene under x -> scale * x + translation (no rotation, so SH stays as it is).
 
-        The arithmetic is float64 and the result has the dtype of the input: a geo-referenced translation
-        would otherwise round every mean to half a unit before it is added.
+        The result has the dtype of the input. The arithmetic is float64, because a geo-referenced translation in
+        float32 is only exact to about half a unit.
         """
         means = (self.means.double() * scale + translation.double()).to(self.means.dtype)
         log_scales = (self.log_scales.double() + torch.tensor(scale, dtype=torch.float64).log()).to(

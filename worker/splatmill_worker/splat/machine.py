@@ -1,4 +1,4 @@
-"""Where a report was made: processor, memory and versions."""
+"""The machine and the software that a report was made with."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PACKAGES = ("splatmill", "splatmill-worker", "torch", "pycolmap", "numpy")
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores that may be used, memory in bytes, operating system."""
+    """Processor, usable cores, memory in bytes, operating system and GPU (None without one)."""
     return {
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
@@ -27,7 +27,7 @@ def machine() -> dict[str, Any]:
 
 
 def versions(kernels: str) -> dict[str, Any]:
-    """Versions of what computes, and the backend used."""
+    """Versions of Python and of the packages that compute, and the backend `kernels` that was used."""
     found: dict[str, Any] = {"python": platform.python_version(), "backend": kernels}
     for package in PACKAGES:
         try:
@@ -53,7 +53,7 @@ def resident_memory() -> int:
 
 
 def _processor() -> str:
-    """The model name as the kernel tells it, or what Python knows."""
+    """The processor's model name from Linux, or what Python knows of it elsewhere."""
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):

@@ -1,4 +1,4 @@
-"""Rigid motions as twists: the exponential map of SE(3)."""
+"""Rigid motions from twists: the exponential map of SE(3)."""
 
 from __future__ import annotations
 

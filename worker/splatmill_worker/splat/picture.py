@@ -1,4 +1,4 @@
-"""Rendered images as pictures."""
+"""Rendered colours as 8-bit pictures and JPEG."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from splatmill.files import replacing
 
 
 def as_image(color: Tensor) -> Image.Image:
-    """An 8-bit picture of colour [H, W, 3] in 0..1 (or of uint8 values as they are)."""
+    """An 8-bit picture of colour [H, W, 3]: floats in 0 to 1 are scaled, uint8 values taken as they are."""
     if color.is_floating_point():
         color = (color.detach().clamp(0.0, 1.0) * 255.0).round().byte()
     return Image.fromarray(color.cpu().contiguous().numpy())
@@ -26,7 +26,7 @@ def save_jpeg(path: Path, color: Tensor) -> None:
 
 
 def data_uri(color: Tensor, longest: int) -> str:
-    """A JPEG of colour [H, W, 3] with its longest side at most `longest`, for a self-contained page."""
+    """A data: URI of a JPEG of colour [H, W, 3], reduced to `longest` pixels on the longer side at most."""
     image = as_image(color)
     image.thumbnail((longest, longest))
     stream = io.BytesIO()

@@ -1,4 +1,4 @@
-"""The standard 3D Gaussian `.ply`: one fixed layout written, any tool's file read by property name."""
+"""The standard 3D Gaussian `.ply`: written in one fixed layout, read from any tool's file by property name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.gaussians import Gaussians
 
 MIN_OPACITY = 1.0 / 255.0
-"""An opacity under this adds nothing to an 8-bit image, and every renderer skips it."""
+"""Gaussians of less opacity are not written: they cannot change an 8-bit image."""
 
 _DEGREE_OF_REST = {0: 0, 9: 1, 24: 2, 45: 3}
 _HEAD_BYTES = 65536
@@ -36,10 +36,11 @@ def property_names(degree: int) -> list[str]:
 def write(
     path: Path, gaussians: Gaussians, *, degree: int | None = None, comments: tuple[str, ...] = ()
 ) -> int:
-    """Write `gaussians` as binary little-endian float32 and return how many were written.
+    """Write `gaussians` as binary little-endian float32; returns how many were written.
 
-    Left out are rows with a non-finite parameter and those with an opacity under 1/255; quaternions become
-    unit length. `degree` pads or cuts the SH coefficients (some viewers insist on 3); None keeps them.
+    Rows with a non-finite parameter and rows with an opacity under MIN_OPACITY are left out. Quaternions are
+    normalised. degree: SH degree of the file (some viewers read degree 3 only); that of the Gaussians where None.
+    comments: lines of the header.
     The file is replaced atomically and synced.
     """
     if degree is not None:
@@ -74,9 +75,9 @@ def write(
 
 
 def offset(path: Path) -> tuple[float, float, float]:
-    """By how much `export` moved the scene to keep float32 exact (world = file + offset); zeros where it did not.
+    """The offset that `export` subtracted to keep float32 exact: world = file + offset. Zeros where there is none.
 
-    Raises ModelUnreadable for a comment that says so and holds no three numbers.
+    It is a comment of the header. Raises ModelUnreadable where that comment does not hold three numbers.
     """
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES).partition(b"end_header")[0]
@@ -86,7 +87,9 @@ def offset(path: Path) -> tuple[float, float, float]:
             try:
                 x, y, z = (float(word) for word in words[2:])
             except ValueError as error:
-                raise ModelUnreadable(f"{path.name} has a broken offset in its header: {line!r}.") from error
+                raise ModelUnreadable(
+                    f"{path.name} has an offset without three numbers in its header: {line!r}."
+                ) from error
             return x, y, z
     return 0.0, 0.0, 0.0
 
@@ -94,8 +97,8 @@ def offset(path: Path) -> tuple[float, float, float]:
 def read(path: Path) -> Gaussians:
     """Read any tool's 3D Gaussian `.ply` (binary of either byte order, or text) as float32 tensors.
 
-    Properties are found by name; unknown ones are ignored, as are normals. Rows that hold a non-finite value
-    are dropped. Raises ModelUnreadable for anything that is no such file.
+    Properties are found by name; normals and unknown properties are ignored. Rows with a non-finite value are left
+    out. Raises ModelUnreadable for any other file, and FileNotFoundError where there is none.
     """
     try:
         document = PlyData.read(str(path))
@@ -106,23 +109,25 @@ def read(path: Path) -> Gaussians:
     elements = {element.name: element for element in document.elements}
     if "chunk" in elements:
         raise ModelUnreadable(
-            f"{path.name} is a packed (quantised) splat .ply; convert it to the standard float layout first."
+            f"{path.name} is a packed (quantised) splat .ply. Convert it to the standard float layout first."
         )
     if "vertex" not in elements:
-        raise ModelUnreadable(f"{path.name} has no vertex element (found: {', '.join(elements) or 'none'}).")
+        raise ModelUnreadable(
+            f"{path.name} has no vertex element; its elements are: {', '.join(elements) or 'none'}."
+        )
     vertex = elements["vertex"]
     present = [p.name for p in vertex.properties]
     rest = sum(name.startswith("f_rest_") for name in present)
     if rest not in _DEGREE_OF_REST:
         raise ModelUnreadable(
-            f"{path.name} has {rest} f_rest properties; 0, 9, 24 or 45 are needed (SH degree 0 to 3)."
+            f"{path.name} has {rest} f_rest properties; SH degrees 0 to 3 have 0, 9, 24 or 45."
         )
     degree = _DEGREE_OF_REST[rest]
     wanted = [name for name in property_names(degree) if name not in ("nx", "ny", "nz")]
     missing = [name for name in wanted if name not in present]
     if missing:
         raise ModelUnreadable(
-            f"{path.name} is no 3D Gaussian .ply: it lacks the properties {', '.join(missing)}."
+            f"{path.name} is not a 3D Gaussian .ply: the properties {', '.join(missing)} are missing."
         )
 
     def columns(*names: str) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""One view of a scene: the differentiable renderer over the kernels."""
+"""Renders one view of a scene, differentiably, on any backend."""
 
 from __future__ import annotations
 
@@ -14,14 +14,19 @@ from splatmill_worker.splat.gaussians import Gaussians
 
 
 class Rendering(NamedTuple):
-    """color [H, W, 3] with the background blended in, alpha [H, W] in 0..1, depth [H, W] = sum w_i z_i."""
+    """One rendered view.
+
+    color: [H, W, 3], blended over the background.
+    alpha: [H, W], 0 to 1.
+    depth: [H, W], sum of the Gaussians' camera z times their blending weights, world units.
+    """
 
     color: Tensor
     alpha: Tensor
     depth: Tensor
 
     def expected_depth(self) -> Tensor:
-        """Mean camera z of what was hit [H, W]; 0 where nothing was."""
+        """Mean camera z of the Gaussians at each pixel [H, W], world units; 0 where there are none."""
         return torch.where(
             self.alpha > 0, self.depth / self.alpha.clamp_min(1e-10), torch.zeros_like(self.depth)
         )
@@ -43,11 +48,12 @@ def render(
     backend: ops.Backend | None = None,
     antialias: bool = False,
 ) -> Rendering:
-    """Render `gaussians` as `camera` sees them; gradients flow to every parameter that asks for them.
+    """Render `gaussians` as `camera` sees them; gradients flow to the parameters that require them.
 
-    background: RGB in 0..1, black when None. degree: highest SH degree used, all that there is when None.
-    backend: which kernels compute it, chosen by the tensors' device when None. antialias: compensate
-    opacities for the 0.3 px dilation (Yu et al. 2024, Mip-Splatting). An absent backend is an error.
+    background: RGB in 0 to 1; black where None.
+    degree: highest SH degree that is used; that of the Gaussians where None.
+    backend: the kernels that compute it; chosen by the tensors' device where None. An absent backend is an error.
+    antialias: compensate opacities for the dilation of 0.3 pixels^2 (Yu et al. 2024, Mip-Splatting).
     """
     viewmat, intrinsics = camera_tensors(camera, gaussians.means)
     if background is not None:

@@ -1,4 +1,4 @@
-"""Training photos as tensors at every resolution that the schedule asks for."""
+"""Photos as tensors in the training world, at full and at reduced resolution."""
 
 from __future__ import annotations
 
@@ -13,7 +13,15 @@ from splatmill_worker.scene import Camera, Normalization
 
 
 class Target(NamedTuple):
-    """What one camera should see: rgb uint8 [H, W, 3], alpha uint8 [H, W], mask bool [H, W] of pixels that count."""
+    """A camera and the photo that it should see.
+
+    camera: in the training world, at the size of the photo.
+    viewmat: float32 [4, 4], world to camera.
+    K: float32 [3, 3], intrinsics in pixels.
+    rgb: uint8 [H, W, 3].
+    alpha: uint8 [H, W]; None where the photo is opaque.
+    mask: bool [H, W], true at the pixels that count; None where all do.
+    """
 
     camera: Camera
     viewmat: Tensor
@@ -23,7 +31,7 @@ class Target(NamedTuple):
     mask: Tensor | None
 
     def over(self, background: Tensor) -> Tensor:
-        """The photo, uint8 [H, W, 3], with `background` [3] in 0..1 behind what is transparent."""
+        """The photo uint8 [H, W, 3] over an RGB `background` [3] in 0 to 1."""
         if self.alpha is None:
             return self.rgb
         cover = self.alpha[..., None].float() / 255.0
@@ -32,14 +40,18 @@ class Target(NamedTuple):
 
 @dataclass(frozen=True)
 class TrainingView:
-    """One photo in the training world, with its reduced copies made on first use."""
+    """One photo in the training world.
+
+    name: of the photo.
+    levels: the photo by the factor that it is reduced by; 1 is the full size, the others are made on first use.
+    """
 
     name: str
     levels: dict[int, Target]
 
     @staticmethod
     def of(photo: Photo, normalization: Normalization) -> TrainingView:
-        """The photo at full training resolution; its camera moved into the training world."""
+        """The photo at full training resolution, with its camera in the training world."""
         mask = None if photo.mask is None or photo.mask.all() else torch.from_numpy(photo.mask)
         alpha = None if photo.alpha is None or (photo.alpha == 255).all() else torch.from_numpy(photo.alpha)
         target = _target(normalization.camera(photo.camera), torch.from_numpy(photo.rgb), alpha, mask)
@@ -47,11 +59,11 @@ class TrainingView:
 
     @property
     def full(self) -> Target:
-        """At full training resolution."""
+        """The photo at full training resolution."""
         return self.levels[1]
 
     def reduced(self, factor: int) -> Target:
-        """With both sides divided by `factor` (area filter), or as far as one pixel."""
+        """The photo with both sides divided by `factor`, averaged over area, but no side under one pixel."""
         if factor not in self.levels:
             self.levels[factor] = _reduced(self.full, factor)
         return self.levels[factor]
@@ -75,7 +87,7 @@ def _reduced(full: Target, factor: int) -> Target:
     if full.alpha is None:
         rgb = area(rgb)
     else:
-        # Colours are averaged by what they cover, so that hidden ones do not bleed in.
+        # Colours are weighted by alpha, so that those of transparent pixels do not bleed in.
         cover = full.alpha[None].float() / 255.0
         small = area(cover)
         rgb = area(rgb * cover) / small.clamp_min(1.0 / 255.0)

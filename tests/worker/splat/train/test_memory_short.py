@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from splatmill_worker.errors import FailureName, TrainingFailed
-from splatmill_worker.splat.engine.cpu import FusedStep
+from splatmill_worker.splat.engine.cpu import CpuEngine
 from splatmill_worker.splat.train.loop import Hooks, train
 from tests.support import still_life
 from tests.support.training import first_engine, plan
@@ -22,7 +22,7 @@ from tests.support.training import first_engine, plan
 class Cramped:
     """An engine whose steps run out of memory above `room` Gaussians."""
 
-    def __init__(self, engine: FusedStep, room: int) -> None:
+    def __init__(self, engine: CpuEngine, room: int) -> None:
         self._engine, self._room = engine, room
 
     def __getattr__(self, name: str) -> Any:

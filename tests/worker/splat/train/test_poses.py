@@ -14,7 +14,7 @@ import torch
 from splatmill_worker.splat.motion import motion
 from splatmill_worker.splat.plan.probe import ZERO_RATES
 from splatmill_worker.splat.train.loop import Trained, train
-from splatmill_worker.splat.train.poses import Poses, gauge, mean_depth, moved
+from splatmill_worker.splat.train.poses import Poses, gauge, mean_depth, with_viewmat
 from splatmill_worker.splat.views import TrainingView
 from tests.support.training import first_engine, plan, split
 
@@ -27,7 +27,7 @@ def shaken(views: list[TrainingView], turn: float, shift: float) -> list[Trainin
     twists = torch.randn(len(views), 2, 3, generator=random, dtype=torch.float64)
     twists = torch.nn.functional.normalize(twists, dim=2) * torch.tensor([shift, turn])[:, None]
     return [
-        moved(view, motion(twist.reshape(6)) @ torch.from_numpy(view.full.camera.viewmat))
+        with_viewmat(view, motion(twist.reshape(6)) @ torch.from_numpy(view.full.camera.viewmat))
         for view, twist in zip(views, twists, strict=True)
     ]
 

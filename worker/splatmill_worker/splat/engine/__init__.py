@@ -1,1 +1,1 @@
-"""A training step over all Gaussians: the protocol, and its implementations by backend."""
+"""Engines: a scene under optimisation on one backend, behind one protocol."""

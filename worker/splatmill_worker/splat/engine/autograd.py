@@ -1,4 +1,4 @@
-"""The training step through torch's autograd, for any backend whose ops are differentiable."""
+"""The engine that differentiates with torch's autograd, for any backend whose ops are differentiable."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.motion import motion
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+"""Adam's decay of the first and second moment, and the term that keeps its divisor above 0."""
 
 
-class AutogradStep:
-    """An Engine over `kernels.ops`: slow on a CPU, and the same optimisation as the fused step does.
+class AutogradEngine:
+    """An Engine over `kernels.ops`. It is slow, and takes the same steps as the fused engines.
 
-    Adam runs over all Gaussians, those that a photo does not show with a zero gradient.
+    Adam updates all Gaussians; those that a photo does not show have a zero gradient. Scores are always kept, whatever
+    `keep_scores` says, because autograd has them anyway.
     """
 
     def __init__(self, gaussians: Gaussians, *, backend: ops.Backend) -> None:
@@ -89,7 +91,6 @@ class AutogradStep:
             projected, bins, width, height, background=background, backend=self._backend
         )
         self._pending = (projected, color, alpha, depth)
-        self._pairs = int(bins.ids.numel())
         return color.detach(), alpha.detach(), depth.detach()
 
     def backward_update(
@@ -140,9 +141,10 @@ class AutogradStep:
         assert self._pending is not None
         visible = int((self._pending[0].extents[:, 0] > 0).sum())
         self.backward_update(gradient, rates=rates, step=step)
-        return StepResult(float(loss.detach()), visible, self._pairs)
+        return StepResult(float(loss.detach()), visible)
 
     def _score(self, projected: ops.Projected, width: int, height: int) -> None:
+        """Add this view to the densification scores."""
         gradient = projected.means2d.grad
         if gradient is None:
             return
@@ -155,7 +157,7 @@ class AutogradStep:
             self.max_extent = torch.maximum(self.max_extent, extent)
 
     def _adam(self, rates: Rates, step: int) -> None:
-        """Kingma & Ba 2015, with bias correction, on every group."""
+        """One step of Adam (Kingma & Ba 2015) with bias correction, on every parameter group."""
         correction = (1.0 - BETA2**step) ** 0.5 / (1.0 - BETA1**step)
         for name, value in self._gaussians.parameters().items():
             gradient = torch.zeros_like(value) if value.grad is None else value.grad
@@ -172,9 +174,11 @@ class AutogradStep:
             value.grad = None
 
     def _packed(self, groups: dict[str, Tensor]) -> Tensor:
+        """All groups side by side [N, 59]."""
         return torch.cat([value.reshape(self.count, -1) for value in groups.values()], dim=1)
 
     def _unpacked(self, packed: Tensor | None) -> dict[str, Tensor]:
+        """The groups of `packed` [N, 59] by name; zeros where it is None."""
         shapes = {name: value.shape for name, value in self._gaussians.parameters().items()}
         if packed is None:
             return {name: torch.zeros(shape) for name, shape in shapes.items()}

@@ -1,4 +1,4 @@
-"""The fused CPU step as the training loop drives it: photos that come again keep what was computed about them."""
+"""The fused CPU step as an Engine, which keeps the statistics of photos between their visits."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 
 KEPT_BYTES = 400 * 10**6
-"""For the photos' statistics, at 28 bytes a pixel; beyond it they are computed anew at every visit."""
+"""Memory for the photos' statistics, bytes, at 28 a pixel. Those of further photos are computed at every visit."""
 
 
-class FusedStep(Step):
-    """An Engine on the C++ kernels."""
+class CpuEngine(Step):
+    """An Engine on the C++ kernels, with as many threads as the kernels choose where `threads` is None."""
 
     def __init__(self, gaussians: Gaussians, *, threads: int | None = None) -> None:
         super().__init__(**gaussians.padded(3).parameters(), threads=threads)
@@ -64,9 +64,10 @@ class FusedStep(Step):
             antialias=antialias,
             pose_gradient=self.keep_pose_gradient,
         )
-        return StepResult(seen.loss, seen.visible, seen.pairs)
+        return StepResult(seen.loss, seen.visible)
 
     def _stats(self, photo: Tensor, mask: Tensor | None, key: Hashable | None) -> PhotoStats:
+        """The part of the loss that depends on the photo alone, kept under `key` while KEPT_BYTES has room."""
         if key is not None and key in self._kept:
             return self._kept[key]
         stats = photo_stats(photo, mask=mask)

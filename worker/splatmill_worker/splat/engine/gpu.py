@@ -1,4 +1,4 @@
-"""The fused GPU step as the training loop drives it."""
+"""The fused GPU step as an Engine."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 
 
-class FusedGpuStep(Step):
-    """An Engine on the Triton kernels. Photos stay on the device as uint8 for as long as their tensors
-    live.
+class GpuEngine(Step):
+    """An Engine on the Triton kernels. Photos stay on the device as uint8 for as long as their tensors live.
+
+    These kernels compute no gradient of the camera, so `pose_gradient` stays None; the plan refines no poses here.
     """
 
     def __init__(
@@ -24,9 +25,7 @@ class FusedGpuStep(Step):
         where: str | None = None,
         together: Together | None = None,
     ) -> None:
-        self.keep_pose_gradient = (
-            False  # the plan refuses to refine poses here: these kernels have no such gradient
-        )
+        self.keep_pose_gradient = False
         self.pose_gradient: Tensor | None = None
         super().__init__(**gaussians.padded(3).parameters(), where=where, together=together)
 
@@ -44,13 +43,12 @@ class FusedGpuStep(Step):
         antialias: bool = False,
         key: Hashable | None = None,
     ) -> StepResult:
-        """One step, enqueued; the numbers are those of the latest step that has been heard from.
+        """Enqueue one step; the result is that of the latest step whose numbers have reached the host.
 
-        The promise in `key` is not needed: the photo's window sums cost the device less than the memory to
-        keep them.
+        `key` is not used: computing the photo's window sums costs the device less than the memory to keep them.
         """
         seen = self.train(
             viewmat, K, photo,
             degree=degree, rates=rates, step=step, background=background, mask=mask, antialias=antialias,
         )  # fmt: skip
-        return StepResult(seen.loss, seen.visible, seen.pairs)
+        return StepResult(seen.loss, seen.visible)

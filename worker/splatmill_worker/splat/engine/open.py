@@ -1,25 +1,25 @@
-"""Opens the engine that trains on a backend."""
+"""Opens the engine of a backend, and copies the scene out of one."""
 
 from __future__ import annotations
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.splat.engine.autograd import AutogradStep
-from splatmill_worker.splat.engine.cpu import FusedStep
+from splatmill_worker.splat.engine.autograd import AutogradEngine
+from splatmill_worker.splat.engine.cpu import CpuEngine
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.gaussians import Gaussians
 
 
 def open_engine(gaussians: Gaussians, kernels: ops.Backend) -> Engine:
-    """The engine of a backend, holding `gaussians`. The fused step where there is one, autograd elsewhere."""
+    """The engine of a backend, holding `gaussians`: the fused step on cpu and gpu, autograd elsewhere."""
     if kernels == "cpu":
-        return FusedStep(gaussians)
+        return CpuEngine(gaussians)
     if kernels == "gpu":
-        from splatmill_worker.splat.engine.gpu import FusedGpuStep
+        from splatmill_worker.splat.engine.gpu import GpuEngine
 
-        return FusedGpuStep(gaussians)
-    return AutogradStep(gaussians, backend=kernels)
+        return GpuEngine(gaussians)
+    return AutogradEngine(gaussians, backend=kernels)
 
 
 def gaussians_of(engine: Engine) -> Gaussians:
-    """A copy of what the engine holds, on the CPU."""
+    """A copy of the scene that the engine holds, on the CPU."""
     return Gaussians(**engine.parameters()).map(lambda value: value.cpu())

@@ -1,10 +1,9 @@
-"""One scene on several GPUs: every process trains on its share of the views, and all of them take the same
-averaged step.
+"""One scene on several GPUs: every process trains on its share of the views, and all take the same averaged step.
 
-The rule is one worker per GPU, each with its own scene; this is for the scene that has to be finished sooner.
-Start one process per GPU with `torchrun`, call `join`, give `train` the views of `share` and the engine of
-`open_replica`. A step over P processes is a step over P photos: plan P times fewer steps. The budget must be
-in steps, since clocks differ between processes.
+Usually every GPU has a worker of its own, with its own scene; several GPUs on one scene finish that scene sooner.
+Start one process per GPU with `torchrun`, call `join`, and give `train` the views of `share` and the engine of
+`open_replica`. A step over P processes is a step over P photos, so plan P times fewer steps. The budget must be in
+steps, because clocks differ between processes.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from torch import Tensor
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.gpu.device import interpreting
 from splatmill_worker.kernels.records import Rates
-from splatmill_worker.splat.engine.autograd import AutogradStep
+from splatmill_worker.splat.engine.autograd import AutogradEngine
 from splatmill_worker.splat.engine.protocol import Engine, StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -30,27 +29,33 @@ View = TypeVar("View")
 
 @dataclass(frozen=True)
 class Replicas:
-    """The processes that train one scene together: how many, and which of them this is."""
+    """The processes that train one scene together.
+
+    rank: number of this process, from 0.
+    count: number of processes.
+    """
 
     rank: int
     count: int
 
     def average_(self, values: Tensor) -> None:
-        """Replace values by their mean over the processes; the same bits in all of them."""
+        """Replace `values` by their mean over the processes; all get the same bits."""
         dist.all_reduce(values, op=dist.ReduceOp.SUM)
         values.div_(self.count)
 
     def add_(self, values: Tensor) -> None:
-        """Replace values by their sum over the processes."""
+        """Replace `values` by their sum over the processes."""
         dist.all_reduce(values, op=dist.ReduceOp.SUM)
 
     def largest_(self, values: Tensor) -> None:
-        """Replace values by the largest of any process."""
+        """Replace `values` by their maximum over the processes."""
         dist.all_reduce(values, op=dist.ReduceOp.MAX)
 
     def share(self, views: Sequence[View]) -> list[View]:
-        """This process's views: every `count`-th. All shares are equally long, the last views coming twice
-        where need be, so that all processes draw the same random numbers and densify alike.
+        """The views of this process: every `count`-th one.
+
+        All shares have the same length, some views occurring in two of them where the division leaves a rest, so that
+        all processes draw the same random numbers and densify alike. Raises ValueError where there are no views.
         """
         if not views:
             raise ValueError("there are no views to share among the processes.")
@@ -58,7 +63,7 @@ class Replicas:
         return [views[(self.rank + i * self.count) % len(views)] for i in range(length)]
 
     def check_same(self, gaussians: Gaussians) -> None:
-        """Raise RuntimeError when the processes no longer hold the same scene."""
+        """Raise RuntimeError where the processes do not hold the same scene."""
         sums = torch.stack([value.double().sum() for value in gaussians])
         least, most = sums.clone(), sums.clone()
         dist.all_reduce(least, op=dist.ReduceOp.MIN)
@@ -67,20 +72,24 @@ class Replicas:
         dist.all_reduce(counts, op=dist.ReduceOp.MAX)
         if int(counts[0]) != -int(counts[1]) or not torch.equal(least, most):
             raise RuntimeError(
-                f"Process {self.rank} of {self.count} holds another scene than the rest "
+                f"Process {self.rank} of {self.count} holds another scene than the other processes "
                 f"({gaussians.count} Gaussians here). "
                 "Start all of them from the same checkpoint, with the same seed and a budget in steps."
             )
 
 
 def join(backend: str | None = None) -> Replicas:
-    """Meet the other processes that `torchrun` started: over NCCL where there are GPUs, else gloo."""
+    """Join the process group that `torchrun` started: over NCCL where there are GPUs, over gloo otherwise.
+
+    Raises RuntimeError where the environment of `torchrun` is missing.
+    """
     missing = [
         name for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT") if name not in os.environ
     ]
     if missing:
         raise RuntimeError(
-            f"{', '.join(missing)} not set; start the processes with torchrun --nproc-per-node N, which sets them."
+            f"The environment lacks {', '.join(missing)}. Start the processes with torchrun --nproc-per-node N, "
+            "which sets them."
         )
     if backend is None:
         backend = "nccl" if torch.cuda.is_available() else "gloo"
@@ -90,10 +99,8 @@ def join(backend: str | None = None) -> Replicas:
     return Replicas(dist.get_rank(), dist.get_world_size())
 
 
-class ReplicatedStep(AutogradStep):
-    """The autograd engine, its gradients averaged over the processes before Adam; scores add up over all
-    their views.
-    """
+class ReplicatedEngine(AutogradEngine):
+    """The autograd engine with gradients averaged over the processes before Adam, and scores over all their views."""
 
     def __init__(self, gaussians: Gaussians, replicas: Replicas, *, backend: ops.Backend) -> None:
         self._replicas = replicas
@@ -118,7 +125,7 @@ class ReplicatedStep(AutogradStep):
         super()._adam(rates, step)
 
     def train_photo(self, *arguments: Any, **options: Any) -> StepResult:
-        """As the base class does it, with the loss of all processes, so that all judge their health alike."""
+        """The step of the base class, with the mean loss of all processes, so that all notice a divergence together."""
         own = super().train_photo(*arguments, **options)
         loss = torch.tensor(own.loss, dtype=torch.float64)
         self._replicas.average_(loss)
@@ -126,11 +133,11 @@ class ReplicatedStep(AutogradStep):
 
 
 def open_replica(gaussians: Gaussians, kernels: ops.Backend, replicas: Replicas) -> Engine:
-    """The engine of one process. All must be given the same Gaussians, which is checked."""
+    """The engine of one process. Raises RuntimeError where the processes were given different Gaussians."""
     replicas.check_same(gaussians)
     if kernels == "gpu":
-        from splatmill_worker.splat.engine.gpu import FusedGpuStep
+        from splatmill_worker.splat.engine.gpu import GpuEngine
 
         where = gaussians.means.device if interpreting() else f"cuda:{torch.cuda.current_device()}"
-        return FusedGpuStep(gaussians, where=str(where), together=replicas)
-    return ReplicatedStep(gaussians, replicas, backend=kernels)
+        return GpuEngine(gaussians, where=str(where), together=replicas)
+    return ReplicatedEngine(gaussians, replicas, backend=kernels)

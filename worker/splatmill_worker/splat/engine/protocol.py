@@ -1,4 +1,4 @@
-"""What the training loop asks of a backend: parameters, moments and scores of a scene, and one step over them."""
+"""The protocol between training and a backend: parameters, moments and scores of a scene, and one step."""
 
 from __future__ import annotations
 
@@ -11,22 +11,29 @@ from splatmill_worker.kernels.records import Rates
 
 
 class StepResult(NamedTuple):
-    """Loss of one step, and what it looked at."""
+    """What one training step measured.
+
+    loss: training loss of the photo, before the step.
+    visible: Gaussians that the photo shows.
+    """
 
     loss: float
     visible: int
-    pairs: int
 
 
 class Engine(Protocol):
-    """One scene under optimisation. The fused CPU step and the autograd step both are one.
+    """One scene under optimisation, with Adam's moments and the scores for densification.
 
-    Scores are sums since the last `replace`, one value per Gaussian: `plain_sum` of the norm of the gradient of the
-    projected mean in NDC units, `visible_count` of steps that saw it, `max_extent` its largest half size over half the
-    photo's longer side. `keep_scores` says whether they will be read.
+    keep_scores: whether the next steps add to the scores.
+    keep_pose_gradient: whether the next steps leave a `pose_gradient`.
+    pose_gradient: [6], gradient of the last step's loss with respect to a twist (rho, phi) of the camera
+        exp(twist^) viewmat, as `kernels.cpu.step` defines it; None where there is none.
+    count: number of Gaussians.
+    plain_sum: [N], sum over steps of the norm of the gradient of the projected mean, in NDC units.
+    visible_count: [N], steps whose photo showed the Gaussian.
+    max_extent: [N], largest half side of its box in a photo, in halves of the photo's longer side.
 
-    With `keep_pose_gradient`, every step leaves in `pose_gradient` [6] the loss's gradient to a twist (rho, phi) of the
-    camera exp(twist^) viewmat, as `kernels.cpu.step` defines it.
+    The scores are sums and a maximum over the steps since the last `replace`.
     """
 
     keep_scores: bool
@@ -43,15 +50,15 @@ class Engine(Protocol):
     def max_extent(self) -> Tensor: ...
 
     def parameters(self) -> dict[str, Tensor]:
-        """Copies by name, as in Gaussians; sh has 16 coefficients."""
+        """Copies of the parameters by name, as in `Gaussians`; sh has 16 coefficients."""
 
     def moments(self) -> tuple[Tensor, Tensor]:
-        """Adam's first and second moments [N, 59] each, in the engine's own column order."""
+        """Adam's first and second moments, [N, 59] each, in a column order that `replace` of this engine takes."""
 
     def replace(
         self, parameters: dict[str, Tensor], exp_avg: Tensor | None, exp_avg_sq: Tensor | None
     ) -> None:
-        """Take over other parameters and moments (None: zero); scores start again at zero."""
+        """Take over other parameters and moments (zeros where None), and set the scores to zero."""
 
     def forward(
         self,
@@ -64,7 +71,7 @@ class Engine(Protocol):
         background: Tensor | None = None,
         antialias: bool = False,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Colour [H, W, 3], alpha [H, W] and depth [H, W]; valid until the next call."""
+        """Render colour [H, W, 3], alpha [H, W] and depth [H, W]; the tensors are valid until the next call."""
 
     def backward_update(
         self,
@@ -75,7 +82,7 @@ class Engine(Protocol):
         rates: Rates,
         step: int,
     ) -> object:
-        """Gradients of the last forward pass, and one Adam step (1-based number `step`)."""
+        """Differentiate the last forward pass and take one Adam step, of 1-based number `step`."""
 
     def train_photo(
         self,
@@ -91,7 +98,12 @@ class Engine(Protocol):
         antialias: bool = False,
         key: Hashable | None = None,
     ) -> StepResult:
-        """Forward, loss against `photo` uint8 [H, W, 3], backward and Adam.
+        """Take one step on `photo` uint8 [H, W, 3]: render, loss over the pixels of `mask` [H, W], gradients, Adam.
 
-        A `key` promises the same photo and mask whenever it comes again, so that work on them may be kept.
+        degree: spherical-harmonics degree that is rendered.
+        rates: learning rates of the step.
+        step: its 1-based number.
+        background: RGB [3] behind the scene; black where None.
+        antialias: compensate opacities for the dilation of small Gaussians.
+        key: names the photo and its mask; the same key always comes with the same two, so work on them may be kept.
         """

@@ -1,1 +1,1 @@
-"""The training loop, and what changes while it runs."""
+"""The training loop, its state, and the parts of the optimisation beside the Gaussians."""

@@ -1,4 +1,4 @@
-"""Small corrections of the training cameras, learned beside the scene."""
+"""Pose refinement: small corrections of the training cameras, optimised together with the scene."""
 
 from __future__ import annotations
 
@@ -13,99 +13,107 @@ from splatmill_worker.splat.motion import cross_matrix, motion
 from splatmill_worker.splat.views import Target, TrainingView
 
 REACH = 6.0
-"""Pixels of the full training size that a camera could go if it went on at its first rate."""
+"""Pixels at the training size by which a run could move a camera if the rate did not fall. It does not depend on how
+often the budget lets the photo come."""
 
-FALL = 0.1
-"""Of the rate, from the beginning to the end of a run."""
+RATE_FALL = 0.1
+"""Rate at the end of a run over the rate at its start; it falls exponentially."""
 
-FROM = 0.2
-"""Share of the budget before anything moves: a scene that shows nothing yet says nothing about cameras."""
+STARTS_AT = 0.2
+"""Share of the budget from which cameras move: before, the scene shows too little to align them with."""
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
-"""Of Adam; a camera is seen once in many steps, so that the second moment must not remember 1000 of them."""
+"""Adam's decay of the first and second moment, and the term that keeps its divisor above 0. BETA2 is lower than usual
+because a camera gets a gradient only when its photo comes."""
 
 
 class Poses:
-    """One twist (rho, phi) [6] per training camera: its matrix is exp(twist) times the one it came with.
+    """A twist (rho, phi) [6] per training camera: the refined viewmat is exp(twist^) times the given one.
 
-    rho is in world units, phi in radians, both in the camera's own axes. The seven degrees of freedom that move all
-    cameras together (the world's position, direction and scale) are taken out after every step: the scene stays where
-    the held-out cameras, which are left as they came, look at it.
+    rho is in world units and phi in radians, both in the camera's axes. The seven gauge directions (motions of all
+    cameras together that amount to moving, turning and scaling the world) are projected out after every step, so that
+    the scene stays where the held-out cameras, which are not refined, look at it.
+
+    given: float64 [n, 4, 4], the viewmats as the views came with them.
+    depth: typical distance from a camera to the scene, world units.
+    twists: float64 [n, 6].
     """
 
     def __init__(self, views: Sequence[TrainingView], depth: float) -> None:
-        """depth: a typical distance to what is seen, by which a step of rho is as many pixels as one of phi."""
+        """depth: typical distance from a camera to the scene, which says how many pixels a translation is worth."""
         self.given = torch.stack([torch.from_numpy(view.full.camera.viewmat) for view in views])
         focal = torch.tensor([view.full.camera.fx for view in views], dtype=torch.float64)
         self.depth = depth
-        self._unit = torch.cat([torch.full((3,), depth), torch.ones(3)]).double() / focal.median()
+        # Each component of a twist that moves the image by one pixel.
+        self._pixel = torch.cat([torch.full((3,), depth), torch.ones(3)]).double() / focal.median()
         self._gauge = gauge(self.given)
-        self._onto_gauge = torch.linalg.pinv(self._gauge / self._unit.repeat(len(views))[:, None])
+        self._onto_gauge = torch.linalg.pinv(self._gauge / self._pixel.repeat(len(views))[:, None])
         self.twists = torch.zeros(len(views), 6, dtype=torch.float64)
-        self._average = torch.zeros_like(self.twists)
-        self._square = torch.zeros_like(self.twists)
+        self._exp_avg = torch.zeros_like(self.twists)
+        self._exp_avg_sq = torch.zeros_like(self.twists)
+        self._updates = torch.zeros(len(views), dtype=torch.int64)
         self._visits = torch.zeros(len(views), dtype=torch.int64)
-        self._seen = torch.zeros(len(views), dtype=torch.int64)
 
-    def viewmat(self, number: int) -> Tensor:
-        """The corrected matrix of camera `number`, float32 [4, 4]."""
-        return self.matrix(number).float()
+    def viewmat(self, index: int) -> Tensor:
+        """The refined viewmat of camera `index`, float32 [4, 4]."""
+        return self.viewmat_double(index).float()
 
-    def matrix(self, number: int) -> Tensor:
-        """The same in float64."""
-        return motion(self.twists[number]) @ self.given[number]
+    def viewmat_double(self, index: int) -> Tensor:
+        """The refined viewmat of camera `index`, float64 [4, 4]."""
+        return motion(self.twists[index]) @ self.given[index]
 
-    def update(self, number: int, gradient: Tensor, progress: float, scale: float) -> None:
-        """One Adam step of camera `number` down `gradient` [6], with the rate times `scale`, at `progress` in 0..1.
+    def update(self, index: int, gradient: Tensor, progress: float, scale: float) -> None:
+        """Take one Adam step of camera `index` along `gradient` [6], the derivative of the loss by its twist.
 
-        A gradient that is not finite is not followed.
+        progress: share of the budget that is spent, 0 to 1. scale: factor on the rate. Nothing moves before STARTS_AT,
+        or where the gradient is not finite.
         """
-        slope = gradient.double().cpu() * self._unit
-        self._seen[number] += 1
-        if progress < FROM or not bool(torch.isfinite(slope).all()):
+        slope = gradient.double().cpu() * self._pixel
+        self._visits[index] += 1
+        if progress < STARTS_AT or not bool(torch.isfinite(slope).all()):
             return
-        self._visits[number] += 1
-        visits = int(self._visits[number])
-        self._average[number].lerp_(slope, 1.0 - BETA1)
-        self._square[number].lerp_(slope.square(), 1.0 - BETA2)
-        correction = math.sqrt(1.0 - BETA2**visits) / (1.0 - BETA1**visits)
-        # However often the budget lets a photo come, its camera gets as far.
-        rate = scale * REACH * progress / float(self._seen[number]) * FALL**progress
-        move = correction * self._average[number] / (self._square[number].sqrt() + EPSILON)
-        self.twists[number] -= rate * self._unit * move
-        weighed = (self.twists / self._unit).reshape(-1)
-        self.twists -= (self._gauge @ (self._onto_gauge @ weighed)).reshape_as(self.twists)
+        self._updates[index] += 1
+        updates = int(self._updates[index])
+        self._exp_avg[index].lerp_(slope, 1.0 - BETA1)
+        self._exp_avg_sq[index].lerp_(slope.square(), 1.0 - BETA2)
+        correction = math.sqrt(1.0 - BETA2**updates) / (1.0 - BETA1**updates)
+        # `progress` over the visits so far estimates one over the visits of the whole run.
+        rate = scale * REACH * progress / float(self._visits[index]) * RATE_FALL**progress
+        move = correction * self._exp_avg[index] / (self._exp_avg_sq[index].sqrt() + EPSILON)
+        self.twists[index] -= rate * self._pixel * move
+        in_pixels = (self.twists / self._pixel).reshape(-1)
+        self.twists -= (self._gauge @ (self._onto_gauge @ in_pixels)).reshape_as(self.twists)
 
     def pixels_moved(self) -> float:
-        """How far the corrections move what the cameras see: median over cameras, in pixels of the training size."""
-        weighed = (self.twists / self._unit).reshape(-1, 2, 3)
-        return float(torch.linalg.vector_norm(weighed, dim=2).amax(dim=1).median())
+        """Median over the cameras of how far the correction moves the image, pixels at the training size."""
+        in_pixels = (self.twists / self._pixel).reshape(-1, 2, 3)
+        return float(torch.linalg.vector_norm(in_pixels, dim=2).amax(dim=1).median())
 
     def corrected(self, views: Sequence[TrainingView]) -> list[TrainingView]:
-        """The views as their cameras are now."""
-        return [moved(view, self.matrix(i)) for i, view in enumerate(views)]
+        """The views with their refined cameras."""
+        return [with_viewmat(view, self.viewmat_double(i)) for i, view in enumerate(views)]
 
     def state(self) -> dict[str, Tensor]:
-        """For a checkpoint."""
+        """Copies of the twists and of Adam's state, for a snapshot; the keys are those of the checkpoint file."""
         return {
             "twists": self.twists.clone(),
-            "average": self._average.clone(),
-            "square": self._square.clone(),
-            "visits": self._visits.clone(),
-            "seen": self._seen.clone(),
+            "average": self._exp_avg.clone(),
+            "square": self._exp_avg_sq.clone(),
+            "visits": self._updates.clone(),
+            "seen": self._visits.clone(),
         }
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """From a checkpoint."""
+        """Take over what `state()` returned."""
         self.twists.copy_(state["twists"])
-        self._average.copy_(state["average"])
-        self._square.copy_(state["square"])
-        self._visits.copy_(state["visits"])
-        self._seen.copy_(state["seen"])
+        self._exp_avg.copy_(state["average"])
+        self._exp_avg_sq.copy_(state["square"])
+        self._updates.copy_(state["visits"])
+        self._visits.copy_(state["seen"])
 
 
 def gauge(viewmats: Tensor) -> Tensor:
-    """Twists [6 n, 7] of n cameras [n, 4, 4] that no photo can tell from none.
+    """The seven gauge directions, twists [6 n, 7] of n cameras [n, 4, 4] that change no image together with the world.
 
     The columns move the world along its axes, turn it about them, and scale it about its origin.
     """
@@ -121,8 +129,8 @@ def gauge(viewmats: Tensor) -> Tensor:
     return torch.cat(columns)
 
 
-def moved(view: TrainingView, viewmat: Tensor) -> TrainingView:
-    """The view with another camera matrix, float64 [4, 4]."""
+def with_viewmat(view: TrainingView, viewmat: Tensor) -> TrainingView:
+    """The view with another viewmat, float64 [4, 4], at every resolution."""
 
     def turned(target: Target) -> Target:
         camera = replace(target.camera, viewmat=viewmat.numpy())
@@ -132,6 +140,6 @@ def moved(view: TrainingView, viewmat: Tensor) -> TrainingView:
 
 
 def mean_depth(depth: Tensor, alpha: Tensor) -> float:
-    """Mean depth of a rendered view (depth and alpha [H, W]); 1, the cameras' radius, where it shows nothing."""
+    """Mean depth of a rendered view (depth, alpha [H, W]), world units; 1, the cameras' radius, where it is empty."""
     total = float(alpha.sum())
     return float(depth.sum()) / total if total > 0.0 else 1.0

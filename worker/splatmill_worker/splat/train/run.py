@@ -267,7 +267,10 @@ class TrainingRun:
             exposure.update(self.rate_scale)
         assert color.grad is not None
         self.engine.backward_update(color.grad, rates=rates, step=self.step)
-        return StepResult(float(loss.detach()), int(bool((alpha > 0).any())), 0)
+        any_visible = bool(
+            (alpha > 0).any()
+        )  # this path does not count them, and only zero or not is looked at
+        return StepResult(float(loss.detach()), int(any_visible))
 
     def _background(self) -> Tensor:
         """RGB [3] behind this step's photo. A random one keeps training from hiding holes in the surface."""

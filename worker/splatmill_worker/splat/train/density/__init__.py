@@ -1,1 +1,1 @@
-"""How the number of Gaussians follows the photos: by cloning, splitting and pruning."""
+"""Adaptive density control: cloning, splitting and pruning of Gaussians."""

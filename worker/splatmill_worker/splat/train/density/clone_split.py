@@ -1,4 +1,4 @@
-"""Clone and split by the gradient of the projected mean (Kerbl et al. 2023, section 5.2), within a budget."""
+"""Cloning and splitting by the gradient of the projected mean (Kerbl et al. 2023, section 5.2), up to a number."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from splatmill_worker.splat.train.density import prune
 from splatmill_worker.splat.train.density.rows import Rows, offsets
 
 THRESHOLD = 2e-4
-"""The paper's least mean score worth another Gaussian, in NDC units."""
+"""Mean gradient of the projected mean, in NDC units, above which a Gaussian is doubled. The paper's value."""
 
 SPLIT_SHRINK = 1.6
-"""The paper's factor between the scale of a Gaussian and those of its two halves."""
+"""Scale of a Gaussian over that of the two it is split into. The paper's value."""
 
 SMALL = 0.01
-"""Share of the scene extent: smaller Gaussians are cloned, larger ones split."""
+"""Largest scale over the extent of the scene: up to it Gaussians are cloned, above it split. The paper's value."""
 
 
 class Change(NamedTuple):
-    """How many Gaussians an event added and removed."""
+    """How many Gaussians a densification added and removed."""
 
     added: int
     removed: int
@@ -39,48 +39,49 @@ def densify(
     opacity_decay: float = 1.0,
     decay_within: float = math.inf,
 ) -> Change:
-    """The Gaussians with the largest mean gradient are doubled: the small are cloned, the large are split.
+    """Prune, then clone the small and split the large Gaussians whose mean gradient is above THRESHOLD.
 
-    extent: radius of the cameras in the training world. Of those above THRESHOLD, no more are taken than `allowed`
-    Gaussians leave room for, the largest scores first. opacity_decay: factor on the opacities of those that stay
-    and are nearer to the origin than `decay_within`.
+    random: places the two halves of a split Gaussian.
+    extent: radius of the cameras in the training world.
+    allowed: most Gaussians afterwards; those with the largest mean gradient are doubled first.
+    opacity_decay: factor on the opacities of the Gaussians that stay as they are.
+    decay_within: distance from the origin, in the training world, up to which opacities decay.
     """
     before = engine.count
     score = engine.plain_sum / engine.visible_count.clamp_min(1)
     rows = Rows.of(engine)
-    stay = prune.keep(rows.gaussians, engine.max_extent)
-    hot = stay & (score > THRESHOLD)
-    hot = strongest(hot, score, allowed - int(stay.sum()))
+    kept = prune.keep(rows.gaussians, engine.max_extent)
+    doubled = largest(kept & (score > THRESHOLD), score, allowed - int(kept.sum()))
     large = rows.gaussians.log_scales.amax(dim=1) > math.log(SMALL * extent)
-    split, clone = hot & large, hot & ~large
+    split, clone = doubled & large, doubled & ~large
     new = concatenate(
         rows.gaussians.select(clone),
         halves(rows.gaussians.select(split), random),
     )
-    rows = rows.keep(stay & ~split)
+    rows = rows.keep(kept & ~split)
     if opacity_decay < 1.0:
         near = rows.gaussians.means.norm(dim=1) < decay_within
         opacities = rows.gaussians.logit_opacities
         opacities.copy_(torch.where(near, decayed(opacities, opacity_decay), opacities))
     rows = rows.grown(new)
     rows.into(engine)
-    added = int(hot.sum())
+    added = int(doubled.sum())
     return Change(added=added, removed=before + added - engine.count)
 
 
-def strongest(candidates: Tensor, score: Tensor, room: int) -> Tensor:
-    """bool [N]: at most `room` of the candidates, the largest scores first (ties by index)."""
-    if int(candidates.sum()) <= room:
+def largest(candidates: Tensor, score: Tensor, limit: int) -> Tensor:
+    """The `limit` candidates with the largest scores, bool [N]; ties go to the lower index."""
+    if int(candidates.sum()) <= limit:
         return candidates
     picked = torch.zeros_like(candidates)
-    if room > 0:
+    if limit > 0:
         rank = torch.where(candidates, score, torch.full_like(score, -1.0))
-        picked[torch.argsort(rank, descending=True, stable=True)[:room]] = True
+        picked[torch.argsort(rank, descending=True, stable=True)[:limit]] = True
     return picked
 
 
 def halves(gaussians: Gaussians, random: torch.Generator) -> Gaussians:
-    """Two Gaussians for each: placed at random inside it, smaller by SPLIT_SHRINK."""
+    """Two Gaussians for each: drawn at random from it, smaller by SPLIT_SHRINK; first halves first."""
     twice = gaussians.map(lambda value: torch.cat([value, value]))
     twice.means.add_(offsets(twice, random))
     twice.log_scales.sub_(math.log(SPLIT_SHRINK))

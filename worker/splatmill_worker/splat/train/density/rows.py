@@ -1,4 +1,4 @@
-"""Rows of a scene under optimisation: parameters and moments, cut, grown and written back together."""
+"""Gaussians with the optimiser's moments, so that both are selected and appended together."""
 
 from __future__ import annotations
 
@@ -14,7 +14,12 @@ from splatmill_worker.splat.gaussians import Gaussians, concatenate
 
 @dataclass
 class Rows:
-    """N Gaussians with Adam's moments [N, 59]; new rows start with zero moments."""
+    """N Gaussians with Adam's moments.
+
+    gaussians: the parameters.
+    exp_avg: first moments [N, 59], in the engine's column order.
+    exp_avg_sq: second moments [N, 59].
+    """
 
     gaussians: Gaussians
     exp_avg: Tensor
@@ -22,7 +27,7 @@ class Rows:
 
     @staticmethod
     def of(engine: Engine) -> Rows:
-        """A copy of what the engine holds."""
+        """A copy of the scene and the moments that `engine` holds."""
         return Rows(Gaussians(**engine.parameters()), *engine.moments())
 
     def keep(self, rows: Tensor) -> Rows:
@@ -30,7 +35,7 @@ class Rows:
         return Rows(self.gaussians.select(rows), self.exp_avg[rows], self.exp_avg_sq[rows])
 
     def grown(self, new: Gaussians) -> Rows:
-        """With `new` appended."""
+        """The rows with `new` ones appended, whose moments are zero."""
         zeros = self.exp_avg.new_zeros(new.count, self.exp_avg.shape[1])
         return Rows(
             concatenate(self.gaussians, new),
@@ -39,7 +44,7 @@ class Rows:
         )
 
     def into(self, engine: Engine) -> None:
-        """Hand the rows back to the engine; its scores start again at zero."""
+        """Replace the scene and the moments of `engine`; its scores start at zero."""
         engine.replace(self.gaussians.parameters(), self.exp_avg, self.exp_avg_sq)
 
 
