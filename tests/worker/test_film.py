@@ -1,6 +1,6 @@
-"""Proves that a video is whole or not there, and that what broke it is what is told.
+"""Proves that a video is complete or absent, that an error while it is written is the one raised, and its size.
 
-Does not prove what the pictures show: `test_fit_image` and `test_pipeline` decode theirs.
+Does not prove what the frames show: `test_fit_image` and `test_pipeline` decode theirs.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatmill_worker.film import Film, whole
+from splatmill.files import replacing
+from splatmill_worker.film import Film, with_even_sides
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.report.progress_film import HELD, ProgressFilm
 from splatmill_worker.splat.views import TrainingView
@@ -22,12 +23,12 @@ GREY = np.full((16, 32, 3), 128, np.uint8)
 
 
 def progress(folder: Path, *, anew: bool = False) -> ProgressFilm:
-    """A film that is only developed: the view and the plan are for taking shots."""
+    """A film that is only written; the view and the plan, which are for taking shots, are absent."""
     return ProgressFilm(folder, cast(TrainingView, None), cast(Plan, None), anew=anew)
 
 
-def test_a_film_is_there_when_it_is_whole(tmp_path: Path) -> None:
-    with whole(tmp_path / "a.mp4") as part, Film(part, 32, 16, 24) as film:
+def test_a_film_appears_when_it_is_complete(tmp_path: Path) -> None:
+    with replacing(tmp_path / "a.mp4") as part, Film(part, 32, 16, 24) as film:
         film.add(GREY)
         assert not (tmp_path / "a.mp4").exists()
     with av.open(str(tmp_path / "a.mp4")) as video:
@@ -36,9 +37,9 @@ def test_a_film_is_there_when_it_is_whole(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("pictures", [0, 3])
-def test_what_breaks_a_film_is_what_is_told(tmp_path: Path, pictures: int) -> None:
+def test_an_error_leaves_the_earlier_film_and_is_raised(tmp_path: Path, pictures: int) -> None:
     def break_off() -> None:
-        with whole(tmp_path / "a.mp4") as part, Film(part, 32, 16, 24) as film:
+        with replacing(tmp_path / "a.mp4") as part, Film(part, 32, 16, 24) as film:
             for _ in range(pictures):
                 film.add(GREY)
             raise ZeroDivisionError
@@ -48,6 +49,17 @@ def test_what_breaks_a_film_is_what_is_told(tmp_path: Path, pictures: int) -> No
         break_off()
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
     assert (tmp_path / "a.mp4").read_text() == "an earlier one"
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"), [((5, 8), (20, 32)), ((16, 33), (16, 34)), ((1, 1), (16, 16)), ((17, 21), (18, 22))]
+)
+def test_odd_and_tiny_images_get_even_sides(size: tuple[int, int], expected: tuple[int, int]) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (*size, 3), np.uint8)
+    shown = with_even_sides(pixels)
+    assert shown.shape == (*expected, 3)
+    factor = expected[0] // size[0]
+    np.testing.assert_array_equal(shown[: size[0] * factor : factor, : size[1] * factor : factor], pixels)
 
 
 def test_shots_become_a_film_and_none_become_none(tmp_path: Path) -> None:

@@ -1,8 +1,8 @@
-"""Imports pycolmap without letting it take over the process.
+"""Imports pycolmap, restores the handler of SIGTERM, and silences pycolmap's log.
 
-On import it installs handlers for SIGTERM and the crash signals that print a stack trace and abort: a worker
-told to end would die with a core dump instead of handing its job back. It also talks on stderr about each step;
-what goes wrong comes back as an exception anyway.
+On import, pycolmap installs handlers for SIGTERM and for crashes that print a stack trace and abort: a worker that is
+asked to end would dump core instead of handing its job back. Its log goes to stderr; errors are raised as exceptions
+as well.
 """
 
 from __future__ import annotations

@@ -17,10 +17,11 @@ import torch
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from splatmill.files import replacing
 from splatmill.schema import FitImageOptions, ModelCamera, ModelCameras
 from splatmill.schema.photos import MAX_PHOTO_PIXELS, MIN_PHOTO_SIDE
 from splatmill_worker.errors import Refusal, TrainingFailed
-from splatmill_worker.film import Film, even, whole
+from splatmill_worker.film import Film, with_even_sides
 from splatmill_worker.fit_image import plane
 from splatmill_worker.images import load_view
 from splatmill_worker.images.decode import upright_size
@@ -232,8 +233,8 @@ def _size(photo: Path, say: Say) -> tuple[int, int]:
 @contextmanager
 def _emerging(path: Path, view: TrainingView) -> Iterator[_Emerging]:
     """The video at `path`, which is there when it is whole."""
-    height, width = even(view.full.rgb.numpy()).shape[:2]
-    with whole(path) as part, Film(part, width, height, FPS) as film:
+    height, width = with_even_sides(view.full.rgb.numpy()).shape[:2]
+    with replacing(path) as part, Film(part, width, height, FPS) as film:
         yield _Emerging(film, width, height)
 
 
@@ -246,7 +247,7 @@ class _Emerging:
 
     def add(self, color: Tensor) -> None:
         """Append a rendering [H, W, 3]."""
-        self._last = even(np.asarray(as_image(color)))
+        self._last = with_even_sides(np.asarray(as_image(color)))
         self._film.add(self._last)
 
     def hold(self) -> None:

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from splatmill.files import replacing
 from splatmill.schema import format_duration
-from splatmill_worker.film import Film, even, whole
+from splatmill_worker.film import Film, with_even_sides
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.renderer import render_view
@@ -52,7 +52,7 @@ class ProgressFilm:
         started = time.perf_counter()
         color = render_view(engine, self._plan, self._view)
         picture = Image.fromarray(
-            even((color.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy())
+            with_even_sides((color.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy())
         )
         _caption(picture, f"{format_duration(seconds)}   {engine.count:,} Gaussians")
         while self.is_due(progress):
@@ -73,7 +73,7 @@ class ProgressFilm:
             return False
         with Image.open(shots[0]) as first:
             width, height = first.size
-        with whole(path) as part, Film(part, width, height, FPS) as film:
+        with replacing(path) as part, Film(part, width, height, FPS) as film:
             for shot in shots:
                 with Image.open(shot) as picture:
                     pixels = np.asarray(picture.convert("RGB"))
