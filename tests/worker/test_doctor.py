@@ -1,6 +1,6 @@
-"""Proves that `splatmill doctor` reports this machine, and that it notices a Redis that does not answer.
+"""Proves that `splatmill doctor` finds this machine in order, and that it names what is wrong and says what to do.
 
-Does not prove its findings on machines that lack other things.
+Does not prove its findings on machines without a compiler, without memory or with a GPU.
 """
 
 import json
@@ -8,22 +8,39 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 
-def test_doctor_reports_this_machine_and_finds_what_is_wrong(tmp_path: Path) -> None:
-    def doctor(**environment: str) -> tuple[int, dict[str, str]]:
-        done = subprocess.run(
-            [sys.executable, "-m", "splatmill_worker", "doctor", "--json"],
-            env=dict(os.environ) | {"SPLATMILL_DATA": str(tmp_path)} | environment,
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
-        return done.returncode, {line["topic"]: line["verdict"] for line in json.loads(done.stdout)}
+def doctor(data: Path, **environment: str) -> tuple[int, dict[str, dict[str, Any]]]:
+    """Exit status and the findings by topic; where a topic has several, the last."""
+    done = subprocess.run(
+        [sys.executable, "-m", "splatmill_worker", "doctor", "--json"],
+        env=dict(os.environ) | {"SPLATMILL_DATA": str(data)} | environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    return done.returncode, {finding["topic"]: finding for finding in json.loads(done.stdout)}
 
-    status, verdicts = doctor()
+
+def test_this_machine_is_in_order(tmp_path: Path) -> None:
+    status, findings = doctor(tmp_path)
     assert status == 0
-    assert {"python", "kernels", "memory", "disk", "redis", "storage", "gpu"} <= verdicts.keys()
-    status, verdicts = doctor(REDIS_URL=f"unix://{tmp_path}/nothing.sock")
+    topics = {"python", "parts", "colmap", "kernels", "threads", "memory", "disk", "redis", "storage", "gpu"}
+    assert findings.keys() == topics
+    assert not [topic for topic, finding in findings.items() if finding["verdict"] == "bad"]
+
+
+def test_what_is_wrong_is_found_and_advised_on(tmp_path: Path) -> None:
+    status, findings = doctor(
+        tmp_path,
+        REDIS_URL=f"unix://{tmp_path}/nothing.sock",
+        SPLATMILL_STORAGE="ftp://nowhere",
+        SPLATMILL_CPU_ISA="baseline",
+    )
     assert status == 1
-    assert verdicts["redis"] == "bad"
+    wrong = {"redis": "bad", "storage": "bad", "kernels": "warning"}
+    assert {topic: findings[topic]["verdict"] for topic in wrong} == wrong
+    assert all(findings[topic]["advice"] for topic in wrong)
+    assert "nothing.sock" in findings["redis"]["seen"]
+    assert "ftp://nowhere" in findings["storage"]["seen"]

@@ -1,4 +1,4 @@
-"""`python -m splatmill_worker train | renderer | fit-image | doctor | bench NAME`."""
+"""The worker's programs: `python -m splatmill_worker train | renderer | fit-image | doctor | bench NAME`."""
 
 import argparse
 import ctypes
@@ -7,47 +7,46 @@ import os
 import sys
 from pathlib import Path
 
-SPINS = "1000"
-"""How often a thread looks before it sleeps at a barrier of the kernels. OpenMP's default spins for milliseconds,
-which keeps the thread that is waited for off the core wherever cores are shared: beside other work on two cores a
-training step took ten times as long. On a quiet machine this costs 2 %."""
+SPIN_COUNT = "1000"
+"""GOMP_SPINCOUNT: how often a thread polls at a barrier of the kernels before it sleeps. Under OpenMP's default it
+polls for milliseconds, and occupies the core that the awaited thread needs (decisions: SPIN_COUNT)."""
 
-OWN_PAGES = 8 * 2**20
-"""Bytes from which an allocation has pages of its own, which go back when it is freed. glibc moves this limit up to
-32 MiB by itself; the rows that densification copies then leave holes, and an attempt kept 200 MB more."""
+MMAP_THRESHOLD = 8 * 2**20
+"""Size in bytes from which glibc maps memory for an allocation alone, and returns it to the system when it is freed.
+Without it, glibc raises the size to 32 MiB by itself (decisions: MMAP_THRESHOLD)."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one of the worker's programs; returns its exit status."""
+    """Run one of the worker's programs and return its exit status."""
     parser = argparse.ArgumentParser(prog="python -m splatmill_worker", description=__doc__)
     programs = parser.add_subparsers(dest="program", required=True)
     train = programs.add_parser(
-        "train", help="take jobs from the queue (REDIS_URL, SPLATMILL_STORAGE, SPLATMILL_DATA)"
+        "train", help="run jobs from the queue (set REDIS_URL, SPLATMILL_STORAGE and SPLATMILL_DATA)"
     )
     train.add_argument(
-        "--stop-grace", type=float, help="seconds a job has to save its state when told to stop"
+        "--stop-grace", type=float, help="seconds that a job has to save its state when the worker is stopped"
     )
-    renderer = programs.add_parser("renderer", help="render stored models over HTTP")
+    renderer = programs.add_parser("renderer", help="render stored models on request over HTTP")
     renderer.add_argument("--host", default="127.0.0.1")
     renderer.add_argument("--port", type=int, default=8090)
     renderer.add_argument("--uds", type=Path, help="listen on this unix socket instead of host and port")
     renderer.add_argument(
-        "--backend", choices=["reference", "cpu", "gpu"], help="what computes (default: cpu)"
+        "--backend", choices=["reference", "cpu", "gpu"], help="kernels to render with (default: cpu)"
     )
-    fit_image = programs.add_parser("fit-image", help="fit one picture by Gaussians in a plane")
+    fit_image = programs.add_parser("fit-image", help="fit one image by Gaussians in a plane")
     fit_image.add_argument("photo", type=Path)
     fit_image.add_argument("--out", type=Path, required=True, help="folder for the results")
     fit_image.add_argument("--options", default="{}", help="FitImageOptions as JSON")
-    doctor = programs.add_parser("doctor", help="check this machine and say what to do")
-    doctor.add_argument("--json", action="store_true", help="one JSON document instead of lines")
+    doctor = programs.add_parser("doctor", help="check whether Splatmill runs on this machine")
+    doctor.add_argument("--json", action="store_true", help="print one JSON document instead of lines")
     bench = programs.add_parser("bench", help="run worker/bench/NAME.py (source tree only)")
     bench.add_argument("name")
     bench.add_argument("arguments", nargs=argparse.REMAINDER)
     chosen = parser.parse_args(argv)
     if "OMP_WAIT_POLICY" not in os.environ:
-        os.environ.setdefault("GOMP_SPINCOUNT", SPINS)  # read once, when torch is loaded
+        os.environ.setdefault("GOMP_SPINCOUNT", SPIN_COUNT)  # OpenMP reads it once, when torch is imported
     if chosen.program == "train":
-        give_memory_back()
+        return_freed_memory()
         from splatmill_worker.service.command import serve
 
         return serve(chosen.stop_grace)
@@ -66,12 +65,12 @@ def main(argv: list[str] | None = None) -> int:
     return _bench(chosen.name, chosen.arguments)
 
 
-def give_memory_back() -> None:
-    """Keep glibc from holding on to what was freed; other C libraries are left as they are."""
-    mmap_threshold, arena_max = -3, -8  # malloc.h
+def return_freed_memory() -> None:
+    """Let glibc return freed memory to the system. There is no effect with another C library."""
+    mmap_threshold, arena_max = -3, -8  # M_MMAP_THRESHOLD and M_ARENA_MAX of malloc.h
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None and sys.platform == "linux":
-        mallopt(mmap_threshold, OWN_PAGES)
+        mallopt(mmap_threshold, MMAP_THRESHOLD)
         mallopt(arena_max, 2)
 
 
@@ -81,9 +80,9 @@ def _bench(name: str, arguments: list[str]) -> int:
     if not script.is_file():
         known = sorted(path.stem for path in folder.glob("*.py") if not path.stem.startswith("_"))
         print(
-            f"There is no benchmark {name!r}; there are {', '.join(known)}."
+            f"There is no benchmark {name!r}. The benchmarks are {', '.join(known)}."
             if known
-            else "Benchmarks are no part of the installed package: run this from a source tree.",
+            else "The benchmarks are not part of the installed package. Run this in a source tree.",
             file=sys.stderr,
         )
         return 2

