@@ -80,21 +80,21 @@ def run(
         task.out.mkdir(parents=True, exist_ok=True)
         _warn_of_idle_gpu(task)
         emit(StateEvent(state=JobState.sfm))
-        cameras = _cameras(task, stages)
+        cameras = _recover_cameras(task, stages)
         emit(StateEvent(state=JobState.training))
-        probed = _photos(cameras, loading_size(options, task.kernels), stages)
+        probed = _load_photos(cameras, loading_size(options, task.kernels), stages)
         with stages.measured("plan"):
             first, start = _first_gaussians(task, cameras, probed)
-            facts = _facts(task, cameras, probed, first, start)
-            plan = _plan(task, facts, revise)
+            facts = _measure_facts(task, cameras, probed, first, start)
+            plan = _make_plan(task, facts, revise)
         emit(PlanEvent(plan=plan.as_dict()))
-        photos = _photos_as_planned(cameras, probed, plan, facts, stages)
+        photos = _resize_photos(cameras, probed, plan, facts, stages)
         engine = open_engine(_seeded(first, cameras, photos, plan), plan.kernels)
-        training = _trained(task, engine, photos, plan)
+        training = _train(task, engine, photos, plan)
     except Cancelled:
         return Outcome("cancelled", workdir / "out")
     emit(StateEvent(state=JobState.exporting))
-    _leave(task, cameras, photos, facts, plan, engine, training, stages)
+    _write_files(task, cameras, photos, facts, plan, engine, training, stages)
     return Outcome("succeeded", task.out, training.trained)
 
 
@@ -159,7 +159,7 @@ def _warn_of_idle_gpu(task: Task) -> None:
         task.emit(LogEvent(level="warning", message=f"{absence()} Training runs on the CPU."))
 
 
-def _cameras(task: Task, stages: Stages) -> Cameras:
+def _recover_cameras(task: Task, stages: Stages) -> Cameras:
     """The cameras that came with the photos or are recovered from them, and which photos are held out."""
     with stages.measured("sfm"):
         scene = cameras_of(
@@ -174,7 +174,7 @@ def _cameras(task: Task, stages: Stages) -> Cameras:
     return Cameras(scene, normalization, normalization.apply(scene), training, held_out)
 
 
-def _photos(cameras: Cameras, size: int, stages: Stages) -> Photos:
+def _load_photos(cameras: Cameras, size: int, stages: Stages) -> Photos:
     """All photos, undistorted, with `size` pixels at most on the longer side."""
     with stages.measured("load"):
         training, held_out = (
@@ -184,11 +184,11 @@ def _photos(cameras: Cameras, size: int, stages: Stages) -> Photos:
     return Photos(training, held_out)
 
 
-def _photos_as_planned(cameras: Cameras, loaded: Photos, plan: Plan, facts: Facts, stages: Stages) -> Photos:
+def _resize_photos(cameras: Cameras, loaded: Photos, plan: Plan, facts: Facts, stages: Stages) -> Photos:
     """The photos that are `loaded`, or smaller ones where the plan needs no more."""
     if plan.image_size >= max(facts.width, facts.height):
         return loaded
-    return _photos(cameras, plan.image_size, stages)
+    return _load_photos(cameras, plan.image_size, stages)
 
 
 def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaussians, GivenModel | None]:
@@ -198,7 +198,7 @@ def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaus
         given = read_given_model(path, cameras.normalization)
         start = assess(given, photos.training)
         if start.doubtful:
-            task.emit(LogEvent(level="warning", message=_doubt(start)))
+            task.emit(LogEvent(level="warning", message=_doubt_message(start)))
         return given, start
     world = cameras.world
     if len(world.points) >= ENOUGH_POINTS:
@@ -207,14 +207,14 @@ def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaus
     return from_points(*sample_frusta(targets, RANDOM_GAUSSIANS, task.options.seed)), None
 
 
-def _doubt(start: GivenModel) -> str:
+def _doubt_message(start: GivenModel) -> str:
     return (
         f"The model given shows the training photos at {start.psnr:.1f} dB, hardly better than one colour per photo "
         f"({start.one_color:.1f} dB). If it is of another scene, train without it."
     )
 
 
-def _facts(
+def _measure_facts(
     task: Task, cameras: Cameras, photos: Photos, gaussians: Gaussians, start: GivenModel | None
 ) -> Facts:
     """What can be measured before training: the scene, and how fast this machine trains it."""
@@ -224,7 +224,7 @@ def _facts(
     return facts if card is None else replace(facts, memory_available=card.free_bytes)
 
 
-def _plan(task: Task, facts: Facts, revise: Revise) -> Plan:
+def _make_plan(task: Task, facts: Facts, revise: Revise) -> Plan:
     """The plan, made once: an attempt that goes on keeps the one that it started with."""
     stored = task.workdir / "plan.json"
     kept = read_plan(stored, task.options)
@@ -257,7 +257,7 @@ def _seeded(first: Gaussians, cameras: Cameras, photos: Photos, plan: Plan) -> G
     )
 
 
-def _trained(task: Task, engine: Engine, photos: Photos, plan: Plan) -> Training:
+def _train(task: Task, engine: Engine, photos: Photos, plan: Plan) -> Training:
     """Train to the end of the budget, from the checkpoint of an earlier attempt where there is one."""
     checkpoints = task.workdir / "checkpoints"
     earlier = _resumable(checkpoints, photos)
@@ -291,7 +291,7 @@ def _resumable(checkpoints: Path, photos: Photos) -> Snapshot | None:
     return snapshot if snapshot is not None and snapshot.view_names == names else None
 
 
-def _leave(
+def _write_files(
     task: Task,
     cameras: Cameras,
     photos: Photos,
