@@ -78,7 +78,7 @@ def test_corrected_cameras_are_exported_and_held_out_ones_are_not_touched(tmp_pa
     out = run(capture, tmp_path / "work", options(pose_refinement="on"))[0].out
     report = json.loads((out / "report.json").read_text())
     assert 0.0 < report["result"]["cameras_moved_pixels"] < 5.0
-    assert "Held-out cameras stay as they came" in report["plan"]["reasons"]["pose_refinement"]
+    assert "Held-out cameras are not corrected" in report["plan"]["reasons"]["pose_refinement"]
     cameras = ModelCameras.model_validate_json((out / "cameras.json").read_text()).cameras
     given = {view.name: view.camera.center for view in still_life.scene().views}
     moves = {
