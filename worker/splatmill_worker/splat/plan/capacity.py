@@ -13,7 +13,7 @@ from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.reasons import Reasons
 
 PRESET_STEPS = {Preset.draft: 1000, Preset.balanced: 3000, Preset.quality: 10_000}
-"""Steps without a budget."""
+"""Number of steps where no budget is given."""
 
 GAUSSIANS_PER_ROOT_STEP = 1550.0
 """Gaussians that a run can train, per square root of its number of steps (decisions: GAUSSIANS_PER_ROOT_STEP)."""
@@ -25,7 +25,7 @@ MEAN_STEP = 0.8
 """Time of the mean step over that of the last: early steps have smaller photos and fewer Gaussians."""
 
 ASSUMED_SPEED = Speed(per_pixel=3e-8, per_gaussian=1e-7)
-"""Where no probe was run."""
+"""Speed of a machine that was not probed."""
 
 
 class Capacity(NamedTuple):
@@ -65,7 +65,8 @@ def decide_capacity(
 ) -> Capacity:
     """The budget, and the number of Gaussians that pays within it.
 
-    initial: number of Gaussians before the first step. pixels: pixels of a photo at the training size.
+    initial: number of Gaussians before the first step.
+    pixels: number of pixels of a photo at the training size.
     """
     limits = _limits(facts, options, kernels, pixels, initial)
     budget, steps = _budget(options, facts.speed or ASSUMED_SPEED, pixels, initial, limits, reasons)
@@ -107,7 +108,7 @@ def _budget(
         reasons.option("budget")
         reasons.chosen["schedule"] = f"The option steps asks for {options.steps} steps."
         return Budget(options.steps), options.steps
-    # A target is reached or not: it needs room to be.
+    # A target ends the run as soon as it is reached, so that the longest preset costs no more than is needed.
     preset = Preset.quality if options.target_psnr is not None else options.preset
     steps = PRESET_STEPS[preset]
     reasons.chosen["budget"] = f"No budget was given; the preset {preset.value} allows {steps} steps."

@@ -119,7 +119,7 @@ def _schedule(
 
 
 def _resolution(steps: int, image_size: int, reasons: Reasons) -> tuple[tuple[int, int], ...]:
-    """Coarse to fine: pairs of first step and reduction of the photos (decisions: coarse-to-fine)."""
+    """Coarse to fine: a quarter of the photos' size first, then half, then all of it (decisions: coarse-to-fine)."""
     first, second = max(20, min(200, steps // 8)), max(50, min(500, steps // 3))
     if image_size < 100:
         reasons.left_out["coarse_to_fine"] = f"Photos of {image_size} pixels are too small to be reduced."

@@ -34,7 +34,16 @@ RESIDUAL_FLOOR = 0.02
 """Natural logarithm of brightness: residuals below this floor have the same weight."""
 
 ITERATIONS = 30
-"""Of the reweighted least squares that separates exposures from the brightness of points."""
+"""Iterations of the reweighted least squares that separates exposures from the brightness of points."""
+
+ENOUGH_OBSERVATIONS = 40
+"""With fewer observations, nothing is said about exposures, angles and distances."""
+
+ENOUGH_OF_A_PHOTO = 10
+"""Observations from which the exposure of a photo counts."""
+
+ENOUGH_PHOTOS = 3
+"""Photos from which the spread of exposures is measured."""
 
 
 @dataclass(frozen=True)
@@ -235,7 +244,7 @@ def _spread(seen: _Observations, log: Float) -> float | None:
 
     Each value is the sum of a point's part and a photo's part. Both are solved for by reweighted least squares in
     alternation. The weights fall with the residual, so that outliers (highlights, occlusions) move little.
-    None where fewer than three photos have ten observations.
+    None where fewer than ENOUGH_PHOTOS photos have ENOUGH_OF_A_PHOTO observations.
     """
     share = np.zeros(seen.photos)
     weight = np.ones(len(log))
@@ -245,8 +254,8 @@ def _spread(seen: _Observations, log: Float) -> float | None:
         share -= np.median(share)
         left = log - point[seen.point] - share[seen.photo]
         weight = 1.0 / np.maximum(np.abs(left), RESIDUAL_FLOOR)
-    enough = np.bincount(seen.photo, minlength=seen.photos) >= 10
-    if enough.sum() < 3:
+    enough = np.bincount(seen.photo, minlength=seen.photos) >= ENOUGH_OF_A_PHOTO
+    if enough.sum() < ENOUGH_PHOTOS:
         return None
     return float(1.4826 * np.median(np.abs(share[enough] - np.median(share[enough]))))
 
@@ -273,7 +282,7 @@ class _Observations:
     @staticmethod
     def of(scene: Scene, views: Sequence[TrainingView]) -> _Observations | None:
         """The observations of the scene's tracks in `views`; None without tracks, or with too few of them."""
-        if scene.point_views is None or len(scene.points) < 20:
+        if scene.point_views is None or len(scene.points) < ENOUGH_POINTS:
             return None
         number = {view.name: i for i, view in enumerate(views)}
         of_scene = np.array([number.get(view.name, -1) for view in scene.views], dtype=np.int64)
@@ -294,7 +303,7 @@ class _Observations:
             direction = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
             columns.append((rows, np.full(len(rows), i), color, z / camera.fx, direction))
         joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
-        if len(joined[0]) < 40:
+        if len(joined[0]) < ENOUGH_OBSERVATIONS:
             return None
         return _Observations(len(scene.points), len(views), *joined)
 

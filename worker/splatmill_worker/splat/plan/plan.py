@@ -16,7 +16,7 @@ BYTES_PER_GAUSSIAN = 59 * 4 * 8
 while they are rewritten, the snapshot, and room for the kernels' records."""
 
 BYTES_OF_PROGRAM = 350 * 10**6
-"""Memory of the program and the photos."""
+"""Memory that is assumed for the program and the photos."""
 
 
 @dataclass(frozen=True)

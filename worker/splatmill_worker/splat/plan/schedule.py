@@ -13,8 +13,8 @@ class Schedule:
     """The course of a run.
 
     budget: its limits in steps and seconds.
-    resolution: pairs of first step and reduction. Photos are reduced by 4, then by 2, then not at all, because
-        early steps gain as much from a small photo as from a large one.
+    resolution: pairs of a step and the factor by which photos are reduced after it, until the next pair. Early steps
+        gain as much from a small photo as from a large one.
     degree: of the spherical harmonics, from the first step on.
     densify_from: first step after which Gaussians may be added.
     densify_every: steps between densifications.
