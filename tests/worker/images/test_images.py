@@ -68,7 +68,7 @@ def test_unusable_files_are_named_with_their_reason(photos: Path, tmp_path: Path
     assert "good.jpg" in found["same.jpg"]
     assert "not an image" in found["text.jpg"]
     assert "empty" in found["empty.png"]
-    assert "does not decode" in found["cut.jpg"]
+    assert "does not decode completely" in found["cut.jpg"]
     assert "too small" in found["one.png"]
 
 

@@ -18,7 +18,7 @@ import pytest
 from splatmill_worker import sfm, synthetic
 from splatmill_worker.errors import Cancelled
 from splatmill_worker.images import exif
-from splatmill_worker.images.prepare import Usable
+from splatmill_worker.images.prepare import UsablePhoto
 from splatmill_worker.scene import Camera, Scene
 from splatmill_worker.sfm import cameras
 from splatmill_worker.sfm.features import Features
@@ -190,8 +190,8 @@ def test_matches_are_the_mutual_nearest_that_pass_the_ratio_test() -> None:
     assert found == {(k, 100 + k) for k in range(10, 200)}
 
 
-def usable(name: str, **tags: object) -> Usable:
-    return Usable(name, Path(name), name, 640, 480, exif.Exif(**tags))  # type: ignore[arg-type]
+def usable(name: str, **tags: object) -> UsablePhoto:
+    return UsablePhoto(name, Path(name), name, 640, 480, exif.Exif(**tags))  # type: ignore[arg-type]
 
 
 def test_photos_that_agree_share_a_camera() -> None:

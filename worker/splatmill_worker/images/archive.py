@@ -1,4 +1,4 @@
-"""Zips of photos, unpacked without trusting them: names stay inside, sizes stay bounded."""
+"""Unpacks zips of strangers: names that leave the target folder, links and zip bombs are refused."""
 
 from __future__ import annotations
 
@@ -10,23 +10,36 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from splatmill_worker.errors import Cancelled
 
 MAX_ENTRIES = 20_000
+"""Files in an archive, at most."""
+
 MAX_FILE_BYTES = 2 * 2**30
+"""Bytes of an unpacked file, at most."""
+
 MAX_TOTAL_BYTES = 16 * 2**30
-MAX_RATIO = 100  # photos and videos hardly deflate; a bomb does by a thousand
-RATIO_FLOOR = 2**20  # bytes below which the ratio of a file says nothing
+"""Bytes of all unpacked files, at most."""
+
+MAX_RATIO = 100
+"""Unpacked over packed size of a file, at most: photos and videos hardly compress, a zip bomb does by a thousand."""
+
+RATIO_FLOOR = 2**20
+"""Bytes of an unpacked file up to which its ratio is not limited."""
+
 CHUNK = 2**20
+"""Bytes written at a time; size and cancellation are checked in between."""
 
 
 class UnsafeArchive(ValueError):
-    """The archive is refused as a whole; the message says for what."""
+    """The whole archive is refused; the message is the reason."""
 
 
 def unpack(path: Path, target: Path, cancelled: Callable[[], bool] = lambda: False) -> list[Path]:
-    """Writes the archive's files under `target` and returns them, in the archive's order.
+    """Write the archive's files under `target` and return their paths, in the archive's order.
 
-    Sizes are checked as declared before anything is written, and as they really are while writing. Hidden
-    files and macOS' resource forks are left out. Raises UnsafeArchive for absolute names, `..`, links,
-    encryption, bombs, too many files, and files that are no zip.
+    Sizes are checked as declared before anything is written, and as they are while writing. Hidden files and the
+    resource forks of macOS are left out.
+
+    Raises UnsafeArchive for absolute names, names with `..`, links, encrypted files, zip bombs, too many files, and
+    files that are no complete zip; Cancelled when `cancelled()` turns true.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -44,12 +57,13 @@ def unpack(path: Path, target: Path, cancelled: Callable[[], bool] = lambda: Fal
                 written.append(place)
             return written
     except (zipfile.BadZipFile, NotImplementedError, EOFError) as error:
-        raise UnsafeArchive(f"it is not a whole zip file ({error})") from error
+        raise UnsafeArchive(f"it is not a complete zip file ({error})") from error
 
 
 def _check_declared(entries: list[zipfile.ZipInfo]) -> None:
+    """Raise UnsafeArchive for names, kinds and sizes in the archive's directory that are not allowed."""
     if len(entries) > MAX_ENTRIES:
-        raise UnsafeArchive(f"it holds {len(entries)} files; at most {MAX_ENTRIES} are unpacked")
+        raise UnsafeArchive(f"it holds {len(entries)} files; at most {MAX_ENTRIES} are allowed")
     seen: set[str] = set()
     for entry in entries:
         name = entry.filename
@@ -67,20 +81,24 @@ def _check_declared(entries: list[zipfile.ZipInfo]) -> None:
         seen.add(name)
         if entry.file_size > MAX_FILE_BYTES:
             raise UnsafeArchive(
-                f"{name!r} would be {entry.file_size} bytes; at most {MAX_FILE_BYTES} are unpacked"
+                f"{name!r} has {entry.file_size} bytes when unpacked; at most {MAX_FILE_BYTES} are allowed"
             )
         if entry.file_size > RATIO_FLOOR and entry.file_size > MAX_RATIO * max(entry.compress_size, 1):
             ratio = entry.file_size // max(entry.compress_size, 1)
-            raise UnsafeArchive(f"{name!r} is compressed {ratio} to 1, as no photo is: a zip bomb")
+            raise UnsafeArchive(
+                f"{name!r} is compressed {ratio} to 1, where at most {MAX_RATIO} to 1 is allowed; it may be a zip bomb"
+            )
     total = sum(entry.file_size for entry in entries)
     if total > MAX_TOTAL_BYTES:
-        raise UnsafeArchive(f"its files would be {total} bytes; at most {MAX_TOTAL_BYTES} are unpacked")
+        raise UnsafeArchive(
+            f"its files have {total} bytes when unpacked; at most {MAX_TOTAL_BYTES} are allowed"
+        )
 
 
 def _write(
     archive: zipfile.ZipFile, entry: zipfile.ZipInfo, place: Path, total: int, cancelled: Callable[[], bool]
 ) -> int:
-    """Streams one entry to `place` and returns the bytes written so far, which headers cannot understate."""
+    """Write one entry to `place`; returns `total` plus the bytes written, counted and not as the header declares."""
     size = 0
     with archive.open(entry) as source, place.open("wb") as sink:
         while chunk := source.read(CHUNK):
@@ -89,6 +107,8 @@ def _write(
             size += len(chunk)
             total += len(chunk)
             if size > entry.file_size or size > MAX_FILE_BYTES or total > MAX_TOTAL_BYTES:
-                raise UnsafeArchive(f"{entry.filename!r} is larger than its header says: a zip bomb")
+                raise UnsafeArchive(
+                    f"{entry.filename!r} is larger than its header says; it may be a zip bomb"
+                )
             sink.write(chunk)
     return total

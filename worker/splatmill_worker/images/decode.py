@@ -1,4 +1,4 @@
-"""One photo file to pixels: decoded, turned upright, reduced by whole factors on the way where the size allows."""
+"""Decodes one photo: upright by its EXIF orientation, with 8 bits per channel, and reduced by a whole factor."""
 
 from __future__ import annotations
 
@@ -14,38 +14,46 @@ pillow_heif.register_heif_opener()
 
 Pixels = npt.NDArray[np.uint8]
 ORIENTATION = 0x0112
-TURNED = (5, 6, 7, 8)  # EXIF orientations that swap width and height
-# Decompression bombs are refused by `check` on the header; Pillow's own limit would only add a warning.
+"""EXIF tag."""
+
+TURNED = (5, 6, 7, 8)
+"""EXIF orientations that swap width and height."""
+
+MAX_REDUCTION = 64
+"""Largest factor by which a decoded photo is reduced."""
+
+# `prepare` refuses decompression bombs by the size in their header; Pillow's limit would only add a warning.
 Image.MAX_IMAGE_PIXELS = None
 
 
 def upright_size(image: Image.Image) -> tuple[int, int]:
-    """Width and height once the EXIF orientation is applied, from the header alone."""
+    """Width and height in pixels once the EXIF orientation is applied; nothing is decoded."""
     width, height = image.size
     return (height, width) if orientation(image) in TURNED else (width, height)
 
 
 def orientation(image: Image.Image) -> int:
-    """The EXIF orientation, 1 (as stored) where there is none or it makes no sense."""
+    """The EXIF orientation, 1 to 8; 1 (as stored) when there is none or it is invalid."""
     value = tags(image).get(ORIENTATION, 1)
     return value if value in range(1, 9) else 1
 
 
 def tags(image: Image.Image) -> Image.Exif:
-    """The EXIF that stands before the pixels; Pillow would decode a whole PNG to look for more behind them."""
+    """The EXIF tags that precede the pixels; to find tags behind them, Pillow would decode a whole PNG."""
     if image.format == "PNG" and not image.info.keys() & {"exif", "Raw profile type exif"}:
         return Image.Exif()
     return image.getexif()
 
 
 def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool = True) -> Image.Image:
-    """The photo as an RGB or RGBA image, or a grey one for a grey file.
+    """The photo as an RGB, RGBA or grey image with 8 bits per channel.
 
-    `at_least` (width, height): the smallest size the caller can use. The photo comes back reduced by a whole
-    factor (box filter; for JPEG in the DCT, which saves most of the decoding time) as long as it stays that
-    large. Only factors that divide both sides are used: a cut pixel at the border would shift the camera.
+    at_least: width and height that the caller needs. The photo is reduced by the largest whole factor that leaves this
+        size: JPEGs in the DCT, which saves most of the decoding time, others by a box filter. Only factors that divide
+        both sides are used, because a cropped border would shift the principal point.
+    upright: apply the EXIF orientation.
 
-    Raises OSError or ValueError for files that do not decode.
+    Raises OSError or ValueError when the file does not decode.
     """
     with Image.open(path) as image:
         turn = upright and orientation(image) != 1
@@ -58,18 +66,17 @@ def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool
                 image.draft(None, (image.width // factor, image.height // factor))
         image.load()
         photo = _plain_mode(ImageOps.exif_transpose(image) if turn else image)
-        if (
-            want is not None and photo.mode != "RGBA"
-        ):  # which Pillow would average in 8-bit premultiplied steps
-            factor = _factor(image.size, want, range(64, 0, -1))
+        # Pillow would reduce RGBA in premultiplied steps of 8 bits, which loses colour.
+        if want is not None and photo.mode != "RGBA":
+            factor = _factor(image.size, want, range(MAX_REDUCTION, 0, -1))
             if factor > 1:
                 photo = photo.reduce(factor)
-        # `image` is closed on the way out; a photo that is still the same object keeps its pixels.
+        # Leaving the block closes `image`.
         return photo.copy() if photo is image else photo
 
 
 def _factor(size: tuple[int, int], at_least: tuple[int, int], choices: Iterable[int]) -> int:
-    """The first of `choices` that divides both sides of `size` and leaves `at_least`; 1 where none does."""
+    """The first of `choices` that divides both sides of `size` and leaves `at_least`; 1 when none does."""
     for factor in choices:
         divides = size[0] % factor == 0 and size[1] % factor == 0
         if divides and size[0] // factor >= at_least[0] and size[1] // factor >= at_least[1]:
@@ -78,7 +85,7 @@ def _factor(size: tuple[int, int], at_least: tuple[int, int], choices: Iterable[
 
 
 def _plain_mode(photo: Image.Image) -> Image.Image:
-    """RGB, RGBA or L with 8 bits, whatever the file held."""
+    """The photo as RGB, RGBA or L with 8 bits per channel."""
     if photo.mode in ("RGB", "RGBA", "L"):
         return photo
     if photo.mode.startswith(("I;16", "I", "F")):
@@ -89,7 +96,7 @@ def _plain_mode(photo: Image.Image) -> Image.Image:
 
 
 def _to_8_bits(values: npt.NDArray[np.generic]) -> Pixels:
-    """16-bit integers by their range, floats as 0..1 (the two conventions of TIFF files)."""
+    """Grey values as uint8: floats from 0 to 1, integers from 0 to 255, or from 0 to 65535 when any exceeds 255."""
     if np.issubdtype(values.dtype, np.floating):
         return np.asarray(np.clip(np.nan_to_num(values) * 255.0 + 0.5, 0, 255), np.uint8)
     wide = values.astype(np.int64)

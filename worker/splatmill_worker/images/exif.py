@@ -1,4 +1,4 @@
-"""What a photo's EXIF says that structure from motion can use: the camera, its focal length, the place."""
+"""The EXIF tags that structure from motion uses: camera, focal length and GPS position."""
 
 from __future__ import annotations
 
@@ -12,14 +12,21 @@ from splatmill_worker.images.decode import tags
 
 MAKE, MODEL, EXIF_IFD, GPS_IFD = 0x010F, 0x0110, 0x8769, 0x8825
 FOCAL_LENGTH, FOCAL_LENGTH_35MM, LENS_MODEL = 0x920A, 0xA405, 0xA434
-FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # mm; the equivalent focal length is defined by the diagonal
+"""EXIF tags."""
+
+FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)
+"""Millimetres; the 35 mm equivalent focal length refers to this diagonal."""
 
 
 @dataclass(frozen=True)
 class Exif:
-    """Absent fields are None. focal_length in mm; `focal_in_diagonals`: focal length over the photo's diagonal.
+    """EXIF of one photo; None: absent or invalid.
 
-    latitude, longitude in degrees (north and east positive), altitude in metres above sea level.
+    make, model, lens: of the camera.
+    focal_length: in millimetres.
+    focal_in_diagonals: focal length over the photo's diagonal, from the 35 mm equivalent.
+    latitude, longitude: in degrees, positive to the north and east.
+    altitude: in metres above sea level.
     """
 
     make: str | None = None
@@ -33,7 +40,7 @@ class Exif:
 
 
 def read(image: Image.Image) -> Exif:
-    """The fields of an opened image; broken EXIF counts as none."""
+    """The tags of an opened image; unreadable EXIF counts as absent."""
     try:
         found = tags(image)
         details, gps = found.get_ifd(EXIF_IFD), found.get_ifd(GPS_IFD)
@@ -44,7 +51,7 @@ def read(image: Image.Image) -> Exif:
         _degrees(gps.get(2), gps.get(1), "S", 90.0),
         _degrees(gps.get(4), gps.get(3), "W", 180.0),
     )
-    # Exactly 0, 0 is what devices write that had no fix.
+    # Devices without a GPS fix write exactly 0, 0.
     if latitude is None or longitude is None or (latitude == 0.0 and longitude == 0.0):
         latitude = longitude = None
     altitude = _number(gps.get(6))
@@ -81,7 +88,7 @@ def _positive(value: Any) -> float | None:
 
 
 def _degrees(value: Any, side: Any, negative: str, bound: float) -> float | None:
-    """Degrees, minutes and seconds as one signed number; None where they make none."""
+    """Degrees, minutes and seconds as one signed number of degrees; None when they are invalid or exceed `bound`."""
     if not isinstance(value, tuple | list) or len(value) != 3:
         return None
     parts = [_number(part) for part in value]

@@ -1,6 +1,6 @@
-"""From the lens a photo was taken with to the pinhole camera the trainer renders with.
+"""Lens distortion: the pinhole camera of the undistorted photo, and where its rays meet the photo.
 
-Distortion itself is COLMAP's (`pycolmap.Camera`), so every camera model it knows is undistorted here.
+Distortion is computed by COLMAP (`pycolmap.Camera`), so that all its camera models are supported.
 """
 
 from __future__ import annotations
@@ -14,16 +14,26 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Camera, Lens
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
-# With all extra parameters 0 these are a pinhole; a fisheye model is not.
+"""COLMAP's camera models without distortion."""
+
 POLYNOMIAL_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-# The zoom of the undistorted photo is kept in these bounds: a fisheye photo has no pinhole picture of all it saw.
+"""COLMAP's camera models that are a pinhole when all distortion coefficients are zero; fisheye models are not."""
+
 MIN_ZOOM, MAX_ZOOM = 0.4, 2.0
+"""Bounds of the focal length of the undistorted photo over that of the photo: no pinhole shows all of a fisheye's."""
+
 BORDER_SAMPLES = 64
-ZOOM_STEPS = 800  # 0.2 % each
+"""Points on each side of the undistorted photo that must lie within the photo."""
+
+ZOOM_STEPS = 800
+"""Zooms tried between the bounds, 0.2 % apart."""
+
+NOWHERE = -1e6
+"""Pixel position of a ray that the lens does not see, far outside any photo."""
 
 
 def lens_of(camera: pycolmap.Camera) -> Lens | None:
-    """The lens of a COLMAP camera; None where it is a plain pinhole or its distortion is exactly zero."""
+    """The lens of a COLMAP camera; None when it is a pinhole or its distortion is exactly zero."""
     name = camera.model.name
     params = np.asarray(camera.params, np.float64)
     if name in PINHOLE_MODELS or (name in POLYNOMIAL_MODELS and not params[camera.extra_params_idxs()].any()):
@@ -32,10 +42,10 @@ def lens_of(camera: pycolmap.Camera) -> Lens | None:
 
 
 def pinhole(lens: Lens, viewmat: npt.NDArray[np.float64]) -> Camera:
-    """The pinhole camera of the undistorted photo: its centre stays, its focal length is zoomed.
+    """The pinhole camera of the undistorted photo, with the size and principal point of the photo.
 
-    The zoom is the smallest for which the frame of the undistorted photo lies inside the photo, within
-    [0.4, 2]; where a lens goes beyond that, the pixels without a source are masked by `load_views`.
+    Its focal length is the smallest, within the bounds of the zoom, for which the whole undistorted photo lies within
+    the photo. At the bounds, `load_view` masks the pixels that the photo does not cover.
     """
     fx, fy, cx, cy, zoom = _pinhole_of(lens)
     return Camera(lens.width, lens.height, fx * zoom, fy * zoom, cx, cy, viewmat)
@@ -59,15 +69,15 @@ def _pinhole_of(lens: Lens) -> tuple[float, float, float, float, float]:
     rays = np.stack(plain.normalized(frame[:, 0], frame[:, 1]), axis=1)
 
     def reach(zoom: float) -> tuple[bool, float]:
-        """Whether the frame at this zoom lies inside the photo, and how far from the centre its corners land."""
-        seen = project(camera, rays / zoom)
+        """Whether the border at this zoom lies within the photo, and its largest distance from the principal point."""
+        seen = distort(camera, rays / zoom)
         low, high = seen.min(axis=0), seen.max(axis=0)
-        # Half a pixel beyond the border is still served by the border pixels.
+        # Half a pixel beyond the border, border pixels are still the nearest.
         inside = bool(low.min() >= -0.5 and high[0] <= lens.width + 0.5 and high[1] <= lens.height + 0.5)
         return inside, float(np.linalg.norm(seen - (cx, cy), axis=1).max())
 
-    # From the narrowest view outwards, since far from the centre a distortion polynomial folds back into the
-    # photo and a frame there would look as if it fitted.
+    # From the narrowest view to wider ones: far from the centre a distortion polynomial is no longer monotonic, and a
+    # border there would be mapped back into the photo.
     zoom, before = MAX_ZOOM, 0.0
     for wider in np.geomspace(MAX_ZOOM, MIN_ZOOM, ZOOM_STEPS):
         inside, distance = reach(float(wider))
@@ -79,12 +89,12 @@ def _pinhole_of(lens: Lens) -> tuple[float, float, float, float, float]:
 
 @lru_cache(maxsize=4096)
 def distortion(lens: Lens) -> float:
-    """The farthest that the lens moves a pixel on the photo's border from where a pinhole would have put it."""
+    """The largest distance, in pixels, by which the lens moves a pixel on the photo's border."""
     camera = colmap_camera(lens)
     corner = np.array([[0.0, 0.0], [lens.width, 0.0], [0.0, lens.height], [lens.width, lens.height]])
     frame = np.concatenate([corner, (corner + corner[[1, 3, 0, 2]]) / 2])
     rays = np.stack(without_distortion(camera).normalized(frame[:, 0], frame[:, 1]), axis=1)
-    seen = project(camera, rays)
+    seen = distort(camera, rays)
     return float(np.linalg.norm(seen - frame, axis=1).max())
 
 
@@ -106,8 +116,11 @@ def colmap_camera(lens: Lens) -> pycolmap.Camera:
     return pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
 
 
-def project(camera: pycolmap.Camera, rays: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Pixels [n,2] where rays (x, y, 1) [n,2] meet the photo; far outside the photo where the lens sees nothing."""
+def distort(camera: pycolmap.Camera, rays: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Pixel positions [n,2] on the distorted photo of rays (x, y, 1), given as [n,2].
+
+    Rays that the lens does not see are put at NOWHERE.
+    """
     ahead = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
     pixels = np.asarray(camera.img_from_cam(ahead), np.float64)
-    return np.where(np.isfinite(pixels), pixels, -1e6)
+    return np.where(np.isfinite(pixels), pixels, NOWHERE)

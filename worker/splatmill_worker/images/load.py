@@ -1,4 +1,4 @@
-"""Photos of a scene at the training size: upright, undistorted, reduced by the exact area filter."""
+"""Loads photos at the training size: upright, undistorted, and reduced by an exact area filter."""
 
 from __future__ import annotations
 
@@ -18,15 +18,22 @@ from splatmill_worker.images import lens as lenses
 from splatmill_worker.images.decode import Pixels, decode
 from splatmill_worker.scene import Camera, Lens, View
 
-MAX_SAMPLES = 4  # per axis and pixel when undistorting; the decoder leaves at most this reduction to do
+MAX_SAMPLES = 4
+"""Look-ups per pixel and axis when a photo is undistorted; a larger one is reduced before."""
+
+MIN_COVER = 127.5
+"""Mean of a mask, 0 to 255, from which a reduced pixel counts."""
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo ready to train on and the pinhole camera at its size.
+    """A photo ready to train on.
 
-    rgb [H,W,3] uint8 (over `background` where there was alpha and a background was asked for), alpha [H,W]
-    uint8 where the file has it, mask [H,W] bool: True where the pixel may be trained on.
+    view: the view that it was loaded for.
+    camera: the pinhole camera at its size.
+    rgb: uint8 [H,W,3]; over the background that `load_view` was given, when the file has alpha.
+    alpha: uint8 [H,W]; None when the file has none.
+    mask: bool [H,W], True for pixels to train on; None: all of them.
     """
 
     view: View
@@ -37,7 +44,7 @@ class Photo:
 
 
 def training_size(width: int, height: int, longest_side: int) -> tuple[int, int]:
-    """Width and height with the longest side reduced to `longest_side`; a smaller photo is never enlarged."""
+    """Width and height in pixels, reduced so that the longest side has `longest_side`; never enlarged."""
     if longest_side < 1:
         raise ValueError(f"longest_side is {longest_side}; it must be at least 1 pixel.")
     factor = min(1.0, longest_side / max(width, height))
@@ -51,10 +58,14 @@ def load_views(
     background: tuple[float, float, float] | None = None,
     threads: int | None = None,
 ) -> list[Photo]:
-    """Reads the views' photos with their longest side at `longest_side` pixels, several at a time.
+    """Load the photos of `views`, several at a time.
 
-    `background` (RGB in 0..1) is put behind photos with alpha; None leaves their colours as they are stored.
-    Raises OSError for a file that is gone or does not decode.
+    longest_side: in pixels; smaller photos keep their size.
+    background: RGB, 0 to 1, behind transparent pixels; None keeps their stored colours.
+    threads: photos loaded at a time; None: one per core.
+
+    Raises OSError for a file that is missing or does not decode, and ValueError for one whose shape differs from its
+    camera's.
     """
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
         return list(pool.map(lambda view: load_view(view, longest_side, background=background), views))
@@ -63,10 +74,10 @@ def load_views(
 def load_view(
     view: View, longest_side: int, *, background: tuple[float, float, float] | None = None
 ) -> Photo:
-    """One photo of `load_views`."""
+    """Load the photo of one view; arguments and errors are those of `load_views`."""
     full = view.camera
     width, height = training_size(full.width, full.height, longest_side)
-    # Undistortion looks up the photo at twice the training size, so that bilinear look-ups do not soften it.
+    # Undistortion interpolates a photo of at least twice the size, so that it does not blur.
     enough = (width, height) if view.lens is None else (2 * width, 2 * height)
     pixels = np.array(_decode_for(view, enough))
     if pixels.ndim == 2:
@@ -77,7 +88,7 @@ def load_view(
     if mask is not None:
         planes = torch.cat([planes, torch.from_numpy(mask).float()[None] * 255.0])
     if has_alpha:
-        # Averages of a half-covered pixel must not take colour from what alpha hides.
+        # Premultiplied, so that averages take no colour from transparent pixels.
         planes[:3] *= planes[3:4] / 255.0
     keep = None
     if view.lens is None:
@@ -86,7 +97,7 @@ def load_view(
         planes, seen = _undistort(planes, view.lens, full, width, height)
         keep = None if bool(seen.all()) else seen
     if mask is not None:
-        keep = planes[-1] >= 127.5 if keep is None else keep & (planes[-1] >= 127.5)
+        keep = planes[-1] >= MIN_COVER if keep is None else keep & (planes[-1] >= MIN_COVER)
     alpha = None
     rgb = planes[:3]
     if has_alpha:
@@ -106,36 +117,36 @@ def load_view(
 
 
 def _decode_for(view: View, enough: tuple[int, int]) -> Image.Image:
-    """The photo's pixels with its longest side at least as asked, checked against the camera's shape."""
+    """The photo at least as large as `enough` (width, height), its shape checked against the camera's."""
     photo = decode(view.image, at_least=enough, upright=view.upright)
     _check_shape(view, view.image, photo.size)
     return photo
 
 
 def _check_shape(view: View, path: Path, size: tuple[int, int]) -> None:
-    """Intrinsics scale with the photo, but a photo of another shape is another photo (or a turned one)."""
+    """Raise ValueError for a photo or mask whose aspect ratio differs from the camera's by more than rounding."""
     width, height = size
     expected = view.camera.width / view.camera.height
     if abs(width / height / expected - 1.0) > 0.02 + 2.0 / min(width, height):
         raise ValueError(
-            f"{path.name} is {width} x {height} but its camera is for {view.camera.width} x {view.camera.height}: "
-            "a different shape. Give the photo the camera was made for."
+            f"{path.name} has {width} x {height} pixels, a different shape from the {view.camera.width} x "
+            f"{view.camera.height} of its camera. Give the file that the camera was made for, not cropped or rotated."
         )
 
 
 def _read_mask(view: View, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """The mask at the photo's decoded size: True where the pixel counts (COLMAP: black hides)."""
+    """The mask at `size` (width, height): True for pixels to train on; black hides, as in COLMAP."""
     assert view.mask is not None
     mask = decode(view.mask, upright=view.upright)
     _check_shape(view, view.mask, mask.size)
-    # A mask drawn as transparency hides where it is transparent; any other, where it is dark.
+    # A mask with transparent pixels hides these; any other hides dark ones.
     drawn = mask.mode == "RGBA" and np.asarray(mask)[:, :, 3].min() < 255
     grey = mask.getchannel("A") if drawn else mask.convert("L")
     return np.asarray(grey.resize(size, Image.Resampling.BOX)) >= 128
 
 
 def _area(planes: torch.Tensor, width: int, height: int) -> torch.Tensor:
-    """[C,h,w] to [C,height,width] with each output pixel the exact mean over the area it covers."""
+    """Planes [C,h,w] resampled to [C,height,width]; each pixel is the exact mean over the area that it covers."""
     if planes.shape[2] != width:
         planes = planes @ _area_weights(planes.shape[2], width).T
     if planes.shape[1] != height:
@@ -145,7 +156,7 @@ def _area(planes: torch.Tensor, width: int, height: int) -> torch.Tensor:
 
 @lru_cache(maxsize=16)
 def _area_weights(source: int, target: int) -> torch.Tensor:
-    """[target, source]: the share of each source pixel in each target pixel, rows summing to 1."""
+    """Weights [target, source] of each source pixel in each target pixel; rows sum to 1."""
     edges = np.arange(target + 1) * (source / target)
     pixel = np.arange(source)
     overlap = np.minimum(edges[1:, None], pixel + 1.0) - np.maximum(edges[:-1, None], pixel)
@@ -155,7 +166,7 @@ def _area_weights(source: int, target: int) -> torch.Tensor:
 def _undistort(
     planes: torch.Tensor, lens: Lens, camera: Camera, width: int, height: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """[C,h,w] through the lens to [C,height,width] of the pinhole camera, and where it had a source [height,width]."""
+    """Planes [C,h,w] of the photo as [C,height,width] of `camera`, and which pixels the photo covers [height,width]."""
     if planes.shape[2] > MAX_SAMPLES * width:
         planes = _area(planes, MAX_SAMPLES * width, MAX_SAMPLES * height)
     samples = max(1, min(MAX_SAMPLES, int(np.ceil(planes.shape[2] / width - 1e-6))))
@@ -164,7 +175,7 @@ def _undistort(
     taken = torch.nn.functional.grid_sample(
         planes[None],
         grid[None],
-        # One sample per pixel means no averaging afterwards: the sharper look-up.
+        # With one look-up per pixel nothing is averaged afterwards, and bicubic interpolation blurs less.
         mode="bilinear" if samples > 1 else "bicubic",
         padding_mode="border",
         align_corners=False,
@@ -176,16 +187,16 @@ def _undistort(
 def _look_up(
     lens: Lens, intrinsics: tuple[float, float, float, float], width: int, height: int, samples: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where samples x samples positions in each pixel of the pinhole camera lie in the photo.
+    """Where `samples` x `samples` positions in each pixel of a pinhole camera lie on the photo.
 
-    Returns the grid [samples * height, samples * width, 2] in grid_sample's -1..1 and the pixels whose centre
-    the photo covers [height, width].
+    intrinsics: fx, fy, cx, cy of the camera in pixels. Returns the grid [samples * height, samples * width, 2] in
+    grid_sample's -1 to 1, and the pixels of which the photo covers every position [height, width].
     """
     x, y = Camera(width, height, *intrinsics, np.eye(4)).normalized(
         (np.arange(width * samples) + 0.5) / samples, (np.arange(height * samples) + 0.5) / samples
     )
     rays = np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1).reshape(-1, 2)
-    pixels = lenses.project(lenses.colmap_camera(lens), rays)
+    pixels = lenses.distort(lenses.colmap_camera(lens), rays)
     grid = pixels / (lens.width, lens.height) * 2.0 - 1.0
     shape = height * samples, width * samples
     inside = np.all(np.abs(grid) <= 1.0 + 1.0 / min(lens.width, lens.height), axis=1).reshape(shape)
@@ -194,4 +205,5 @@ def _look_up(
 
 
 def _bytes(values: torch.Tensor) -> Pixels:
+    """Values from 0 to 255, rounded to uint8."""
     return np.asarray(values.round().clamp(0.0, 255.0).to(torch.uint8).numpy())

@@ -1,4 +1,4 @@
-"""Finds the mask that belongs to a photo."""
+"""Finds the masks of photos by their names."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from splatmill.schema.photos import MASK_SUFFIXES
 
 
 def masks_under(directory: Path) -> dict[str, Path]:
-    """Mask files by their name relative to `directory`."""
+    """The masks in `directory`, by their name relative to it."""
     return {
         path.relative_to(directory).as_posix(): path
         for path in sorted(directory.rglob("*"))
@@ -17,7 +17,7 @@ def masks_under(directory: Path) -> dict[str, Path]:
 
 
 def mask_of(name: str, masks: dict[str, Path]) -> Path | None:
-    """The mask of the photo `name`: by COLMAP's convention (name.jpg.png), or by the same name or stem."""
+    """The mask of the photo `name`: by COLMAP's convention (name.jpg.png), the same name, or the same stem."""
     stem = str(PurePosixPath(name).with_suffix(""))
     candidates = (f"{name}.png", f"{stem}.png", name, *(f"{stem}{suffix}" for suffix in MASK_SUFFIXES))
     return next((masks[candidate] for candidate in candidates if candidate in masks), None)

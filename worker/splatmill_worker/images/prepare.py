@@ -1,4 +1,4 @@
-"""Which of the files a person gave are usable photos, and why the others are not."""
+"""Finds the usable photos among the given files, unpacks zips and videos, and says why other files are left out."""
 
 from __future__ import annotations
 
@@ -20,14 +20,29 @@ from splatmill_worker.images.decode import upright_size
 from splatmill_worker.images.masks import mask_of, masks_under
 
 IGNORED_PREFIXES = (".", "__MACOSX")
+"""Beginnings of the names of files and folders that are left out without mention."""
+
 IGNORED_NAMES = ("thumbs.db", "desktop.ini")
+"""Names, in lower case, of files that are left out without mention."""
+
+MAX_ASPECT_ERROR = 0.02
+"""Relative difference of aspect ratios up to which a mask fits its photo."""
+
+DEFAULT_FRAMES = 100
+"""Frames taken from a video."""
 
 
 @dataclass(frozen=True)
-class Usable:
-    """A photo that decodes: its name, file, mask, content hash, size once upright, and what its EXIF says.
+class UsablePhoto:
+    """A photo that decodes.
 
-    `sequence` names the video it is a frame of.
+    name: relative to the given folder; of photos in zips and videos, below the name of those.
+    path: of the file.
+    sha256: of the file's content.
+    width, height: in pixels, with the EXIF orientation applied.
+    exif: the tags that structure from motion uses.
+    mask: path of the mask, if there is one.
+    sequence: name of the video that the photo is a frame of, if it is one.
     """
 
     name: str
@@ -42,15 +57,20 @@ class Usable:
 
 @dataclass(frozen=True)
 class Prepared:
-    """The usable photos sorted by name, and (name, reason) of every file that was skipped."""
+    """The outcome of `prepare`.
 
-    photos: tuple[Usable, ...]
+    photos: sorted by name.
+    skipped: (name, reason) of every file that is left out.
+    notes: sentences for the user.
+    """
+
+    photos: tuple[UsablePhoto, ...]
     skipped: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
-        """A hash of the names and contents: the same photos, the same key."""
+        """A hash of the names and contents of all photos and masks."""
         digest = hashlib.sha256()
         for photo in self.photos:
             mask = _sha256(photo.mask) if photo.mask is not None else ""
@@ -60,7 +80,13 @@ class Prepared:
 
 @dataclass
 class _Found:
-    files: list[tuple[str, Path, str | None]] = field(default_factory=list)  # name, path, video it came from
+    """Files found so far.
+
+    files: name, path, and name of the video that the file is a frame of.
+    skipped, notes: as in `Prepared`.
+    """
+
+    files: list[tuple[str, Path, str | None]] = field(default_factory=list)
     skipped: list[tuple[str, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -70,18 +96,20 @@ def prepare(
     masks: Path | None,
     workdir: Path,
     *,
-    frames: int = 100,
+    frames: int = DEFAULT_FRAMES,
     on_progress: Callable[[str, int, int, str], None] = lambda stage, done, total, note: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Prepared:
-    """Looks through the files under `images`: zips are unpacked and videos cut into `frames` photos in `workdir`.
+    """Examine the files under `images`.
 
-    Skipped by rule, each with its reason: what is no image, does not decode to the end, has a side under 16
-    pixels or more than 250 million pixels (told from the header, never decoded), and the second of two files
-    with the same bytes. Masks are found in `masks`, or beside a photo as name.jpg.png. `on_progress` gets the
-    stage, files done, files in all, and the file's name.
+    Zips are unpacked into `workdir`, and `frames` frames of each video are stored there. These files are skipped, each
+    with its reason: those that are no image or do not decode completely, images that are too small or too large (by the
+    size in their header; they are not decoded), and copies of a file.
 
-    Raises Cancelled when cancelled.
+    masks: folder of the masks, if there is one; a mask may also lie beside its photo as name.jpg.png.
+    on_progress: called as ("images", files examined, files in all, name of the file).
+
+    Raises Cancelled.
     """
     found = _Found()
     for path in _files(images):
@@ -90,19 +118,19 @@ def prepare(
     mask_files = masks_under(masks) if masks is not None and masks.is_dir() else {}
     own_masks = {name for name in beside if name.endswith(".png") and name[: -len(".png")] in beside}
     candidates = [file for file in found.files if file[0] not in own_masks]
-    photos: dict[str, Usable] = {}
+    photos: dict[str, UsablePhoto] = {}
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        looked = pool.map(lambda file: None if cancelled() else _look_at(*file), candidates)
-        for done, ((name, _, _), result) in enumerate(zip(candidates, looked, strict=True), 1):
+        inspected = pool.map(lambda file: None if cancelled() else _inspect(*file), candidates)
+        for done, ((name, _, _), result) in enumerate(zip(candidates, inspected, strict=True), 1):
             if result is None:
-                raise Cancelled("Looking through the photos was cancelled.")
+                raise Cancelled("Examining the photos was cancelled.")
             on_progress("images", done, len(candidates), name)
             if isinstance(result, str):
                 found.skipped.append((name, result))
                 continue
             same = photos.get(result.sha256)
             if same is not None:
-                found.skipped.append((name, f"the same bytes as {same.name}"))
+                found.skipped.append((name, f"its content is the same as that of {same.name}"))
                 continue
             mask = mask_of(name, mask_files)
             if mask is None and f"{name}.png" in own_masks:
@@ -135,11 +163,14 @@ def _expand(
     found: _Found,
     cancelled: Callable[[], bool],
 ) -> None:
-    """Adds a file, or what a zip or video holds, to `found`; unpacked content is kept by its hash."""
+    """Add a file, or the content of a zip or video, to `found`.
+
+    inside: name of the zip that holds the file, if there is one. Unpacked content is kept under the hash of its file.
+    """
     suffix = path.suffix.lower()
     try:
         if suffix in ARCHIVE_SUFFIXES and inside is None:
-            folder = _once(
+            folder = _filled_once(
                 workdir / "unpacked" / _sha256(path)[:24],
                 lambda place: archive.unpack(path, place, cancelled),
             )
@@ -147,16 +178,16 @@ def _expand(
                 inner_name = f"{Path(name).with_suffix('').as_posix()}/{inner.relative_to(folder).as_posix()}"
                 _expand(inner_name, inner, name, workdir, frames, found, cancelled)
         elif suffix in ARCHIVE_SUFFIXES:
-            found.skipped.append((name, "a zip inside a zip is not unpacked"))
+            found.skipped.append((name, "a zip inside a zip is not unpacked; give its photos themselves"))
         elif suffix in VIDEO_SUFFIXES:
-            folder = _once(
+            folder = _filled_once(
                 workdir / "frames" / f"{_sha256(path)[:24]}_{frames}",
                 lambda place: video.sharpest_frames(path, place, frames, cancelled=cancelled),
             )
             pictures = _files(folder)
             prefix = Path(name).with_suffix("").as_posix()
             found.files += [(f"{prefix}_{p.stem.rpartition('_')[2]}.jpg", p, name) for p in pictures]
-            found.notes.append(f"{len(pictures)} frames were taken from {name}.")
+            found.notes.append(f"{len(pictures)} frames were taken from the video {name}.")
         else:
             found.files.append((name, path, None))
     except Cancelled:
@@ -165,8 +196,11 @@ def _expand(
         found.skipped.append((name, str(error)))
 
 
-def _once(folder: Path, make: Callable[[Path], object]) -> Path:
-    """`folder` as `make` filled it: made under another name and moved, so that a half-made one is never taken."""
+def _filled_once(folder: Path, make: Callable[[Path], object]) -> Path:
+    """`folder` as filled by `make`, which is called when it does not exist yet.
+
+    `make` fills a folder with another name, which is renamed when it is complete.
+    """
     if folder.is_dir():
         return folder
     partial = folder.with_name(f"{folder.name}.partial")
@@ -180,51 +214,56 @@ def _once(folder: Path, make: Callable[[Path], object]) -> Path:
     return folder
 
 
-def _look_at(name: str, path: Path, sequence: str | None) -> Usable | str:
-    """The photo, or the reason why it is none."""
+def _inspect(name: str, path: Path, sequence: str | None) -> UsablePhoto | str:
+    """The photo, or the reason why the file is left out."""
     try:
         if path.stat().st_size == 0:
             return "the file is empty"
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # broken EXIF is not a reason to refuse a photo
+            warnings.simplefilter("ignore")  # Pillow warns of broken EXIF, with which a photo is usable
             with Image.open(path) as image:
                 width, height = image.size
                 if min(width, height) < MIN_PHOTO_SIDE:
                     return (
-                        f"{width} x {height} pixels: sides under {MIN_PHOTO_SIDE} pixels are too small to use"
+                        f"it has {width} x {height} pixels, which is too small: each side needs at least "
+                        f"{MIN_PHOTO_SIDE}"
                     )
                 if width * height > MAX_PHOTO_PIXELS:
                     limit = MAX_PHOTO_PIXELS // 10**6
-                    return f"{width} x {height} pixels: more than the {limit} million that are decoded"
+                    return f"it has {width} x {height} pixels; at most {limit} million are decoded"
                 width, height = upright_size(image)
                 tags = exif.read(image)
                 if image.format == "JPEG":
-                    image.draft(None, (1, 1))  # the smallest DCT scale still reads the file to its end
+                    image.draft(
+                        None, (1, 1)
+                    )  # decodes at the smallest DCT scale, and still reads the whole file
                 image.load()
     except UnidentifiedImageError:
         return (
-            "not an image (or of a kind that is not read: JPEG, PNG, WebP, TIFF, HEIC, MP4, MOV and zip are)"
+            "it is not an image, or its format is not supported; give JPEG, PNG, WebP, TIFF or HEIC photos, videos or "
+            "zips"
         )
     except Image.DecompressionBombError as error:
         return str(error)
     except (OSError, ValueError, SyntaxError, EOFError, IndexError) as error:
-        return f"does not decode to its end: {error}"
-    return Usable(name, path, _sha256(path), width, height, tags, sequence=sequence)
+        return f"it does not decode completely: {error}"
+    return UsablePhoto(name, path, _sha256(path), width, height, tags, sequence=sequence)
 
 
-def _with_mask(photo: Usable, mask: Path | None, found: _Found) -> Usable:
-    """The photo with its mask, where that is readable and has the photo's shape."""
+def _with_mask(photo: UsablePhoto, mask: Path | None, found: _Found) -> UsablePhoto:
+    """The photo with `mask`, or without it and with a note when it is unreadable or has another shape."""
     if mask is None:
         return photo
     try:
         with Image.open(mask) as image:
             width, height = upright_size(image)
     except (OSError, ValueError, SyntaxError) as error:
-        found.notes.append(f"The mask of {photo.name} is not used: it does not open ({error}).")
+        found.notes.append(f"The mask of {photo.name} is not used: it cannot be read ({error}).")
         return photo
-    if abs(width / height / (photo.width / photo.height) - 1.0) > 0.02:
+    if abs(width / height / (photo.width / photo.height) - 1.0) > MAX_ASPECT_ERROR:
         found.notes.append(
-            f"The mask of {photo.name} is not used: it is {width} x {height}, the photo {photo.width} x {photo.height}."
+            f"The mask of {photo.name} is not used: its shape differs from the photo's ({width} x {height} and "
+            f"{photo.width} x {photo.height} pixels)."
         )
         return photo
     return replace(photo, mask=mask)

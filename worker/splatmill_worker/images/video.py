@@ -1,4 +1,4 @@
-"""The sharpest frames of a video, one from each of as many equal stretches of time as asked for."""
+"""Takes the sharpest frames of a video, one from each of several intervals of equal length."""
 
 from __future__ import annotations
 
@@ -12,8 +12,14 @@ from PIL import Image
 
 from splatmill_worker.errors import Cancelled
 
-SHARPNESS_SIDE = 480  # pixels of the longest side on which sharpness is judged
+SHARPNESS_SIDE = 480
+"""Pixels of the longest side of the reduced frame on which sharpness is measured."""
+
 QUALITY = 95
+"""JPEG quality of the frames."""
+
+DEFAULT_RATE = 30.0
+"""Frames per second assumed for videos without time stamps."""
 
 
 def sharpest_frames(
@@ -24,72 +30,76 @@ def sharpest_frames(
     cancelled: Callable[[], bool] = lambda: False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
-    """Writes `count` frames of the video as JPEGs called <stem>_<frame number>.jpg and returns them in order.
+    """Write `count` frames of the video at `path` as JPEGs in `target`, and return their paths in order.
 
-    The video is cut into `count` stretches of equal length, and the frame with the largest variance of its
-    Laplacian is taken from each; a video with fewer frames gives all of them. The rotation in the file is
-    applied. Raises ValueError where the file holds no video that decodes, Cancelled when cancelled.
+    The frame with the largest variance of its Laplacian is taken from each of `count` intervals of equal length; a
+    video with fewer frames gives all of them. The files are called <stem>_<frame number>.jpg. The rotation in the video
+    is applied. A video that breaks off gives the frames before that.
+
+    Raises ValueError when the file has no video that decodes, and Cancelled.
     """
     if count < 1:
-        raise ValueError(f"{count} frames were asked for; at least 1 is needed.")
+        raise ValueError(f"{count} frames were asked for; ask for at least 1.")
     target.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
-                raise ValueError("it holds no video")
+                raise ValueError("it contains no video")
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             length = _duration(container, stream)
             best: tuple[float, av.VideoFrame, int] | None = None
-            stretch = 0
+            interval = 0
             for number, frame in enumerate(container.decode(stream)):
                 if cancelled():
                     raise Cancelled("Reading the video was cancelled.")
-                time = frame.time if frame.time is not None else number / 30.0
-                at = min(count - 1, max(stretch, int(time / length * count)))
-                if at != stretch and best is not None:
+                time = frame.time if frame.time is not None else number / DEFAULT_RATE
+                at = min(count - 1, max(interval, int(time / length * count)))
+                if at != interval and best is not None:
                     written.append(_save(best, target, path.stem))
                     on_progress(len(written), count)
                     best = None
-                stretch = at
+                interval = at
                 score = sharpness(_grey(frame))
                 if best is None or score > best[0]:
                     best = score, frame, number
             if best is not None:
                 written.append(_save(best, target, path.stem))
     except av.FFmpegError as error:
-        # What was read before a broken end is still good.
+        # The frames before a broken end are usable.
         if not written:
             raise ValueError(f"it does not decode as video ({error})") from error
     if not written:
-        raise ValueError("it holds no frame")
+        raise ValueError("it contains no frame")
     return written
 
 
 def sharpness(grey: npt.NDArray[np.float32]) -> float:
-    """The variance of the Laplacian of a grey image [H,W]; motion blur and bad focus lower it."""
+    """The variance of the Laplacian of a grey image [H,W]; motion blur and defocus lower it."""
     laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4.0 * grey[1:-1, 1:-1]
     return float(laplacian.var()) if laplacian.size else 0.0
 
 
 def _duration(container: av.container.InputContainer, stream: av.VideoStream) -> float:
-    """The video's length in seconds, by the stream, the container, or the number of frames."""
+    """The video's length in seconds: that of the stream, of the container, or by the number of frames."""
     if stream.duration and stream.time_base:
         return max(float(stream.duration * stream.time_base), 1e-3)
     if container.duration:
         return max(container.duration / av.time_base, 1e-3)
-    rate = float(stream.average_rate) if stream.average_rate else 30.0
+    rate = float(stream.average_rate) if stream.average_rate else DEFAULT_RATE
     return max(stream.frames / rate, 1e-3)
 
 
 def _grey(frame: av.VideoFrame) -> npt.NDArray[np.float32]:
+    """The frame in grey [H,W], reduced to SHARPNESS_SIDE."""
     factor = min(1.0, SHARPNESS_SIDE / max(frame.width, frame.height))
     width, height = max(3, int(frame.width * factor)), max(3, int(frame.height * factor))
     return frame.reformat(width=width, height=height, format="gray").to_ndarray().astype(np.float32)
 
 
 def _save(best: tuple[float, av.VideoFrame, int], target: Path, stem: str) -> Path:
+    """Write the frame of (sharpness, frame, number), upright."""
     _, frame, number = best
     image: Image.Image = frame.to_image()  # type: ignore[no-untyped-call]  # PyAV leaves it untyped
     turn = {

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.images.prepare import Usable
+from splatmill_worker.images.prepare import UsablePhoto
 
 DEFAULT_FOCAL = 1.2
 """Focal length over the longest side where EXIF gives none; COLMAP's default, about a phone's main camera."""
@@ -33,7 +33,7 @@ class CameraGroup:
     known: bool
 
 
-def group(photos: Sequence[Usable]) -> list[CameraGroup]:
+def group(photos: Sequence[UsablePhoto]) -> list[CameraGroup]:
     """One camera for all photos that agree in size, make, model, lens and focal length.
 
     Photos without EXIF share a camera when their sizes agree. A change of zoom among them costs less than one focal
@@ -55,7 +55,7 @@ def group(photos: Sequence[Usable]) -> list[CameraGroup]:
     return [_group(tuple(members), photos[members[0]]) for members in groups.values()]
 
 
-def _group(members: tuple[int, ...], photo: Usable) -> CameraGroup:
+def _group(members: tuple[int, ...], photo: UsablePhoto) -> CameraGroup:
     focal = _focal(photo)
     known = focal is not None and FOCAL_BOUNDS[0] <= focal <= FOCAL_BOUNDS[1]
     return CameraGroup(
@@ -63,7 +63,7 @@ def _group(members: tuple[int, ...], photo: Usable) -> CameraGroup:
     )
 
 
-def _focal(photo: Usable) -> float | None:
+def _focal(photo: UsablePhoto) -> float | None:
     """The focal length over the longest side, by EXIF; None when EXIF does not give it.
 
     From the 35 mm equivalent, else from the focal length and COLMAP's table of sensors.

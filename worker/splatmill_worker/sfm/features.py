@@ -18,7 +18,7 @@ from splatmill.files import replacing
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.decode import decode
 from splatmill_worker.images.load import training_size
-from splatmill_worker.images.prepare import Usable
+from splatmill_worker.images.prepare import UsablePhoto
 from splatmill_worker.sfm.callbacks import OnProgress, native_token, stop_if
 from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.options import Effort
@@ -77,7 +77,7 @@ def photo_index(name: str) -> int:
 
 
 def extract(
-    photos: Sequence[Usable],
+    photos: Sequence[UsablePhoto],
     groups: Sequence[CameraGroup],
     effort: Effort,
     camera_model: str,
@@ -196,7 +196,7 @@ def _extracted(path: Path) -> set[str]:
         database.close()
 
 
-def _reduce(photo: Usable, side: int, store: FeatureStore, name: str) -> None:
+def _reduce(photo: UsablePhoto, side: int, store: FeatureStore, name: str) -> None:
     """Write the photo and its mask in grey, with a longest side of at most `side` pixels."""
     target = store.images / name
     target.parent.mkdir(parents=True, exist_ok=True)

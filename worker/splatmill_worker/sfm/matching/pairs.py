@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from splatmill_worker.images.prepare import Usable
+from splatmill_worker.images.prepare import UsablePhoto
 from splatmill_worker.sfm.callbacks import stop_if
 from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.matching.matcher import Matcher
@@ -66,7 +66,7 @@ def sequential(order: Sequence[int], steps: Iterable[int] = SEQUENCE_STEPS) -> s
     }
 
 
-def video_sequences(photos: Sequence[Usable]) -> list[list[int]]:
+def video_sequences(photos: Sequence[UsablePhoto]) -> list[list[int]]:
     """The frames of each video, in order."""
     videos: dict[str, list[int]] = {}
     for index, photo in enumerate(photos):
@@ -75,7 +75,7 @@ def video_sequences(photos: Sequence[Usable]) -> list[list[int]]:
     return list(videos.values())
 
 
-def numbered_runs(photos: Sequence[Usable]) -> list[list[int]]:
+def numbered_runs(photos: Sequence[UsablePhoto]) -> list[list[int]]:
     """Photos whose names differ only in their final number, ordered by that number.
 
     Most photos with consecutive numbers were taken one after the other, so that neighbours are worth matching
@@ -89,7 +89,7 @@ def numbered_runs(photos: Sequence[Usable]) -> list[list[int]]:
     return [[index for _, index in sorted(run)] for run in runs.values() if len(run) >= MIN_NUMBERED_RUN]
 
 
-def gps_positions(photos: Sequence[Usable]) -> npt.NDArray[np.float64]:
+def gps_positions(photos: Sequence[UsablePhoto]) -> npt.NDArray[np.float64]:
     """East, north and up in metres [n,3], from the mean position; NaN for photos without GPS."""
     degrees = np.array(
         [(p.exif.latitude or math.nan, p.exif.longitude or math.nan) for p in photos], np.float64
