@@ -1,4 +1,4 @@
-"""What a capture gives to train on: its cameras, its held-out views, and the kernels that will do the work."""
+"""What a job trains on: the posed scene of its capture, the split, the model to start from, and the kernels."""
 
 from __future__ import annotations
 
@@ -14,19 +14,25 @@ from splatmill_worker.sfm import posed
 from splatmill_worker.splat.plan.plan import Kernels
 
 OnProgress = Callable[[str, int, int, str], None]
+"""Called with the stage, the number of steps done, their total (0 if unknown), and a note."""
 
 
-def cameras_of(
+def posed_scene(
     capture: Path,
     workdir: Path,
     options: TrainOptions,
     on_progress: OnProgress,
     cancelled: Callable[[], bool],
 ) -> Scene:
-    """The posed scene: the cameras that came with the photos, or those recovered from them.
+    """Return the scene with the cameras that came with the photos, or else with recovered ones.
 
-    `capture` holds images/, and masks/ and poses/ where given (or is a data set's own folder). Raises Refusal
-    for poses that cannot be used, and what `posed.with_stereo_points` and `sfm.reconstruct` raise.
+    capture: folder with images/, and masks/ and poses/ where they were given; or the folder of a posed data set.
+    workdir: folder for what structure from motion computes; what is there already is used.
+    options: those of structure from motion are read.
+    on_progress: is told how far structure from motion is.
+    cancelled: is asked often; when it returns true, Cancelled is raised.
+
+    Raises Refusal for poses that cannot be used, and SfmFailed.
     """
     given = posed.find(capture)
     if given is not None:
@@ -36,7 +42,7 @@ def cameras_of(
             raise Refusal(
                 "poses_invalid",
                 str(error),
-                advice="Correct the poses, or leave them out to have the cameras recovered from the photos.",
+                advice="Correct the poses, or remove them to have the cameras recovered from the photos.",
             ) from error
         return posed.with_stereo_points(scene, workdir, on_progress, cancelled)
     images = capture / "images"
@@ -58,10 +64,11 @@ def cameras_of(
     )
 
 
-def held_out_of(scene: Scene, options: TrainOptions) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """Training and held-out views: those named by `test_views`, else the data set's own, else every n-th.
+def split_views(scene: Scene, options: TrainOptions) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """Return the views to train on and the held-out ones.
 
-    Raises Refusal when a name is unknown or nothing is left to train on.
+    Held out are the photos that `test_views` names; without it, those of the data set's own split; without one, every
+    `holdout`-th. Raises Refusal when a name is unknown or nothing is left to train on.
     """
     if options.test_views is not None:
         wanted = set(options.test_views)
@@ -69,8 +76,9 @@ def held_out_of(scene: Scene, options: TrainOptions) -> tuple[tuple[View, ...], 
         if unknown:
             raise Refusal(
                 "holdout_empty",
-                f"test_views names photos that have no camera: {', '.join(unknown[:5])}.",
-                advice="Name photos as the capture does, and only those that were registered.",
+                f"test_views has {len(unknown)} of {len(wanted)} names that belong to no photo with a camera: "
+                f"{', '.join(unknown[:5])}{', ...' if len(unknown) > 5 else ''}.",
+                advice="Use the names of the photos in the capture, and only photos whose cameras were recovered.",
                 facts={"unknown": unknown},
             )
         ordered = sorted(scene.views, key=lambda view: view.name)
@@ -80,20 +88,23 @@ def held_out_of(scene: Scene, options: TrainOptions) -> tuple[tuple[View, ...], 
         try:
             train, test = split(scene, options.holdout)
         except ValueError as error:
-            raise Refusal("holdout_empty", str(error), advice="Hold out fewer photos.") from error
+            raise Refusal(
+                "holdout_empty", str(error), advice="Set holdout to 2 or more, or to 0 to hold out none."
+            ) from error
     if not train:
         raise Refusal(
             "holdout_empty",
-            f"All {len(test)} views are held out; nothing is left to train on.",
-            advice="Hold out fewer photos.",
+            f"All {len(test)} photos with a camera are held out, so that none is left to train on.",
+            advice="Hold out fewer photos, by other values of test_views or holdout.",
         )
     return train, test
 
 
-def start_file(capture: Path, workdir: Path, options: TrainOptions) -> Path | None:
-    """The .ply to start from: named among the capture's poses, or a model's own, fetched as start.ply; None without.
+def start_model_path(capture: Path, workdir: Path, options: TrainOptions) -> Path | None:
+    """Return the path of the .ply file to start from, or None when the training starts from points.
 
-    Raises Refusal where the capture has no such file.
+    It is a file among the capture's poses if the option `start` names one, else the stored model that the service has
+    copied to `workdir/start.ply`. Raises Refusal when the capture has no such file.
     """
     if options.start is None:
         return None
@@ -104,23 +115,23 @@ def start_file(capture: Path, workdir: Path, options: TrainOptions) -> Path | No
             return folder / options.start_file
     raise Refusal(
         "start_unusable",
-        f"The capture has no file {options.start_file!r} among its poses.",
-        advice="Upload the .ply to the capture's poses, or leave start out.",
+        f"There is no file {options.start_file!r} among the poses of the capture.",
+        advice="Upload the .ply file to the poses of the capture, or leave out the option start.",
     )
 
 
-def kernels_of(options: TrainOptions) -> Kernels:
-    """The kernels to train with: those asked for, else the GPU's where there is one, else the CPU's.
+def choose_kernels(options: TrainOptions) -> Kernels:
+    """Return the kernels to train with: those that `backend` names; for auto, the GPU's if usable, else the CPU's.
 
-    Raises Refusal where the ones asked for do not run.
+    Raises Refusal when the requested ones do not run on this machine.
     """
     if options.backend is Backend.auto:
         return "gpu" if absence() is None else "cpu"
     if options.backend is Backend.gpu and (reason := absence()) is not None:
         raise Refusal(
             "backend_unavailable",
-            f"The gpu backend was asked for. {reason}",
-            advice="Leave backend at auto, or run a worker on a machine with a GPU.",
+            f"The backend gpu was requested, but it does not run on this machine. {reason}",
+            advice="Set backend to auto or cpu, or run a worker on a machine with a GPU.",
         )
     named: dict[Backend, Kernels] = {Backend.reference: "reference", Backend.cpu: "cpu", Backend.gpu: "gpu"}
     return named[options.backend]

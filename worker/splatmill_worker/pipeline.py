@@ -11,7 +11,7 @@ import av
 import torch
 
 from splatmill.schema import Backend, JobState, LogEvent, PlanEvent, StateEvent, TrainOptions
-from splatmill_worker.capture import cameras_of, held_out_of, kernels_of, start_file
+from splatmill_worker.capture import choose_kernels, posed_scene, split_views, start_model_path
 from splatmill_worker.errors import Cancelled, Refusal
 from splatmill_worker.events import Emit, TrainingEvents, progress_events
 from splatmill_worker.images import load_views
@@ -76,7 +76,7 @@ def run(
     """
     stages = Stages(workdir / "stages.json")
     try:
-        task = Task(capture, workdir, options, kernels_of(options), emit, cancelled)
+        task = Task(capture, workdir, options, choose_kernels(options), emit, cancelled)
         task.out.mkdir(parents=True, exist_ok=True)
         _warn_of_idle_gpu(task)
         emit(StateEvent(state=JobState.sfm))
@@ -162,7 +162,7 @@ def _warn_of_idle_gpu(task: Task) -> None:
 def _recover_cameras(task: Task, stages: Stages) -> Cameras:
     """The cameras that came with the photos or are recovered from them, and which photos are held out."""
     with stages.measured("sfm"):
-        scene = cameras_of(
+        scene = posed_scene(
             task.capture, task.workdir, task.options, progress_events(task.emit), task.cancelled
         )
     for note in scene.notes:
@@ -170,7 +170,7 @@ def _recover_cameras(task: Task, stages: Stages) -> Cameras:
     for name, reason in scene.left_out:
         task.emit(LogEvent(level="warning", message=f"{name} is left out: {reason}"))
     normalization = Normalization.of(scene)
-    training, held_out = held_out_of(scene, task.options)
+    training, held_out = split_views(scene, task.options)
     return Cameras(scene, normalization, normalization.apply(scene), training, held_out)
 
 
@@ -193,7 +193,7 @@ def _resize_photos(cameras: Cameras, loaded: Photos, plan: Plan, facts: Facts, s
 
 def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaussians, GivenModel | None]:
     """The Gaussians to start with, and what is known of the model they are, where one was given."""
-    path = start_file(task.capture, task.workdir, task.options)
+    path = start_model_path(task.capture, task.workdir, task.options)
     if path is not None:
         given = read_given_model(path, cameras.normalization)
         start = assess(given, photos.training)

@@ -13,7 +13,7 @@ from PIL import Image
 
 from splatmill.schema import TrainOptions
 from splatmill_worker import synthetic
-from splatmill_worker.capture import cameras_of
+from splatmill_worker.capture import posed_scene
 from splatmill_worker.errors import Cancelled
 from splatmill_worker.images import load_views
 from splatmill_worker.scene import Lens, Scene, View
@@ -155,7 +155,7 @@ def test_a_photo_that_does_not_decode_is_no_fault_of_the_poses(tmp_path: Path) -
     photo.write_bytes(photo.read_bytes()[:2000])  # its size can still be read
     stages: list[str] = []
     with pytest.raises(OSError, match=r"truncated|broken"):
-        cameras_of(
+        posed_scene(
             capture, tmp_path / "work", TrainOptions(), lambda stage, *_: stages.append(stage), lambda: False
         )
     assert stages == []

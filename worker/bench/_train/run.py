@@ -23,7 +23,7 @@ from _train.scenes import UNEQUAL
 from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline, sfm, synthetic
 from splatmill_worker.__main__ import return_freed_memory
-from splatmill_worker.capture import cameras_of, held_out_of, kernels_of
+from splatmill_worker.capture import choose_kernels, posed_scene, split_views
 from splatmill_worker.errors import ModelUnreadable, Refusal, TrainingFailed
 from splatmill_worker.images import load_views
 from splatmill_worker.scene import Normalization, Scene
@@ -53,7 +53,7 @@ def prepare(job: Row) -> Row:
     options = TrainOptions.model_validate(job["options"])
     try:
         scene = _posed(job, options)
-        train, test = held_out_of(scene, options)
+        train, test = split_views(scene, options)
     except NAMED as failure:
         return {"failure": str(failure)}
     return {"views": len(train), "held_out": len(test), "points": len(scene.points)}
@@ -111,7 +111,7 @@ def judge(job: Row) -> Row:
     try:
         gaussians = ply.read(path)
         scene = _posed(job, options)
-        _, test = held_out_of(scene, options)
+        _, test = split_views(scene, options)
     except (ModelUnreadable, *NAMED) as failure:
         return {"failure": str(failure)}
     if not test or options.image_size is None:
@@ -119,7 +119,7 @@ def judge(job: Row) -> Row:
     # The training world, for the same near plane and the same float32 rounding as a run's own evaluation.
     frame = Normalization.of(scene)
     moved = gaussians.moved(frame.scale, torch.from_numpy(frame.translation))
-    backend = kernels_of(options)
+    backend = choose_kernels(options)
 
     def draw(target: Target, background: Tensor) -> Tensor:
         return render(moved, target.camera, background=background, backend=backend).color
@@ -170,7 +170,7 @@ def _posed(job: Row, options: TrainOptions) -> Scene:
             unequal.expose(part)
         part.rename(capture / "images")
     with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
-        return cameras_of(capture, _with_cameras(Path(folder), job), options, _quiet, lambda: False)
+        return posed_scene(capture, _with_cameras(Path(folder), job), options, _quiet, lambda: False)
 
 
 def _with_cameras(workdir: Path, job: Row) -> Path:
