@@ -13,7 +13,7 @@ PARTS := constraints.txt $(wildcard */pyproject.toml) client/splatmill/__init__.
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --cov
 
-.PHONY: help install demo test check wheels bench serve sanitize clean
+.PHONY: help install demo quick test check wheels bench serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -23,6 +23,9 @@ install: $(VENV)/.installed ## set up .venv with the three parts and the compile
 demo: install ## photos in, splats out, into demo/ (PHOTOS=path takes your own)
 	@test -n "$(PHOTOS)" || $(BIN)/python -m splatmill_worker.synthetic demo/photos
 	@$(BIN)/splatmill train "$(or $(PHOTOS),demo/photos)" -o demo --novel-view --orbit
+
+quick: $(VENV)/.installed-dev ## run the tests that most changes need (not those marked slow), in under a minute
+	$(PYTEST) -m "not slow" $(PYTEST_ARGS)
 
 test: $(VENV)/.installed-dev ## run all tests and print their coverage (PYTEST_ARGS="..." chooses)
 	$(PYTEST) $(PYTEST_ARGS)

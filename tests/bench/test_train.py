@@ -22,6 +22,8 @@ from splatmill_worker.splat.plan.plan import Plan
 from tests.support import still_life
 from tests.support.paths import BENCH
 
+pytestmark = pytest.mark.slow
+
 Row = dict[str, Any]
 
 

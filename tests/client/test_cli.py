@@ -146,6 +146,7 @@ def test_a_path_with_nothing_to_train(tmp_path: Path):
     assert "contains no photos" in done.stderr
 
 
+@pytest.mark.slow
 def test_train_on_a_server(service, photos: Path, tmp_path: Path):
     out = tmp_path / "out"
     worker = work(service, lambda job_id: service.finish(job_id, PLY))
@@ -173,6 +174,7 @@ def test_train_on_a_server(service, photos: Path, tmp_path: Path):
     assert "\x1b" not in stdout, "no control sequences where nobody watches a terminal"
 
 
+@pytest.mark.slow
 def test_train_on_a_terminal(service, photos: Path, tmp_path: Path):
     worker = work(service, lambda job_id: service.finish(job_id, PLY))
     ours, theirs = pty.openpty()
@@ -210,6 +212,7 @@ def test_a_failed_job(service, photos: Path, tmp_path: Path):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interruption_cancels_the_job(service, photos: Path, tmp_path: Path, number: signal.Signals):
     process = spawn("train", photos, "-o", tmp_path / "out", "--server", service.url)
@@ -317,6 +320,7 @@ def test_starting_is_quick():
     assert not {"pydantic", "httpx", "asyncio", "rich.progress"} & set(loaded)
 
 
+@pytest.mark.slow
 def test_a_second_interruption_does_not_wait(peer, reply, photos: Path, tmp_path: Path):
     job = {
         "id": "j1",

@@ -19,6 +19,8 @@ from splatmill.cli.exits import Exit
 from splatmill.errors import ServiceFailed, Unauthorized
 from tests.support.waiting import wait_for
 
+pytestmark = pytest.mark.slow
+
 
 def family() -> set[int]:
     return {child.pid for child in psutil.Process().children(recursive=True)}

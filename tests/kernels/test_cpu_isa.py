@@ -22,6 +22,8 @@ from tests.support.kernels.cases import scene
 from tests.support.kernels.proof import use
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.slow
+
 RATES = Rates(1e-3, 1e-3, 1e-3, 1e-2, 1e-3, 1e-4)
 
 

@@ -24,7 +24,10 @@ from splatmill_worker.kernels.gpu.step import Step
 from splatmill_worker.kernels.records import Rates
 from tests.support.kernels.cases import scene
 
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's, in lanes that are masked
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # numpy's, in lanes that are masked
+]
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 ARRAYS = {
     torch.float32: "*fp32",

@@ -15,6 +15,8 @@ import torch
 
 from tests.support.paths import BENCH
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def bench() -> ModuleType:

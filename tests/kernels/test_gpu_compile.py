@@ -17,6 +17,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip(
     "triton", reason="Triton comes with torch's GPU builds; pip install triton to compile the kernels here"
 )

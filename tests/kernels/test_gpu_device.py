@@ -72,6 +72,7 @@ def test_backends_are_chosen_by_the_tensors_device() -> None:
     assert ops.backend_for(torch.zeros(1, device="meta")) == "cpu"
 
 
+@pytest.mark.slow
 def test_importing_the_package_imports_no_triton_and_starts_no_gpu() -> None:
     program = (
         "import sys, torch, splatmill_worker.kernels.ops, splatmill_worker.kernels.gpu.device, "

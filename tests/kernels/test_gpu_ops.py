@@ -26,9 +26,10 @@ from splatmill_worker.kernels.reference.composite import _weights
 from tests.support.kernels.cases import CASES, GROUPS, Case
 from tests.support.kernels.proof import filled
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::RuntimeWarning"
-)  # the interpreter's numpy, where NaN is the point
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # the interpreter's numpy, where NaN is the point
+]
 INTERPRETING = os.environ.get("TRITON_INTERPRET") == "1"
 EPS = 2.0**-24
 DEVICES = [

@@ -22,6 +22,8 @@ from splatmill_worker.splat.engine.parallel import Replicas, join
 from tests.support.kernels import replica
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.slow
+
 STEPS = {"cpu": 3, "gpu": 2}
 
 

@@ -28,7 +28,10 @@ from splatmill_worker.kernels.gpu.step import Step
 from splatmill_worker.kernels.records import Rates
 from tests.support.kernels.cases import GROUPS, Case, scene
 
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),
+]
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 WIDTH, HEIGHT = 20, 12
 

@@ -21,9 +21,10 @@ from tests.support.kernels import replica
 pytest.importorskip(
     "triton", reason="Triton comes with torch's GPU builds; pip install triton to prove this here"
 )
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::RuntimeWarning"
-)  # the interpreter's numpy, in lanes that are masked
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # the interpreter's numpy, in lanes that are masked
+]
 STEPS = 3
 
 

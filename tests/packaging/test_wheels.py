@@ -17,6 +17,8 @@ import pytest
 
 from tests.support.wheels import PARTS, ROOT, build, environment, metadata, run, watch
 
+pytestmark = pytest.mark.slow
+
 FOREIGN = ("torch", "numpy", "redis", "rq", "obstore", "fastapi", "splatmill_server", "splatmill_worker")
 MODULES = ("splatmill", "splatmill_server", "splatmill_worker")
 

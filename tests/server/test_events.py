@@ -8,6 +8,8 @@ import threading
 import time
 from typing import Any
 
+import pytest
+
 from splatmill.backplane import events
 from splatmill.schema import JobState, LogEvent, PlanEvent, ProgressEvent, StateEvent
 from tests.support.served_app import Serve, ServedApp, problem
@@ -70,6 +72,7 @@ def test_events_arrive_while_they_happen_with_heartbeats_between(serve: Serve) -
         assert brief(rest) == ["succeeded"]
 
 
+@pytest.mark.slow
 def test_a_cancelled_job_ends_its_stream_with_the_servers_word(app: ServedApp) -> None:
     job_id = app.job()
     found: list[dict[str, Any]] = []
@@ -128,6 +131,7 @@ def test_an_open_stream_does_not_hold_up_the_end_of_the_server(serve: Serve) -> 
         assert time.monotonic() - begun < 5
 
 
+@pytest.mark.slow
 def test_the_progress_stream_is_trimmed_and_the_states_are_not(app: ServedApp) -> None:
     job_id = app.job()
     app.begin(job_id)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -35,6 +36,7 @@ walks = st.lists(st.tuples(st.integers(1, 3), st.integers(1, 4), names), max_siz
 verdicts = st.none() | st.tuples(st.integers(0, 30), st.sampled_from(["cancelled", "failed"]))
 
 
+@pytest.mark.slow
 @settings(max_examples=500, deadline=None)
 @given(
     walks,

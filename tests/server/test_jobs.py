@@ -209,6 +209,7 @@ def test_deleting_a_job_removes_its_model_and_every_key(app: ServedApp) -> None:
     problem(app.http.delete(f"/v1/jobs/{job_id}"), 404, "job_not_found")
 
 
+@pytest.mark.slow
 def test_one_request_with_a_form_does_it_all(app: ServedApp) -> None:
     files = [("images", (f"{i:04}.jpg", PHOTO + b"%d" % i)) for i in range(300)]
     files += [("masks", ("0000.png", PHOTO)), ("poses", ("transforms.json", b"{}"))]

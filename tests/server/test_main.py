@@ -23,6 +23,8 @@ import pytest
 from tests.support.served_app import problem
 from tests.support.waiting import wait_for
 
+pytestmark = pytest.mark.slow
+
 
 def command(**env: str) -> dict[str, Any]:
     clean = {k: v for k, v in os.environ.items() if not k.startswith("SPLATMILL_")}

@@ -5,6 +5,7 @@ Short on purpose: breadth over all operations rather than depth in one. Not prov
 
 from typing import Any
 
+import pytest
 import schemathesis
 from hypothesis import HealthCheck, given, settings
 from schemathesis.checks import not_a_server_error
@@ -16,6 +17,8 @@ from schemathesis.specs.openapi.checks import (
 )
 
 from tests.support.served_app import ServedApp
+
+pytestmark = pytest.mark.slow
 
 CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
 

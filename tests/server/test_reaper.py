@@ -21,6 +21,8 @@ from splatmill.schema import JobState, ProgressEvent, StateEvent
 from tests.support.served_app import Serve, ServedApp
 from tests.support.waiting import wait_for
 
+pytestmark = pytest.mark.slow
+
 WORKER = textwrap.dedent(
     """
     import os, pathlib, sys, time

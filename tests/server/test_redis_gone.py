@@ -5,11 +5,15 @@ Not proved here: a Redis that comes back with its log (tests/service does that w
 
 from pathlib import Path
 
+import pytest
+
 from splatmill.backplane import layout
 from splatmill.backplane.connection import connect
 from tests.support.redis_server import empty_redis
 from tests.support.served_app import Serve, ServedApp, problem, served_app, store_model
 from tests.support.server_events import brief, follow
+
+pytestmark = pytest.mark.slow
 
 MODEL = "a" * 16
 

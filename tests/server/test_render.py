@@ -19,6 +19,8 @@ from splatmill.schema import RenderRequest
 from tests.support.served_app import Serve, ServedApp, problem, store_model
 from tests.support.waiting import wait_for
 
+pytestmark = pytest.mark.slow
+
 MODEL = "a" * 16
 EYE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -4], [0, 0, 0, 1]]
 CAMERA: dict[str, Any] = {"camera_to_world": EYE, "width": 64, "height": 48, "fov_y_deg": 50}

@@ -21,6 +21,8 @@ from splatmill_server.problems import ProblemError
 from splatmill_server.service import Service
 from splatmill_server.settings import Settings
 
+pytestmark = pytest.mark.slow
+
 PHASES = [JobState.preparing, JobState.sfm, JobState.training, JobState.exporting]
 CAPTURE = "c" * 16
 

@@ -19,6 +19,8 @@ from splatmill_worker.scene import Camera
 from tests.support.up import Up
 from tests.support.waiting import gone, wait_for
 
+pytestmark = pytest.mark.slow
+
 COUNT, WIDTH, HEIGHT = 10, 160, 120
 
 

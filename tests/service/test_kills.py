@@ -15,6 +15,8 @@ from splatmill.backplane import queue
 from tests.support.up import Up
 from tests.support.waiting import gone, wait_for
 
+pytestmark = pytest.mark.slow
+
 STEPS = 40
 
 

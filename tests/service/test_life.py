@@ -6,8 +6,12 @@ The pipeline is a stand-in: nothing here says that a model looks like its photos
 import json
 import time
 
+import pytest
+
 from tests.support.up import Up
 from tests.support.waiting import gone, wait_for
+
+pytestmark = pytest.mark.slow
 
 
 def test_a_job_becomes_a_model_and_leaves_no_work_behind(service: Up) -> None:

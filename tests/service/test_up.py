@@ -18,6 +18,8 @@ from tests.support.redis_server import RedisServer
 from tests.support.up import Up
 from tests.support.waiting import gone, wait_for
 
+pytestmark = pytest.mark.slow
+
 
 def refused(*options: str, **environment: str) -> str:
     """What `up` says when it ends at its start with status 1."""

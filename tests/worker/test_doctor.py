@@ -10,6 +10,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+pytestmark = pytest.mark.slow
+
 
 def doctor(data: Path, **environment: str) -> tuple[int, dict[str, dict[str, Any]]]:
     """Exit status and the findings by topic; where a topic has several, the last."""

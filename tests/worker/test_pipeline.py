@@ -24,6 +24,8 @@ from splatmill_worker.splat.render import render
 from tests.support import still_life
 from tests.support.paths import DATA
 
+pytestmark = pytest.mark.slow
+
 
 def options(**values: object) -> TrainOptions:
     return TrainOptions.model_validate({"steps": 150, "seed": 1, **values})

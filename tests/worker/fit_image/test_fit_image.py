@@ -99,6 +99,7 @@ def test_what_is_transparent_stays_so(tmp_path: Path) -> None:
     assert cover[:, 34:].mean() > 245
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     photo = saved(tmp_path / "p.png")
     written = []
@@ -241,6 +242,7 @@ def test_what_is_no_picture_is_refused_by_code(tmp_path: Path, kind: str, code: 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_the_command_fits_and_refuses_with_the_documented_codes(tmp_path: Path) -> None:
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "splatmill", "fit-image", *arguments]

@@ -5,6 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.slow
+
 
 def test_a_worker_started_by_hand_says_that_redis_is_away(tmp_path: Path) -> None:
     environment = dict(os.environ) | {"REDIS_URL": f"unix://{tmp_path}/nothing.sock"}

@@ -26,6 +26,8 @@ from splatmill_worker.sfm.matching import pairs
 from splatmill_worker.sfm.matching.matcher import MAX_ANGLE, MAX_RATIO, Matcher
 from tests.support.paths import DATA
 
+pytestmark = pytest.mark.slow
+
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the shared data folder is not beside the project")
 
 

@@ -15,6 +15,8 @@ from splatmill_worker.sfm import features
 from splatmill_worker.sfm.features import FeatureStore
 from splatmill_worker.sfm.matching import pairs
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> FeatureStore:

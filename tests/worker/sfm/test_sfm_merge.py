@@ -15,6 +15,8 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.mapping.merge import merge
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> pycolmap.Reconstruction:

@@ -21,6 +21,8 @@ from splatmill_worker.sfm import posed, stereo
 from splatmill_worker.sfm.stereo.plane_sweep import GreyView, sweep
 from tests.support import still_life
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 320, 240
 
 

@@ -8,9 +8,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from splatmill_worker import synthetic
+
+pytestmark = pytest.mark.slow
 
 
 def points_of(camera, depth):

@@ -24,6 +24,8 @@ from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.start.points import from_points
 from tests.support import still_life
 
+pytestmark = pytest.mark.slow
+
 
 def run(
     capture: Path, work: Path, cancelled: Callable[[], bool] = lambda: False, **values: object

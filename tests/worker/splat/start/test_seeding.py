@@ -5,6 +5,7 @@ Does not prove where they are put: test_gaps and test_far_shell do.
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from splatmill_worker.splat.start import far_shell, gaps, seeding
@@ -13,6 +14,7 @@ from splatmill_worker.splat.start.points import from_points
 from tests.support.training import sparse_scene
 
 
+@pytest.mark.slow
 def test_what_is_added_keeps_to_the_limit_and_to_what_the_plan_says() -> None:
     world, views = sparse_scene()
     first = from_points(torch.from_numpy(world.points), torch.from_numpy(world.colors))

@@ -24,6 +24,8 @@ from splatmill_worker.splat.views import Target, TrainingView
 from tests.support import still_life
 from tests.support.training import first_engine, plan
 
+pytestmark = pytest.mark.slow
+
 STEPS = 120
 
 

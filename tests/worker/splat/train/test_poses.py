@@ -45,6 +45,7 @@ def run(views: list[TrainingView], held_out: list[TrainingView], refined: bool) 
     return train(first_engine(), views, held_out, plan(600, pose_refinement=refined), extent=1.1)
 
 
+@pytest.mark.slow
 def test_shaken_cameras_come_back_and_held_out_views_gain() -> None:
     truth, held_out = split()
     views = shaken(truth, TURN, SHIFT)
@@ -58,6 +59,7 @@ def test_shaken_cameras_come_back_and_held_out_views_gain() -> None:
     assert refined.on_training.psnr > left.on_training.psnr + 0.5
 
 
+@pytest.mark.slow
 def test_exact_cameras_stay_within_what_the_photos_resolve() -> None:
     truth, held_out = split()
     left, refined = run(truth, held_out, False), run(truth, held_out, True)

@@ -31,6 +31,7 @@ from tests.support import still_life
 from tests.support.training import first_engine, plan, split
 
 
+@pytest.mark.slow
 def test_held_out_views_are_learned() -> None:
     views, held_out = split()
     trained = train(first_engine(), views, held_out, plan(400), extent=1.1)
@@ -69,6 +70,7 @@ def test_steps_are_as_long_as_suits_what_the_time_turns_out_to_hold() -> None:
     assert run.rates(0.0).log_scales == pytest.approx(5e-3 * boost_of(160 + 920), rel=0.02)
 
 
+@pytest.mark.slow
 def test_there_are_never_more_gaussians_than_allowed() -> None:
     views, held_out = split()
     trained = train(first_engine(), views, held_out, plan(300, max_gaussians=2200), extent=1.1)
@@ -77,6 +79,7 @@ def test_there_are_never_more_gaussians_than_allowed() -> None:
     assert trained.gaussians.count <= 2200
 
 
+@pytest.mark.slow
 def test_dark_surfaces_are_no_holes_over_random_colours() -> None:
     """Over black, what is not there looks like a dark wall, and training has no reason to put one."""
     views = [
@@ -109,6 +112,7 @@ def test_opaque_photos_are_judged_over_black_and_transparent_ones_over_white() -
         assert evaluation_background(plan(background=background), judged).tolist() == [colour] * 3
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes() -> None:
     views, _ = split()
     first = train(first_engine(), views, [], plan(120), extent=1.1).gaussians
@@ -118,6 +122,7 @@ def test_the_same_seed_gives_the_same_bytes() -> None:
     assert other.count != first.count or not torch.equal(other.means, first.means)
 
 
+@pytest.mark.slow
 def test_the_reference_trains_through_the_same_loop_and_agrees() -> None:
     views, _ = split()
     course = replace(plan().schedule, budget=Budget(12), resolution=((0, 2),))
@@ -132,6 +137,7 @@ def test_the_reference_trains_through_the_same_loop_and_agrees() -> None:
     assert losses["cpu"] == pytest.approx(losses["reference"], rel=2e-3)
 
 
+@pytest.mark.slow
 def test_a_time_budget_ends_on_time_with_rates_annealed() -> None:
     views, held_out = split()
     reports: list[Progress] = []
@@ -234,6 +240,7 @@ def spoilt(parameters: dict[str, torch.Tensor]) -> None:
     parameters["means"][:5] = math.nan
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoil", [thrown_away, spoilt])
 def test_a_planted_divergence_is_rolled_back(spoil: Any) -> None:
     views, held_out = split()
@@ -272,6 +279,7 @@ def test_a_scene_that_no_camera_sees_is_empty_by_name() -> None:
     assert held_out
 
 
+@pytest.mark.slow
 def test_transparent_photos_train_over_random_backgrounds() -> None:
     views = still_life.training_views(alpha=True)
     targets = [view.full for view in views]
@@ -290,6 +298,7 @@ def test_transparent_photos_train_over_random_backgrounds() -> None:
     assert float(alpha[~hidden].mean()) > 0.8
 
 
+@pytest.mark.slow
 def test_exposures_are_fitted_where_photos_differ() -> None:
     views = still_life.training_views()
     for view in views[1::2]:
