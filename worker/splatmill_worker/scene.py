@@ -1,7 +1,7 @@
-"""A scene as the trainer takes it: photos with cameras, sparse points, and the held-out split.
+"""A scene: photos with cameras, sparse points, the held-out split, and the similarity to the training world.
 
-Cameras follow OpenCV: x right, y down, z forward, world-to-camera matrices, and the centre of the first
-pixel at (0.5, 0.5). Everything here is float64; `Normalization` makes it small enough for float32.
+Cameras follow OpenCV: x right, y down, z forward, world-to-camera matrices, and the centre of the first pixel at
+(0.5, 0.5). All geometry is float64; `Normalization` brings it to a size at which float32 is accurate.
 """
 
 from __future__ import annotations
@@ -16,17 +16,22 @@ import numpy.typing as npt
 Float = npt.NDArray[np.float64]
 Real = npt.NDArray[np.floating[Any]]
 Source = Literal["sfm", "colmap", "transforms", "blender"]
+"""Where cameras come from: structure from motion, a COLMAP model, transforms.json, or a Blender data set."""
 
 MIN_DEPTH = 1e-9
-"""World units: a point that is not at least this far in front of a camera has no position on its photo."""
+"""World units: a point that is not farther than this in front of a camera has no position on its photo."""
+
+MIN_SPREAD = 1e-3
+"""Radius of the cameras over the median distance of the points, up to which the cameras count as one place."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """How the photo itself was projected, when that was not a plain pinhole.
+    """The projection of a photo with lens distortion.
 
-    `model` and `params` are COLMAP's (e.g. OPENCV: fx, fy, cx, cy, k1, k2, p1, p2), in pixels of a photo
-    of `width` x `height`.
+    model: COLMAP's name of the camera model.
+    params: COLMAP's parameters of that model, lengths in pixels (OPENCV: fx, fy, cx, cy, k1, k2, p1, p2).
+    width, height: size in pixels of the photo that the parameters refer to.
     """
 
     model: str
@@ -122,7 +127,7 @@ class Camera:
         return replace(self, viewmat=viewmat_of(self.viewmat[:3, :3], center))
 
     def scaled_to(self, width: int, height: int) -> Camera:
-        """The same camera for a photo resampled to `width` x `height` pixels."""
+        """The same camera for the photo resampled to `width` x `height` pixels."""
         x, y = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
@@ -156,9 +161,13 @@ def looked_at(centers: Float, axes: Float, ridge: float = 1e-3) -> Float:
 class View:
     """One photo and its camera.
 
-    `camera` is the pinhole camera of the undistorted photo at its own size; `lens` says how the file itself
-    was projected (None: it is that pinhole). `upright` says whether the camera describes the photo after its
-    EXIF orientation was applied. `split` is given only by data sets that bring their own.
+    name: of the photo, unique in its scene.
+    camera: the pinhole camera of the undistorted photo at full size.
+    image: path of the photo.
+    mask: path of its mask, if there is one.
+    lens: projection of the photo itself; None: that of `camera`.
+    split: as given by a data set that brings its own; None: by the rule of `split`.
+    upright: whether the camera describes the photo with its EXIF orientation applied.
     """
 
     name: str
@@ -171,7 +180,7 @@ class View:
 
 
 class PointViews(NamedTuple):
-    """Which views see each point, in rows: point i is seen by `views[offsets[i]:offsets[i + 1]]`."""
+    """Tracks of the points: point i is observed by the views with indices `views[offsets[i]:offsets[i + 1]]`."""
 
     offsets: npt.NDArray[np.int64]
     views: npt.NDArray[np.int32]
@@ -179,10 +188,18 @@ class PointViews(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """Posed photos and the sparse points, [M,3] float64 with colours [M,3] uint8 and errors in pixels [M].
+    """Posed photos and sparse points.
 
-    `facts` are the figures measured on the way, `left_out` the photos that have no camera, with the reason,
-    and `notes` sentences for a person.
+    views: the photos with their cameras.
+    points: positions in the world, float64 [M,3].
+    colors: RGB of the points, uint8 [M,3].
+    source: where the cameras come from.
+    point_errors: mean reprojection error of each point, in pixels of the photos [M]; None: not known.
+    track_lengths: number of views that observe each point [M]; None: not known.
+    point_views: which ones; None: not known.
+    facts: figures about photos, pairs and model, by name.
+    left_out: (name, reason) of each photo or file that is not used.
+    notes: sentences for the user.
     """
 
     views: tuple[View, ...]
@@ -203,20 +220,24 @@ class Scene:
 
 
 def split(scene: Scene, holdout: int = 8) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """Training and held-out views: of all views sorted by name, every `holdout`-th from the first is held out.
+    """Training views and held-out views.
 
-    0 holds none out. A data set's own split wins over the rule. With fewer than two views, nothing is held out.
+    Every `holdout`-th view in order of the names is held out, from the first one on; 0 holds out none. The split of a
+    data set takes precedence. With fewer than two views none is held out. Raises ValueError when `holdout` is negative,
+    and when it would hold out every view.
     """
     views = sorted(scene.views, key=lambda view: view.name)
     if holdout < 0:
-        raise ValueError(f"holdout is {holdout}; it must be 0 (none) or the distance between held-out views.")
+        raise ValueError(
+            f"holdout is {holdout}; give 0 to hold out none, or 2 or more to hold out every n-th view."
+        )
     own = [view for view in views if view.split == "test"]
     if own and holdout:
         return tuple(view for view in views if view.split != "test"), tuple(own)
     if own or holdout == 0 or len(views) < 2:
         return tuple(view for view in views if view.split != "test"), ()
     if holdout == 1:
-        raise ValueError("holdout is 1: every view would be held out and none trained. Use 2 or more, or 0.")
+        raise ValueError("holdout is 1, which holds out every view; give 2 or more, or 0 to hold out none.")
     test = tuple(views[::holdout])
     names = {view.name for view in test}
     return tuple(view for view in views if view.name not in names), test
@@ -224,9 +245,9 @@ def split(scene: Scene, holdout: int = 8) -> tuple[tuple[View, ...], tuple[View,
 
 @dataclass(frozen=True)
 class Normalization:
-    """The similarity x' = scale * x + translation between the scene's own world and the training world.
+    """The similarity x' = scale * x + translation from the scene's world to the training world.
 
-    Kept in float64: a geo-referenced scene at northing 5e6 has steps of 0.5 m in float32.
+    It is float64: in float32, neighbouring numbers near a northing of 5e6 metres are 0.5 metres apart.
     """
 
     scale: float
@@ -234,26 +255,26 @@ class Normalization:
 
     @staticmethod
     def of(scene: Scene) -> Normalization:
-        """Centres the cameras on the origin and puts the farthest at distance 1.
+        """The similarity that puts the cameras' mean at the origin and the farthest camera at distance 1.
 
-        Where the cameras do not spread (a single view, a turning tripod), the median depth of the points
-        sets the scale instead; with no points either, the scale stays 1.
+        When the cameras are in one place (a single view, a turning tripod), the median distance of the points becomes
+        1 instead; without points the scale is 1.
         """
         centers = scene.centers
         middle = centers.mean(axis=0) if len(centers) else np.zeros(3)
         radius = float(np.linalg.norm(centers - middle, axis=1).max(initial=0.0))
         depth = float(np.median(np.linalg.norm(scene.points - middle, axis=1))) if len(scene.points) else 0.0
-        if not radius > 1e-3 * depth:
+        if not radius > MIN_SPREAD * depth:
             radius = depth
         scale = 1.0 / radius if radius > 0.0 and np.isfinite(radius) else 1.0
         return Normalization(scale, -scale * middle)
 
     def points(self, points: Float) -> Float:
-        """Points [M,3] of the scene's world in the training world."""
+        """Points [M,3] of the scene's world, in the training world."""
         return np.asarray(points, np.float64) * self.scale + self.translation
 
     def camera(self, camera: Camera) -> Camera:
-        """The camera in the training world; the picture it takes is the same, depths are `scale` times as large."""
+        """The camera in the training world: its photo is the same, and depths are multiplied by `scale`."""
         return camera.moved_to(self.scale * camera.center + self.translation)
 
     def undo_camera(self, camera: Camera) -> Camera:

@@ -1,4 +1,4 @@
-"""A built-in still life and the photos of it: the demo's capture, and ground truth for tests and benchmarks."""
+"""A built-in still life with exact cameras: the demo's capture, and ground truth for tests and benchmarks."""
 
 from splatmill_worker.synthetic.ray_caster import StillLife, capture, look_at, orbit, photograph, still_life
 

@@ -1,4 +1,4 @@
-"""`python -m splatmill_worker.synthetic DIR` photographs the still life into a folder."""
+"""`python -m splatmill_worker.synthetic DIR` writes photos of the still life to a folder."""
 
 import argparse
 from pathlib import Path
@@ -7,7 +7,7 @@ from splatmill_worker.synthetic import capture
 
 
 def main() -> None:
-    """Write the photos, and say where they are."""
+    """Write the photos and print where they are."""
     parser = argparse.ArgumentParser(prog="python -m splatmill_worker.synthetic", description=__doc__)
     parser.add_argument("directory", type=Path)
     parser.add_argument("--count", type=int, default=40)

@@ -1,8 +1,8 @@
-"""A small ray caster that "photographs" a textured still life: the demo's capture, and ground truth for tests.
+"""A small ray caster that renders photos of a textured still life, with exact cameras and depths.
 
-Every surface is hit analytically (discs, boxes, spheres, cylinders, a dome), so cameras and depths are exact;
-only colour is sampled (a box filter of `samples`^2 rays a pixel over mip-mapped textures). The world has z up,
-units of about a table's half width, and cameras in OpenCV axes (x right, y down, z forward).
+Intersections with all surfaces (discs, boxes, spheres, cylinders, a dome) are analytic. Only colour is sampled: with a
+box filter of samples x samples rays per pixel, and mip-mapped textures. In the world z points up, and a unit is about
+half the width of the table; cameras have OpenCV axes (x right, y down, z forward).
 """
 
 from __future__ import annotations
@@ -22,15 +22,27 @@ from splatmill_worker.synthetic.textures import MipMap, painted, planks, sky
 Tensor = torch.Tensor
 
 _FAR = 1e9
+"""Distance along a ray that hits nothing, in world units."""
+
+_NEAR = 1e-4
+"""Distance along a ray, in world units, up to which an intersection counts as its origin."""
+
 _LIGHT = np.array([0.45, -0.35, 0.82])
+"""Direction to the sun, of any length."""
+
 _AMBIENT = 0.42
+"""Share of a surface's colour that is seen in shadow."""
+
 _DOME_RADIUS = 40.0
-_RAYS_AT_ONCE = 16384  # a band of the picture whose intermediate results stay in the cache
+"""World units, around the origin."""
+
+_RAYS_PER_BAND = 16384
+"""Rays cast at a time, in whole rows of pixels; their intermediate results stay in the cache."""
 
 
 @dataclass(frozen=True)
 class Disc:
-    """A horizontal disc at height z, textured in the plane: `scale` texture widths a unit of length."""
+    """A horizontal disc at height `z`; `scale`: widths of the texture per world unit."""
 
     z: float
     radius: float
@@ -41,7 +53,7 @@ class Disc:
         t = (self.z - origin[..., 2]) / rays[..., 2]
         x = origin[..., 0] + t * rays[..., 0]
         y = origin[..., 1] + t * rays[..., 1]
-        return torch.where((t > 1e-4) & (x * x + y * y < self.radius**2), t, _FAR)
+        return torch.where((t > _NEAR) & (x * x + y * y < self.radius**2), t, _FAR)
 
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
         normal = torch.zeros_like(points)
@@ -51,7 +63,10 @@ class Disc:
 
 @dataclass(frozen=True)
 class Box:
-    """A box turned by `turn` radians about z; every face shows another part of the texture."""
+    """A box turned by `turn` radians about z; each face shows another part of the texture.
+
+    half: half its extents. shine: strength of its highlight.
+    """
 
     center: tuple[float, float, float]
     half: tuple[float, float, float]
@@ -71,7 +86,7 @@ class Box:
         a, b = (-half - o) * inverse, (half - o) * inverse
         near = torch.minimum(a, b).amax(-1)
         far = torch.maximum(a, b).amin(-1)
-        return torch.where((near < far) & (near > 1e-4), near, _FAR)
+        return torch.where((near < far) & (near > _NEAR), near, _FAR)
 
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
         local = self._local(points - torch.tensor(self.center))
@@ -91,7 +106,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A sphere, textured by longitude and latitude; `shine` is the strength of its highlight."""
+    """A sphere textured by longitude and latitude; `shine`: strength of its highlight."""
 
     center: tuple[float, float, float]
     radius: float
@@ -104,7 +119,7 @@ class Sphere:
         b = (o * rays).sum(-1)
         disc = b * b - ((o * o).sum(-1) - self.radius**2)
         t = -b - disc.clamp(min=0).sqrt()
-        return torch.where((disc > 0) & (t > 1e-4), t, _FAR)
+        return torch.where((disc > 0) & (t > _NEAR), t, _FAR)
 
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
         normal = (points - torch.tensor(self.center)) / self.radius
@@ -115,7 +130,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """An upright cylinder with a lid."""
+    """An upright cylinder with a lid; `half_height`: half its height."""
 
     center: tuple[float, float, float]
     radius: float
@@ -130,10 +145,10 @@ class Cylinder:
         b = (o[..., :2] * rays[..., :2]).sum(-1)
         disc = b * b - a * ((o[..., :2] ** 2).sum(-1) - self.radius**2)
         side = (-b - disc.clamp(min=0).sqrt()) / a
-        on_side = (disc > 0) & (side > 1e-4) & ((o[..., 2] + side * rays[..., 2]).abs() < self.half_height)
+        on_side = (disc > 0) & (side > _NEAR) & ((o[..., 2] + side * rays[..., 2]).abs() < self.half_height)
         lid = (self.half_height - o[..., 2]) / rays[..., 2]
         at = o[..., :2] + lid[..., None] * rays[..., :2]
-        on_lid = (lid > 1e-4) & ((at * at).sum(-1) < self.radius**2)
+        on_lid = (lid > _NEAR) & ((at * at).sum(-1) < self.radius**2)
         return torch.minimum(torch.where(on_side, side, _FAR), torch.where(on_lid, lid, _FAR))
 
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -155,7 +170,12 @@ Solid = Disc | Box | Sphere | Cylinder
 
 @dataclass(frozen=True)
 class StillLife:
-    """The scene: solids on a round table, on a floor, under a dome of sky; `light` is a unit vector."""
+    """The scene.
+
+    solids: things on a round table, the table and the floor.
+    dome: texture of the sky around them.
+    light: unit vector to the sun.
+    """
 
     solids: tuple[Solid, ...]
     dome: MipMap
@@ -163,7 +183,7 @@ class StillLife:
 
 
 def still_life(seed: int = 0) -> StillLife:
-    """The demo scene. The same seed gives the same scene; another seed paints and places it anew."""
+    """The still life; `seed` decides textures, positions and angles."""
     rng = np.random.default_rng(seed)
     solids: list[Solid] = [
         Disc(0.0, 1.9, MipMap(painted(rng, 1024, density=900)), 0.27),
@@ -188,7 +208,7 @@ def still_life(seed: int = 0) -> StillLife:
 
 
 def orbit(count: int, width: int, height: int, seed: int = 0) -> list[Camera]:
-    """`count` cameras around the table on a rising spiral, hand-held: each is a little off its place and aim."""
+    """`count` cameras on a rising spiral around the table, with random offsets of position and direction."""
     rng = np.random.default_rng([seed, 7])
     focal = 0.82 * max(width, height)
     cameras = []
@@ -206,7 +226,10 @@ def orbit(count: int, width: int, height: int, seed: int = 0) -> list[Camera]:
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, focal: float) -> Camera:
-    """A level pinhole camera at `eye` [3] that looks at `target` [3]; `focal` in pixels, centre in the middle."""
+    """A level pinhole camera at `eye` [3], directed at `target` [3].
+
+    focal: in pixels. The principal point is the photo's centre.
+    """
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -215,11 +238,14 @@ def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, focal:
 
 
 def photograph(scene: StillLife, camera: Camera, samples: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """What `camera` sees: colour, uint8 [H, W, 3], and camera-space depth at pixel centres, float32 [H, W]."""
+    """The photo that `camera` takes: colour, uint8 [H, W, 3], and depth at pixel centres, float32 [H, W].
+
+    samples: rays per pixel along each axis.
+    """
     rgb = np.empty((camera.height, camera.width, 3), np.uint8)
     depth = np.empty((camera.height, camera.width), np.float32)
     offsets = [(k + 0.5) / samples for k in range(samples)]
-    band = max(1, _RAYS_AT_ONCE // camera.width)
+    band = max(1, _RAYS_PER_BAND // camera.width)
     for top in range(0, camera.height, band):
         rows = slice(top, min(top + band, camera.height))
         shaded = torch.stack([_cast(scene, camera, rows, u, v)[0] for u in offsets for v in offsets])
@@ -231,7 +257,10 @@ def photograph(scene: StillLife, camera: Camera, samples: int = 2) -> tuple[np.n
 def capture(
     directory: Path, count: int = 40, width: int = 640, height: int = 480, seed: int = 0, samples: int = 2
 ) -> dict[str, Camera]:
-    """Photograph the still life: `count` JPEGs with EXIF under `directory`; returns the true camera of each name."""
+    """Write `count` photos of the still life to `directory`, as JPEGs with EXIF; returns the true camera of each name.
+
+    width, height: in pixels. seed: of the scene and of the cameras. samples: rays per pixel along each axis.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     scene = still_life(seed)
     cameras = {f"still_{k + 1:04d}.jpg": c for k, c in enumerate(orbit(count, width, height, seed))}
@@ -245,7 +274,7 @@ def capture(
         exif.get_ifd(0x8769)[0xA405] = round(35 * camera.fx / max(width, height))
         Image.fromarray(rgb).save(directory / name, quality=95, exif=exif)
 
-    # One photo a thread: bands are too small for torch's own threads to pay.
+    # One photo per thread: bands are too small for torch's own threads.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -259,7 +288,10 @@ def capture(
 def _cast(
     scene: StillLife, camera: Camera, rows: slice, du: float, dv: float, shade: bool = True
 ) -> tuple[Tensor, Tensor]:
-    """One ray a pixel of `rows` through (column + du, row + dv): colour [rows, W, 3] and depth [rows, W]."""
+    """Colour [rows, W, 3] and depth [rows, W] along one ray per pixel of `rows`, at (column + du, row + dv).
+
+    Without `shade`, no colour is computed.
+    """
     rotation = torch.from_numpy(camera.viewmat[:3, :3].astype(np.float32))
     eye = torch.from_numpy(camera.center.astype(np.float32))
     x, y = camera.normalized(torch.arange(camera.width) + du, torch.arange(rows.start, rows.stop) + dv)
@@ -302,7 +334,7 @@ def _cast(
 def _lit(
     scene: StillLife, surface: Solid, points: Tensor, normal: Tensor, rays: Tensor, albedo: Tensor
 ) -> Tensor:
-    """Lambert under one sun with hard shadows, and a Phong highlight where the surface shines."""
+    """Colour [N, 3]: Lambertian shading under one sun with hard shadows, and Phong highlights."""
     light = torch.from_numpy(scene.light.astype(np.float32))
     lambert = (normal @ light).clamp(min=0)
     start = points + 1e-3 * normal

@@ -1,4 +1,4 @@
-"""Painted textures with structure at every scale, and their mip-mapped look-up, for the synthetic scene."""
+"""Random textures with structure at every scale, and their mip-mapped look-up."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _PALETTE = np.array(
 
 
 class MipMap:
-    """A square RGB texture that repeats, with its halvings, looked up by texture coordinates and footprint."""
+    """A square RGB texture of period 1 in both coordinates, with all its mip levels."""
 
     def __init__(self, image: np.ndarray) -> None:
-        """`image` is uint8 [S, S, 3] with S a power of two."""
+        """The texture of `image`, uint8 [S, S, 3], with S a power of two."""
         level = torch.from_numpy(image.astype(np.float32) / 255)
         levels, starts, sizes, start = [], [], [], 0
         while True:
@@ -35,7 +35,10 @@ class MipMap:
         self._sizes = torch.tensor(sizes)
 
     def sample(self, uv: torch.Tensor, footprint: torch.Tensor) -> torch.Tensor:
-        """Bilinear colours [N, 3] at `uv` [N, 2] (period 1), from the level with texels as wide as `footprint` [N]."""
+        """Bilinear colours [N, 3], 0 to 1, at `uv` [N, 2], from the level whose texels are as wide as `footprint` [N].
+
+        The footprint is in texture widths.
+        """
         level = torch.log2((footprint * self._sizes[0]).clamp(min=1)).round().long()
         level = level.clamp(max=len(self._sizes) - 1)
         size, start = self._sizes[level], self._starts[level]
@@ -56,7 +59,7 @@ class MipMap:
 
 
 def painted(rng: np.random.Generator, size: int, density: int) -> np.ndarray:
-    """Discs, bars and triangles of a warm palette over soft noise; uint8 [size, size, 3]."""
+    """Discs, bars and triangles of a warm palette over noise, uint8 [size, size, 3]; `density`: their number."""
     base = _PALETTE[rng.integers(len(_PALETTE))] * 0.5 + 90
     canvas = Image.fromarray((base + 26 * _noise(rng, size)[..., None]).clip(0, 255).astype(np.uint8))
     draw = ImageDraw.Draw(canvas)
@@ -79,7 +82,7 @@ def painted(rng: np.random.Generator, size: int, density: int) -> np.ndarray:
 
 
 def planks(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Floor boards with grain along them; uint8 [size, size, 3]."""
+    """Floor boards with grain, uint8 [size, size, 3]."""
     grain = np.repeat(_noise(rng, size)[:, :: size // 64], size // 64, axis=1)
     canvas = np.array([150.0, 110.0, 76.0]) + 16 * grain[..., None] + 9 * _noise(rng, size)[..., None]
     boards = 8
@@ -93,9 +96,9 @@ def planks(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def sky(rng: np.random.Generator, size: int) -> np.ndarray:
-    """The dome by longitude (columns) and latitude (rows): distant hills, haze and clouds; uint8 [size, size, 3]."""
+    """Distant hills, haze and clouds by longitude (columns) and latitude (rows), uint8 [size, size, 3]."""
     latitude = ((np.arange(size) + 0.5) / size)[:, None]
-    # Row v holds latitude pi*v for v in [-1/2, 1/2), wrapped: the upper half of the sky is rows 0 .. size/2.
+    # Row v, from 0 to 1, holds the latitude pi * v, wrapped to -pi/2 .. pi/2: the upper half of the dome comes first.
     up = np.where(latitude < 0.5, latitude * 2, 0.0)[..., None]
     noise = _noise(rng, size)
     clouds = np.clip(noise, 0, 1.5)[..., None]
@@ -109,13 +112,13 @@ def sky(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def _grain(rng: np.random.Generator, canvas: Image.Image) -> np.ndarray:
-    """Soften drawn edges by a texel, then add fine grain, so that no scale is empty."""
+    """The canvas with edges blurred by a texel and grain added, so that no scale is without structure."""
     soft = np.asarray(canvas.filter(ImageFilter.GaussianBlur(0.7)), np.float32)
     return (soft + rng.normal(0, 7, soft.shape[:2])[..., None]).clip(0, 255).astype(np.uint8)
 
 
 def _noise(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Seamless noise of six octaves, about unit variance; float64 [size, size]."""
+    """Periodic noise of six octaves with unit standard deviation, float64 [size, size]."""
     total = np.zeros((size, size))
     for octave in range(2, 8):
         cells = 2**octave
