@@ -10,10 +10,9 @@ import pytest
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Role
+from tests.support.jobs import CAPTURE
 from tests.support.redis_server import connection as connection
 from tests.support.redis_server import redis_server as redis_server
-
-CAPTURE = "capture1"
 
 
 @pytest.fixture

@@ -9,8 +9,7 @@ from splatmill.backplane import keys
 from splatmill.backplane.storage import Storage
 from splatmill_worker.service.abandoned_folders import KEEP_SECONDS, remove_abandoned
 from splatmill_worker.service.job_folder import JobFolder
-
-CAPTURE = "capture1"
+from tests.support.jobs import CAPTURE
 
 
 def test_only_old_unused_folders_of_unknown_jobs_are_removed(local: Storage, connection: redis.Redis) -> None:

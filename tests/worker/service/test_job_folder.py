@@ -17,8 +17,9 @@ from splatmill_worker.service import job_folder
 from splatmill_worker.service.job_folder import JobFolder, in_use
 from splatmill_worker.service.mirror import Mirror
 from splatmill_worker.service.problems import is_transient, problem_of
+from tests.support.jobs import CAPTURE
 
-JOB, CAPTURE = "job00001", "capture1"
+JOB = "job00001"
 
 
 def staged(folder: JobFolder) -> dict[str, bytes]:

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from splatmill.backplane.storage import Storage
 from splatmill_worker.service import sfm_cache
-
-CAPTURE = "capture1"
+from tests.support.jobs import CAPTURE
 
 
 def test_recovered_cameras_serve_the_next_job_on_the_capture(remote: Storage, tmp_path: Path) -> None:

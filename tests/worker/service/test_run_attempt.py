@@ -1,0 +1,51 @@
+"""Proves how an attempt that storage refuses ends: queued again while it can be retried, failed by name when not.
+
+Does not prove what happens to the processes: tests/service does.
+"""
+
+import logging
+from pathlib import Path
+
+import pytest
+import redis
+
+from splatmill.backplane.storage import StorageError
+from splatmill_worker.service import run_attempt as module
+from splatmill_worker.service.attempt import Attempt, start_attempt
+from splatmill_worker.service.run_attempt import run_attempt
+from tests.support.jobs import messages, read_job, write_row
+
+JOB = "job00001"
+
+
+@pytest.fixture
+def refused(connection: redis.Redis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Attempt:
+    """An attempt whose storage folder cannot be made, because a file is in its place."""
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("SPLATMILL_STORAGE", (tmp_path / "file" / "storage").as_uri())
+    monkeypatch.setattr(module, "RETRY_SECONDS", 0.0)
+    monkeypatch.setattr(logging.getLogger("splatmill_worker"), "level", logging.WARNING)  # it is set for good
+    write_row(connection, JOB)
+    return start_attempt(connection, f"{JOB}-1", "token")
+
+
+def test_a_transient_failure_is_raised_while_it_can_be_retried(
+    refused: Attempt, connection: redis.Redis
+) -> None:
+    with pytest.raises(StorageError):
+        run_attempt(refused, can_retry=True)
+    job = read_job(connection, JOB)
+    assert (job.state, job.attempt, job.problem) == ("queued", 1, None)
+    assert any("tried again" in message for message in messages(connection, JOB))
+
+
+def test_a_transient_failure_without_retries_left_is_the_jobs_problem(
+    refused: Attempt, connection: redis.Redis
+) -> None:
+    run_attempt(refused, can_retry=False)
+    job = read_job(connection, JOB)
+    assert job.state == "failed"
+    assert job.problem is not None
+    assert job.problem.code == "storage_unavailable"
+    assert job.problem.sentence in messages(connection, JOB)
+    assert refused.lock.holder() is None
