@@ -1,4 +1,5 @@
-# The REST API. Build from the repository's root: docker build -f docker/server.Dockerfile -t splatmill-server .
+# The REST API. Build it in the root folder of the repository:
+#   docker build -f docker/server.Dockerfile -t splatmill-server .
 FROM debian:bookworm-slim AS build
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3 python3-venv ca-certificates \

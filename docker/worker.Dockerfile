@@ -1,6 +1,7 @@
-# The queue worker and the renderer. Build from the repository's root:
+# The queue worker and the renderer. Build it in the root folder of the repository:
 #   docker build -f docker/worker.Dockerfile -t splatmill-worker .
-# PIP_ARGS chooses another build of torch (a CPU-only or a CUDA one) by pip's own options.
+# PIP_ARGS: options of pip that choose another build of torch, such as the CPU-only one.
+# GPU_PACKAGES: set it to "gcc libc6-dev python3-dev" to train on a GPU, because Triton compiles C code at run time.
 FROM debian:bookworm-slim AS build
 ARG PIP_ARGS=""
 RUN apt-get update \
@@ -10,15 +11,16 @@ RUN python3 -m venv /opt/splatmill
 ENV PATH=/opt/splatmill/bin:$PATH PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /src
 COPY constraints.txt ./
-# The heavy wheels first: they change rarely, the code below often.
+# The large wheels first: they change rarely, so that a change of the code leaves this layer as it is.
 RUN pip install -q -c constraints.txt -U pip && pip install -q $PIP_ARGS -c constraints.txt torch pycolmap matplotlib av
 COPY client client
 COPY worker worker
 RUN pip install -q $PIP_ARGS -c constraints.txt ./client ./worker
 
 FROM debian:bookworm-slim
+ARG GPU_PACKAGES=""
 RUN apt-get update \
-    && apt-get install -y --no-install-recommends python3 ca-certificates libgomp1 \
+    && apt-get install -y --no-install-recommends python3 ca-certificates libgomp1 $GPU_PACKAGES \
     && rm -rf /var/lib/apt/lists/* \
     && useradd --system --uid 10001 --create-home splatmill \
     && install -d -o splatmill -g splatmill /data
