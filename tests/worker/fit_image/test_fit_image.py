@@ -21,7 +21,8 @@ from splatmill.schema import FitImageOptions, ModelCameras, describe_options
 from splatmill_worker.errors import FailureName, Refusal, TrainingFailed
 from splatmill_worker.fit_image import command as program
 from splatmill_worker.fit_image import plane
-from splatmill_worker.fit_image.command import fit_image, load
+from splatmill_worker.fit_image.command import fit_image
+from splatmill_worker.fit_image.photo import load
 from splatmill_worker.splat import ply
 from splatmill_worker.splat.plan.budget import Budget
 
@@ -141,7 +142,7 @@ def test_more_gaussians_than_pixels_are_not_used(tmp_path: Path) -> None:
     said: list[str] = []
     result = fit_image(saved(tmp_path / "p.png"), tmp_path, options(steps=2, gaussians=10_000), said.append)
     assert result.gaussians <= WIDTH * HEIGHT
-    assert any("would describe nothing" in line for line in said)
+    assert any("4480 are used" in line for line in said)
 
 
 def test_what_nobody_asked_for_is_not_spoken_of(tmp_path: Path) -> None:
@@ -186,7 +187,7 @@ def test_a_numerical_failure_advises_on_a_picture(
 
 
 @pytest.mark.parametrize(
-    ("where", "told"), [("plane.fit", "nothing was written"), ("draw_curve", "is not whole")]
+    ("where", "told"), [("plane.fit", "nothing was written"), ("results.draw_curve", "is incomplete")]
 )
 def test_ctrl_c_says_what_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], where: str, told: str
@@ -194,12 +195,15 @@ def test_ctrl_c_says_what_is_left(
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(f"splatmill_worker.fit_image.command.{where}", stop)
+    monkeypatch.setattr(f"splatmill_worker.fit_image.{where}", stop)
     out = tmp_path / "out"
     options = '{"steps": 2, "video": true}'
     assert program.main(saved(tmp_path / "p.png"), out, options) == Exit.cancelled
     assert told in capsys.readouterr().err
-    assert ((out / "model.ply").exists(), (out / "fit.mp4").exists()) == (where == "draw_curve", False)
+    assert ((out / "model.ply").exists(), (out / "fit.mp4").exists()) == (
+        where == "results.draw_curve",
+        False,
+    )
 
 
 def write_bad(path: Path, kind: str) -> Path:

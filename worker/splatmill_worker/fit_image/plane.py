@@ -1,8 +1,8 @@
-"""One picture as a flat scene: Gaussians in a plane before one camera, fitted coarse to fine and added where it errs.
+"""One picture as a flat scene: Gaussians in a plane before one camera, fitted from coarse to fine.
 
-Loss, gradients and optimiser are those of training; left out is everything that only several views need: depth,
-directions, SH above degree 0. The Gaussians are blended as every viewer of 3-D splats blends them, front to back,
-not summed as in GaussianImage (Zhang et al. 2024), so that the file shows the picture anywhere.
+Loss, gradients and optimiser are those of training. Depth, orientation out of the plane and SH above degree 0, which
+only several views determine, are not optimised. The Gaussians are blended front to back, as every viewer of Gaussian
+splats does it, and not summed as in GaussianImage (Zhang et al. 2024), so that any viewer shows the picture.
 """
 
 from __future__ import annotations
@@ -27,47 +27,59 @@ from splatmill_worker.splat.train.density.rows import Rows
 from splatmill_worker.splat.views import Target, TrainingView
 
 THICKNESS = 0.05
-"""Depth of the slab over its distance. No two Gaussians share a depth, so that every viewer blends in this order."""
+"""Depth of the slab that holds the Gaussians, over its distance. No two Gaussians share a depth, so that every viewer
+blends them in the same order."""
 
 FLAT = 1e-5
-"""Standard deviation across the slab over its distance: far under a pixel, and no zero for viewers to divide by."""
+"""Standard deviation of a Gaussian across the slab, over its distance: far below a pixel, and not zero, because viewers
+divide by it."""
 
 FIRST_SHARE = 0.1
-"""Of the Gaussians there at the start; the others go where the picture errs."""
+"""Share of the Gaussians that are there at the start; the others are added where the error is large."""
 
 GROWN_AT = (0.06, 0.12, 0.18, 0.25, 0.32, 0.4, 0.48)
 """Shares of the budget at which Gaussians are added, the same number each time."""
 
 REDUCTIONS = ((0.0, 4), (0.04, 2), (0.12, 1))
-"""(share of the budget, by how much the picture is reduced from then on)."""
+"""(share of the budget, factor by which the picture is reduced from then on)."""
 
 SMALLEST = 48
-"""Pixels of the shorter side below which a reduced copy says too little."""
+"""Least pixels on the shorter side of a reduced picture."""
 
 WIDTH = 0.25
-"""Standard deviation of a new Gaussian over the radius of the disc that is its share of the picture."""
+"""Standard deviation of a new Gaussian over the radius of a disc that has its share of the picture's area."""
 
-NARROWEST = 0.4  # pixels; the renderer's own dilation is 0.55
+NARROWEST = 0.4
+"""Least standard deviation of a new Gaussian, pixels. Rendering adds a dilation of 0.55 pixels."""
+
 FIRST_OPACITY = 0.7
-FAINT = 0.01
-"""A Gaussian of less opacity was given up by the optimiser; its place is used for another."""
+"""Opacity of a new Gaussian."""
 
-MEASURED_AT = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+FAINT = 0.01
+"""Opacity at or below which a Gaussian is removed when others are added."""
+
+EVALUATED_AT = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 
 class PlaneRates(Rates):
-    """Rates under which Gaussians stay in their plane: depth, thickness and the two turns out of it rest."""
+    """Rates that keep Gaussians in their plane: depth, thickness and the rotations out of the plane do not change."""
 
-    RESTING = (2, 5, 7, 8)  # z; scale along z; quaternion x and y
+    FIXED = (2, 5, 7, 8)  # z; scale along z; quaternion x and y
 
     def rows(self) -> list[float]:
-        """One rate for each of the 59 rows of a block."""
-        return [0.0 if i in self.RESTING else rate for i, rate in enumerate(super().rows())]
+        """The rate of each of a Gaussian's 59 parameters."""
+        return [0.0 if i in self.FIXED else rate for i, rate in enumerate(super().rows())]
 
 
 @dataclass(frozen=True)
-class Row:
-    """A point of error against time: PSNR in dB and SSIM at full size."""
+class FitPoint:
+    """One evaluation during a fit.
+
+    seconds: time of the fit so far; evaluations and frames are not counted.
+    step: optimisation steps so far.
+    gaussians: how many there were.
+    score: error against the picture at full size.
+    """
 
     seconds: float
     step: int
@@ -76,58 +88,62 @@ class Row:
 
 
 def camera_before(width: int, height: int) -> Camera:
-    """The camera at the origin that sees a picture of this size, its longer side one unit long, one unit away."""
+    """The camera at the origin, in front of a picture of `width` x `height` pixels with a longer side of 1, 1 away."""
     focal = float(max(width, height))
     return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
 
 
 def fit(
     view: TrainingView,
-    gaussians: int,
+    limit: int,
     budget: Budget,
     *,
     seed: int = 0,
-    measured: Callable[[Row], None] = lambda _: None,
-    moments: tuple[float, ...] = (),
-    frame: Callable[[Tensor, Row], None] = lambda _color, _row: None,
-) -> tuple[Gaussians, list[Row]]:
-    """Fit at most `gaussians` to `view`, which `camera_before` sees; returns them and the measured points.
+    evaluated: Callable[[FitPoint], None] = lambda _: None,
+    frames_at: tuple[float, ...] = (),
+    frame: Callable[[Tensor], None] = lambda _: None,
+) -> tuple[Gaussians, list[FitPoint]]:
+    """Fit at most `limit` Gaussians to `view`, whose camera is `camera_before`; returns them and the evaluations.
 
-    `measured` gets each point, `frame` a rendering [H, W, 3] at each of `moments` (shares of the budget). With
-    alpha the picture is fitted over random backgrounds, so that it becomes transparent where the photo is.
-    Measuring and frames are not on the clock. Raises TrainingFailed when the optimisation leaves the numbers.
+    evaluated: gets each evaluation.
+    frames_at: shares of the budget at which `frame` gets a rendering [H, W, 3].
+
+    The picture is fitted over random backgrounds, so that the scene becomes transparent where the photo is, and nowhere
+    else. Raises TrainingFailed where the loss is not finite.
     """
-    run = _Fit(view, gaussians, budget, torch.Generator().manual_seed(seed))
-    rows: list[Row] = []
-    due = list(MEASURED_AT)
-    wanted = list(moments)
+    run = _Fit(view, limit, budget, torch.Generator().manual_seed(seed))
+    curve: list[FitPoint] = []
+    due = list(EVALUATED_AT)
+    frames_due = list(frames_at)
     progress = 0.0
     while progress < 1.0:
         run.advance()
         progress = run.progress
-        if due[0] <= progress or (wanted and wanted[0] <= progress):
+        if due[0] <= progress or (frames_due and frames_due[0] <= progress):
             with run.clock.stopped():
-                row, color = run.look()
+                point, color = run.evaluate()
                 if due[0] <= progress:
                     due = [share for share in due if share > progress]
-                    rows.append(row)
-                    measured(row)
-                if wanted and wanted[0] <= progress:
-                    wanted = [share for share in wanted if share > progress]
-                    frame(color, row)
-    return gaussians_of(run.engine).padded(0), rows
+                    curve.append(point)
+                    evaluated(point)
+                if frames_due and frames_due[0] <= progress:
+                    frames_due = [share for share in frames_due if share > progress]
+                    frame(color)
+    return gaussians_of(run.engine).padded(0), curve
 
 
 class _Fit:
-    def __init__(self, view: TrainingView, most: int, budget: Budget, random: torch.Generator) -> None:
-        self.view, self.most, self.budget, self.random = view, most, budget, random
+    """A fit in progress: the Gaussians, their optimiser, the clock and the random numbers."""
+
+    def __init__(self, view: TrainingView, limit: int, budget: Budget, random: torch.Generator) -> None:
+        self.view, self.limit, self.budget, self.random = view, limit, budget, random
         full = view.full
         self.pixel = 1.0 / full.camera.fx
-        first = max(1, round(FIRST_SHARE * most))
+        first = max(1, round(FIRST_SHARE * limit))
         self.engine = CpuEngine(self._stacked(self._placed(_detail(full), first)))
         self.engine.keep_scores = False
         self.step = 0
-        self.events = list(GROWN_AT)
+        self.growth_due = list(GROWN_AT)
         self.clock = Clock()
 
     @property
@@ -135,14 +151,14 @@ class _Fit:
         return self.budget.progress(self.step, self.clock.seconds)
 
     def advance(self) -> None:
-        """One step, and new Gaussians where they are due."""
+        """Take one step, and add Gaussians where they are due. Raises TrainingFailed for a loss that is not finite."""
         progress = self.progress
-        if self.events and progress >= self.events[0]:
+        if self.growth_due and progress >= self.growth_due[0]:
             self._grow()
         self.step += 1
         factor = self._reduction(progress)
         target = self.view.reduced(factor)
-        # Random also behind an opaque photo: what is left transparent would show the viewer's own background.
+        # Random also behind an opaque photo: the viewer's own background would show through transparent parts.
         background = torch.rand(3, generator=self.random)
         result = self.engine.train_photo(
             target.viewmat,
@@ -157,11 +173,11 @@ class _Fit:
         if not math.isfinite(result.loss):
             raise TrainingFailed(FailureName.non_finite, f"the loss became {result.loss}.", step=self.step)
 
-    def look(self) -> tuple[Row, Tensor]:
-        """How near the picture is, over white where it is transparent, and the rendering [H, W, 3]."""
+    def evaluate(self) -> tuple[FitPoint, Tensor]:
+        """The error against the picture over white, and the rendering [H, W, 3]."""
         color, target = self._rendered()
         score = compare(self.view.name, color, target.over(torch.ones(3)))
-        return Row(self.clock.seconds, self.step, self.engine.count, score), color
+        return FitPoint(self.clock.seconds, self.step, self.engine.count, score), color
 
     def _rendered(self) -> tuple[Tensor, Target]:
         target = self.view.full
@@ -178,23 +194,23 @@ class _Fit:
         return factor
 
     def _grow(self) -> None:
-        """Give up the faint ones and add the next share of Gaussians, by the squared error of the picture."""
+        """Remove faint Gaussians, and add the next share where the squared error of the picture is large."""
         color, target = self._rendered()
         error = (color - target.over(torch.ones(3)).float() / 255.0).square().sum(dim=2)
         rows = Rows.of(self.engine)
         rows = rows.keep(torch.sigmoid(rows.gaussians.logit_opacities) > FAINT)
-        left = self.most - rows.gaussians.count
-        count = left if len(self.events) == 1 else math.ceil(left / len(self.events))
-        self.events.pop(0)
+        left = self.limit - rows.gaussians.count
+        count = left if len(self.growth_due) == 1 else math.ceil(left / len(self.growth_due))
+        self.growth_due.pop(0)
         if count > 0:
             rows = rows.grown(self._placed(_blurred(error), count).padded(3))
         stacked = self._stacked(rows.gaussians)
         self.engine.replace(stacked.parameters(), rows.exp_avg, rows.exp_avg_sq)
 
     def _placed(self, weight: Tensor, count: int) -> Gaussians:
-        """New Gaussians [count] at pixels drawn by `weight` [H, W], coloured as the photo is there.
+        """`count` new Gaussians at pixels drawn with probability `weight` [H, W], with the colours of the photo.
 
-        Each is as wide as its share of the picture: where many are drawn, they are small.
+        A Gaussian is as wide as its share of the picture: where many are drawn, they are small.
         """
         target = self.view.full
         height, width = weight.shape
@@ -203,7 +219,7 @@ class _Fit:
         weight = weight + max(1e-12, 1e-3 * float(weight.mean()))
         chance = (weight / weight.sum()).reshape(-1)
         if count > chance.numel() // 2:
-            # By the inverse of the sum, in double precision: a large photo has more pixels than float32 has steps.
+            # By inverting the cumulative sum in float64: a large photo has more pixels than float32 has values.
             ends = chance.double().cumsum(0)
             places = torch.rand(count, dtype=torch.float64, generator=self.random) * ends[-1]
             drawn = torch.searchsorted(ends, places).clamp_max(chance.numel() - 1)
@@ -217,7 +233,7 @@ class _Fit:
         camera = target.camera
         x = (columns + jitter[:, 0] - camera.cx) * self.pixel
         y = (rows + jitter[:, 1] - camera.cy) / camera.fy
-        share = 1.0 / (chance[drawn] * count)  # pixels for each
+        share = 1.0 / (chance[drawn] * count)  # pixels per Gaussian
         sigma = (WIDTH * (share / math.pi).sqrt()).clamp(NARROWEST, max(height, width) / 8) * self.pixel
         log_scales = sigma.log()[:, None].repeat(1, 3)
         log_scales[:, 2] = math.log(FLAT)
@@ -233,8 +249,8 @@ class _Fit:
         )
 
     def _stacked(self, gaussians: Gaussians) -> Gaussians:
-        """The same picture with the later ones before the earlier ones, each at a depth of its own."""
-        depth = 1.0 - THICKNESS * torch.arange(gaussians.count) / max(1, self.most)
+        """The same picture with every Gaussian at a depth of its own, later ones in front."""
+        depth = 1.0 - THICKNESS * torch.arange(gaussians.count) / max(1, self.limit)
         ratio = depth / gaussians.means[:, 2]
         means = gaussians.means * ratio[:, None]
         log_scales = gaussians.log_scales.clone()
@@ -243,9 +259,11 @@ class _Fit:
 
 
 def rates_at(progress: float, pixel: float) -> PlaneRates:
-    """Rates at a share of the budget; positions start at 0.3 pixels a step, and all fall by a half cosine.
+    """Learning rates at `progress`, 0 to 1: they fall by half a cosine, positions from 0.3 pixels a step.
 
-    They are larger than those of a scene: every step sees the whole picture, so that its gradient has no noise.
+    pixel: size of a pixel in the plane, world units.
+
+    The rates are larger than a scene's: every step sees the whole picture, so that its gradient is not noisy.
     """
     fall = 0.02 + 0.98 * 0.5 * (1.0 + math.cos(math.pi * progress))
     return PlaneRates(
@@ -259,7 +277,7 @@ def rates_at(progress: float, pixel: float) -> PlaneRates:
 
 
 def _detail(target: Target) -> Tensor:
-    """Where a picture needs Gaussians before any is there [H, W]: its slope, and everywhere a little."""
+    """Weight of each pixel for the first Gaussians [H, W]: the picture's gradient, blurred, plus its mean."""
     grey = target.rgb.float().mean(dim=2) / 255.0
     slope = torch.zeros_like(grey)
     slope[:, 1:] += (grey[:, 1:] - grey[:, :-1]).abs()
@@ -268,7 +286,7 @@ def _detail(target: Target) -> Tensor:
 
 
 def _blurred(plane: Tensor) -> Tensor:
-    """The mean over 5 x 5 pixels, or what there is of them."""
+    """The mean over 5 x 5 pixels, over those inside the image at its border."""
     return torch.nn.functional.avg_pool2d(plane[None, None], 5, stride=1, padding=2, count_include_pad=False)[
         0, 0
     ]

@@ -1,1 +1,1 @@
-"""What a finished training leaves: the model's files and the report of error against run time."""
+"""The files of a finished training: the model, its cameras, the report and the progress video."""

@@ -53,7 +53,11 @@ class ExportWorld:
 
 @dataclass(frozen=True)
 class Exported:
-    """What `export` wrote: how many Gaussians, and into which world."""
+    """The files that `export` wrote.
+
+    gaussians: how many model.ply holds.
+    world: the world of both files.
+    """
 
     gaussians: int
     world: ExportWorld

@@ -1,4 +1,4 @@
-"""Error against run time as a picture, with what it took: Gaussians and memory."""
+"""The figure of error against run time, with the number of Gaussians and the memory."""
 
 from __future__ import annotations
 
@@ -13,35 +13,42 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-QUANTISATION_PSNR = 58.9
-"""dB between a photo and its own 8-bit copy: nothing can be measured to be better."""
+from splatmill.files import replacing
 
-ERROR, TRAINED_ON, GAUSSIANS, MEMORY = "#1f6f8b", "#9aa5ad", "#c97b3d", "#7a5c99"
+ERROR, TRAINING, GAUSSIANS, MEMORY = "#1f6f8b", "#9aa5ad", "#c97b3d", "#7a5c99"
+"""Colours of the lines."""
 
 
 def draw_curve(
-    path: Path, curve: Sequence[dict[str, Any]], seconds: dict[str, float], *, measured: str = "held out"
+    path: Path,
+    curve: Sequence[dict[str, Any]],
+    seconds: dict[str, float],
+    *,
+    evaluated: str = "held-out photos",
 ) -> None:
-    """PSNR and SSIM against training seconds, and what they took: the Gaussians and, where known, the memory.
+    """Draw PSNR, SSIM, the number of Gaussians and, where known, the memory against training seconds.
 
-    measured: what psnr and ssim of the curve were measured on. Photos that were trained on have a line of their own
-    where the curve has it: what it gains alone is learnt by heart.
+    path: the PNG file to write.
+    curve: points as in report.json. Where they have train_psnr and train_ssim, training photos get a line of their
+        own, and over-fitting shows as a rise of that line alone.
+    seconds: by stage, for the title.
+    evaluated: label of the line of psnr and ssim.
     """
     figure = Figure(figsize=(7.2, 6.4), dpi=130, layout="constrained")
     panels: tuple[Axes, Axes, Axes] = figure.subplots(3, 1, sharex=True, height_ratios=(3, 1.5, 1.4))
     psnr, ssim, cost = panels
     for axes, name in ((psnr, "psnr"), (ssim, "ssim")):
-        _line(axes, *_course(curve, f"train_{name}"), TRAINED_ON, label="trained on")
-        _line(axes, *_course(curve, name), label=measured)
+        _line(axes, *_course(curve, f"train_{name}"), TRAINING, label="training photos")
+        _line(axes, *_course(curve, name), label=evaluated)
     psnr.set_ylabel("PSNR (dB)")
     ssim.set_ylabel("SSIM")
     if len(psnr.lines) > 1:
         psnr.legend(loc="upper left", frameon=False, fontsize=9)  # the corner that a rising curve leaves free
     elif psnr.lines:
         psnr.set_ylabel(f"PSNR (dB), {psnr.lines[0].get_label()}")
-    judged = [row for row in curve if row["psnr"] is not None]
-    if judged:
-        last = judged[-1]
+    scored = [row for row in curve if row["psnr"] is not None]
+    if scored:
+        last = scored[-1]
         psnr.text(
             0.985,
             0.06,
@@ -59,9 +66,10 @@ def draw_curve(
         axes.grid(True, which="major", color="#dddddd", linewidth=0.5)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
-    apart = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items() if value >= 0.05)
-    psnr.set_title(apart, fontsize=8, loc="left", color="#555555")
-    figure.savefig(path)
+    stages = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items() if value >= 0.05)
+    psnr.set_title(stages, fontsize=8, loc="left", color="#555555")
+    with replacing(path) as part:
+        figure.savefig(part, format="png")
 
 
 def _draw_cost(axes: Axes, curve: Sequence[dict[str, Any]]) -> None:
@@ -69,17 +77,17 @@ def _draw_cost(axes: Axes, curve: Sequence[dict[str, Any]]) -> None:
     _line(axes, [row["seconds"] for row in curve], counts, GAUSSIANS)
     axes.set_ylabel("thousand\nGaussians", color=GAUSSIANS)
     axes.set_ylim(0, 1.1 * max(counts, default=1.0) or 1.0)
-    held = [(row["seconds"], row["memory"] / 1e9) for row in curve if row.get("memory")]
-    if held:
+    resident = [(row["seconds"], row["memory"] / 1e9) for row in curve if row.get("memory")]
+    if resident:
         memory = axes.twinx()
-        _line(memory, [moment for moment, _ in held], [size for _, size in held], MEMORY)
+        _line(memory, [moment for moment, _ in resident], [size for _, size in resident], MEMORY)
         memory.set_ylabel("memory (GB)", color=MEMORY)
-        memory.set_ylim(0, 1.25 * max(size for _, size in held))  # apart from the Gaussians' line
+        memory.set_ylim(0, 1.25 * max(size for _, size in resident))  # apart from the Gaussians' line
         memory.spines["top"].set_visible(False)
 
 
 def _course(curve: Sequence[dict[str, Any]], name: str) -> tuple[list[float], list[float]]:
-    """Seconds and values of the points that have `name`."""
+    """Seconds and values of the points where `name` is known."""
     rows = [row for row in curve if row.get(name) is not None]
     return [row["seconds"] for row in rows], [row[name] for row in rows]
 
@@ -90,7 +98,7 @@ def _line(axes: Axes, x: Sequence[float], y: Sequence[float], color: str = ERROR
 
 
 def _logarithmic(axes: Axes) -> None:
-    """Seconds at 1, 2 and 5 of every decade, as plain numbers."""
+    """A logarithmic time axis with plain numbers at 1, 2 and 5 of every decade."""
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

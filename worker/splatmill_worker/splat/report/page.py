@@ -1,4 +1,4 @@
-"""The report as one self-contained page."""
+"""The report as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -29,7 +29,12 @@ img { max-width: 100%; height: auto; } .pairs { display: flex; flex-wrap: wrap; 
 
 @dataclass(frozen=True)
 class Pair:
-    """A rendered view [H, W, 3] beside its photo."""
+    """A rendered view beside its photo.
+
+    score: error of the view.
+    rendered: colour [H, W, 3], 0 to 1.
+    photo: uint8 [H, W, 3].
+    """
 
     score: ViewScore
     rendered: Tensor
@@ -37,17 +42,17 @@ class Pair:
 
 
 def render(report: dict[str, Any], figure: Path, pairs: Sequence[Pair]) -> str:
-    """The page as text; the figure and the pictures are inside it."""
+    """The page as text, with the picture `figure` of the curve and the `pairs` embedded."""
     curve = base64.b64encode(figure.read_bytes()).decode()
     parts = [
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
         f"<title>Splatmill report</title><style>{STYLE}</style>",
         f"<h1>{_headline(report['result'])}</h1>",
         *(f"<p class=warn>{html.escape(warning)}</p>" for warning in report["warnings"]),
-        f"<img alt='held-out error against training seconds' src='data:image/png;base64,{curve}'>",
-        "<h2>Where the time went</h2>",
+        f"<img alt='PSNR and SSIM against training seconds' src='data:image/png;base64,{curve}'>",
+        "<h2>Time by stage</h2>",
         _table(["stage", "seconds"], [[name, f"{value:.1f}"] for name, value in report["seconds"].items()]),
-        f"<p class=dim>At most {format_bytes(report['peak_memory'])} of memory were in use.</p>",
+        f"<p class=dim>Peak memory: {format_bytes(report['peak_memory'])}.</p>",
         "<h2>What was decided, and why</h2>",
         _plan(report["plan"]),
         "<h2>What was left out, and why</h2>",
@@ -59,11 +64,11 @@ def render(report: dict[str, Any], figure: Path, pairs: Sequence[Pair]) -> str:
             ],
             2,
         ),
-        "<h2>Worst views: rendered, and the photo</h2>",
+        "<h2>Worst views beside their photos</h2>",
         "<div class=pairs>",
         *(_pair(pair) for pair in pairs),
         "</div>",
-        "<h2>Every measured view</h2>",
+        "<h2>All evaluated views</h2>",
         _table(
             ["photo", "split", "PSNR (dB)", "SSIM"],
             [
@@ -80,8 +85,8 @@ def render(report: dict[str, Any], figure: Path, pairs: Sequence[Pair]) -> str:
 def _headline(result: dict[str, Any]) -> str:
     counted = f"{result['gaussians']:,} Gaussians after {result['steps']:,} steps"
     if result["psnr"] is None:
-        return f"{counted}; no photo was held out, training photos {result['train_psnr']:.2f} dB"
-    return f"{result['psnr']:.2f} dB on held-out views (SSIM {result['ssim']:.3f}), {counted}"
+        return f"{result['train_psnr']:.2f} dB on training photos, none were held out; {counted}"
+    return f"{result['psnr']:.2f} dB on held-out photos (SSIM {result['ssim']:.3f}); {counted}"
 
 
 def _plan(plan: dict[str, Any]) -> str:
@@ -105,7 +110,7 @@ def _pair(pair: Pair) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[Any]], text_columns: int = 1) -> str:
-    """A table whose first `text_columns` columns are text and whose others are numbers."""
+    """A table whose first `text_columns` columns are text and whose other columns are numbers."""
 
     def cell(tag: str, column: int, value: Any) -> str:
         kind = "" if column < text_columns else " class=n"
@@ -119,7 +124,7 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[Any]], text_columns: in
 
 
 def _ended(stopped: str) -> str:
-    """Why training ended, as a sentence; a failure is one already."""
+    """Why training ended, as a sentence. `stopped` is a clause, or after a failure a sentence."""
     return stopped if stopped.endswith(".") else f"Training ended because {stopped}."
 
 

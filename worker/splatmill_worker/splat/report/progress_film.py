@@ -1,4 +1,4 @@
-"""A video of a scene as it is trained: one view, from a fixed camera, at moments that lie close where much changes."""
+"""The progress video: one view of the scene while it is trained, most often at the beginning."""
 
 from __future__ import annotations
 
@@ -18,20 +18,28 @@ from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.renderer import render_view
 from splatmill_worker.splat.views import TrainingView
 
-SHOTS = 96
-MOMENTS = tuple((i / SHOTS) ** 2 for i in range(SHOTS + 1))
-"""Shares of the budget: the first second changes more than the last minute."""
+INTERVALS = 96
+TAKEN_AT = tuple((i / INTERVALS) ** 2 for i in range(INTERVALS + 1))
+"""Shares of the budget at which frames are taken: dense at the beginning, where the scene changes most."""
 
-FPS, HELD = 24, 24
+FPS = 24
+
+HELD = 24
+"""Repetitions of the last frame, one second."""
+
 QUALITY = 92
-CAPTIONED = 160  # pixels of width under which a line of text covers too much of the picture
+"""JPEG quality of the stored frames."""
+
+CAPTIONED = 160
+"""Width in pixels under which the video has no caption, because it would cover too much."""
 
 
 class ProgressFilm:
-    """Shots kept in `folder` as they are taken, so that a later attempt goes on with the film of this one.
+    """Observes a training run and keeps each frame as a JPEG in `folder`, so that a later attempt goes on with them.
 
-    A shot is one forward pass and one JPEG, taken while the training clock stands still. `seconds` is what shots and
-    video cost this attempt; what earlier ones spent is in no account.
+    view: the view that is shown.
+    anew: drop the frames of earlier attempts.
+    seconds: wall time of the frames and the video in this attempt.
     """
 
     def __init__(self, folder: Path, view: TrainingView, plan: Plan, *, anew: bool) -> None:
@@ -44,11 +52,11 @@ class ProgressFilm:
         self.seconds = 0.0
 
     def is_due(self, progress: float) -> bool:
-        """Whether a shot is to be taken at this share of the budget."""
-        return self._next < len(MOMENTS) and MOMENTS[self._next] <= progress
+        """Whether a frame is to be taken at this share of the budget."""
+        return self._next < len(TAKEN_AT) and TAKEN_AT[self._next] <= progress
 
     def observe(self, engine: Engine, progress: float, seconds: float) -> None:
-        """Take the shot that is due, `seconds` into the training."""
+        """Take the frame that is due, `seconds` into the training."""
         started = time.perf_counter()
         color = render_view(engine, self._plan, self._view)
         picture = Image.fromarray(
@@ -63,19 +71,19 @@ class ProgressFilm:
         self.seconds += time.perf_counter() - started
 
     def develop(self, path: Path) -> bool:
-        """Write the shots so far as a video, the last one held for a second; False, and no file, without shots.
+        """Write the frames so far as a video, the last one for a second longer; returns False where there are none.
 
         Raises av.FFmpegError, OSError or ValueError, and leaves no file, where the video cannot be written.
         """
         started = time.perf_counter()
-        shots = sorted(self._folder.glob("*.jpg"))
-        if not shots:
+        frames = sorted(self._folder.glob("*.jpg"))
+        if not frames:
             return False
-        with Image.open(shots[0]) as first:
+        with Image.open(frames[0]) as first:
             width, height = first.size
         with replacing(path) as part, Film(part, width, height, FPS) as film:
-            for shot in shots:
-                with Image.open(shot) as picture:
+            for frame in frames:
+                with Image.open(frame) as picture:
                     pixels = np.asarray(picture.convert("RGB"))
                 film.add(pixels)
             for _ in range(HELD):
@@ -85,7 +93,7 @@ class ProgressFilm:
 
 
 def _caption(picture: Image.Image, text: str) -> None:
-    """White letters with a dark rim at the lower left, a thirtieth of the picture's width high."""
+    """Write `text` at the lower left, in white with a dark outline, a thirtieth of the picture's width high."""
     if picture.width < CAPTIONED:
         return
     size = max(10, picture.width // 30)

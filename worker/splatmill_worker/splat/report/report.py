@@ -1,4 +1,4 @@
-"""The report of a job: error against run time, what was done and left out, and what to look at."""
+"""The report of a job: error against run time, the plan with its reasons, and the photos that fit worst."""
 
 from __future__ import annotations
 
@@ -26,13 +26,12 @@ from splatmill_worker.splat.train.renderer import evaluation_background
 from splatmill_worker.splat.views import Target, TrainingView
 
 MISFIT = 6.0
-"""dB under the median training view: such a photo does not fit the others."""
+"""A training photo whose PSNR is more than this below the median, dB, is named in a warning."""
 
 WORST = 4
+"""Views shown beside their photos."""
 
-NO_LPIPS = (
-    "It needs the weights of an image network, which nothing installed brings; PSNR and SSIM are reported."
-)
+NO_LPIPS = "LPIPS needs the weights of an image network, which are not part of Splatmill. PSNR and SSIM are reported."
 
 
 @dataclass(frozen=True)
@@ -122,13 +121,13 @@ def _worst_views(planned: PlannedScene, trained: Trained, render: Renderer) -> l
 
 
 def _compared_part(target: Target, background: Tensor) -> Tensor:
-    """The photo uint8 [H, W, 3], grey where a mask keeps pixels out."""
+    """The photo uint8 [H, W, 3], with the pixels that do not count in grey."""
     photo = target.over(background)
     return photo if target.mask is None else torch.where(target.mask[..., None], photo, photo.new_tensor(128))
 
 
 def plain(value: Any) -> Any:
-    """`value` as JSON can hold it: numbers that are not finite become null, arrays become lists."""
+    """`value` in JSON's types: numbers that are not finite become None, arrays lists, and other objects their text."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -168,21 +167,24 @@ def _view_rows(trained: Trained) -> list[dict[str, Any]]:
 
 
 def _unplaced(scene: Scene) -> list[str]:
-    """One sentence for the photos that have no camera; each with its reason is among what was left out."""
+    """A warning that counts the photos without a camera, and names some; none where all have one."""
     if not scene.left_out:
         return []
     names = [name for name, _ in scene.left_out]
     shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-    return [f"{len(names)} of {len(names) + len(scene.views)} photos are not used: {shown}."]
+    photos = len(names) + len(scene.views)
+    return [f"{len(names)} of {photos} photos are not used: {shown}. The report lists the reasons."]
 
 
 def _misfits(trained: Trained) -> list[str]:
+    """A warning for each training photo that the scene shows far worse than the others."""
     ordered = sorted(trained.on_training.views, key=lambda view: view.psnr)
     if len(ordered) < 5:
         return []
     median = ordered[len(ordered) // 2].psnr
     return [
-        f"{view.name} does not fit the other photos: {view.psnr:.1f} dB where the median is {median:.1f} dB."
+        f"{view.name} does not fit the other photos: its PSNR is {view.psnr:.1f} dB, the median {median:.1f} dB. "
+        "Leave it out if it is blurred, shows something that moved, or has a wrong camera."
         for view in ordered
         if view.psnr < median - MISFIT
     ]

@@ -1,4 +1,4 @@
-"""Seconds of each stage, over all attempts at a job."""
+"""Wall time of the stages of a job, over all attempts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from splatmill.files import atomic_write
 
 
 class Stages:
-    """Wall seconds by stage name, kept in a file: a later attempt adds to what earlier ones spent."""
+    """Wall seconds by stage name, kept in a file, so that a later attempt adds to those of earlier ones."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -20,7 +20,7 @@ class Stages:
 
     @contextmanager
     def measured(self, stage: str) -> Iterator[None]:
-        """Adds the time inside to `stage`, also when it ends with an exception."""
+        """Add the time inside to `stage`, also where it ends with an exception."""
         started = time.perf_counter()
         try:
             yield
@@ -28,6 +28,6 @@ class Stages:
             self.add(stage, time.perf_counter() - started)
 
     def add(self, stage: str, seconds: float) -> None:
-        """Adds `seconds` that were measured elsewhere to `stage`."""
+        """Add `seconds` to `stage` and store the sums."""
         self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
         atomic_write(self._path, json.dumps(self.seconds))
