@@ -5,14 +5,17 @@ Not proven here: lens distortion (`test_images`), and how well a normalised scen
 """
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 
 from splatmill_worker.scene import Camera, Normalization, Scene, View, looked_at, split, viewmat_of
 
+Split = Literal["train", "test"]
 
-def scene_of(names: list[str], offset: float = 0.0, splits: dict[str, str] | None = None) -> Scene:
+
+def scene_of(names: list[str], offset: float = 0.0, splits: dict[str, Split] | None = None) -> Scene:
     random = np.random.default_rng(0)
     views = []
     for name in names:
@@ -21,7 +24,7 @@ def scene_of(names: list[str], offset: float = 0.0, splits: dict[str, str] | Non
         viewmat[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
         viewmat[:3, 3] = -viewmat[:3, :3] @ (random.normal(size=3) * 5.0 + offset)
         camera = Camera(100, 80, 90.0, 91.0, 50.0, 40.0, viewmat)
-        views.append(View(name, camera, Path(name), split=(splits or {}).get(name)))  # type: ignore[arg-type]
+        views.append(View(name, camera, Path(name), split=(splits or {}).get(name)))
     points = random.normal(size=(50, 3)) * 20.0 + offset
     return Scene(tuple(views), points, np.zeros((50, 3), np.uint8), "sfm")
 

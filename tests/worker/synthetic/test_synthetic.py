@@ -12,26 +12,28 @@ import pytest
 from PIL import Image
 
 from splatmill_worker import synthetic
+from splatmill_worker.scene import Camera
+from splatmill_worker.synthetic.ray_caster import Disc, Sphere
 
 pytestmark = pytest.mark.slow
 
 
-def points_of(camera, depth):
+def points_of(camera: Camera, depth: np.ndarray) -> np.ndarray:
     """World points [H*W, 3] behind the pixel centres of a depth image."""
     column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     return camera.unproject(column.ravel(), row.ravel(), depth.ravel())
 
 
-def test_depth_lands_on_the_surfaces():
+def test_depth_lands_on_the_surfaces() -> None:
     scene = synthetic.still_life(0)
     camera = synthetic.orbit(8, 64, 48)[2]
     _, depth = synthetic.photograph(scene, camera, samples=1)
     points = points_of(camera, depth.astype(np.float64))
-    center = np.array(scene.solids[5].center)
-    sphere = scene.solids[5]
+    sphere = next(solid for solid in scene.solids if isinstance(solid, Sphere))
+    discs = [solid for solid in scene.solids if isinstance(solid, Disc)]
     distances = [np.abs(np.linalg.norm(points, axis=1) - 40.0)]  # the dome
-    distances += [np.abs(points[:, 2] - disc.z) for disc in scene.solids[:2]]
-    distances += [np.abs(np.linalg.norm(points - center, axis=1) - sphere.radius)]
+    distances += [np.abs(points[:, 2] - disc.z) for disc in discs]
+    distances += [np.abs(np.linalg.norm(points - np.array(sphere.center), axis=1) - sphere.radius)]
     on_known = np.min(distances, axis=0) < 1e-3
     # What is left are boxes, the other spheres and the cylinder; all of them stand inside radius 1.6.
     others = points[~on_known]
@@ -40,7 +42,7 @@ def test_depth_lands_on_the_surfaces():
     assert (others[:, 2] > -1e-3).all()
 
 
-def test_two_views_agree_where_both_see_a_diffuse_point():
+def test_two_views_agree_where_both_see_a_diffuse_point() -> None:
     scene = synthetic.still_life(0)
     first, second = synthetic.orbit(24, 160, 120)[:2]
     rgb_a, depth_a = synthetic.photograph(scene, first, samples=2)
@@ -57,7 +59,7 @@ def test_two_views_agree_where_both_see_a_diffuse_point():
     assert np.median(difference) < 12
 
 
-def test_a_capture_is_jpegs_with_exif_and_the_same_bytes_for_the_same_seed(tmp_path: Path):
+def test_a_capture_is_jpegs_with_exif_and_the_same_bytes_for_the_same_seed(tmp_path: Path) -> None:
     cameras = synthetic.capture(tmp_path / "a", count=2, width=96, height=64, seed=3)
     synthetic.capture(tmp_path / "b", count=2, width=96, height=64, seed=3)
     synthetic.capture(tmp_path / "c", count=2, width=96, height=64, seed=4)

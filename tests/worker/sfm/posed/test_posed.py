@@ -1,7 +1,7 @@
-"""Proves that cameras given with a capture come out as OpenCV world-to-camera matrices of the right photos:
-COLMAP text and binary, nerfstudio and instant-ngp transforms with their distortion, Blender sets.
+"""Proves that given cameras become OpenCV world-to-camera matrices of the right photos: COLMAP text and binary,
+nerfstudio and instant-ngp transforms with distortion, Blender sets.
 
-Not proven here: that the cameras which others give are good.
+Not proven here: that given cameras are accurate.
 """
 
 import json

@@ -1,5 +1,5 @@
-"""Proves the way from photos to cameras on real and on generated photos: poses against the truth, named failures,
-caching, cancelling, and the parts that choose and match pairs.
+"""Proves structure from motion on real and generated photos: poses against the truth, named failures, caching and
+cancelling.
 
 Not proven here: speed and quality on larger sets, which `bench sfm` measures.
 """
@@ -11,19 +11,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from splatmill_worker import sfm, synthetic
 from splatmill_worker.errors import Cancelled
-from splatmill_worker.images import exif
-from splatmill_worker.images.prepare import UsablePhoto
 from splatmill_worker.scene import Camera, Scene
-from splatmill_worker.sfm import cameras
-from splatmill_worker.sfm.features import Features
-from splatmill_worker.sfm.matching import pairs
-from splatmill_worker.sfm.matching.matcher import MAX_ANGLE, MAX_RATIO, Matcher
 from tests.support.paths import DATA
 
 pytestmark = pytest.mark.slow
@@ -35,8 +30,8 @@ def quiet(stage: str, done: int, total: int, note: str) -> None:
     pass
 
 
-def reconstruct(images: Path, workdir: Path, **options: object) -> Scene:
-    return sfm.reconstruct(images, None, workdir, sfm.SfmOptions(**options), quiet, lambda: False)  # type: ignore[arg-type]
+def reconstruct(images: Path, workdir: Path, **options: Any) -> Scene:
+    return sfm.reconstruct(images, None, workdir, sfm.SfmOptions(**options), quiet, lambda: False)
 
 
 def errors(scene: Scene, truth: dict[str, Camera]) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +83,7 @@ def test_cameras_of_generated_photos_match_the_truth(
     assert scene.facts["seconds"]["stereo"] >= 0.9 * scene.facts["stereo_seconds"]
 
 
-def test_a_restart_reads_the_cameras_back(
+def test_the_same_photos_are_read_back(
     still_life: tuple[Path, dict[str, Camera]], solved: tuple[Scene, Path]
 ) -> None:
     first, workdir = solved
@@ -102,7 +97,7 @@ def test_a_restart_reads_the_cameras_back(
         np.testing.assert_array_equal(a.camera.viewmat, b.camera.viewmat)
 
 
-def test_cancelling_ends_it_and_a_restart_goes_on(
+def test_a_cancelled_run_continues_from_what_it_stored(
     still_life: tuple[Path, dict[str, Camera]], tmp_path: Path
 ) -> None:
     seen: list[str] = []
@@ -120,7 +115,7 @@ def test_cancelling_ends_it_and_a_restart_goes_on(
     assert len(scene.views) >= 14
 
 
-def test_the_global_mapper_can_be_asked_for(
+def test_the_global_mapper_finds_the_cameras_too(
     still_life: tuple[Path, dict[str, Camera]], solved: tuple[Scene, Path]
 ) -> None:
     scene = reconstruct(still_life[0], solved[1], mapper="global")
@@ -143,7 +138,7 @@ def test_too_few_photos_are_refused(tmp_path: Path) -> None:
 
 
 @needs_data
-def test_kermit_finds_all_its_cameras(tmp_path: Path) -> None:
+def test_all_photos_of_a_real_capture_are_registered(tmp_path: Path) -> None:
     scene = reconstruct(DATA / "kermit_640x480/images", tmp_path)
     assert len(scene.views) == 11
     assert scene.facts["reprojection_pixels"] < 1.0
@@ -155,81 +150,14 @@ def test_kermit_finds_all_its_cameras(tmp_path: Path) -> None:
     ("folder", "code"),
     [("failure_unrelated_640", "sfm_too_few_registered"), ("failure_pure_rotation", "sfm_no_parallax")],
 )
-def test_hopeless_photos_end_by_name(tmp_path: Path, folder: str, code: str) -> None:
+def test_photos_without_overlap_or_parallax_are_refused_by_name(
+    tmp_path: Path, folder: str, code: str
+) -> None:
     with pytest.raises(sfm.SfmFailed) as failed:
         reconstruct(DATA / folder / "images", tmp_path)
     assert failed.value.code == code
     assert failed.value.facts["photos"] == len(list((DATA / folder / "images").iterdir()))
     assert failed.value.advice
-
-
-def random_features(count: int, seed: int) -> Features:
-    random = np.random.default_rng(seed)
-    descriptors = random.integers(0, 256, (count, 128), np.uint8)
-    return Features(
-        random.uniform(0, 500, (count, 2)), random.uniform(1, 9, count).astype(np.float32), descriptors
-    )
-
-
-def test_matches_are_the_mutual_nearest_that_pass_the_ratio_test() -> None:
-    a, b = random_features(300, 1), random_features(700, 2)
-    noise = np.random.default_rng(3).integers(-12, 13, (200, 128))
-    b.descriptors[100:300] = np.clip(a.descriptors[:200].astype(int) + noise, 0, 255)
-    b.descriptors[300:310] = b.descriptors[100:110]  # ten ambiguous ones
-    found = {tuple(row) for row in Matcher([a, b]).match(0, 1).tolist()}
-    unit = [
-        f.descriptors / np.linalg.norm(f.descriptors.astype(float), axis=1, keepdims=True) for f in (a, b)
-    ]
-    angles = np.arccos(np.clip(unit[0] @ unit[1].T, -1, 1))
-    expected = set()
-    for row in range(300):
-        first, second = np.argsort(angles[row])[:2]
-        if angles[:, first].argmin() == row and angles[row, first] < min(
-            MAX_ANGLE, MAX_RATIO * angles[row, second]
-        ):
-            expected.add((row, int(first)))
-    assert found == expected
-    assert found == {(k, 100 + k) for k in range(10, 200)}
-
-
-def usable(name: str, **tags: object) -> UsablePhoto:
-    return UsablePhoto(name, Path(name), name, 640, 480, exif.Exif(**tags))  # type: ignore[arg-type]
-
-
-def test_photos_that_agree_share_a_camera() -> None:
-    phone = {"make": "A", "model": "B", "focal_in_diagonals": 0.6}
-    groups = cameras.group([usable("1", **phone), usable("2"), usable("3", **phone), usable("4")])
-    assert [group.photos for group in groups] == [(0, 2), (1, 3)]
-    assert groups[0].known
-    assert groups[0].focal == pytest.approx(0.6 * 800 / 640)
-    assert not groups[1].known
-
-
-def test_gps_neighbours_are_the_nearest_ones() -> None:
-    # A walk along a meridian, 11 metres a step, across the date line's other side for good measure.
-    photos = [usable(str(k), latitude=10.0 + 1e-4 * k, longitude=180.0 - 1e-9) for k in range(6)]
-    photos.append(usable("nowhere"))
-    places = pairs.gps_positions(photos)
-    assert np.linalg.norm(places[1] - places[0]) == pytest.approx(11.1, rel=0.01)
-    assert np.isnan(places[6, :2]).all()
-    two = pairs.spatial(places, 2)
-    assert {(k, k + 1) for k in range(5)} <= two
-    # Only the ends reach further than their neighbours.
-    assert two - {(k, k + 1) for k in range(5)} == {(0, 2), (3, 5)}
-    assert all(index != 6 for pair in pairs.spatial(places, 3) for index in pair)
-
-
-def test_numbered_photos_are_followed_in_order() -> None:
-    names = [f"walk/IMG_{k}.jpg" for k in (10, 9, 8, 11, 12)] + ["other.jpg", "IMG_1.jpg"]
-    assert pairs.numbered_runs([usable(name) for name in names]) == [[2, 1, 0, 3, 4]]
-    assert pairs.sequential([2, 1, 0, 3, 4], (1,)) == {(1, 2), (0, 1), (0, 3), (3, 4)}
-
-
-def test_components_of_the_view_graph_are_connected_by_the_likeliest_pairs() -> None:
-    components = pairs.connected_components(6, [(0, 1), (1, 2), (3, 4)])
-    assert components == [[0, 1, 2], [3, 4], [5]]
-    more = pairs.connecting_pairs(components, {(2, 3): 9, (0, 4): 5, (1, 5): 3}, {(0, 3)}, per_photo=1)
-    assert more == {(2, 3), (0, 4), (1, 5)}
 
 
 def test_importing_leaves_sigterm_alone() -> None:

@@ -1,7 +1,7 @@
-"""Points found by sweeping patches over known cameras lie on the scene's surfaces, in places that had none.
+"""Proves that stereo points lie on the scene's surfaces, fill places without points, and when none are searched for.
 
-Proven on generated photos, whose cameras and depths are known exactly. It does not prove that training gains from
-such points on real photos, which the benchmarks measure.
+Proven on generated photos, whose cameras and depths are known exactly. Does not prove that training gains from such
+points on real photos, which the benchmarks measure.
 """
 
 from dataclasses import replace
@@ -119,14 +119,14 @@ def of_noise(scene: Scene, count: int, folder: Path) -> Scene:
     return replace(scene, views=tuple(views))
 
 
-def test_photos_without_a_common_scene_are_given_up(bare: Scene, tmp_path: Path) -> None:
+def test_the_search_is_given_up_for_photos_without_a_common_scene(bare: Scene, tmp_path: Path) -> None:
     found = stereo.find_points(of_noise(bare, len(bare.views), tmp_path))
     assert found.given_up
     assert len(found.points) == 0
     assert stereo.add(bare, found).facts["stereo_points"] == 0
 
 
-def test_posed_captures_without_points_get_them_once(bare: Scene, tmp_path: Path) -> None:
+def test_posed_captures_without_points_get_stored_stereo_points(bare: Scene, tmp_path: Path) -> None:
     first = posed.with_stereo_points(bare, tmp_path)
     assert len(first.points) > 500
     stored = list((tmp_path / "sfm").iterdir())
@@ -139,7 +139,7 @@ def test_posed_captures_without_points_get_them_once(bare: Scene, tmp_path: Path
     assert len(list((tmp_path / "sfm").iterdir())) == 2
 
 
-def test_other_points_and_masks_are_searched_anew(bare: Scene, tmp_path: Path) -> None:
+def test_other_points_and_masks_are_stored_apart(bare: Scene, tmp_path: Path) -> None:
     few = replace(bare, views=bare.views[:3], points=np.full((5, 3), 0.1), colors=np.zeros((5, 3), np.uint8))
     Image.fromarray(np.full((HEIGHT, WIDTH), 255, np.uint8)).save(tmp_path / "white.png")
     masked = tuple(replace(view, mask=tmp_path / "white.png") for view in few.views)
@@ -151,7 +151,7 @@ def test_other_points_and_masks_are_searched_anew(bare: Scene, tmp_path: Path) -
     assert stages == ["stereo"] * 9  # three photos, three times; the fourth time all is there
 
 
-def test_a_photo_that_does_not_decode_is_no_fault_of_the_poses(tmp_path: Path) -> None:
+def test_a_photo_that_does_not_decode_is_not_reported_as_invalid_poses(tmp_path: Path) -> None:
     capture = still_life.posed_capture(tmp_path / "capture")
     photo = capture / "images" / "03.png"
     photo.write_bytes(photo.read_bytes()[:2000])  # its size can still be read
@@ -163,9 +163,7 @@ def test_a_photo_that_does_not_decode_is_no_fault_of_the_poses(tmp_path: Path) -
     assert stages == []
 
 
-def test_scenes_with_enough_points_or_transparent_surroundings_are_left_as_they_are(
-    bare: Scene, tmp_path: Path
-) -> None:
+def test_scenes_with_enough_points_and_blender_sets_get_none(bare: Scene, tmp_path: Path) -> None:
     middle = np.random.default_rng(0).normal(0.0, 0.2, (2000, 3))
     full = replace(bare, points=middle, colors=np.zeros((2000, 3), np.uint8))
     assert stereo.observations_per_view(full) > 1900
@@ -174,19 +172,19 @@ def test_scenes_with_enough_points_or_transparent_surroundings_are_left_as_they_
     assert posed.with_stereo_points(blender, tmp_path) is blender
 
 
-def test_cancelling_ends_the_search(bare: Scene) -> None:
+def test_a_search_can_be_cancelled(bare: Scene) -> None:
     with pytest.raises(Cancelled):
         stereo.find_points(bare, cancelled=lambda: True)
 
 
-def test_cancelling_reaches_the_loading_of_photos(bare: Scene, tmp_path: Path) -> None:
+def test_loading_photos_can_be_cancelled(bare: Scene, tmp_path: Path) -> None:
     asked = iter([False, False, True])
     gone = [replace(view, image=tmp_path / "gone.png") for view in bare.views[6:]]
     with pytest.raises(Cancelled):  # and not OSError: the photos that are gone are not waited for
         stereo.find_points(replace(bare, views=(*bare.views[:6], *gone)), cancelled=lambda: next(asked))
 
 
-def test_three_photos_are_judged_as_well(bare: Scene, tmp_path: Path) -> None:
+def test_the_search_is_given_up_for_three_photos_too(bare: Scene, tmp_path: Path) -> None:
     found = stereo.find_points(of_noise(bare, 3, tmp_path))
     assert found.given_up
     assert len(found.points) == 0
@@ -208,9 +206,7 @@ def test_photos_held_out_by_the_data_set_take_no_part(bare: Scene, tmp_path: Pat
     assert np.median(depth_errors(bare, found.points, found.seen)) < 0.01
 
 
-def test_points_without_tracks_are_not_said_to_be_seen_by_no_photo(
-    bare: Scene, added: stereo.StereoPoints
-) -> None:
+def test_without_tracks_of_its_own_points_a_scene_gets_none(bare: Scene, added: stereo.StereoPoints) -> None:
     own = np.random.default_rng(0).normal(0.0, 0.2, (30, 3))
     both = stereo.add(replace(bare, points=own, colors=np.zeros((30, 3), np.uint8)), added)
     assert len(both.points) == 30 + len(added.points)
@@ -221,5 +217,5 @@ def test_points_without_tracks_are_not_said_to_be_seen_by_no_photo(
     np.testing.assert_array_equal(both.point_errors[30:], added.errors)
 
 
-def test_without_any_points_the_sentence_says_so(bare: Scene, added: stereo.StereoPoints) -> None:
+def test_the_note_says_when_cameras_came_without_points(bare: Scene, added: stereo.StereoPoints) -> None:
     assert "without points" in stereo.add(bare, added).notes[-1]

@@ -1,10 +1,11 @@
-"""A raised effort keeps what is sure: features and pairs of photos that are not looked at again stay as they are.
+"""Proves that a higher effort keeps the features and pairs of photos that are not extracted anew, and the cache's keys.
 
-Proven on the database of generated photos. It does not prove that a raised effort places more photos.
+Proven on the database of generated photos. Does not prove that a higher effort registers more photos.
 """
 
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,12 +24,14 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> FeatureStore:
     folder = tmp_path_factory.mktemp("effort")
     synthetic.capture(folder / "images", 8, 240, 180, samples=1)
     options = sfm.SfmOptions(effort="lean", stereo=False)
-    with suppress(sfm.SfmFailed):  # small photos may not be placed; their features and pairs are there
+    with suppress(sfm.SfmFailed):  # few may be registered; features and pairs are stored
         sfm.reconstruct(folder / "images", None, folder / "work", options, lambda *_: None, lambda: False)
     return FeatureStore(next((folder / "work").rglob("database.db")).parent)
 
 
-def test_only_the_doubtful_photos_lose_their_features_and_pairs(store: FeatureStore, tmp_path: Path) -> None:
+def test_only_photos_extracted_anew_lose_their_features_and_pairs(
+    store: FeatureStore, tmp_path: Path
+) -> None:
     target = FeatureStore(tmp_path / "next")
     features.carry_over(store, target, {2, 5})
     old, new = pycolmap.Database.open(store.database), pycolmap.Database.open(target.database)
@@ -53,7 +56,7 @@ def test_only_the_doubtful_photos_lose_their_features_and_pairs(store: FeatureSt
         new.close()
 
 
-def test_what_is_there_is_not_started_again(store: FeatureStore, tmp_path: Path) -> None:
+def test_a_database_that_exists_is_left_as_it_is(store: FeatureStore, tmp_path: Path) -> None:
     target = FeatureStore(tmp_path / "next")
     features.carry_over(store, target, {0})
     stamp = target.database.stat().st_mtime_ns
@@ -61,17 +64,11 @@ def test_what_is_there_is_not_started_again(store: FeatureStore, tmp_path: Path)
     assert target.database.stat().st_mtime_ns == stamp
 
 
-def test_the_likeliest_partners_come_first() -> None:
-    scores = {(0, 1): 5, (0, 2): 9, (1, 2): 30, (0, 3): 7}
-    assert pairs.best_pairs_of([0], scores, 4, 2) == {(0, 2), (0, 3)}
-    assert pairs.best_pairs_of([0, 1], scores, 4, 1) == {(0, 2), (1, 2)}
-    assert pairs.best_pairs_of([], scores, 4, 2) == set()
-
-
-def test_another_seed_and_another_matcher_do_not_read_what_was_matched_before(tmp_path: Path) -> None:
+def test_another_seed_or_matcher_has_a_database_of_its_own(tmp_path: Path) -> None:
     synthetic.capture(tmp_path / "images", 4, 120, 90, samples=1)
-    for changed in ({}, {"seed": 1}, {"matcher": "sequential"}, {}):
-        options = sfm.SfmOptions(effort="lean", stereo=False, **changed)  # type: ignore[arg-type]
+    changes: tuple[dict[str, Any], ...] = ({}, {"seed": 1}, {"matcher": "sequential"}, {})
+    for changed in changes:
+        options = sfm.SfmOptions(effort="lean", stereo=False, **changed)
         with suppress(sfm.SfmFailed):
             sfm.reconstruct(
                 tmp_path / "images", None, tmp_path / "work", options, lambda *_: None, lambda: False

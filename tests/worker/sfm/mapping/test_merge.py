@@ -1,7 +1,7 @@
-"""Models that share photos become one, in the world of the first; models that share too few stay apart.
+"""Proves that models that share photos are merged into one, in the world of the first, and others are left apart.
 
-Proven on a model of generated photos taken apart and put together again. It does not prove that a mapper's own
-fragments, with their own errors, always agree well enough to be joined.
+Proven on parts of a model of generated photos. Does not prove that the models of a mapper, each with errors of its own,
+always agree well enough to be merged.
 """
 
 import copy
@@ -45,15 +45,13 @@ def moved(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return model
 
 
-def test_two_halves_that_share_photos_become_the_whole(
-    model: pycolmap.Reconstruction, tmp_path: Path
-) -> None:
+def test_two_halves_that_share_photos_are_merged(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
     count = model.num_reg_images()
     assert count >= 12
     left, right = part(model, 0, 9, tmp_path / "left"), moved(part(model, 5, count, tmp_path / "right"))
     assert (left.num_images(), right.num_images()) == (9, count - 5)
-    whole, joined = merge([left, right])
-    assert joined == [1]
+    whole, merged = merge([left, right])
+    assert merged == [1]
     assert left.num_reg_images() == 9  # the model given is left as it was
     assert whole.num_reg_images() == count
     for image_id in model.reg_image_ids():
@@ -65,27 +63,29 @@ def test_two_halves_that_share_photos_become_the_whole(
         assert len({element.image_id for element in point.track.elements}) >= 2
 
 
-def test_models_that_cannot_be_joined_stay_as_they_are(
+def test_models_that_colmap_fails_to_merge_are_left_apart(
     model: pycolmap.Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     count = model.num_reg_images()
     left, right = part(model, 0, 9, tmp_path / "left"), part(model, 5, count, tmp_path / "right")
 
     def refuse(models: list[pycolmap.Reconstruction]) -> None:
-        # COLMAP's own words: no pair of models is known that it says them of.
+        # Raises COLMAP's own error; no two models are known for which merging fails.
         model.images[model.reg_image_ids()[0]].points2D = pycolmap.Point2DList()
 
     monkeypatch.setattr(mapper, "merge", refuse)
-    models, joined, notes = mapper.merge_models([left, right])
+    models, merged, notes = mapper.merge_models([left, right])
     assert [id(each) for each in models] == [id(left), id(right)]
-    assert joined == 0
+    assert merged == 0
     assert "merging them failed" in notes[0]
     assert "Check failed" in notes[0]
 
 
-def test_parts_that_share_too_few_photos_stay_apart(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
+def test_models_that_share_too_few_photos_are_left_apart(
+    model: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
     count = model.num_reg_images()
     left, right = part(model, 0, 8, tmp_path / "left"), moved(part(model, 6, count, tmp_path / "right"))
-    whole, joined = merge([left, right])
-    assert joined == []
+    whole, merged = merge([left, right])
+    assert merged == []
     assert whole is left
