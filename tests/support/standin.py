@@ -1,8 +1,13 @@
-"""A small pipeline with the real one's contract, whose stages can be held, crashed and slowed from outside.
+"""A stand-in for the pipeline, with the same interface, which a test can slow down and crash at a chosen step.
 
-It checkpoints every step and goes on from there, so that a test can tell a resumed attempt from a new one. The
-capture's `images/script.json` steers it: `steps` how many, `pause` seconds per step, `do` what `at` which step,
-`gaussians` how many the model has. Each attempt writes into the `diary`, and whether another ran beside it.
+It stores a checkpoint after each step and resumes from it, so that a test can tell a resumed attempt from a new one.
+The capture's `images/script.json` controls it:
+
+    steps: number of steps.
+    pause: seconds per step.
+    do, at: what happens (see `_act`), and at which step.
+    gaussians: number of Gaussians of the model.
+    diary: file to which each attempt appends its process, its first step, and whether another attempt ran beside it.
 """
 
 import fcntl
@@ -16,6 +21,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from splatmill.files import atomic_write
 from splatmill.schema import (
     Event,
     JobState,
@@ -37,12 +43,12 @@ def run(
     emit: Callable[[Event], None],
     cancelled: Callable[[], bool],
 ) -> SimpleNamespace:
-    """Photos are not looked at; the model is a ball of Gaussians."""
+    """Follow the script and leave a ball of Gaussians as the model. The photos are not read."""
     script = json.loads((capture / "images" / "script.json").read_text())
     workdir.mkdir(parents=True, exist_ok=True)
     checkpoint = workdir / "checkpoints" / "state.json"
     diary = Path(script["diary"])
-    # The kernel drops this lock when the process is gone, not before: finding it held means two at once.
+    # The kernel releases this lock when the process ends, not before: if it is held, two attempts run at once.
     alone = diary.with_suffix(".lock").open("w")
     try:
         fcntl.flock(alone, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -84,14 +90,11 @@ def _step(checkpoint: Path) -> int:
 
 
 def _save(checkpoint: Path, step: int) -> None:
-    checkpoint.parent.mkdir(exist_ok=True)
-    part = checkpoint.with_suffix(".part")
-    part.write_text(json.dumps({"step": step}))
-    part.replace(checkpoint)
+    atomic_write(checkpoint, json.dumps({"step": step}))
 
 
 def _act(script: dict[str, object], step: int) -> None:
-    """Fail at a step as the script asks: once per marker file, or each time."""
+    """Do what the script says at its step; the step is not stored then, so that a later attempt does it again."""
     if script.get("at") != step:
         return
     match script.get("do"):
@@ -102,5 +105,5 @@ def _act(script: dict[str, object], step: int) -> None:
         case "segv":
             os.kill(os.getpid(), signal.SIGSEGV)
         case "native":
-            # One call that never comes back to the interpreter, as a mapper's does for seconds.
+            # One call that does not return to the interpreter for many seconds, like a mapper's.
             np.linalg.svd(np.random.default_rng(0).normal(size=(6000, 6000)))

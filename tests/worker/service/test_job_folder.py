@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import Role
 from splatmill_worker.errors import FolderInUse, StartNotStored
 from splatmill_worker.service import job_folder
@@ -73,6 +73,30 @@ def test_checkpoints_reach_an_attempt_on_another_machine(
     there.remove()
     assert not there.path.exists()
     assert list(remote.entries(layout.job(JOB))) == []
+
+
+def test_a_checkpoint_that_storage_refuses_is_reported_and_copied_later(
+    remote: Storage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = JobFolder(remote, JOB, CAPTURE)
+    folder.run.mkdir()
+    (folder.run / "plan.json").write_text("{}")
+    warnings: list[str] = []
+    mirror = Mirror(folder, warnings.append)
+    stored = f"{layout.job_work(JOB)}/plan.json"
+
+    def refuse(path: str, data: object) -> None:
+        raise StorageError(f"Storage could not write {path}: connection refused.")
+
+    with monkeypatch.context() as away:
+        away.setattr(remote, "put", refuse)
+        mirror.close(copy=True)
+    assert len(warnings) == 1
+    assert "plan.json" in warnings[0]
+    assert not remote.exists(stored)
+    mirror.close(copy=True)
+    assert len(warnings) == 1
+    assert remote.get(stored) == b"{}"
 
 
 @pytest.mark.parametrize("elsewhere", [True, False])
