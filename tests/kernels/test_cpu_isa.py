@@ -1,4 +1,4 @@
-"""Every build of the engine that this processor can run gives the same answers; a build is chosen, or refused, as said.
+"""All builds of the engine that this processor can run agree; the environment chooses a build, or is refused by name.
 
 Not proven here: that the builds run on processors older than this one.
 """

@@ -1,5 +1,6 @@
-"""The GPU training step against the reference's ops in float64, over steps that miss Gaussians; its room, and
-that it never waits.
+"""The GPU training step agrees with the reference's ops in float64, over steps that miss Gaussians, and never waits.
+
+Also the room of its lists, which follows what a view used.
 
 Runs in Triton's interpreter where there is no GPU. Does not prove that the device overlaps what the host
 enqueues, only that nothing in a step asks for a value, nor the recovery from a real allocation failure.

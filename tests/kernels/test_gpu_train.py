@@ -1,7 +1,6 @@
-"""The training loop runs on the GPU engine as it is, with densification and evaluation, and ends where the
-CPU engine ends.
+"""The training loop on the GPU engine, with densification and evaluation, ends where it ends on the CPU engine.
 
-Three steps on twelve lines of pixels, in Triton's interpreter where there is no GPU: the seam, not the quality.
+Three steps on twelve rows of pixels, in Triton's interpreter where there is no GPU. Proves nothing about quality.
 """
 
 from __future__ import annotations

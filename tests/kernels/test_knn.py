@@ -1,5 +1,7 @@
-"""Mean distance to the three nearest others: every backend against all pairs in float64, on points of every awkward
-kind."""
+"""Mean distance to the three nearest others: every backend against all pairs in float64, on awkward sets of points.
+
+Says nothing about speed.
+"""
 
 from __future__ import annotations
 

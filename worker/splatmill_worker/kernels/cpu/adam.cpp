@@ -1,4 +1,4 @@
-// Adam over all parameter groups of a scene in one parallel pass, dense or for the visible rows only.
+// Adam over all parameter groups of a scene in one parallel pass, dense or for the visible rows alone.
 #include "adam.hpp"
 
 #include <algorithm>
@@ -18,7 +18,7 @@ struct Group {
   float rate;
 };
 
-// One run of values; returns how many were refused.
+// Updates one run of values; returns how many gradient values were refused.
 int64_t update_run(const Group& group, int64_t begin, int64_t end, float rate, float root) {
   int64_t refused = 0;
   for (int64_t i = begin; i < end; i += kLanes) {
@@ -33,7 +33,7 @@ int64_t update_run(const Group& group, int64_t begin, int64_t end, float rate, f
   return refused;
 }
 
-// Steps of drift a catch-up replays: (0.9 / sqrt 0.999)^256 = 2e-12, below float32's resolution.
+// Missed steps whose drift is computed: the terms of later ones are below (0.9 / sqrt 0.999)^256 = 2e-12.
 constexpr int64_t kMemory = 256;
 
 // sum over s = last + j, last < s <= step, of beta1^j / (1 - beta1^s) * sqrt((1 - beta2^s) / beta2^j)
@@ -47,7 +47,7 @@ double drift(int64_t last, int64_t step) {
   return total;
 }
 
-// What dense Adam with zero gradients would have done to a row since it was last current.
+// Moves a run as dense Adam with zero gradients would have done since it was last current.
 void catch_up_run(const Group& group, int64_t begin, int64_t end, double travel, double decay1, double decay2) {
   for (int64_t i = begin; i < end; ++i) {
     const float m = group.m[i], v = group.v[i];
@@ -59,7 +59,7 @@ void catch_up_run(const Group& group, int64_t begin, int64_t end, double travel,
 
 }  // namespace
 
-// Values of gradients that were refused. With `visible`, rows elsewhere stay, and `last_step` holds the step each row is at.
+// Returns how many gradient values were refused. With `visible`, other rows stay, and `last_step` is the step each row is at.
 int64_t adam(const std::vector<Group>& groups, int64_t rows, int64_t step, const bool* visible, int32_t* last_step,
              int threads) {
   const AdamStep scale(step);
@@ -70,13 +70,13 @@ int64_t adam(const std::vector<Group>& groups, int64_t rows, int64_t step, const
     const int64_t t = omp_get_thread_num(), all = omp_get_num_threads();
     if (!visible) {
       for (const Group& group : groups) {
-        // Boundaries at whole vectors: every value is computed in the same lane arithmetic on any number of threads.
+        // Threads divide the values at whole vectors, so that every value is computed by the same arithmetic on any number.
         const int64_t vectors = (rows * group.width + kLanes - 1) / kLanes, size = rows * group.width;
         refused += update_run(group, std::min(size, vectors * t / all * kLanes),
                               std::min(size, vectors * (t + 1) / all * kLanes), group.rate * scale.size, scale.root);
       }
     } else {
-      int64_t missed_before = 0;  // neighbours were mostly last seen together: the three factors are kept
+      int64_t missed_before = 0;  // the three factors are kept: neighbours have mostly missed the same steps
       double travel = 0, decay1 = 1, decay2 = 1;
       for (int64_t row = rows * t / all; row < rows * (t + 1) / all; ++row) {
         if (!visible[row]) continue;

@@ -1,4 +1,4 @@
-// The shapes in which Python hands over a scene and a camera.
+// Types of the arguments that Python passes: scenes in blocks, rows of tensors, matrices and images.
 #pragma once
 
 #include "bindings.hpp"
@@ -14,7 +14,6 @@ using Row = Tensor<float, nb::shape<-1>>;
 template <int N>
 using Rows = Tensor<float, nb::shape<-1, N>>;
 using Matrix4 = Tensor<float, nb::shape<4, 4>>;
-using CameraArgument = Camera;  // bound as a class
 using Image = Tensor<float, nb::ndim<3>>;  // [3 or 5, rows, stride], both padded to whole tiles
 
 inline Planes planes_of(const Image& image, const Camera& cam) {

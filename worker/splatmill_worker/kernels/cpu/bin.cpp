@@ -1,5 +1,5 @@
-// bin: the pairs of a frame by tile, front to back. Depth is sorted once for the visible Gaussians, on the bits in which their
-// depths differ; then one stable counting pass by tile.
+// bin: the pairs of a frame by tile, front to back. The visible Gaussians are sorted by depth, on the bits in which their depths
+// differ; one stable counting pass then sorts the pairs by tile.
 #include "bin.hpp"
 
 #include <algorithm>
@@ -11,8 +11,8 @@
 namespace splatmill {
 namespace {
 
-constexpr int kMostDigitBits = 11;  // a pass writes to that many places at once: more would not stay in the first cache
-constexpr int kAhead = 16;          // Gaussians whose touches are fetched early
+constexpr int kMostDigitBits = 11;  // a pass writes to 2^11 places at once; more would not stay in the first-level cache
+constexpr int kAhead = 16;          // how many Gaussians ahead touches are prefetched
 
 struct Digits {
   uint32_t lowest = 0;
@@ -127,7 +127,7 @@ void bind_bin(nb::module_& m) {
       },
       "frame"_a, "means2d"_a.noconvert(), "conics"_a.noconvert(), "opacities"_a.noconvert(), "depths"_a.noconvert(),
       "extents"_a.noconvert(), "width"_a, "height"_a, "threads"_a,
-      "Makes the lists of projected Gaussians in the frame; returns the number of pairs, for `lists`.");
+      "Makes the lists of projected Gaussians and keeps them in the frame; returns the number of pairs, which `lists` needs.");
   m.def(
       "lists",
       [](const Frame& frame, Tensor<int64_t, nb::ndim<1>> offsets, Tensor<int32_t, nb::ndim<1>> ids) {

@@ -1,7 +1,7 @@
-// What every op's file shares with Python: tensor arguments that are views (never copies), and errors that name the argument.
+// What the files of the ops need to be called from Python. Tensors arrive as views, never as copies.
 //
-// An op's file `foo.cpp` ends with `void bind_foo(nb::module_& m)`; module.cpp calls it. Outputs are allocated in torch by the
-// caller and passed in, so that nothing here needs to link torch.
+// The file `foo.cpp` of an op ends with `void bind_foo(nb::module_& m)`, which module.cpp calls. The caller allocates outputs in
+// torch and passes them, so that nothing here links torch.
 #pragma once
 
 #include <nanobind/nanobind.h>

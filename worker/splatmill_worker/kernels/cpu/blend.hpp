@@ -1,4 +1,4 @@
-// One Gaussian over one 4x4-pixel block: the arithmetic that the forward and the backward pass must do bit for bit alike.
+// One Gaussian over one 4x4-pixel block: the arithmetic whose bits must agree between the forward and the backward pass.
 #pragma once
 
 #include "frame.hpp"
@@ -7,7 +7,7 @@
 
 namespace splatmill {
 
-// Pixel centres relative to a tile's corner block, by lane, and the blocks' corners, by block.
+// Places of pixels within a block, by lane, and of blocks within a tile, in pixels.
 struct TileLanes {
   Float pixel_x, pixel_y;  // lane's pixel within a block
   Float block_x, block_y;  // lane b: left and top of block b
@@ -17,7 +17,7 @@ SPLATMILL_INLINE TileLanes tile_lanes() {
   return {column, row, column * 4.0f, row * 4.0f};
 }
 
-// u and v over a tile: at block b they are the lanes' part plus that block's offset.
+// u and v of a Gaussian over a tile: at block b, the lanes' part plus the offset of the block.
 struct TileForm {
   Float u, v;
   alignas(64) float block_u[kTileBlocks], block_v[kTileBlocks];
@@ -38,7 +38,7 @@ struct TileForm {
 // log2 of alpha before the clamp.
 SPLATMILL_INLINE Float log2_alpha(Float level, Float u, Float v) { return fnma(v, v, fnma(u, u, level)); }
 
-// The blocks of a tile that hold pixels of the image.
+// The blocks of a tile that contain pixels of the image, as bits.
 inline uint32_t blocks_inside(int tile_x, int tile_y, const Camera& cam) {
   uint32_t inside = 0;
   for (int b = 0; b < kTileBlocks; ++b)
@@ -47,7 +47,7 @@ inline uint32_t blocks_inside(int tile_x, int tile_y, const Camera& cam) {
   return inside;
 }
 
-// Copies between a plane and a block's sixteen lanes.
+// Loading and storing a block's sixteen pixels of a plane.
 SPLATMILL_INLINE float* block_origin(const Planes& image, int plane, int tile_x, int tile_y, int block) {
   return image.at(plane, tile_y * kTile + block / 4 * kBlockSide, tile_x * kTile + block % 4 * kBlockSide);
 }
@@ -62,6 +62,6 @@ SPLATMILL_INLINE void store_block(float* origin, int64_t stride, Float x) {
   for (int y = 0; y < kBlockSide; ++y) std::memcpy(origin + y * stride, lanes + 4 * y, 16);
 }
 
-inline constexpr int kEntriesAhead = 16;  // records of the list that are fetched early
+inline constexpr int kEntriesAhead = 16;  // how far ahead in the list records are prefetched
 
 }  // namespace splatmill

@@ -22,7 +22,7 @@ def empty(count: int) -> Tensor:
     """Return zeroed blocks for `count` Gaussians."""
     blocks = torch.zeros(-(-count // LANES), PARAMETERS, LANES)
     # Before the memory is first touched: the system hands out zeros of this size without touching them.
-    engine.wish_huge_pages(blocks)
+    engine.advise_huge_pages(blocks)
     return blocks
 
 

@@ -1,4 +1,4 @@
-// Aligned memory that grows and is kept from step to step.
+// Aligned memory that grows, and is kept from step to step.
 #pragma once
 
 #include <cstdint>
@@ -13,9 +13,9 @@ namespace splatmill {
 
 inline constexpr size_t kHugePage = size_t{2} << 20;  // bytes
 
-// Asks the system to back whole huge pages within [p, p + bytes) by such: what is read and written at random misses the tables of
-// small pages at every other access. A wish, where the system knows it; nothing depends on it.
-inline void wish_huge_pages(void* p, size_t bytes) {
+// Advises the system to back the whole huge pages within [p, p + bytes) by such: with small pages, random access misses the TLB
+// at every other access. Nothing depends on it.
+inline void advise_huge_pages(void* p, size_t bytes) {
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
   const auto begin = (reinterpret_cast<uintptr_t>(p) + kHugePage - 1) / kHugePage * kHugePage;
   const auto end = (reinterpret_cast<uintptr_t>(p) + bytes) / kHugePage * kHugePage;
@@ -33,8 +33,8 @@ class Buffer {
   Buffer& operator=(const Buffer&) = delete;
   ~Buffer() { std::free(data_); }
 
-  // Room for `count` elements; what was there is lost when it has to grow. Grows by half, so that a slowly growing scene does
-  // not allocate at every step. Throws std::bad_alloc.
+  // Makes room for `count` elements; the old ones are lost when it grows. Grows by half at least, so that a slowly growing scene
+  // does not allocate at every step. Throws std::bad_alloc.
   T* reserve(int64_t count) {
     if (count > capacity_) {
       const int64_t wanted = count > capacity_ + capacity_ / 2 ? count : capacity_ + capacity_ / 2;
@@ -45,7 +45,7 @@ class Buffer {
       const size_t bytes = (exact + alignment - 1) / alignment * alignment;
       data_ = static_cast<T*>(std::aligned_alloc(alignment, bytes));
       if (!data_) throw std::bad_alloc();
-      wish_huge_pages(data_, bytes);
+      advise_huge_pages(data_, bytes);
       capacity_ = wanted;
     }
     return data_;

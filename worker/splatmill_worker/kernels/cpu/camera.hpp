@@ -1,4 +1,4 @@
-// One pinhole camera, with what projection derives from it.
+// A pinhole camera, with the values that projection derives from it.
 #pragma once
 
 #include "image.hpp"
@@ -10,7 +10,7 @@ struct Camera {
   float fx = 0, fy = 0, cx = 0, cy = 0;
   float R[9] = {}, t[3] = {};     // world to camera
   float center[3] = {};           // -R^T t
-  float low_u = 0, high_u = 0;    // x/z is held within these in the Jacobian (at most 15 % of the image outside it)
+  float low_u = 0, high_u = 0;    // bounds of x/z in the Jacobian: 15 % of the image beyond its edges
   float low_v = 0, high_v = 0;
   float near = 0.01f;             // world units
   bool antialias = false;

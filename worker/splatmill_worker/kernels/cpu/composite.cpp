@@ -1,4 +1,4 @@
-// composite as an op of its own: records from projected tensors, any lists, and gradients back to the tensors.
+// composite as a separate op: it takes projected tensors and any lists, and returns gradients to the tensors.
 #include "composite.hpp"
 
 #include <cmath>
@@ -12,7 +12,7 @@
 namespace splatmill {
 namespace {
 
-// Lists come from the caller: what would read out of bounds is refused here.
+// Throws std::invalid_argument for lists, which come from the caller, that would make a pass read out of bounds.
 void check_lists(const int64_t* offsets, int64_t tiles, const int32_t* ids, int64_t pairs, int64_t count) {
   if (offsets[0] != 0 || offsets[tiles] != pairs)
     throw std::invalid_argument("bins.offsets must run from 0 to the " + std::to_string(pairs) + " ids given.");
@@ -53,7 +53,7 @@ void take_lists(Frame& frame, const ProjectedRows& rows, int64_t count, const in
   }
 }
 
-// Gives every pair a slot such that a Gaussian's pairs lie together, in tile order.
+// Numbers the slots of the pairs so that those of a Gaussian are consecutive, in tile order.
 void assign_slots(Frame& frame) {
   Span* spans = frame.spans.reserve(frame.count);
   for (int64_t i = 0; i < frame.count; ++i) spans[i] = {0, 0};
@@ -73,7 +73,7 @@ void assign_slots(Frame& frame) {
   }
 }
 
-// A Gaussian's sums over (u, v) to the gradients of the op's inputs: d = (dx, dy) with dy = v / vy, dx = (u - uy dy) / ux.
+// Writes the gradients to the inputs of the op from a Gaussian's sums over (u, v): dy = v / vy and dx = (u - uy dy) / ux.
 void write_gradient(const Record& r, const double* s, const ProjectedRows& out, int64_t i) {
   const double ux = r.ux, uy = r.uy, vy = r.vy, k1 = 2.0 * 0.6931471805599453, shear = uy / vy;
   out.means2d[2 * i] = static_cast<float>(k1 * ux * s[kSumQU]);
@@ -98,7 +98,7 @@ void gradients_of_rows(const Frame& frame, const ProjectedRows& out, int threads
       if (!frame.touches[k].blocks) continue;
       any = true;
       const float* pair = &frame.pair_sums[static_cast<int64_t>(k) * kPairSums];
-      for (int j = 0; j <= kSumDepth; ++j) s[j] += pair[j];
+      for (int j = 0; j < kSums; ++j) s[j] += pair[j];
     }
     if (any) write_gradient(frame.records[i], s, out, i);
   }
@@ -108,8 +108,8 @@ struct BlockCounts {
   int64_t reached = 0, changed = 0;
 };
 
-// 4x4-pixel blocks that the pairs of the last render reached before their tiles were done, and those that they changed: the work of
-// the two passes. To be asked between them, because the backward pass clears what it skips.
+// Counts the 4x4-pixel blocks that the pairs of the last render reached before their tiles ended, and those that they changed: the
+// work of the two passes. To be called between the passes, because the backward pass clears the blocks of pairs that it skips.
 BlockCounts count_blocks(const Frame& frame) {
   BlockCounts found;
   for (int tile = 0; tile < frame.tiles(); ++tile)
@@ -140,7 +140,7 @@ void bind_composite(nb::module_& m) {
       "frame"_a, "means2d"_a.noconvert(), "conics"_a.noconvert(), "opacities"_a.noconvert(), "colors"_a.noconvert(),
       "depths"_a.noconvert(), "extents"_a.noconvert(), "offsets"_a.noconvert(), "ids"_a.noconvert(), "width"_a, "height"_a,
       "background"_a, "image"_a.noconvert(), "threads"_a,
-      "Blends the lists into five planes: colour, alpha, depth. The frame keeps what the backward pass needs.");
+      "Blends the lists into five planes (colour, alpha, depth) and leaves in the frame what the backward pass needs.");
   m.def(
       "composite_backward",
       [](Frame& frame, Image image, Image gradient, Rows<2> d_means2d, Rows<3> d_conics, Row d_opacities, Rows<3> d_colors,
@@ -154,14 +154,14 @@ void bind_composite(nb::module_& m) {
       },
       "frame"_a, "image"_a.noconvert(), "gradient"_a.noconvert(), "d_means2d"_a.noconvert(), "d_conics"_a.noconvert(),
       "d_opacities"_a.noconvert(), "d_colors"_a.noconvert(), "d_depths"_a.noconvert(), "threads"_a,
-      "Adds nothing: writes the gradients of the Gaussians that were blended, and leaves the other rows alone (give zeros).");
+      "Writes the gradients of the Gaussians that were blended; other rows keep what they hold, so pass zeros.");
   m.def(
       "count_blocks",
       [](const Frame& frame) {
         const BlockCounts found = count_blocks(frame);
         return std::make_tuple(found.reached, found.changed);
       },
-      "frame"_a, "Blocks of 4x4 pixels that the last `render` of the frame worked on, and those that it changed (for benchmarks).");
+      "frame"_a, "The numbers of 4x4-pixel blocks that the last `render` worked on and that it changed; for benchmarks.");
 }
 
 }  // namespace splatmill

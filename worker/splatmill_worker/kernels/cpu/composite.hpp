@@ -4,31 +4,29 @@
 
 namespace splatmill {
 
-// Planes beyond colour that a pass fills or reads.
+// The planes after the three of colour.
 inline constexpr int kAlphaPlane = 3, kDepthPlane = 4;
 
-// Blends frame.entries front to back into `image` (3 planes of colour, with alpha and depth 5). Leaves final_T and walked, and
-// in every entry the blocks that it changed, for the backward pass.
+// Blends frame.entries front to back into `image`: three planes of colour, or five with alpha and depth. For the backward pass it
+// writes final_T and walked, and reduces the blocks of every entry to those that it changed.
 void composite_forward(Frame& frame, const Planes& image, bool with_alpha_and_depth, const float background[3], int threads);
 
-// What a backward pass is given: the forward image (as it was written, background and all) and its gradient, 3 planes, or 5 with
-// alpha and depth. `absolute` asks for the sums behind the absolute densification score too; the plain one needs none of its own.
+// The input of a backward pass: the image as the forward pass wrote it, with the background, and its gradient; three planes each,
+// or five with alpha and depth.
 struct ImageGradient {
   Planes image, gradient;
   bool with_alpha_and_depth = false;
-  bool absolute = false;
 };
 
-// Rows of frame.pair_sums: what each (tile, Gaussian) pair adds up over its pixels. q = alpha dL/dalpha, w the blending weight.
+// Columns of frame.pair_sums: sums over the pixels of a (tile, Gaussian) pair. q = alpha dL/dalpha, w the blending weight.
 enum PairSum {
   kSumQ = 0, kSumQU, kSumQV, kSumQUU, kSumQUV, kSumQVV,
   kSumRed, kSumGreen, kSumBlue,  // w dL/dcolour
-  kSumDepth,                     // w dL/ddepth
-  kSumAbsX, kSumAbsY,            // |dL/dx|, |dL/dy| of the mean, pixel by pixel, up to 2 ln 2
+  kSumDepth,                     // w dL/ddepth; last, because a pass without depth stops before it
   kSums
 };
 
-// Fills pair_sums of every pair that the forward pass blended, and clears `blocks` of every other touch.
+// Writes the pair_sums of every pair that the forward pass blended, and clears `blocks` of every other touch.
 void composite_backward(Frame& frame, const ImageGradient& gradient, int threads);
 
 }  // namespace splatmill

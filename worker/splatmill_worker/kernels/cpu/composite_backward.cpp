@@ -1,8 +1,9 @@
-// composite, backward: the lists again front to back. What lies behind a splat is the final colour minus what was blended so far,
-// so transmittance is never recovered by division; a pixel ends where its transmittance reaches the forward pass's, bit for bit.
+// composite, backward: the lists once more, front to back. What lies behind a splat is the final colour minus what was blended so
+// far, so that no transmittance is recovered by division; a pixel ends where its transmittance equals that of the forward pass,
+// bit for bit.
 //
-// The sums of a (tile, Gaussian) pair stay in registers over the tile's blocks, are reduced together, and stored once; a
-// Gaussian's pairs are added later in a fixed order. No atomics, and the same bytes on any number of threads.
+// The sums of a (tile, Gaussian) pair stay in registers over the tile's blocks, are reduced together and stored once; the pairs of
+// a Gaussian are added later in a fixed order. There are no atomics, and results do not depend on the number of threads.
 #include "blend.hpp"
 #include "composite.hpp"
 #include "shuffles.hpp"
@@ -14,7 +15,7 @@ namespace {
 template <bool kDepth>
 struct Block {
   alignas(64) float T[kLanes], final_T[kLanes];
-  alignas(64) float behind[kLanes];  // gradient . (final image - blended so far): what a splat here would hide
+  alignas(64) float behind[kLanes];  // gradient . (final image - what was blended so far)
   alignas(64) float d_red[kLanes], d_green[kLanes], d_blue[kLanes];
   alignas(64) float d_depth[kDepth ? kLanes : 1];
 };
@@ -34,7 +35,7 @@ SPLATMILL_INLINE void load_block_gradient(const Frame& frame, const ImageGradien
     const Float d_depth = load_block(block_origin(g.gradient, kDepthPlane, tile_x, tile_y, b), g.gradient.stride);
     behind = fma(d_depth, load_block(block_origin(g.image, kDepthPlane, tile_x, tile_y, b), g.image.stride), behind);
     store(block.d_depth, d_depth);
-    // alpha = 1 - final T: a splat that hides what is behind it takes that share of the background's weight with it.
+    // alpha = 1 - final T, and a splat scales final T as it scales the colour behind it.
     const Float d_alpha = load_block(block_origin(g.gradient, kAlphaPlane, tile_x, tile_y, b), g.gradient.stride);
     behind = fnma(d_alpha, final_T, behind);
   }
@@ -43,9 +44,9 @@ SPLATMILL_INLINE void load_block_gradient(const Frame& frame, const ImageGradien
   store(block.final_T, final_T);
 }
 
-template <bool kDepth, bool kAbsolute>
+template <bool kDepth>
 void differentiate_tile(Frame& frame, const ImageGradient& g, int tile) {
-  constexpr int kCount = kAbsolute ? kSums : kDepth ? kSumDepth + 1 : kSumBlue + 1;
+  constexpr int kCount = kDepth ? kSums : kSumDepth;
   const int columns = frame.camera.columns(), tile_x = tile % columns, tile_y = tile / columns;
   const float x0 = tile_x * kTile + 0.5f, y0 = tile_y * kTile + 0.5f;
   const TileLanes lanes = tile_lanes();
@@ -101,10 +102,6 @@ void differentiate_tile(Frame& frame, const ImageGradient& g, int tile) {
         s[kSumGreen] = fma(w, d_green, s[kSumGreen]);
         s[kSumBlue] = fma(w, d_blue, s[kSumBlue]);
         if constexpr (kDepth) s[kSumDepth] = fma(w, load(block.d_depth), s[kSumDepth]);
-        if constexpr (kAbsolute) {
-          s[kSumAbsX] += abs(qu);
-          s[kSumAbsY] += abs(fma(splat(r.uy), qu, splat(r.vy) * qv));
-        }
       }
     };
     if (__builtin_expect(r.opacity > kAlphaMax * 0.9999f, 0))
@@ -127,14 +124,10 @@ void composite_backward(Frame& frame, const ImageGradient& g, int threads) {
     const FlushDenormals flush;
 #pragma omp for schedule(dynamic, 2)
     for (int tile = 0; tile < tiles; ++tile) {
-      if (g.with_alpha_and_depth && g.absolute)
-        differentiate_tile<true, true>(frame, g, tile);
-      else if (g.with_alpha_and_depth)
-        differentiate_tile<true, false>(frame, g, tile);
-      else if (g.absolute)
-        differentiate_tile<false, true>(frame, g, tile);
+      if (g.with_alpha_and_depth)
+        differentiate_tile<true>(frame, g, tile);
       else
-        differentiate_tile<false, false>(frame, g, tile);
+        differentiate_tile<false>(frame, g, tile);
     }
   }
 }

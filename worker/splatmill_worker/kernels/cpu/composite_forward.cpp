@@ -1,4 +1,4 @@
-// composite, forward: each tile's list front to back, sixteen pixels a register, only the blocks that the ellipse reaches.
+// composite, forward: the list of each tile front to back, sixteen pixels to a register, only the blocks that an ellipse reaches.
 #include "blend.hpp"
 #include "composite.hpp"
 #include "threads.hpp"
@@ -6,14 +6,14 @@
 namespace splatmill {
 namespace {
 
-// A block's pixels while its tile is blended. A transmittance below zero marks a pixel that is done; its value is kept.
+// The pixels of a block while its tile is blended. A finished pixel has its transmittance negated.
 template <bool kDepth>
 struct Block {
   alignas(64) float T[kLanes], red[kLanes], green[kLanes], blue[kLanes];
   alignas(64) float depth[kDepth ? kLanes : 1];
 };
 
-// Blocks with a pixel that is not done. Asked now and then: marking a pixel costs nothing, a branch at each would.
+// The blocks of `live` with an unfinished pixel. Called now and then: a branch at every splat would cost more than it saves.
 constexpr int64_t kEntriesBetweenChecks = 16;
 
 template <bool kDepth>
@@ -63,7 +63,7 @@ void blend_tile(Frame& frame, const Planes& image, const float background[3], in
       const Float alpha = min(exp2_of_alpha(e), kAlphaMax);
       const Float T = load(block.T), T_after = fnma(alpha, T, T);
       const Mask hit = e >= kLog2AlphaMin;
-      const Mask blended = hit & (T_after > kTransmittanceMin);  // never true of a pixel that is done: its T is negative
+      const Mask blended = hit & (T_after > kTransmittanceMin);  // false for finished pixels: their T is negative
       const Float w = keep_product(blended, alpha, T);
       store(block.red, fma(w, red, load(block.red)));
       store(block.green, fma(w, green, load(block.green)));

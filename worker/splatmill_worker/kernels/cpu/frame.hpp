@@ -1,4 +1,4 @@
-// Everything between the parameters and the image for one view, kept from step to step.
+// The intermediate results between the parameters and the image of one view, in buffers that are kept from step to step.
 #pragma once
 
 #include "buffer.hpp"
@@ -7,21 +7,22 @@
 
 namespace splatmill {
 
-// One (Gaussian, tile) pair where it was found, and which of the tile's sixteen 4x4-pixel blocks the ellipse reaches.
+// One (Gaussian, tile) pair, among those of its Gaussian.
 struct Touch {
   uint32_t id;  // Gaussian
   uint32_t tile;
-  uint32_t blocks;
+  uint32_t blocks;  // bits: which of the tile's sixteen 4x4-pixel blocks the ellipse reaches
 };
 
-// The same pair in its tile's list.
+// The same pair, in the list of its tile.
 struct Entry {
   uint32_t id;      // Gaussian
   uint32_t slot;    // its Touch, and its row of pair sums
-  uint32_t blocks;  // reached; the forward pass leaves those that it changed
+  uint32_t blocks;  // reached; after the forward pass, those that it changed
 };
 
-// A Gaussian's touches: a run in the buffer, in tile order. Sums over it are taken in this order, whatever the threads.
+// The touches of a Gaussian: consecutive in the buffer, in tile order. Sums over them are taken in this order on any number of
+// threads.
 struct Span {
   uint32_t first, count;
 };
@@ -53,7 +54,7 @@ struct Frame {
   Buffer<float> final_T;         // [tiles][16 blocks][16 pixels]
   Buffer<int32_t> walked;        // [tiles] entries of the list that the forward pass looked at
   Buffer<float> pair_sums;       // [slots][kPairSums]
-  Buffer<double> pose_sums;      // [chunks of the update][kPoseSums], where the camera's gradient is asked for
+  Buffer<double> pose_sums;      // [chunks of the update][kPoseSums], used when the camera's gradient is asked for
 
   int tiles() const { return camera.columns() * camera.rows(); }
 };

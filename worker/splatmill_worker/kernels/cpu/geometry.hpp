@@ -1,4 +1,4 @@
-// Sixteen Gaussians into one camera, and the gradient back: the arithmetic that `project` and the fused step share.
+// The projection of sixteen Gaussians into one camera, and its gradient, as `project` and the fused step compute them.
 //
 // Covariance factor M = J W R S (2x3), Sigma' = M M^T + 0.3 I (EWA splatting, Zwicker et al. 2002), determinant by Cauchy-Binet:
 // a c - b^2 would lose every digit for needles.
@@ -14,22 +14,22 @@ namespace splatmill {
 struct Projection {
   Float x, y, z, inv_z;        // camera space
   Float u, v;                  // x/z, y/z
-  Float u_held, v_held;        // as the Jacobian takes them
-  Mask u_free, v_free;         // where the clamp does not act
+  Float u_held, v_held;        // u and v within the camera's bounds, for the Jacobian
+  Mask u_free, v_free;         // where u and v lie within the bounds
   Float scale[3], R[3][3];
   Float quat[4], quat_inv;     // unit quaternion; 1 / norm
   Float T0[3], T1[3];          // rows of J W
   Float M0[3], M1[3];          // rows of M
   Float a, b, c, det;          // Sigma' (pixels^2) and its determinant
   Float sigmoid, opacity;      // before and after the antialias compensation
-  Float complement;            // 1 - sigmoid, with all its digits
+  Float complement;            // 1 - sigmoid, without cancellation
   Float x2d, y2d;              // pixels
   Float cut;                   // log2(255 opacity)
   Float extent_x, extent_y;    // pixels
   Mask visible;
 };
 
-// Everything but colour; `visible` still lacks the test of the colour. `p` is the block's parameters.
+// Projects the block of parameters `p`, all but its colour, whose test `visible` still lacks.
 SPLATMILL_INLINE void project_geometry(const float* p, const Camera& cam, Projection& o) {
   const Float X = row(p, kMean), Y = row(p, kMean + 1), Z = row(p, kMean + 2);
   o.x = fma(cam.R[0], X, fma(cam.R[1], Y, fma(cam.R[2], Z, splat(cam.t[0]))));
@@ -52,7 +52,7 @@ SPLATMILL_INLINE void project_geometry(const float* p, const Camera& cam, Projec
   }
   o.visible &= not_finite == 0.0f;
 
-  // The largest component first: the square of 1e-30 is 0 in float32, that of 1e30 infinite.
+  // Divided by the largest component first: the square of 1e-30 is 0 in float32, that of 1e30 infinite.
   Float q[4], largest = splat(0.0f);
   for (int i = 0; i < 4; ++i) {
     q[i] = row(p, kQuat + i);
@@ -103,9 +103,9 @@ SPLATMILL_INLINE void project_geometry(const float* p, const Camera& cam, Projec
 
   const Float odds_against = exp(-row(p, kLogit));
   o.sigmoid = 1.0f / (odds_against + 1.0f);
-  o.complement = odds_against * o.sigmoid;  // 1 - sigmoid would lose its digits from a logit of 10 on
+  o.complement = odds_against * o.sigmoid;  // 1 - sigmoid cancels: beyond a logit of 10 few of its digits are right
   o.opacity = o.sigmoid;
-  // Detached from the covariance: through det the gradient explodes where a splat degenerates, and makes more of those.
+  // Detached from the covariance: through det, the gradient explodes for splats that degenerate, and drives others there.
   if (cam.antialias) o.opacity = o.opacity * sqrt(max(sharp / o.det, kCompensationMin));
   o.visible &= o.opacity > kAlphaMin;
   o.cut = log2(max(o.opacity, kAlphaMin)) - kLog2AlphaMin;
@@ -135,7 +135,7 @@ SPLATMILL_INLINE void sh_color(const float* p, const Float* basis, int degree, F
     for (int c = 0; c < 3; ++c) color[c] = fma(basis[k], row(p, kSh + 3 * k + c), color[c]);
 }
 
-// The triangular factor of the conic that a Record holds: level - u^2 - v^2 = log2 alpha.
+// The triangular factor of the conic as a Record holds it: level - u^2 - v^2 = log2 alpha.
 struct Factor {
   Float ux, uy, vy;
 };
@@ -145,22 +145,22 @@ SPLATMILL_INLINE Factor conic_factor(const Float& b, const Float& c, const Float
   return {ux, -(ux * (b / c)), sqrt(half / c)};
 }
 
-// Gradients that arrive at a projected Gaussian.
+// The gradient to a projected Gaussian.
 struct ProjectedGradient {
   Float x2d, y2d;        // to the 2-D mean, 1 / pixels
-  Float Quu, Quv, Qvv;   // to Sigma': dL/dSigma' = F^T Q F with the conic's factor F, so that no needle's digits cancel
+  Float Quu, Quv, Qvv;   // to Sigma': dL/dSigma' = F^T Q F with the factor F of the conic; nothing cancels for needles
   Float logit;           // to the logit of the opacity
   Float color[3];        // to the clamped colour
   Float depth;
 };
 
-// Gradient to the camera (summed over lanes by the caller).
+// The gradient to the camera, by lane.
 struct CameraGradient {
   Float R[9], t[3];
 };
 
-// Writes all rows of g[kRows][kLanes] up to the active degree (the rest is left alone); lanes that are not visible hold
-// garbage. `basis_color` is the colour before the clamp.
+// Writes the rows of g[kRows][kLanes] up to the active degree; other rows keep what they hold. Lanes that are not visible get
+// meaningless values. With kCamera, also writes the gradient to the camera.
 template <bool kCamera>
 SPLATMILL_INLINE void project_backward(const float* p, const Camera& cam, int degree, const Projection& o,
                                        const ProjectedGradient& d, float* g, CameraGradient* camera) {

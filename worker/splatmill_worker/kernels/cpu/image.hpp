@@ -1,4 +1,4 @@
-// Planar float images, padded so that every tile is whole: what composite, loss and the step hand each other.
+// Planar float images padded to whole tiles, as composite, loss and the step exchange them.
 #pragma once
 
 #include <cstdint>
@@ -8,8 +8,8 @@ namespace splatmill {
 inline constexpr int kTile = 16;  // pixels, both ways
 
 // Plane c, row y, column x is at data[c * plane + y * stride + x], 64-byte aligned at every x that is a multiple of 16.
-// Rows and columns are padded to whole tiles. What the padding holds: images and gradients handed to the loss or to the backward
-// pass may hold anything there that is finite; whoever writes an image that others read keeps it finite.
+// Rows and columns are padded to whole tiles. The padding of an image or a gradient may hold any finite value; code that writes an
+// image keeps its padding finite.
 struct Planes {
   float* data = nullptr;
   int width = 0, height = 0;   // pixels of the image proper

@@ -50,7 +50,8 @@ class Tree {
   int64_t begin(int64_t place, int depth) const { return n_ * place >> depth; }  // first point of a node of one level
   int64_t id(int64_t i) const { return order_[i]; }
 
-  // Mean distance from the i-th point of the order to its nearest others. `leaf` holds it: looking there first bounds the rest.
+  // The mean distance from the i-th point of the order to its nearest others. Its own leaf is searched first, which bounds the
+  // search of the others.
   float mean_distance(int64_t i, int64_t leaf) const {
     Nearest nearest;
     scan(leaf, i, nearest);
@@ -95,7 +96,7 @@ class Tree {
     const int64_t middle = begin(2 * place + 1, depth + 1);
     std::nth_element(order_.begin() + first, order_.begin() + middle, order_.begin() + last, [&](int32_t i, int32_t j) {
       const float x = points_[3 * static_cast<int64_t>(i) + axis], y = points_[3 * static_cast<int64_t>(j) + axis];
-      return x < y || (x == y && i < j);  // a total order: duplicates neither unbalance the tree nor make it vary
+      return x < y || (x == y && i < j);  // a total order: the tree is the same on every run, duplicates or not
     });
 #pragma omp task if (last - first > 20000)
     build(2 * node, depth + 1);

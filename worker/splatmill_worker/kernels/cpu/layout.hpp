@@ -1,4 +1,4 @@
-// How a scene lies in memory: blocks of sixteen Gaussians, one lane each, so that every kernel over Gaussians reads whole vectors.
+// Layout of a scene: blocks of sixteen Gaussians, one lane each, so that every kernel over Gaussians reads whole vectors.
 #pragma once
 
 #include <cstddef>
@@ -41,6 +41,13 @@ struct alignas(64) Record {
   float opacity;
 };
 static_assert(sizeof(Record) == 64);
+
+// The places of a Record's floats.
+enum RecordPlace {
+  kRecordX, kRecordY, kRecordUx, kRecordUy, kRecordVy, kRecordLevel, kRecordRed, kRecordGreen, kRecordBlue, kRecordDepth,
+  kRecordCut, kRecordSlopeX, kRecordSlopeY, kRecordExtentX, kRecordExtentY, kRecordOpacity, kRecordFloats
+};
+static_assert(kRecordFloats == kLanes && offsetof(Record, opacity) == kRecordOpacity * sizeof(float));
 
 inline constexpr float kAlphaMin = 1.0f / 255.0f;
 inline constexpr float kLog2AlphaMin = -7.994353436858858f;

@@ -116,7 +116,7 @@ class Strip {
              double* similarity) {
     for (int m = top - 2 * kHalf; m - 2 * kHalf < bottom; m += kBlock) {
       for (int y = m; y < m + kBlock; ++y) read_row(y);
-      // The first block of slopes ends at top - 4 or later; of its rows those above top - 5 miss moments, and nothing reads them.
+      // The first block of slopes ends at top - 4 or later. Its rows above top - 5 lack moments; they are never read.
       if (m + kBlock > top) find_slopes(m - kHalf, top, bottom, similarity);
       if (m - 2 * kHalf >= top) write_gradient(m - 2 * kHalf, bottom, l1_slope, ssim_slope, gradient, absolute);
     }
@@ -301,7 +301,7 @@ LossValue loss(const Planes& color, const Photo& photo, float dssim_weight, cons
   const int widest = (vectors + strips - 1) / strips * kLanes;
   const std::size_t floats = Rings::floats(widest + 2 * kMargin);
   float* lines = scratch.lines.reserve(static_cast<int64_t>(floats) * threads);
-  // A row's sums are kept apart and added in order at the end, so how rows are dealt to threads cannot show.
+  // The sums of every row are kept and added in order at the end, so that they do not depend on the number of threads.
   const std::size_t rows = static_cast<std::size_t>(3) * strips * height;
   double* sums = scratch.sums.reserve(static_cast<int64_t>(2 * rows));
   const double each = 1.0 / (3 * photo.count);

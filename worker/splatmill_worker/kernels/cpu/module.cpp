@@ -14,7 +14,7 @@ void bind_pack(nb::module_& m);
 void bind_project(nb::module_& m);
 void bind_step(nb::module_& m);
 
-// Which builds this processor can run, best first. Asked of the baseline module, which runs anywhere.
+// The builds that this processor can run, best first. isa.py asks the baseline module, which runs anywhere.
 std::vector<std::string> supported() {
   std::vector<std::string> names;
 #if defined(SPLATMILL_X86)
@@ -34,16 +34,17 @@ std::vector<std::string> supported() {
 
 NB_MODULE(SPLATMILL_MODULE, m) {
   using namespace splatmill;
-  nb::set_leak_warnings(false);  // tensors alive at exit keep frames alive: no fault of theirs
-  m.def("supported", &supported, "Instruction sets this processor can run, best first.");
-  m.def("default_threads", &default_threads, "Threads an op uses when not told: the affinity mask and OMP_NUM_THREADS.");
+  nb::set_leak_warnings(false);  // tensors that live until exit keep frames alive, which is no leak
+  m.def("supported", &supported, "The builds that this processor can run, best first.");
+  m.def("default_threads", &default_threads,
+        "The number of threads that an op uses by default: that of OMP_NUM_THREADS, at most that of the affinity mask.");
   nb::class_<Camera>(m, "Camera", "A pinhole camera: viewmat [4,4] and K [3,3] float32, image size in pixels.")
       .def(
           "__init__",
           [](Camera* self, Matrix4 viewmat, Tensor<float, nb::shape<3, 3>> K, int width, int height, float near,
              bool antialias) { new (self) Camera(make_camera(viewmat.data(), K.data(), width, height, near, antialias)); },
           "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a, "near"_a, "antialias"_a);
-  nb::class_<Frame>(m, "Frame", "Buffers of one view between the passes; grown as needed and reused.")
+  nb::class_<Frame>(m, "Frame", "The intermediate results of one view, in buffers that grow as needed and are reused.")
       .def(nb::init<>())
       .def_prop_ro(
           "seconds",

@@ -1,4 +1,4 @@
-// Between the plain form of a scene, one row per Gaussian, and its blocks of sixteen.
+// Conversion between the plain form of a scene, one row per Gaussian, and blocks of sixteen.
 #include "arguments.hpp"
 #include "buffer.hpp"
 #include "shuffles.hpp"
@@ -74,8 +74,8 @@ void bind_pack(nb::module_& m) {
       },
       "groups"_a, "first"_a, "blocks"_a.noconvert(), "count"_a, "threads"_a, "The reverse of `pack`.");
   m.def(
-      "wish_huge_pages", [](Blocks blocks) { wish_huge_pages(blocks.data(), blocks.size() * sizeof(float)); },
-      "blocks"_a.noconvert(), "Asks for huge pages behind blocks that were just allocated.");
+      "advise_huge_pages", [](Blocks blocks) { advise_huge_pages(blocks.data(), blocks.size() * sizeof(float)); },
+      "blocks"_a.noconvert(), "Advises the system to back blocks by huge pages; to be called before they are first touched.");
 }
 
 }  // namespace splatmill

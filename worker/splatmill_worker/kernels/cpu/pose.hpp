@@ -1,4 +1,5 @@
-// The gradient to the camera: added up over Gaussians in an order that no number of threads changes, and as that of a motion.
+// The gradient to the camera: its sum over Gaussians, in an order that does not depend on the number of threads, and its
+// conversion to that of a small motion.
 #pragma once
 
 #include "geometry.hpp"
@@ -6,10 +7,10 @@
 
 namespace splatmill {
 
-// Of the upper three rows of the viewmat, row by row: entry (i, j) at 4 i + j.
+// Sums for the upper three rows of the viewmat, row by row: entry (i, j) at 4 i + j.
 inline constexpr int kPoseSums = 12;
 
-// Adds the visible lanes of a block.
+// Adds the visible lanes of a block to `sums`.
 SPLATMILL_INLINE void add_camera_gradient(const CameraGradient& g, Mask visible, double* sums) {
   Float lanes[kPoseSums];
   for (int i = 0; i < 3; ++i) {
@@ -21,7 +22,7 @@ SPLATMILL_INLINE void add_camera_gradient(const CameraGradient& g, Mask visible,
   for (int k = 0; k < kPoseSums; ++k) sums[k] += total[k];
 }
 
-// partial[parts][kPoseSums] added in order.
+// Writes the sum of partial[parts][kPoseSums], taken in order, to `sums`.
 inline void add_parts(const double* partial, int64_t parts, double* sums) {
   for (int k = 0; k < kPoseSums; ++k) sums[k] = 0;
   for (int64_t part = 0; part < parts; ++part)

@@ -1,4 +1,4 @@
-// project: Gaussians to the image plane, alone (differentiable) and as the first pass of a frame.
+// project: Gaussians to the image plane, as a separate differentiable op and as the first pass of a frame.
 #include "project.hpp"
 
 #include <vector>
@@ -13,7 +13,7 @@
 namespace splatmill {
 namespace {
 
-// Colour of a block, clamped at 0; a colour that is not finite makes its lane invisible.
+// The colours of a block, clamped at 0 from below. A Gaussian whose colour is not finite becomes invisible.
 SPLATMILL_INLINE void shade(const float* p, const Camera& cam, int degree, Projection& o, Float* color) {
   Float inv_distance, basis[16];
   const Direction d = view_direction(p, cam, inv_distance);
@@ -25,18 +25,18 @@ SPLATMILL_INLINE void shade(const float* p, const Camera& cam, int degree, Proje
   }
 }
 
-// The sixteen records of a block.
+// The sixteen records of a block, one per vector.
 SPLATMILL_INLINE void make_records(const Projection& o, const Float* color, Float* records) {
   const Factor f = conic_factor(o.b, o.c, o.det);
-  records[0] = o.x2d, records[1] = o.y2d;
-  records[2] = f.ux, records[3] = f.uy, records[4] = f.vy;
-  records[5] = o.cut + kLog2AlphaMin;
-  for (int c = 0; c < 3; ++c) records[6 + c] = color[c];
-  records[9] = o.z;
-  records[10] = o.cut;
-  records[11] = o.b / o.c, records[12] = o.b / o.a;
-  records[13] = o.extent_x, records[14] = o.extent_y;
-  records[15] = o.opacity;
+  records[kRecordX] = o.x2d, records[kRecordY] = o.y2d;
+  records[kRecordUx] = f.ux, records[kRecordUy] = f.uy, records[kRecordVy] = f.vy;
+  records[kRecordLevel] = o.cut + kLog2AlphaMin;
+  for (int c = 0; c < 3; ++c) records[kRecordRed + c] = color[c];
+  records[kRecordDepth] = o.z;
+  records[kRecordCut] = o.cut;
+  records[kRecordSlopeX] = o.b / o.c, records[kRecordSlopeY] = o.b / o.a;
+  records[kRecordExtentX] = o.extent_x, records[kRecordExtentY] = o.extent_y;
+  records[kRecordOpacity] = o.opacity;
   transpose(records);
 }
 
@@ -79,32 +79,38 @@ void project_rows(const float* blocks, int64_t count, int degree, const Camera& 
       const float* p = blocks + b * kBlockFloats;
       Projection o;
       project_geometry(p, cam, o);
-      Float color[3], fields[13];
+      Float color[3], fields[kProjectedFloats];
       shade(p, cam, degree, o, color);
-      fields[0] = o.x2d, fields[1] = o.y2d;
-      fields[2] = o.c / o.det, fields[3] = -(o.b / o.det), fields[4] = o.a / o.det;
-      fields[5] = o.opacity;
-      for (int c = 0; c < 3; ++c) fields[6 + c] = color[c];
-      fields[9] = o.z;
-      fields[10] = o.extent_x, fields[11] = o.extent_y;
-      alignas(64) float lanes[12][kLanes];
-      for (int f = 0; f < 12; ++f) store(lanes[f], keep(o.visible, fields[f]));
+      fields[kMeanX] = o.x2d, fields[kMeanY] = o.y2d;
+      fields[kConicA] = o.c / o.det, fields[kConicB] = -(o.b / o.det), fields[kConicC] = o.a / o.det;
+      fields[kOpacity] = o.opacity;
+      for (int c = 0; c < 3; ++c) fields[kRed + c] = color[c];
+      fields[kDepth] = o.z;
+      fields[kExtentX] = o.extent_x, fields[kExtentY] = o.extent_y;
+      alignas(64) float lanes[kProjectedFloats][kLanes];
+      for (int f = 0; f < kProjectedFloats; ++f) store(lanes[f], keep(o.visible, fields[f]));
       const int used = static_cast<int>(std::min<int64_t>(kLanes, count - b * kLanes));
       for (int l = 0; l < used; ++l) {
         const int64_t i = b * kLanes + l;
-        for (int f = 0; f < 2; ++f) out.means2d[2 * i + f] = lanes[f][l], out.extents[2 * i + f] = lanes[10 + f][l];
-        for (int f = 0; f < 3; ++f) out.conics[3 * i + f] = lanes[2 + f][l], out.colors[3 * i + f] = lanes[6 + f][l];
-        out.opacities[i] = lanes[5][l];
-        out.depths[i] = lanes[9][l];
+        for (int f = 0; f < 2; ++f) {
+          out.means2d[2 * i + f] = lanes[kMeanX + f][l];
+          out.extents[2 * i + f] = lanes[kExtentX + f][l];
+        }
+        for (int f = 0; f < 3; ++f) {
+          out.conics[3 * i + f] = lanes[kConicA + f][l];
+          out.colors[3 * i + f] = lanes[kRed + f][l];
+        }
+        out.opacities[i] = lanes[kOpacity][l];
+        out.depths[i] = lanes[kDepth][l];
       }
     }
   }
 }
 
-// Gradient of the op. Conic gradients (a, b, c of the upper triangle) become gradients to Sigma' = C^-1: -C D C.
+// The gradient of the op. With D the gradient to the conic C = Sigma'^-1, given as its upper triangle, that to Sigma' is -C D C.
 void project_rows_backward(const float* blocks, int64_t count, int degree, const Camera& cam, const ProjectedRows& d,
                            float* grad_blocks, float* d_viewmat, int threads) {
-  constexpr int64_t kChunk = 64;  // blocks whose camera gradients are added together first: a fixed cut, whatever the threads
+  constexpr int64_t kChunk = 64;  // blocks of one partial sum of the camera's gradient, the same on any number of threads
   const int64_t n = blocks_for(count), chunks = (n + kChunk - 1) / kChunk;
   std::vector<double> partial(static_cast<size_t>(chunks) * kPoseSums);
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
@@ -121,29 +127,32 @@ void project_rows_backward(const float* blocks, int64_t count, int degree, const
       o.visible &= mask_of(lanes_of(b, count));
       if (!any(o.visible)) continue;
 
-      alignas(64) float lanes[10][kLanes] = {};
+      alignas(64) float lanes[kDifferentiable][kLanes] = {};
       for (uint32_t left = bits(o.visible); left; left &= left - 1) {
         const int l = __builtin_ctz(left);
         const int64_t i = b * kLanes + l;
-        for (int f = 0; f < 2; ++f) lanes[f][l] = d.means2d[2 * i + f];
-        for (int f = 0; f < 3; ++f) lanes[2 + f][l] = d.conics[3 * i + f], lanes[6 + f][l] = d.colors[3 * i + f];
-        lanes[5][l] = d.opacities[i];
-        lanes[9][l] = d.depths[i];
+        for (int f = 0; f < 2; ++f) lanes[kMeanX + f][l] = d.means2d[2 * i + f];
+        for (int f = 0; f < 3; ++f) {
+          lanes[kConicA + f][l] = d.conics[3 * i + f];
+          lanes[kRed + f][l] = d.colors[3 * i + f];
+        }
+        lanes[kOpacity][l] = d.opacities[i];
+        lanes[kDepth][l] = d.depths[i];
       }
       // dL/dSigma' = -C dC C, and C = 2 ln 2 F^T F.
       const Factor f = conic_factor(o.b, o.c, o.det);
       constexpr float k = -4.0f * kLn2 * kLn2;
-      const Float da = load(lanes[2]), half_db = load(lanes[3]) * 0.5f, dc = load(lanes[4]);
+      const Float da = load(lanes[kConicA]), half_db = load(lanes[kConicB]) * 0.5f, dc = load(lanes[kConicC]);
       const Float row_a = fma(f.ux, da, f.uy * half_db), row_b = fma(f.ux, half_db, f.uy * dc);
       ProjectedGradient to;
-      to.x2d = load(lanes[0]);
-      to.y2d = load(lanes[1]);
+      to.x2d = load(lanes[kMeanX]);
+      to.y2d = load(lanes[kMeanY]);
       to.Quu = fma(row_a, f.ux, row_b * f.uy) * k;
       to.Quv = row_b * f.vy * k;
       to.Qvv = f.vy * f.vy * dc * k;
-      to.logit = load(lanes[5]) * o.opacity * o.complement;
-      for (int c = 0; c < 3; ++c) to.color[c] = load(lanes[6 + c]);
-      to.depth = load(lanes[9]);
+      to.logit = load(lanes[kOpacity]) * o.opacity * o.complement;
+      for (int c = 0; c < 3; ++c) to.color[c] = load(lanes[kRed + c]);
+      to.depth = load(lanes[kDepth]);
       CameraGradient camera;
       project_backward<true>(p, cam, degree, o, to, g, &camera);
       const int rows = kSh + 3 * (degree + 1) * (degree + 1);
@@ -162,7 +171,7 @@ void project_rows_backward(const float* blocks, int64_t count, int degree, const
 void bind_project(nb::module_& m) {
   m.def(
       "project",
-      [](Blocks blocks, int64_t count, int degree, const CameraArgument& camera, Rows<2> means2d, Rows<3> conics,
+      [](Blocks blocks, int64_t count, int degree, const Camera& camera, Rows<2> means2d, Rows<3> conics,
          Row opacities, Rows<3> colors, Row depths, Rows<2> extents, int threads) {
         const ProjectedRows out{means2d.data(), conics.data(), opacities.data(), colors.data(), depths.data(), extents.data()};
         nb::gil_scoped_release release;
@@ -172,7 +181,7 @@ void bind_project(nb::module_& m) {
       "opacities"_a.noconvert(), "colors"_a.noconvert(), "depths"_a.noconvert(), "extents"_a.noconvert(), "threads"_a);
   m.def(
       "project_backward",
-      [](Blocks blocks, int64_t count, int degree, const CameraArgument& camera, Rows<2> d_means2d, Rows<3> d_conics,
+      [](Blocks blocks, int64_t count, int degree, const Camera& camera, Rows<2> d_means2d, Rows<3> d_conics,
          Row d_opacities, Rows<3> d_colors, Row d_depths, Blocks grad_blocks, Matrix4 d_viewmat, int threads) {
         const ProjectedRows d{d_means2d.data(), d_conics.data(), d_opacities.data(), d_colors.data(), d_depths.data(), nullptr};
         nb::gil_scoped_release release;

@@ -1,4 +1,4 @@
-// Which tiles, and which 4x4-pixel blocks of each, the 1/255 ellipse of a Gaussian reaches: the one test behind every list.
+// The test behind every list: which tiles, and which 4x4-pixel blocks of each, the 1/255 ellipse of a Gaussian reaches.
 #pragma once
 
 #include <algorithm>
@@ -11,19 +11,20 @@ namespace splatmill {
 inline constexpr int kBlockSide = 4;
 inline constexpr int kTileBlocks = 16;
 
+// Lane b: the left and the upper pixel centre of block b within a tile.
 struct BlockOffsets {
-  Float x, y;  // of lane b: the left and upper pixel centre of block b
+  Float x, y;
 };
 SPLATMILL_INLINE BlockOffsets block_offsets() {
   const Float b = iota(), row = floor(b * 0.25f);
   return {fma(row, splat(-16.0f), b * 4.0f) + 0.5f, fma(row, 4.0f, splat(0.5f))};
 }
 
-// The test, for one Gaussian, tile by tile.
+// The test for one Gaussian, tile by tile.
 //
-// The least u^2 + v^2 over a block's rectangle of pixel centres lies on the edge nearest the mean in x or in y: both are tried at
-// once for the sixteen blocks. The margin covers the rounding of u and v (it grows with how far the ellipse reaches), so that no
-// pixel is missed; the pixel's own test decides afterwards.
+// The smallest u^2 + v^2 over a block's rectangle of pixel centres lies on the edge nearest the mean in x or in y; both are tried,
+// for sixteen blocks at once. The margin in `cut_` covers the rounding of u and v, which grows with the extent of the ellipse, so
+// that no pixel is missed. Each pixel is tested again when it is blended.
 class Reach {
  public:
   SPLATMILL_INLINE explicit Reach(const Record& r)
@@ -31,7 +32,7 @@ class Reach {
         slope_x_(splat(r.slope_x)), slope_y_(splat(r.slope_y)),
         cut_(splat(r.cut + 2e-5f + 1e-6f * (r.ux * r.extent_x + __builtin_fabsf(r.uy) * r.extent_y))) {}
 
-  // Everything that a row of tiles shares.
+  // What the tiles of a row have in common.
   struct Row {
     Float top, bottom, u, v2, best_x;
   };

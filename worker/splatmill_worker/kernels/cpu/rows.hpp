@@ -1,4 +1,4 @@
-// Projected Gaussians as the ops hand them over, [N, ...] tensors each, and the records made of them.
+// Projected Gaussians as the separate ops exchange them with Python, a tensor [N, ...] for each field, and records made of them.
 #pragma once
 
 #include <cmath>
@@ -9,11 +9,17 @@
 namespace splatmill {
 
 struct ProjectedRows {
-  float *means2d, *conics, *opacities, *colors, *depths, *extents;
+  float *means2d, *conics, *opacities, *colors, *depths, *extents;  // unused ones are null
 };
 
-// The factor of a conic (A, B, C) in float32 has lost what the conic lost: for a needle whose A C - B^2 vanishes in rounding the
-// determinant is floored at the rounding error of its terms. The fused step never goes this way.
+// The floats of one projected Gaussian, in the order of the fields; the first kDifferentiable have a gradient.
+enum ProjectedPlace {
+  kMeanX, kMeanY, kConicA, kConicB, kConicC, kOpacity, kRed, kGreen, kBlue, kDepth, kDifferentiable,
+  kExtentX = kDifferentiable, kExtentY, kProjectedFloats
+};
+
+// The factor of a conic (A, B, C) given in float32 has lost the digits that the conic lost. For a needle whose A C - B^2 vanishes
+// in rounding, the determinant is raised to the rounding error of its terms. The fused step never forms conics.
 inline Record record_of(const ProjectedRows& p, int64_t i) {
   Record r{};
   const double A = p.conics[3 * i], B = p.conics[3 * i + 1], C = p.conics[3 * i + 2];

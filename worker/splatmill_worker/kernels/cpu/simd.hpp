@@ -1,4 +1,4 @@
-// Sixteen float lanes on any processor: the one vector layer under every kernel.
+// Sixteen float lanes on any processor: the vector layer of all kernels.
 //
 // A `Float` is sixteen floats held as 1, 2 or 4 native vectors (AVX-512, AVX2, anything else), written with the compiler's
 // vector extensions. Intrinsics appear only where the compiler's own lowering is poor: masks, fused multiply-add, reciprocals.
@@ -63,7 +63,7 @@ SPLATMILL_INLINE Result each(Op op) {
 }
 }  // namespace detail
 
-// ---- making, loading, storing (load and store want 64-byte alignment) ---------------------------------------------------
+// ---- making, loading, storing (load and store need 64-byte alignment) ---------------------------------------------------
 
 SPLATMILL_INLINE Float splat(float x) {
 #if defined(__AVX512F__)
@@ -91,12 +91,6 @@ SPLATMILL_INLINE Float load_unaligned(const float* p) {
 SPLATMILL_INLINE void store_unaligned(float* p, Float x) {
   for (int i = 0; i < kParts; ++i) *reinterpret_cast<UnalignedFloat*>(p + i * kNative) = x.part[i];
 }
-SPLATMILL_INLINE Int load_int(const int32_t* p) {
-  Int x;
-  std::memcpy(&x, p, sizeof x);
-  return x;
-}
-SPLATMILL_INLINE void store_int(int32_t* p, Int x) { std::memcpy(p, &x, sizeof x); }
 
 // The first `count` lanes, zero in the others; reads and writes nothing beyond them (image edges, ends of arrays).
 SPLATMILL_INLINE Float load_first(const float* p, int count) {

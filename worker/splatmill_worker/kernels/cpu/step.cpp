@@ -1,6 +1,6 @@
-// The fused training step: project, bin and composite a view; later, from the gradient of its image, one pass over the blocks of
-// sixteen Gaussians that sums their pairs, differentiates the projection and moves them by Adam. A Gaussian's gradient never
-// leaves the first cache.
+// The fused training step. `render` projects, bins and composites a view. `update` takes the gradient of its image and makes one
+// pass over the blocks of sixteen Gaussians: it adds up their pair sums, differentiates the projection and applies Adam, so that
+// a Gaussian's gradient never leaves the first-level cache.
 #include "adam.hpp"
 #include "arguments.hpp"
 #include "bin.hpp"
@@ -14,25 +14,30 @@
 namespace splatmill {
 namespace {
 
-// Rows of the densification scores [kScoreRows][Gaussians]; lengths in NDC units.
-enum Score { kPlain, kAbsolute, kSeen, kExtent, kScoreRows };
+// Rows of the densification scores [kScoreRows][Gaussians].
+enum Score {
+  kPlain,   // sum over views of |dL/d mean2d|, in NDC units
+  kSeen,    // views in which the Gaussian was visible
+  kExtent,  // largest half side of the ellipse's box, over half the longer side of the image
+  kScoreRows
+};
 
 struct Scene {
   const float* params;
   int degree;
 };
 
-// What the pass over blocks writes: moved parameters and moments, or gradients alone.
+// What the pass over blocks writes: moved parameters and moments, or the gradients alone.
 struct Update {
   float *params = nullptr, *exp_avg = nullptr, *exp_avg_sq = nullptr;
   float rates[kRows] = {};  // with the bias correction of the first moment
   float root = 0;           // bias correction of the second
   float* gradients = nullptr;
-  float* scores = nullptr;  // [kScoreRows][stride], null: none are kept
+  float* scores = nullptr;  // [kScoreRows][score_stride]; null where none are kept
   int64_t score_stride = 0;
 };
 
-// The pair sums of a block, added up in the order of the pairs: row k, lane l is sum k of Gaussian l.
+// Adds up the pair sums of a block in the order of the pairs: lane l of sums[k] is sum k of Gaussian l.
 SPLATMILL_INLINE void add_pairs(const Frame& frame, int64_t b, uint32_t visible, Float* sums) {
   for (int l = 0; l < kLanes; ++l) sums[l] = splat(0.0f);
   for (uint32_t left = visible; left; left &= left - 1) {
@@ -64,8 +69,8 @@ SPLATMILL_INLINE ProjectedGradient gradient_from_sums(const Float* s, const Proj
   return d;
 }
 
-SPLATMILL_INLINE void add_scores(const Update& update, const Camera& cam, int64_t b, const Float* s, const Projection& o,
-                                 const ProjectedGradient& d, Mask visible, bool absolute) {
+SPLATMILL_INLINE void add_scores(const Update& update, const Camera& cam, int64_t b, const Projection& o,
+                                 const ProjectedGradient& d, Mask visible) {
   const float half_w = 0.5f * cam.width, half_h = 0.5f * cam.height;
   const auto length = [&](Float x, Float y) {
     x = x * half_w, y = y * half_h;
@@ -74,24 +79,12 @@ SPLATMILL_INLINE void add_scores(const Update& update, const Camera& cam, int64_
   float* score = update.scores + b * kLanes;
   const auto at = [&](Score k) { return score + k * update.score_stride; };
   store(at(kPlain), visible, load(at(kPlain)) + length(d.x2d, d.y2d));
-  if (absolute) {
-    constexpr float k1 = 2.0f * kLn2;
-    const Float ux = conic_factor(o.b, o.c, o.det).ux;
-    store(at(kAbsolute), visible, load(at(kAbsolute)) + length(ux * s[kSumAbsX] * k1, s[kSumAbsY] * k1));
-  }
   store(at(kSeen), visible, load(at(kSeen)) + 1.0f);
   const float per_image = 2.0f / static_cast<float>(std::max(cam.width, cam.height));
   store(at(kExtent), visible, max(max(o.extent_x, o.extent_y) * per_image, load(at(kExtent))));
 }
 
-// Sums that a pass did not take hold garbage in memory.
-SPLATMILL_INLINE void clear_unused(Float* sums, const ImageGradient& g) {
-  if (!g.absolute)
-    for (int k : {kSumAbsX, kSumAbsY}) sums[k] = splat(0.0f);
-  if (!g.with_alpha_and_depth) sums[kSumDepth] = splat(0.0f);
-}
-
-// One block; returns how many gradient values Adam refused. With kPose the camera's gradient is added to `pose`.
+// Updates one block; returns how many gradient values Adam refused. With kPose, adds the camera's gradient to `pose`.
 template <bool kAdam, bool kPose>
 int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, int64_t b,
                      double* pose) {
@@ -103,11 +96,11 @@ int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& sc
   if (seen) {
     Float sums[kLanes];
     add_pairs(frame, b, seen, sums);
-    clear_unused(sums, g);
+    if (!g.with_alpha_and_depth) sums[kSumDepth] = splat(0.0f);  // that pass does not write it: memory holds garbage
     Projection o;
     project_geometry(p, frame.camera, o);
     const ProjectedGradient d = gradient_from_sums(sums, o);
-    if (update.scores) add_scores(update, frame.camera, b, sums, o, d, visible, g.absolute);
+    if (update.scores) add_scores(update, frame.camera, b, o, d, visible);
     CameraGradient camera;
     project_backward<kPose>(p, frame.camera, scene.degree, o, d, gradient, &camera);
     if constexpr (kPose) add_camera_gradient(camera, visible, pose);
@@ -134,9 +127,9 @@ int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& sc
   }
 }
 
-constexpr int64_t kUpdateChunk = 16;  // blocks dealt out together, and added together where the camera's gradient is asked for
+constexpr int64_t kUpdateChunk = 16;  // blocks that one task updates, and whose camera gradients it adds up
 
-// `pose` null: the camera's gradient is not computed; else its sums [kPoseSums] are written there.
+// Updates all blocks. With kPose, writes the sums [kPoseSums] of the camera's gradient to `pose`.
 template <bool kAdam, bool kPose>
 int64_t update_scene(Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, double* pose, int threads) {
   const int64_t n = blocks_for(frame.count), chunks = (n + kUpdateChunk - 1) / kUpdateChunk;
@@ -162,7 +155,7 @@ using Twist = Tensor<float, nb::shape<6>>;
 
 class Stopwatch {
  public:
-  // Seconds since the last lap, or since the start.
+  // Wall seconds since the last lap, or since the start.
   double lap() {
     const double now = omp_get_wtime(), passed = now - last_;
     last_ = now;
@@ -178,7 +171,7 @@ class Stopwatch {
 void bind_step(nb::module_& m) {
   m.def(
       "render",
-      [](Frame& frame, Blocks params, int64_t count, int degree, const CameraArgument& camera,
+      [](Frame& frame, Blocks params, int64_t count, int degree, const Camera& camera,
          const std::tuple<float, float, float>& background, Image image, int threads) {
         const float rgb[3] = {std::get<0>(background), std::get<1>(background), std::get<2>(background)};
         const bool with_alpha_and_depth = image.shape(0) == 5;
@@ -194,19 +187,19 @@ void bind_step(nb::module_& m) {
         return std::make_tuple(frame.visible_count, frame.pairs);
       },
       "frame"_a, "params"_a.noconvert(), "count"_a, "degree"_a, "camera"_a, "background"_a, "image"_a.noconvert(), "threads"_a,
-      "Renders blocks of parameters into planes (colour, and with five of them alpha and depth); returns how many Gaussians were "
-      "visible, and the (tile, Gaussian) pairs.");
+      "Renders blocks of parameters into three planes of colour or, with alpha and depth, five planes; returns the numbers of "
+      "visible Gaussians and of (tile, Gaussian) pairs.");
   m.def(
       "update",
       [](Frame& frame, Blocks params, Blocks exp_avg, Blocks exp_avg_sq, int degree, Image image, Image gradient,
-         const std::vector<float>& rates, int64_t step, std::optional<ScoreRows> scores, bool absolute, int threads, std::optional<Twist> pose) {
+         const std::vector<float>& rates, int64_t step, std::optional<ScoreRows> scores, int threads,
+         std::optional<Twist> pose) {
         Update update;
         update.params = params.data(), update.exp_avg = exp_avg.data(), update.exp_avg_sq = exp_avg_sq.data();
         const AdamStep scale(step);
         for (int r = 0; r < kRows; ++r) update.rates[r] = rates.at(r) * scale.size;
         update.root = scale.root;
-        ImageGradient g{planes_of(image, frame.camera), planes_of(gradient, frame.camera), gradient.shape(0) == 5};
-        g.absolute = scores && absolute;
+        const ImageGradient g{planes_of(image, frame.camera), planes_of(gradient, frame.camera), gradient.shape(0) == 5};
         if (scores) update.scores = scores->data(), update.score_stride = static_cast<int64_t>(scores->shape(1));
         nb::gil_scoped_release release;
         Stopwatch watch;
@@ -226,9 +219,9 @@ void bind_step(nb::module_& m) {
       },
       "frame"_a, "params"_a.noconvert(), "exp_avg"_a.noconvert(), "exp_avg_sq"_a.noconvert(), "degree"_a,
       "image"_a.noconvert(), "gradient"_a.noconvert(), "rates"_a, "step"_a,
-      "scores"_a.noconvert().none(), "absolute"_a, "threads"_a, "pose"_a.noconvert().none() = nb::none(),
-      "Backward pass of the last render and one Adam step; returns how many gradient values were refused as not finite. Fills "
-      "`pose` [6], where given, with the gradient to a motion of the camera (pose.hpp).");
+      "scores"_a.noconvert().none(), "threads"_a, "pose"_a.noconvert().none() = nb::none(),
+      "Backward pass of the last render and one Adam step; returns how many gradient values were refused as not finite. Adds to "
+      "`scores` [3, Gaussians] and fills `pose` [6] with the gradient to a motion of the camera (pose.hpp), where given.");
   m.def(
       "gradients",
       [](Frame& frame, Blocks params, int degree, Image image, Image gradient, Blocks gradients, int threads) {
@@ -240,7 +233,7 @@ void bind_step(nb::module_& m) {
         update_scene<false, false>(frame, g, {params.data(), degree}, update, nullptr, threads);
       },
       "frame"_a, "params"_a.noconvert(), "degree"_a, "image"_a.noconvert(), "gradient"_a.noconvert(), "gradients"_a.noconvert(),
-      "threads"_a, "Backward pass of the last render: gradients in blocks, nothing moves.");
+      "threads"_a, "Backward pass of the last render; writes the gradients to the parameters into blocks.");
 }
 
 }  // namespace splatmill

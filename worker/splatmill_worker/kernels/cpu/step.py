@@ -114,7 +114,7 @@ class Step:
         self.exp_avg_sq = (
             blocks.empty(count) if exp_avg_sq is None else blocks.pack_rows(exp_avg_sq, self.threads)
         )
-        self._scores = torch.zeros(4, len(self.blocks) * blocks.LANES)
+        self._scores = torch.zeros(3, len(self.blocks) * blocks.LANES)
         self._rendered = False
 
     def parameters(self) -> dict[str, Tensor]:
@@ -147,12 +147,12 @@ class Step:
     @property
     def visible_count(self) -> Tensor:
         """Number of views in which the Gaussian reached a 4x4-pixel block of the image."""
-        return self._scores[2, : self.count]
+        return self._scores[1, : self.count]
 
     @property
     def max_extent(self) -> Tensor:
         """Largest half side, over views, of the box around the 1/255 ellipse, over half the image's longer side."""
-        return self._scores[3, : self.count]
+        return self._scores[2, : self.count]
 
     def clear_scores(self) -> None:
         """Set the scores to 0."""
@@ -313,7 +313,6 @@ class Step:
             rates.rows(),
             step,
             self._scores if self.keep_scores else None,
-            False,
             self.threads,
             self.pose_gradient,
         )

@@ -1,4 +1,4 @@
-// Threads and the floating-point state they run in.
+// The number of threads, and the floating-point state that they run in.
 #pragma once
 
 #include <omp.h>
@@ -13,7 +13,7 @@
 
 namespace splatmill {
 
-// As many as OpenMP was told to use (OMP_NUM_THREADS), and never more than the processors this process may run on now.
+// The number that OpenMP uses (OMP_NUM_THREADS), at most the number of processors that this process may run on now.
 inline int default_threads() {
   int n = omp_get_max_threads();
 #if defined(__linux__)
@@ -23,8 +23,8 @@ inline int default_threads() {
   return std::max(n, 1);
 }
 
-// Denormals are flushed to zero while this lives, on this thread only; the caller's state comes back at the end. One stands at
-// the head of every parallel region: a denormal operand costs over a hundred cycles, and none of them matters to an image.
+// Flushes denormals to zero on this thread while it lives, and restores the state at its end. Every parallel region begins with
+// one: a denormal operand costs over a hundred cycles, and none matters to an image.
 class FlushDenormals {
  public:
 #if defined(SPLATMILL_X86)

@@ -1,4 +1,4 @@
-// Collecting the touches of all visible Gaussians, in parallel, into buffers that grow when a view needs more than any before.
+// Collects the touches of all visible Gaussians in parallel, into buffers that grow when a view has more than any before.
 #pragma once
 
 #include <stdexcept>
@@ -10,17 +10,18 @@
 
 namespace splatmill {
 
-// A slot is 32 bits wide, and each one will need a row of pair sums besides.
+// Slots are numbered in 32 bits.
 inline constexpr int64_t kMostTouches = int64_t{1} << 31;
 
-// One thread's stretch of the frame's touches, and of its visible Gaussians and their depth keys.
+// Writes one thread's stretch of the frame's touches, visible Gaussians and depth keys.
 class TouchWriter {
  public:
   TouchWriter(Frame& frame, int64_t thread, int64_t first_id)
       : frame_(frame), columns_(frame.camera.columns()), rows_(frame.camera.rows()), begin_(frame.stretch * thread),
         next_(begin_), limit_(begin_ + frame.stretch), order_(frame.order.get() + first_id), keys_(frame.keys.get() + first_id) {}
 
-  // Adds the record of Gaussian `id`; false when it reaches no block of the image, or finds no room for all it might reach.
+  // Adds the touches of Gaussian `id`. False when it reaches no block of the image, or when the stretch has no room for all
+  // tiles of its box, which then count as wanted.
   SPLATMILL_INLINE bool add(uint32_t id) {
     const Record& r = frame_.records[id];
     const TileRange range = tile_range(r, columns_, rows_);
@@ -36,7 +37,7 @@ class TouchWriter {
       for (int tx = range.x0; tx < range.x1; ++tx) {
         const uint32_t blocks = reach.blocks(row, tx);
         *touch = {id, static_cast<uint32_t>(ty * columns_ + tx), blocks};
-        touch += blocks != 0;  // no branch: which tiles of the box are missed cannot be predicted
+        touch += blocks != 0;  // no branch: which tiles of the box the ellipse misses is not predictable
       }
     }
     next_ = touch - frame_.touches.get();
@@ -60,8 +61,8 @@ class TouchWriter {
   int64_t visible_ = 0, wanted_ = 0;
 };
 
-// Runs visit(begin, end, writer) over all blocks of sixteen Gaussians, cut among the threads, and closes the gaps between the
-// threads' Gaussians. Once more with more room when a stretch overflowed. Throws std::length_error when no buffer could hold the pairs.
+// Runs visit(begin, end, writer) over all blocks of sixteen Gaussians, divided among the threads, and closes the gaps between the
+// threads' Gaussians. Repeats with more room when a stretch overflowed. Throws std::length_error for more touches than slots.
 template <class Visit>
 void collect_touches(Frame& frame, int64_t count, int threads, Visit visit) {
   const int64_t n = blocks_for(count);
@@ -95,8 +96,8 @@ void collect_touches(Frame& frame, int64_t count, int threads, Visit visit) {
     }
     if (complete) break;
     if (most > kMostTouches / threads)
-      throw std::length_error("The Gaussians cover about " + std::to_string(most * threads) +
-                              " tiles in this view, more than lists are made for; most of them are far too large for the scene.");
+      throw std::length_error("The Gaussians cover about " + std::to_string(most * threads) + " tiles in this view; lists hold " +
+                              std::to_string(kMostTouches) + ". Most of the Gaussians are far too large for the scene.");
     frame.stretch = std::min(most + most / 4, kMostTouches / threads);
   }
 
