@@ -11,7 +11,8 @@ KERNELS := $(shell find worker/splatmill_worker/kernels/cpu -name '*.[ch]pp' 2>/
 PARTS := constraints.txt $(wildcard */pyproject.toml) client/splatmill/__init__.py server/setup.py worker/version.py
 # The tests run in this many processes, a file in one process.
 WORKERS ?= 2
-PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --cov
+# Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
+PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --cov
 
 .PHONY: help install demo quick test check wheels bench serve sanitize clean
 

@@ -12,10 +12,13 @@ from pathlib import Path
 import av
 import numpy as np
 import numpy.typing as npt
+import pytest
 
 from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline
 from tests.support import still_life
+
+pytestmark = pytest.mark.slow
 
 
 def filmed(capture: Path, work: Path, cancelled: Callable[[], bool] = lambda: False) -> pipeline.Outcome:

@@ -104,6 +104,7 @@ def old_checkpoint(run: TrainingRun) -> dict[str, Any]:
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_the_code_before_snapshots_is_resumed(tmp_path: Path) -> None:
     stored = old_checkpoint(advanced(a_run(course()), 120))
     torch.save(stored, tmp_path / "checkpoint.pt")
