@@ -9,6 +9,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -38,7 +39,7 @@ def pixels() -> np.ndarray:
     return picture.clip(0, 255).astype(np.uint8)
 
 
-def saved(path: Path, **how: object) -> Path:
+def saved(path: Path, **how: Any) -> Path:
     Image.fromarray(pixels()).save(path, **how)
     return path
 

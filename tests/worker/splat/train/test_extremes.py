@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ STEPS = 120
 
 
 def outcome(
-    views: list[TrainingView], gaussians: Gaussians | None = None, **changes: object
+    views: list[TrainingView], gaussians: Gaussians | None = None, **changes: Any
 ) -> Trained | TrainingFailed:
     """What training leaves, or the named failure it ends with."""
     engine = first_engine() if gaussians is None else open_engine(gaussians, "cpu")

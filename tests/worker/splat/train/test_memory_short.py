@@ -1,8 +1,7 @@
-"""Running out of memory in mid-training goes back to the last good state and on with fewer Gaussians, said
-aloud.
+"""Proves that training which runs out of memory rolls back, goes on with fewer Gaussians, and warns of it.
 
-The shortage is made by an engine that refuses to hold more than so many Gaussians; a real device's allocator
-is not involved.
+The shortage is made by an engine that refuses to hold more than so many Gaussians. Does not prove that a real
+device's allocator reports a shortage.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import pytest
 import torch
 
 from splatmill_worker.errors import FailureName, TrainingFailed
-from splatmill_worker.splat.engine.cpu import CpuEngine
+from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.train.loop import Hooks, train
 from tests.support import still_life
 from tests.support.training import first_engine, plan
@@ -22,7 +21,7 @@ from tests.support.training import first_engine, plan
 class Cramped:
     """An engine whose steps run out of memory above `room` Gaussians."""
 
-    def __init__(self, engine: CpuEngine, room: int) -> None:
+    def __init__(self, engine: Engine, room: int) -> None:
         self._engine, self._room = engine, room
 
     def __getattr__(self, name: str) -> Any:
@@ -38,9 +37,9 @@ def test_training_shrinks_and_goes_on() -> None:
     engine = first_engine()
     room = engine.count + 50  # the first densification outgrows it
     said: list[str] = []
-    cramped = Cramped(engine, room)  # type: ignore[arg-type]
+    cramped: Any = Cramped(engine, room)
     views = still_life.training_views()
-    done = train(cramped, views[1:], views[:1], plan(200), extent=1.1, hooks=Hooks(warn=said.append))  # type: ignore[arg-type]
+    done = train(cramped, views[1:], views[:1], plan(200), extent=1.1, hooks=Hooks(warn=said.append))
     assert done.failure is None
     assert done.steps == 200
     assert 0 < done.gaussians.count <= room
@@ -50,8 +49,8 @@ def test_training_shrinks_and_goes_on() -> None:
 
 
 def test_memory_that_never_suffices_is_a_named_failure() -> None:
-    cramped = Cramped(first_engine(), 0)  # type: ignore[arg-type]
+    cramped: Any = Cramped(first_engine(), 0)
     views = still_life.training_views()
     with pytest.raises(TrainingFailed) as raised:
-        train(cramped, views[1:], views[:1], plan(200), extent=1.1)  # type: ignore[arg-type]
+        train(cramped, views[1:], views[:1], plan(200), extent=1.1)
     assert raised.value.name is FailureName.memory

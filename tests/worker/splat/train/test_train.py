@@ -53,7 +53,7 @@ def test_held_out_views_are_learned() -> None:
     assert bool(trained.gaussians.finite().all())
 
 
-def test_steps_are_as_long_as_suits_what_the_time_turns_out_to_hold() -> None:
+def test_rates_follow_the_measured_number_of_steps() -> None:
     """The forecast of a million steps is wrong, and the run finds out."""
     views, _ = split()
     wrong = plan(None, 1000.0)
@@ -99,7 +99,7 @@ def test_dark_surfaces_are_no_holes_over_random_colours() -> None:
     assert through["random"] < 0.2
 
 
-def test_opaque_photos_are_judged_over_black_and_transparent_ones_over_white() -> None:
+def test_opaque_photos_are_evaluated_over_black_and_transparent_ones_over_white() -> None:
     views, _ = split()
     opaque = views[0]
     clear = TrainingView("clear", {1: opaque.full._replace(alpha=opaque.full.rgb[..., 0])})
@@ -179,7 +179,7 @@ def test_a_resumed_run_goes_on_where_it_was(tmp_path: Path) -> None:
     assert resumed.held_out.psnr == pytest.approx(straight.held_out.psnr, abs=0.5)
 
 
-def test_a_run_that_had_ended_is_measured_and_delivered_when_resumed() -> None:
+def test_a_run_that_had_ended_is_evaluated_when_resumed() -> None:
     views, held_out = split()
     last: list[Snapshot] = []
     whole = plan(40, densify=False)

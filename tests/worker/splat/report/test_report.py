@@ -1,0 +1,96 @@
+"""Proves the files and the warnings of a report: photos that fit badly or have no camera are named; no NaN in JSON.
+
+Does not prove how the page looks.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from splatmill_worker.scene import Normalization
+from splatmill_worker.splat.evaluate import Score, ViewScore
+from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.plan import facts
+from splatmill_worker.splat.report.export import Exported, ExportWorld
+from splatmill_worker.splat.report.report import FinishedTraining, PlannedScene, plain, write_report
+from splatmill_worker.splat.train.curve import CurvePoint
+from splatmill_worker.splat.train.loop import Trained
+from tests.support import still_life
+from tests.support.training import plan
+
+
+def trained(psnrs: list[float], held_out: bool) -> Trained:
+    """A result whose training views have these PSNRs."""
+    views = still_life.training_views()[: len(psnrs)]
+    scores = tuple(ViewScore(view.name, 0.01, psnr, 0.9) for view, psnr in zip(views, psnrs, strict=True))
+    nothing = torch.zeros(0, 3)
+    return Trained(
+        gaussians=Gaussians(nothing, nothing, torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, 1, 3)),
+        curve=(CurvePoint(1.0, 10, math.nan, None, None, 5), CurvePoint(2.0, 20, 0.1, None, None, 5)),
+        held_out=Score(scores[:1]) if held_out else None,
+        on_training=Score(scores),
+        steps=20,
+        seconds=2.0,
+        evaluate_seconds=0.5,
+        stopped="the budget is spent",
+        failure=None,
+        recoveries=0,
+        views=tuple(views),
+        cameras_moved=None,
+    )
+
+
+def report_of(out: Path, result: Trained, left_out: tuple[tuple[str, str], ...] = ()) -> dict[str, Any]:
+    scene = replace(still_life.scene(), left_out=left_out)
+    views = still_life.training_views()
+    measured = facts.measure(scene, views, 0, None)
+    held_out = views[:1] if result.held_out is not None else []
+    world = ExportWorld(Normalization(1.0, np.zeros(3)), np.array([100.0, 0.0, 0.0]))
+    report = write_report(
+        out,
+        PlannedScene(scene, measured, plan(20), held_out),
+        FinishedTraining(result, Exported(5, world), {"sfm": 3.0}, ["said before."]),
+        lambda target, _: torch.full((*target.rgb.shape[:2], 3), 0.5),
+    )
+    assert json.loads((out / "report.json").read_text()) == report
+    return report
+
+
+def test_a_photo_far_below_the_others_is_named_with_advice(tmp_path: Path) -> None:
+    report = report_of(tmp_path, trained([30.0, 29.0, 31.0, 30.5, 12.0], held_out=True))
+    before, warning = report["warnings"]
+    assert before == "said before."
+    assert warning.startswith(
+        "04.png does not fit the other photos: its PSNR is 12.0 dB, the median 30.0 dB."
+    )
+    assert "Leave it out" in warning
+
+
+def test_photos_without_a_camera_are_counted_and_named(tmp_path: Path) -> None:
+    missing = tuple((f"x{i}.png", "It shares too little.") for i in range(7))
+    report = report_of(tmp_path, trained([30.0], held_out=True), missing)
+    named = "x0.png, x1.png, x2.png, x3.png, x4.png and 2 more"
+    assert f"7 of 21 photos are not used: {named}. The report lists the reasons." in report["warnings"]
+    assert {"photo": "x6.png", "why": "It shares too little."} in report["left_out"]
+
+
+def test_the_stages_the_offset_and_the_headline_are_those_of_the_run(tmp_path: Path) -> None:
+    report = report_of(tmp_path, trained([30.0, 20.0], held_out=False))
+    assert report["seconds"] == {"sfm": 3.0, "train": 2.0, "evaluate": 0.5}
+    assert report["offset"] == [100.0, 0.0, 0.0]
+    assert report["curve"][0]["loss"] is None
+    page = (tmp_path / "report.html").read_text()
+    assert "25.00 dB on training photos, none were held out; 5 Gaussians after 20 steps" in page
+    assert "Training ended because the budget is spent." in page
+    assert (tmp_path / "report.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_json_gets_plain_values() -> None:
+    assert plain({1: (math.inf, np.arange(2), True, Path("x"))}) == {"1": [None, [0, 1], True, "x"]}
