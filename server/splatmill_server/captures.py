@@ -2,6 +2,7 @@
 
 import asyncio
 import hashlib
+import json
 import secrets
 import shutil
 from collections.abc import AsyncIterator, Sequence
@@ -10,8 +11,10 @@ from datetime import UTC, datetime
 from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane import layout
+from splatmill.backplane.records import FORMAT, UnreadableRecord, check_format, reason, warn
 from splatmill.backplane.storage import Entry, Storage
 from splatmill.schema import PHOTO_SUFFIXES, Capture, CaptureFile, CapturePage, Role, format_bytes, safe_name
+from splatmill.schema.tolerant import keep_readable
 from splatmill_server.metrics import Metrics
 from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError
@@ -40,15 +43,16 @@ class Captures:
         """Create an empty capture."""
         capture = Capture(id=secrets.token_hex(8), name=name, created_at=datetime.now(UTC))
         self.storage.put(
-            layout.capture_record(capture.id), capture.model_dump_json(exclude={"files"}).encode()
+            layout.capture_record(capture.id),
+            json.dumps(capture.model_dump(mode="json", exclude={"files"}) | {"format": FORMAT}).encode(),
         )
         return capture
 
     def record(self, capture_id: str) -> Capture:
-        """Return the record without the files. Raises a 404 problem."""
+        """Return the record without the files. Raises a 404 problem, and UnreadableRecord."""
         if layout.is_id(capture_id):
             try:
-                return Capture.model_validate_json(self.storage.get(layout.capture_record(capture_id)))
+                return _read(self.storage.get(layout.capture_record(capture_id)), capture_id)
             except FileNotFoundError:
                 pass
         raise ProblemError(
@@ -66,9 +70,14 @@ class Captures:
 
         async def describe(entry: Entry) -> CaptureFile | None:
             role, _, name = entry.path[len(folder) + 1 :].partition("/")
-            async with gate:
-                digest = await run_in_threadpool(self._digest, capture_id, Role(role), name)
-            return CaptureFile(role=Role(role), name=name, size=entry.size, sha256=digest) if digest else None
+            try:
+                async with gate:
+                    digest = await run_in_threadpool(self._digest, capture_id, Role(role), name)
+                if digest:
+                    return CaptureFile(role=Role(role), name=name, size=entry.size, sha256=digest)
+            except ValueError as error:
+                warn(f"{entry.path} is not listed", reason(error))
+            return None
 
         files = await asyncio.gather(*(describe(entry) for entry in found))
         return capture.model_copy(update={"files": [file for file in files if file is not None]})
@@ -81,6 +90,8 @@ class Captures:
                 records.append(self.record(capture_id))
             except ProblemError:
                 continue  # it is being created or deleted
+            except UnreadableRecord as error:
+                warn(f"capture {capture_id} is not listed", str(error))
         keyed = sorted(((int(c.created_at.timestamp() * 1000), c.id, c) for c in records), reverse=True)
         if cursor is not None:
             after = read_cursor(cursor)
@@ -282,6 +293,18 @@ class _Counted:
             raise _too_large(self.size, self._limit)
         self.digest.update(chunk)
         return chunk
+
+
+def _read(record: bytes, capture_id: str) -> Capture:
+    try:
+        fields = json.loads(record)
+        check_format(fields)
+        capture, left_out = keep_readable(Capture.model_validate, fields)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise UnreadableRecord(f"capture.json of {capture_id} cannot be read: {reason(error)}") from error
+    if left_out:
+        warn(layout.capture_record(capture_id), f"left out what cannot be read: {'; '.join(left_out)[:300]}")
+    return capture
 
 
 def _too_large(size: int, limit: int) -> ProblemError:

@@ -14,9 +14,11 @@ import redis
 
 from splatmill.backplane import events, keys, layout, queue, row
 from splatmill.backplane.fold import fold
+from splatmill.backplane.records import UnreadableRecord, check_format, reason, warn
 from splatmill.backplane.row import JobRow, Verdict
 from splatmill.backplane.storage import Storage
 from splatmill.schema import CreateJob, Job, JobPage, JobState, Problem
+from splatmill.schema.tolerant import keep_readable
 from splatmill_server.metrics import Metrics
 from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError
@@ -78,8 +80,16 @@ class Jobs:
         return cast(str, json.loads(stored)["job"]) if stored else None
 
     def row(self, job_id: str) -> JobRow:
-        """Return the row of a job. Raises a 404 problem if Redis has none."""
-        found = row.read(self.connection, job_id) if layout.is_id(job_id) else None
+        """Return the row of a job. Raises a 404 problem if Redis has none, and a 500 problem if it is not readable."""
+        try:
+            found = row.read(self.connection, job_id) if layout.is_id(job_id) else None
+        except UnreadableRecord as error:
+            raise ProblemError(
+                "job_corrupt",
+                f"The record of the job {job_id} cannot be read: {error}.",
+                advice="It was probably written by a later version of the server; run that version, or delete the "
+                "job.",
+            ) from error
         if found is None:
             raise ProblemError(
                 "job_not_found",
@@ -102,8 +112,11 @@ class Jobs:
         if not layout.is_id(job_id):
             return None
         try:
-            return with_links(Job.model_validate_json(self.storage.get(layout.job_record(job_id))))
-        except (FileNotFoundError, ValueError):
+            return with_links(read_record(self.storage, job_id))
+        except FileNotFoundError:
+            return None
+        except UnreadableRecord as error:
+            warn(layout.job_record(job_id), str(error))
             return None
 
     def page(self, cursor: str | None, limit: int, state: JobState | None = None) -> JobPage:
@@ -125,7 +138,7 @@ class Jobs:
         return JobPage(jobs=[job for _, job in page], cursor=following)
 
     def get_many(self, job_ids: Iterable[str]) -> list[Job | None]:
-        """Return several jobs, with None for those that were deleted."""
+        """Return several jobs, with None for those that were deleted or whose row is not readable."""
         wanted = list(job_ids)
         with self.connection.pipeline(transaction=False) as pipe:
             for job_id in wanted:
@@ -134,18 +147,26 @@ class Jobs:
             replies = pipe.execute()
         jobs: list[Job | None] = []
         for index, job_id in enumerate(wanted):
-            found = JobRow.of(replies[2 * index])
-            states = events.decode(replies[2 * index + 1])
+            try:
+                found = JobRow.of(replies[2 * index])
+            except UnreadableRecord as error:
+                warn(f"job {job_id} is not listed", str(error))
+                found = None
+            states = events.decode(replies[2 * index + 1], keys.states(job_id))
             latest = events.last_progress(self.connection, job_id) if found is not None else None
             jobs.append(with_links(fold(found, states, latest)) if found is not None else None)
         return jobs
 
     def active(self) -> list[JobRow]:
-        """Return the rows of all unfinished jobs."""
+        """Return the rows of all unfinished jobs. A job whose row is not readable stays active, but is left out."""
         ids = sorted(entry.decode() for entry in cast(set[bytes], self.connection.smembers(keys.ACTIVE)))
         found = []
         for job_id in ids:
-            known = row.read(self.connection, job_id)
+            try:
+                known = row.read(self.connection, job_id)
+            except UnreadableRecord as error:
+                warn(f"job {job_id} is not looked after", str(error))
+                continue
             if known is not None and not fold(known, events.read_states(self.connection, job_id)).state.final:
                 found.append(known)
             else:
@@ -221,8 +242,10 @@ class Jobs:
         """Delete a job that has ended, its work files and its model. Raises 404 and 409 problems."""
         try:
             found = self.row(job_id)
-        except ProblemError:
-            if self.stored(job_id) is None:
+        except ProblemError as error:
+            if error.problem.code == "job_corrupt":
+                self._withdraw_unreadable(job_id)
+            elif self.stored(job_id) is None:
                 raise
         else:
             job = self._job(found)
@@ -244,6 +267,19 @@ class Jobs:
             pipe.zrem(keys.JOBS, job_id)
             pipe.srem(keys.ACTIVE, job_id)
             pipe.execute()
+
+    def _withdraw_unreadable(self, job_id: str) -> None:
+        """Remove a job whose row is not readable from the queue. Raises a 409 problem while a worker runs it."""
+        stored = cast(bytes | None, self.connection.hget(keys.job(job_id), "generation")) or b"1"
+        for generation in range(1, (int(stored) if stored.isdigit() else 1) + 1):
+            if queue.status(self.connection, job_id, generation).state == "running":
+                raise ProblemError(
+                    "job_running",
+                    f"A worker runs the job {job_id}, whose record cannot be read.",
+                    advice="Delete it when the worker has ended it, or stop the worker first.",
+                )
+            queue.withdraw(self.connection, job_id, generation)
+            queue.forget(self.connection, job_id, generation)
 
     def give_verdict(self, expected: JobRow, state: str, problem: Problem | None = None) -> bool:
         """End a generation as `state`; return False if it has ended or was restarted meanwhile."""
@@ -311,6 +347,22 @@ class Jobs:
                 facts={"job": known["job"]},
             )
         return cast(str, known["job"])
+
+
+def read_record(storage: Storage, job_id: str) -> Job:
+    """Return the job in the `job.json` of a model, without what is not readable in it.
+
+    Raises FileNotFoundError, and UnreadableRecord.
+    """
+    try:
+        record = json.loads(storage.get(layout.job_record(job_id)))
+        check_format(record)
+        job, left_out = keep_readable(Job.model_validate, record)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise UnreadableRecord(f"job.json cannot be read: {reason(error)}") from error
+    if left_out:
+        warn(layout.job_record(job_id), f"left out what cannot be read: {'; '.join(left_out)[:300]}")
+    return job
 
 
 def with_links(job: Job) -> Job:

@@ -6,9 +6,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from splatmill.backplane import layout
+from splatmill.backplane.records import warn
 from splatmill.backplane.storage import Entry, Storage
-from splatmill.schema import Job, JobState, Model, ModelCameras, ModelFile, ModelPage, Report
-from splatmill_server.jobs import Jobs
+from splatmill.schema import JobState, Model, ModelCameras, ModelFile, ModelPage, Report
+from splatmill_server.jobs import Jobs, read_record
 from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError
 
@@ -63,7 +64,7 @@ class Models:
             entry.path.rsplit("/", 1)[-1]: entry for entry in self.storage.entries(layout.model(model_id))
         }
         try:
-            job = Job.model_validate_json(self.storage.get(layout.job_record(model_id)))
+            job = read_record(self.storage, model_id)
             gaussians, degree = self._header(model_id, files["model.ply"])
         except (KeyError, ValueError, FileNotFoundError) as error:
             raise ProblemError(
@@ -115,8 +116,11 @@ class Models:
         for _, model_id in page:
             try:
                 models.append(self.get(model_id))
-            except ProblemError:
-                continue  # deleted meanwhile or corrupt, which must not hide the other models
+            except (
+                ProblemError
+            ) as error:  # deleted meanwhile or corrupt, which must not hide the other models
+                if error.problem.code == "model_corrupt":
+                    warn(f"model {model_id} is not listed", error.problem.detail)
         return ModelPage(models=models, cursor=write_cursor(*page[-1]) if len(keyed) > limit else None)
 
     def file(self, model_id: str, name: str) -> Entry:

@@ -6,7 +6,8 @@ is left. Its actions are idempotent, so every API process may run one.
 """
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import TypeVar
 
 import redis
 import structlog
@@ -20,6 +21,8 @@ from splatmill_server.metrics import Metrics
 from splatmill_server.settings import Settings
 
 log = structlog.get_logger()
+
+T = TypeVar("T")
 
 _ENDED = {"finished", "failed", "stopped"}
 
@@ -63,7 +66,7 @@ class Reaper:
         queue.reclaim(self.connection)
         active = self.jobs.active()
         cancelling = [row for row in active if row.cancel_requested_at is not None]
-        unfinished = [row for row in cancelling if not self.cancel(row)]
+        unfinished = [row for row in cancelling if not _safely(self.cancel, row, True)]
         self._check(row for row in active if row.cancel_requested_at is None)
         return bool(unfinished)
 
@@ -81,20 +84,21 @@ class Reaper:
         return False
 
     def _check(self, rows: Iterable[JobRow]) -> None:
-        unreported = set()
-        for row in rows:
-            found = queue.status(self.connection, row.id, row.generation)
-            if found.state == "absent":
-                if queue.enqueue(self.connection, row.id, row.generation):
-                    self.metrics.requeued.inc()
-                    log.warning("job was lost by the queue, enqueued again", job=row.id)
-            elif found.state in _ENDED:
-                mark = (row.id, row.generation)
-                if found.state == "finished" and mark not in self._unreported:
-                    unreported.add(mark)
-                else:
-                    self._give_up(row, found)
-        self._unreported = unreported
+        self._unreported = {mark for row in rows if (mark := _safely(self._check_one, row, None)) is not None}
+
+    def _check_one(self, row: JobRow) -> tuple[str, int] | None:
+        """Repair one job. Return its mark if its attempt has ended and its final state may still arrive."""
+        found = queue.status(self.connection, row.id, row.generation)
+        if found.state == "absent":
+            if queue.enqueue(self.connection, row.id, row.generation):
+                self.metrics.requeued.inc()
+                log.warning("job was lost by the queue, enqueued again", job=row.id)
+        elif found.state in _ENDED:
+            mark = (row.id, row.generation)
+            if found.state == "finished" and mark not in self._unreported:
+                return mark
+            self._give_up(row, found)
+        return None
 
     def _give_up(self, row: JobRow, found: queue.QueueStatus) -> None:
         job = self.jobs.get(row.id)
@@ -121,3 +125,17 @@ class Reaper:
         if self.jobs.give_verdict(row, "failed", problem):
             self.metrics.ended.labels(problem.code).inc()
             log.warning("job given up", job=row.id, code=problem.code, reason=found.reason)
+
+
+def _safely(step: Callable[[JobRow], T], row: JobRow, otherwise: T) -> T:
+    """Return the result of a step on one job. An error in it is logged, so that it does not affect other jobs.
+
+    Raises redis.RedisError, which affects all.
+    """
+    try:
+        return step(row)
+    except redis.RedisError:
+        raise
+    except Exception:
+        log.exception("job could not be checked", job=row.id)
+        return otherwise

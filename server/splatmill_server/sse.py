@@ -17,6 +17,7 @@ from prometheus_client import Gauge
 from splatmill.backplane import events, keys
 from splatmill.backplane.events import START, StoredEvent, stream_order
 from splatmill.backplane.fold import Fold
+from splatmill.backplane.records import UnreadableRecord, warn
 from splatmill.backplane.row import JobRow
 from splatmill.schema import EventRecord, Job, JobState, StateEvent, Time
 from splatmill_server.service import Service
@@ -63,7 +64,7 @@ class Follower:
         """Apply the events that the client has already seen; return False if the job had ended by then."""
         self.fold = Fold(row)
         seen = await self._reply(self.redis.xrange(keys.states(self.job_id), max=self.position.states))
-        for stored in events.decode(seen):
+        for stored in events.decode(seen, keys.states(self.job_id)):
             self.fold.apply(stored)
         if self.position.row_events > 2 * row.generation:
             self.fold.close()
@@ -72,7 +73,11 @@ class Follower:
     async def records(self) -> AsyncIterator[EventRecord]:
         """Yield the events that count, until the job ends or the server stops."""
         while not self.closing.is_set():
-            row = JobRow.of(await self._reply(self.redis.hgetall(keys.job(self.job_id))))
+            try:
+                row = JobRow.of(await self._reply(self.redis.hgetall(keys.job(self.job_id))))
+            except UnreadableRecord as error:
+                warn(f"the events of job {self.job_id} end", str(error))
+                return
             if row is None:
                 return  # the job was deleted
             if row.generation != self.fold.row.generation:
@@ -80,13 +85,15 @@ class Follower:
             self.fold.row = row
             if self.position.row_events < 2 * row.generation:
                 yield self._row_event(2 * row.generation, row.queued_at, StateEvent(state=JobState.queued))
-            for stored, is_state in await self._read():
+            found, end = await self._read()
+            for stored, is_state in found:
                 if is_state:
                     self.position.states = stored.id
                 else:
                     self.position.progress = stored.id
                 if self.fold.apply(stored):
                     yield stored.record(str(self.position))
+            self.position.states, self.position.progress = end  # also after entries that are not readable
             if self.fold.final:
                 return
             verdict = row.verdict
@@ -99,13 +106,19 @@ class Follower:
         self.position.row_events = number
         return EventRecord(id=str(self.position), attempt=0, at=at, event=event)
 
-    async def _read(self) -> list[tuple[StoredEvent, bool]]:
-        """Return new entries of both streams, sorted by time; wait briefly if there are none."""
+    async def _read(self) -> tuple[list[tuple[StoredEvent, bool]], tuple[str, str]]:
+        """Return new events of both streams, sorted by time, and the ids of the last entries read from each.
+
+        Waits briefly if there are none.
+        """
         states, progress = keys.states(self.job_id), keys.progress(self.job_id)
         positions: Any = {states: self.position.states, progress: self.position.progress}
         reply = await self._reply(self.redis.xread(positions, block=_BLOCK_MS))
-        entries = {name.decode(): events.decode(found) for name, found in reply or []}
-        return _merge(entries.get(states, []), entries.get(progress, []))
+        entries = {name.decode(): found for name, found in reply or []}
+        end = {name: found[-1][0].decode() for name, found in entries.items()}
+        read = {name: events.decode(found, name) for name, found in entries.items()}
+        merged = _merge(read.get(states, []), read.get(progress, []))
+        return merged, (end.get(states, self.position.states), end.get(progress, self.position.progress))
 
     async def _reply(self, pending: Any) -> Any:
         return await pending

@@ -4,6 +4,7 @@ Each entry carries its generation and attempt. Its time is taken from the entry'
 machines share one clock.
 """
 
+import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -12,7 +13,9 @@ from typing import Any, cast
 import redis
 
 from splatmill.backplane import keys
+from splatmill.backplane.records import FORMAT, check_format, reason, warn
 from splatmill.schema import EVENT, Event, EventRecord, PlanEvent, ProgressEvent, StateEvent
+from splatmill.schema.tolerant import keep_readable
 
 PROGRESS_LENGTH = 4000
 """Number of entries to which the progress stream is trimmed: about one megabyte per job."""
@@ -72,43 +75,61 @@ def begin_attempt(connection: redis.Redis, job_id: str) -> int:
 def append(connection: redis.Redis, job_id: str, generation: int, attempt: int, event: Event) -> str:
     """Append an event to its stream and return the id of the entry. For workers."""
     key = stream_of(job_id, event)
-    fields = {"g": generation, "a": attempt, "e": event.model_dump_json(exclude_none=True)}
+    fields = {"g": generation, "a": attempt, "e": event.model_dump_json(exclude_none=True), "format": FORMAT}
     maxlen = PROGRESS_LENGTH if key == keys.progress(job_id) else None
     return cast(bytes, connection.xadd(key, cast(Any, fields), maxlen=maxlen)).decode()
 
 
-def decode(entries: Iterable[tuple[bytes, Mapping[bytes, bytes]]]) -> list[StoredEvent]:
-    """Return the events in the reply to XRANGE, XREVRANGE, or XREAD of one stream, in the same order."""
-    return [
-        StoredEvent(
-            id=entry_id.decode(),
-            generation=int(fields[b"g"]),
-            attempt=int(fields[b"a"]),
-            event=EVENT.validate_json(fields[b"e"]),
-        )
-        for entry_id, fields in entries
-    ]
+Entries = Iterable[tuple[bytes, Mapping[bytes, bytes]]]
+"""The reply to XRANGE, XREVRANGE, or XREAD of one stream."""
+
+
+def decode(entries: Entries, stream: str) -> list[StoredEvent]:
+    """Return the events among the entries of `stream`, in the same order.
+
+    An entry that this version cannot read, such as an event of an unknown type, is left out and logged.
+    """
+    found = []
+    for entry_id, fields in entries:
+        name = f"entry {entry_id.decode()} of {stream}"
+        try:
+            event, left_out = _event(fields)
+            found.append(StoredEvent(entry_id.decode(), int(fields[b"g"]), int(fields[b"a"]), event))
+        except (KeyError, ValueError, TypeError, AttributeError) as error:
+            warn(name, f"skipped, because it cannot be read: {reason(error)}")
+        else:
+            if left_out:
+                warn(name, f"left out what this version cannot read: {'; '.join(left_out)[:300]}")
+    return found
+
+
+def _event(fields: Mapping[bytes, bytes]) -> tuple[Event, list[str]]:
+    check_format({"format": fields[b"format"]} if b"format" in fields else {})
+    # Errors of the union name the type before the field.
+    return keep_readable(EVENT.validate_python, json.loads(fields[b"e"]), depth=1)
 
 
 def read_states(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
     """Return all states and plans of a job, oldest first."""
-    return decode(cast(Any, connection.xrange(keys.states(job_id))))
+    key = keys.states(job_id)
+    return decode(cast(Any, connection.xrange(key)), key)
 
 
 def read_progress(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
     """Return the entries of a job's progress stream that were not trimmed, oldest first."""
-    return decode(cast(Any, connection.xrange(keys.progress(job_id))))
+    key = keys.progress(job_id)
+    return decode(cast(Any, connection.xrange(key)), key)
 
 
 def last_progress(connection: redis.Redis, job_id: str) -> StoredEvent | None:
     """Return the newest `ProgressEvent` among the last 1000 entries, which include log lines and metrics, or None."""
-    end = "+"
+    key, end = keys.progress(job_id), "+"
     for _ in range(_PAGES):
-        page = decode(cast(Any, connection.xrevrange(keys.progress(job_id), max=end, count=_PAGE)))
-        for stored in page:
+        page = cast(Any, connection.xrevrange(key, max=end, count=_PAGE))
+        for stored in decode(page, key):
             if isinstance(stored.event, ProgressEvent):
                 return stored
         if len(page) < _PAGE:
             return None
-        end = f"({page[-1].id}"
+        end = f"({page[-1][0].decode()}"
     return None

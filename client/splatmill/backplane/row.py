@@ -1,14 +1,17 @@
 """The job row: a Redis hash with the request and the server's decisions. Only the server writes it."""
 
+import json
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import redis
 from pydantic import BaseModel
 
 from splatmill.backplane import keys
+from splatmill.backplane.records import FORMAT, UnreadableRecord, check_format, reason, warn
 from splatmill.schema import Problem, Time, TrainOptions
+from splatmill.schema.tolerant import keep_readable
 
 
 class Verdict(BaseModel):
@@ -31,8 +34,10 @@ class JobRow(BaseModel):
     """The request for a job, and the server's decisions about it.
 
     `generation` grows with each restart. `queued_at`, `cancel_requested_at` and `verdict` refer to the current one.
+    `format` is the version of the row's format (see `records`).
     """
 
+    format: int = FORMAT
     id: str
     capture: str
     name: str | None = None
@@ -52,18 +57,36 @@ class JobRow(BaseModel):
 
     @classmethod
     def of(cls, stored: Mapping[bytes, bytes]) -> "JobRow | None":
-        """Return the row in a reply to HGETALL, or None for an empty reply: there is no such hash."""
+        """Return the row in a reply to HGETALL, or None for an empty reply: there is no such hash.
+
+        Options that this version does not know, or whose value it does not accept, are left out. Raises
+        UnreadableRecord for a row that cannot be read.
+        """
         if not stored:
             return None
-        plain: dict[str, object] = {key.decode(): value.decode() for key, value in stored.items()}
-        plain["options"] = TrainOptions.model_validate_json(stored[b"options"])
-        if b"verdict" in stored:
-            plain["verdict"] = Verdict.model_validate_json(stored[b"verdict"])
-        return cls.model_validate(plain)
+        plain: dict[str, Any] = {
+            key.decode("utf-8", "replace"): value.decode("utf-8", "replace") for key, value in stored.items()
+        }
+        name = f"the row of job {plain.get('id', '?')[:80]}"
+        try:
+            check_format(plain)
+            options, left_out = keep_readable(TrainOptions.model_validate, json.loads(plain["options"]))
+            plain["options"] = options
+            if "verdict" in plain:
+                verdict, more = keep_readable(Verdict.model_validate, json.loads(plain["verdict"]))
+                plain["verdict"] = verdict
+                left_out += more
+            row = cls.model_validate(plain)
+        except (KeyError, ValueError, TypeError, AttributeError) as error:
+            raise UnreadableRecord(f"{name} cannot be read: {reason(error)}") from error
+        if left_out:
+            warn(name, f"left out what this version cannot read: {'; '.join(left_out)[:300]}")
+        return row
 
 
 def read(connection: redis.Redis, job_id: str) -> JobRow | None:
-    """Return the row of a job, or None if Redis has none. Raises redis.RedisError if Redis cannot be reached."""
+    """Return the row of a job, or None if Redis has none. Raises redis.RedisError if Redis cannot be reached,
+    and UnreadableRecord for a row that cannot be read."""
     return JobRow.of(cast(dict[bytes, bytes], connection.hgetall(keys.job(job_id))))
 
 

@@ -8,6 +8,7 @@ from splatmill.schema.base import Request, Response, Time
 from splatmill.schema.events import JobState, LogEvent, Progress
 from splatmill.schema.options import TrainOptions
 from splatmill.schema.problems import Problem
+from splatmill.schema.tolerant import keep_readable
 
 IDEMPOTENCY_HEADER = "Idempotency-Key"
 """Request header. Requests to create a job that carry the same key create one job."""
@@ -21,11 +22,10 @@ class CreateJob(Request):
     options: TrainOptions = Field(default_factory=TrainOptions)
 
 
-def _known_options(value: Any) -> Any:
-    # A newer server may have options that this version does not know; its jobs must still be readable.
-    if isinstance(value, dict):
-        return {name: kept for name, kept in value.items() if name in TrainOptions.model_fields}
-    return value
+def _readable_options(value: Any) -> Any:
+    # A newer server may have options, or values of options, that this version does not know; its jobs, and the
+    # records that it stored, must still be readable.
+    return keep_readable(TrainOptions.model_validate, value)[0] if isinstance(value, dict) else value
 
 
 class Job(Response):
@@ -35,7 +35,7 @@ class Job(Response):
     capture: str
     name: str | None = None
     state: JobState
-    options: Annotated[TrainOptions, BeforeValidator(_known_options)]
+    options: Annotated[TrainOptions, BeforeValidator(_readable_options)]
     created_at: Time
     started_at: Time | None = None
     finished_at: Time | None = None

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from splatmill.backplane import events, layout
 from splatmill.backplane.fold import fold
+from splatmill.backplane.records import FORMAT
 from splatmill.backplane.row import JobRow, now
 from splatmill.backplane.storage import Storage
 from splatmill.schema import JobState
@@ -48,5 +49,8 @@ def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path) -> None:
             "attempt": attempt.number,
         }
     )
-    record = ended.model_dump(mode="json", exclude_none=True) | {"generation": attempt.generation}
+    record = ended.model_dump(mode="json", exclude_none=True) | {
+        "generation": attempt.generation,
+        "format": FORMAT,
+    }
     storage.put(layout.job_record(attempt.job_id), json.dumps(record, indent=1).encode())
