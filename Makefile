@@ -3,6 +3,9 @@ SHELL := /bin/bash
 PYTHON ?= python3
 # A folder of photos, a zip, a video or a posed data set; empty: the built-in synthetic scene.
 PHOTOS ?=
+# Where `make demo` leaves its results, and the options of `splatmill train` that it uses.
+OUT ?= demo
+ARGS ?= --novel-view --orbit
 # Extra arguments of pip, e.g. PIP_ARGS="--extra-index-url ..." to choose another build of torch.
 PIP_ARGS ?=
 VENV := .venv
@@ -14,7 +17,7 @@ WORKERS ?= 2
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --cov
 
-.PHONY: help install demo quick test check wheels bench serve sanitize clean
+.PHONY: help install demo quick test check wheels docs bench serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -22,8 +25,8 @@ help: ## list the targets
 install: $(VENV)/.installed ## set up .venv with the three parts and the compiled kernels
 
 demo: install ## photos in, splats out, into demo/ (PHOTOS=path takes your own)
-	@test -n "$(PHOTOS)" || $(BIN)/python -m splatmill_worker.synthetic demo/photos
-	@$(BIN)/splatmill train "$(or $(PHOTOS),demo/photos)" -o demo --novel-view --orbit
+	@test -n "$(PHOTOS)" || $(BIN)/python -m splatmill_worker.synthetic "$(OUT)/photos"
+	@$(BIN)/splatmill train "$(or $(PHOTOS),$(OUT)/photos)" -o "$(OUT)" $(ARGS)
 
 quick: $(VENV)/.installed-dev ## run the tests that most changes need (not those marked slow), in under a minute
 	$(PYTEST) -m "not slow" $(PYTEST_ARGS)
@@ -40,6 +43,10 @@ check: $(VENV)/.installed-dev ## ruff, mypy, import rules
 wheels: $(VENV)/.installed-dev ## build the wheels and source distributions of the three parts into dist/
 	for part in client server worker; do $(BIN)/python -m build --no-isolation --outdir dist $$part || exit 1; done
 
+docs: $(VENV)/.installed-dev ## build the documentation into docs/build/html, with every warning as an error
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet docs docs/build/html
+	@echo "Open docs/build/html/index.html"
+
 bench: install ## error against run time: kernels, stability, SfM, training (takes a while)
 	for name in kernels stability sfm train; do $(BIN)/splatmill bench $$name || exit 1; done
 
@@ -50,7 +57,7 @@ sanitize: $(VENV)/.installed-dev ## the kernels' tests under AddressSanitizer an
 	worker/sanitize/run
 
 clean: ## remove what the other targets made, except demo/ and your data
-	rm -rf $(VENV) dist client/build server/build worker/build client/*.egg-info server/*.egg-info
+	rm -rf $(VENV) dist docs/build docs/generated client/build server/build worker/build client/*.egg-info server/*.egg-info
 
 $(VENV)/.prerequisites:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \

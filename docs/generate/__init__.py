@@ -1,0 +1,26 @@
+"""The pages that are made from the program each time the documentation is built; none of them is committed.
+
+One module per page. Each has a function `page()` that returns the page as Markdown.
+"""
+
+from pathlib import Path
+
+from docs.generate import command_line, environment, errors, python_errors, rest, settings
+
+PAGES = {
+    "command-line.md": command_line.page,
+    "environment.md": environment.page,
+    "errors.md": errors.page,
+    "python-errors.md": python_errors.page,
+    "rest.md": rest.page,
+    "settings.md": settings.page,
+}
+
+
+def write_pages(folder: Path) -> None:
+    """Write every generated page into `folder`; a page whose text has not changed keeps its time stamp."""
+    folder.mkdir(exist_ok=True)
+    for name, page in PAGES.items():
+        path, text = folder / name, page()
+        if not path.is_file() or path.read_text() != text:
+            path.write_text(text)

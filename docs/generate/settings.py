@@ -1,0 +1,87 @@
+"""The settings of a training, from `splatmill.schema.describe_options()`."""
+
+from itertools import groupby
+
+from docs.generate.markdown import choices, code, table
+
+from splatmill.cli.schema_options import PANELS
+from splatmill.schema import (
+    FitImageOptions,
+    OptionHelp,
+    Preset,
+    describe_options,
+    format_bytes,
+    format_duration,
+)
+from splatmill_worker.splat.plan.capacity import PRESET_STEPS
+from splatmill_worker.splat.plan.photos import PRESET_SIZE
+
+INTRODUCTION = """# Settings
+
+Every setting of a training, generated from the program. A setting has one name everywhere: `time_budget` is
+`--time-budget` on the command line, `time_budget=` in the SDK, and `"time_budget"` among the `options` of a job in the
+REST API. `splatmill options` prints the same list, and `GET /v1/options` returns it as JSON.
+
+No setting is required. A setting without a default is either not used unless it is given (a time budget, a target), or
+decided from the photos (the image size, the degree of the spherical harmonics); the plan in the [report](../report.md)
+names each decision and the fact behind it.
+
+A duration is written as `90s`, `5m`, `1h30m` or a number of seconds; a size in bytes as `500MB`, `1.5GB`, `2GiB` or a
+number of bytes.
+"""
+
+PRESETS = """(presets)=
+### Presets
+
+What a preset decides, where no other setting does: the number of steps, and the longest side of the photos in pixels
+on each backend.
+"""
+
+FIT_IMAGE = """## Fitting one picture
+
+The settings of `splatmill fit-image`, which fits a single picture by Gaussians in a plane.
+"""
+
+
+def page() -> str:
+    """The page of settings."""
+    parts = [INTRODUCTION]
+    for group, options in groupby(describe_options(), key=lambda option: option.group):
+        parts += [f"## {PANELS[group]}\n", _table(list(options))]
+        parts += [PRESETS, _presets()] if group == "budget" else []
+    parts += [FIT_IMAGE, _table(describe_options(FitImageOptions))]
+    return "\n".join(parts)
+
+
+def _presets() -> str:
+    rows = [
+        [
+            code(preset.value),
+            f"{PRESET_STEPS[preset]:,}",
+            *(f"{size[preset]:,}" for size in PRESET_SIZE.values()),
+        ]
+        for preset in Preset
+    ]
+    return table(["preset", "steps", *(code(backend) for backend in PRESET_SIZE)], rows)
+
+
+def _table(options: list[OptionHelp]) -> str:
+    rows = [[code(option.name), _values(option), _default(option), option.help] for option in options]
+    return table(["setting", "values", "default", "meaning"], rows)
+
+
+def _values(option: OptionHelp) -> str:
+    if option.choices:
+        return choices(option.choices)
+    if option.type == "flag":
+        return "on or off"
+    if option.minimum is None or option.maximum is None or option.type == "list":
+        return option.type
+    show = {"duration": format_duration, "bytes": format_bytes}.get(option.type, "{:,}".format)
+    return f"{option.type}, {show(option.minimum)} to {show(option.maximum)}"
+
+
+def _default(option: OptionHelp) -> str:
+    if option.default is None:
+        return ""
+    return "off" if option.default is False else code(option.default)
