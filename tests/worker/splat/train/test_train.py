@@ -22,7 +22,7 @@ from splatmill_worker.splat.start import frusta
 from splatmill_worker.splat.start.points import from_points
 from splatmill_worker.splat.train import checkpoint
 from splatmill_worker.splat.train.exposure import Exposure
-from splatmill_worker.splat.train.loop import Hooks, Progress, train
+from splatmill_worker.splat.train.loop import Hooks, TrainingProgress, train
 from splatmill_worker.splat.train.renderer import evaluation_background
 from splatmill_worker.splat.train.run import TrainingRun
 from splatmill_worker.splat.train.snapshot import Snapshot
@@ -140,7 +140,7 @@ def test_the_reference_trains_through_the_same_loop_and_agrees() -> None:
 @pytest.mark.slow
 def test_a_time_budget_ends_on_time_with_rates_annealed() -> None:
     views, held_out = split()
-    reports: list[Progress] = []
+    reports: list[TrainingProgress] = []
     hooks = Hooks(progress=reports.append)
     trained = train(first_engine(), views, held_out, plan(None, 2.0), extent=1.1, hooks=hooks)
     assert trained.seconds == pytest.approx(2.0, rel=0.05)

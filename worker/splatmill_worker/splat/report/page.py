@@ -28,7 +28,7 @@ img { max-width: 100%; height: auto; } .pairs { display: flex; flex-wrap: wrap; 
 
 
 @dataclass(frozen=True)
-class Pair:
+class ViewComparison:
     """A rendered view beside its photo.
 
     score: error of the view.
@@ -41,8 +41,8 @@ class Pair:
     photo: Tensor
 
 
-def render(report: dict[str, Any], figure: Path, pairs: Sequence[Pair]) -> str:
-    """The page as text, with the picture `figure` of the curve and the `pairs` embedded."""
+def render(report: dict[str, Any], figure: Path, comparisons: Sequence[ViewComparison]) -> str:
+    """The page as text, with the picture `figure` of the curve and the `comparisons` embedded."""
     curve = base64.b64encode(figure.read_bytes()).decode()
     parts = [
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
@@ -66,7 +66,7 @@ def render(report: dict[str, Any], figure: Path, pairs: Sequence[Pair]) -> str:
         ),
         "<h2>Worst views beside their photos</h2>",
         "<div class=pairs>",
-        *(_pair(pair) for pair in pairs),
+        *(_comparison(comparison) for comparison in comparisons),
         "</div>",
         "<h2>All evaluated views</h2>",
         _table(
@@ -99,13 +99,13 @@ def _plan(plan: dict[str, Any]) -> str:
     return _table(["", "", ""], rows, 3)
 
 
-def _pair(pair: Pair) -> str:
-    name = html.escape(pair.score.name)
+def _comparison(view: ViewComparison) -> str:
+    name = html.escape(view.score.name)
     return (
         "<div class=pair>"
-        f"<figure><img alt='rendered' src='{data_uri(pair.rendered, 480)}'>"
-        f"<figcaption>{name}: {pair.score.psnr:.2f} dB, SSIM {pair.score.ssim:.3f}</figcaption></figure>"
-        f"<figure><img alt='photo' src='{data_uri(pair.photo, 480)}'><figcaption>photo</figcaption></figure></div>"
+        f"<figure><img alt='rendered' src='{data_uri(view.rendered, 480)}'>"
+        f"<figcaption>{name}: {view.score.psnr:.2f} dB, SSIM {view.score.ssim:.3f}</figcaption></figure>"
+        f"<figure><img alt='photo' src='{data_uri(view.photo, 480)}'><figcaption>photo</figcaption></figure></div>"
     )
 
 

@@ -107,17 +107,17 @@ def write_report(
     return report
 
 
-def _worst_views(planned: PlannedScene, trained: Trained, render: Renderer) -> list[page.Pair]:
+def _worst_views(planned: PlannedScene, trained: Trained, render: Renderer) -> list[page.ViewComparison]:
     """The views with the lowest PSNR beside their photos: held-out ones where there are any."""
     views = planned.held_out or trained.views
     score = trained.held_out or trained.on_training
     background = evaluation_background(planned.plan, trained.views)
-    pairs = []
+    comparisons = []
     for view_score in sorted(score.views, key=lambda row: row.psnr)[:WORST]:
         view = next(view for view in views if view.name == view_score.name)
         rendered = render(view.full, background).clone()
-        pairs.append(page.Pair(view_score, rendered, _compared_part(view.full, background)))
-    return pairs
+        comparisons.append(page.ViewComparison(view_score, rendered, _compared_part(view.full, background)))
+    return comparisons
 
 
 def _compared_part(target: Target, background: Tensor) -> Tensor:

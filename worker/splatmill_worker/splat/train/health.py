@@ -25,7 +25,7 @@ EMPTY_STEPS = 200
 
 
 @dataclass
-class Health:
+class LossHealth:
     """The course of the loss.
 
     smoothed: exponential mean of the loss; None before the first step.

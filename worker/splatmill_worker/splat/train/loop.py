@@ -46,7 +46,7 @@ FLAT_TAIL = 0.1
 
 
 @dataclass(frozen=True)
-class Progress:
+class TrainingProgress:
     """Where a run stands.
 
     step: training steps so far.
@@ -88,7 +88,7 @@ class Hooks:
     observer: looks at the scene at moments of its own; None: nobody does.
     """
 
-    progress: Callable[[Progress], None] = lambda _: None
+    progress: Callable[[TrainingProgress], None] = lambda _: None
     evaluated: Callable[[CurvePoint, Engine], None] = lambda _point, _engine: None
     warn: Callable[[str], None] = lambda _: None
     cancelled: Callable[[], bool] = lambda: False
@@ -300,8 +300,8 @@ def _reason_to_stop(run: TrainingRun) -> str:
     return ""
 
 
-def _progress(run: TrainingRun) -> Progress:
+def _progress(run: TrainingRun) -> TrainingProgress:
     progress, seconds = run.progress, run.clock.seconds
     total = run.step if progress <= 0 else round(run.step / progress)
     eta = seconds * (1.0 - progress) / max(progress, 1e-6)
-    return Progress(run.step, max(run.step, total), run.loss, run.engine.count, seconds, eta)
+    return TrainingProgress(run.step, max(run.step, total), run.loss, run.engine.count, seconds, eta)

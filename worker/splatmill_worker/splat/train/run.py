@@ -19,7 +19,7 @@ from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
 from splatmill_worker.splat.train.curve import CurvePoint
 from splatmill_worker.splat.train.density import clone_split
 from splatmill_worker.splat.train.exposure import Exposure
-from splatmill_worker.splat.train.health import Health
+from splatmill_worker.splat.train.health import LossHealth
 from splatmill_worker.splat.train.pace import Pace
 from splatmill_worker.splat.train.poses import Poses
 from splatmill_worker.splat.train.renderer import fixed_background
@@ -83,7 +83,7 @@ class TrainingRun:
         self.max_gaussians = plan.max_gaussians
         self.reduction = 0
         self.upcoming: list[int] = []
-        self.health = Health()
+        self.health = LossHealth()
         self.pace = Pace(plan.schedule.expected_steps)
         self.shortened = False
         self.ever_visible = False
@@ -152,7 +152,7 @@ class TrainingRun:
             self.rate_scale *= 0.5
             measure = "with half the learning rates"
         self._restore(self.last_good)
-        self.health = Health(lowest=self.last_good.lowest_loss, checked_from=self.step + len(self.views))
+        self.health = LossHealth(lowest=self.last_good.lowest_loss, checked_from=self.step + len(self.views))
         self.warn(f"{failure} Training went back to the last good state and goes on {measure}.")
 
     def restore_last_good(self) -> bool:
