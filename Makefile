@@ -71,10 +71,10 @@ $(VENV)/.prerequisites:
 	@$(PYTHON) -m venv $(VENV)
 	@touch $@
 
+# The worker is built without isolation, so that worker/build keeps what is compiled: another build compiles only what has changed.
 $(VENV)/.installed: $(VENV)/.prerequisites $(PARTS) $(KERNELS)
 	$(BIN)/python -m pip install -q $(PIP_ARGS) -U pip
 	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --group build -e ./client -e './server[embedded]'
-	# Without isolation, worker/build keeps what is compiled: another build compiles only what has changed.
 	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --no-build-isolation -e ./worker
 	@touch $@
 
