@@ -14,6 +14,8 @@ import uvicorn
 from fastapi import FastAPI
 from pydantic import ValidationError
 
+from splatmill.backplane.connection import InvalidRedisUrl
+from splatmill.backplane.redact import redacted
 from splatmill.backplane.storage import StorageError
 from splatmill_server.app import create_app
 from splatmill_server.settings import Settings
@@ -50,11 +52,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for found in error.errors():
             print(f"splatmill_server: {_sentence(found)}", file=sys.stderr)
         return 2
-    except (StorageError, OSError) as error:
+    except (StorageError, OSError, InvalidRedisUrl) as error:
         print(f"splatmill_server: {error}", file=sys.stderr)
         return 2
     config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=GRACE_SECONDS)
-    log.info("serving", address=_address(listener), storage=settings.storage)
+    log.info("serving", address=_address(listener), storage=redacted(settings.storage))
     server = Server(config, app)
     server.run(sockets=[listener])
     if settings.uds is not None:

@@ -56,6 +56,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         version=splatmill.__version__,
         description=_DESCRIPTION,
         lifespan=lifespan,
+        docs_url=None,  # FastAPI's pages load scripts from other hosts
         redoc_url=None,
         middleware=[Middleware(RequestMiddleware, settings=settings, metrics=service.metrics)],
     )

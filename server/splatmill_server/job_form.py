@@ -1,9 +1,8 @@
 """`POST /v1/jobs` with a form: uploads photos and starts a job in one request."""
 
-import json
-
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
+from pydantic_core import from_json
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 
@@ -77,7 +76,8 @@ async def _store(service: Service, capture_id: str, part: Part, filename: str) -
 
 def _request(capture_id: str, fields: dict[str, str]) -> CreateJob:
     try:
-        options = json.loads(fields.get("options") or "{}")
+        # Unlike json.loads, from_json refuses deep nesting with a ValueError.
+        options = from_json(fields.get("options") or "{}")
     except ValueError as error:
         raise ProblemError(
             "malformed_body",

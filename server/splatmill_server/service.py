@@ -1,6 +1,8 @@
 """What the endpoints of an app share: connections, settings and records. `create_app` makes one per app."""
 
 import asyncio
+import threading
+import time
 from dataclasses import dataclass, field
 from typing import Annotated, cast
 
@@ -11,13 +13,38 @@ from redis.asyncio import Redis as AsyncRedis
 
 from splatmill.backplane import rendering
 from splatmill.backplane.connection import connect, connect_async
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import Storage, StorageError
 from splatmill_server.captures import Captures
 from splatmill_server.jobs import Jobs
 from splatmill_server.metrics import Metrics
 from splatmill_server.models import Models
 from splatmill_server.reaper import Reaper
 from splatmill_server.settings import Settings
+
+CHECK_SECONDS = 5.0
+"""Seconds for which a check of storage holds: everybody may request `/readyz`, and each check writes a file."""
+
+
+class StorageCheck:
+    """Checks by a write whether storage can be used, at most once in CHECK_SECONDS."""
+
+    def __init__(self, storage: Storage) -> None:
+        self._storage = storage
+        self._lock = threading.Lock()
+        self._checked = float("-inf")
+        self._result = ""
+
+    def result(self) -> str:
+        """Return "ok" or what is wrong, as of the last check."""
+        with self._lock:
+            if time.monotonic() - self._checked >= CHECK_SECONDS:
+                try:
+                    self._storage.check()
+                    self._result = "ok"
+                except StorageError as error:
+                    self._result = str(error)
+                self._checked = time.monotonic()
+            return self._result
 
 
 @dataclass
@@ -28,6 +55,7 @@ class Service:
     redis: Redis
     redis_async: AsyncRedis
     storage: Storage
+    storage_check: StorageCheck
     renderer: httpx.AsyncClient | None
     metrics: Metrics
     captures: Captures
@@ -49,6 +77,7 @@ class Service:
             redis=connection,
             redis_async=connect_async(settings.redis_url),
             storage=storage,
+            storage_check=StorageCheck(storage),
             renderer=_renderer(settings),
             metrics=metrics,
             captures=Captures(storage, settings, metrics),

@@ -15,11 +15,14 @@ from splatmill.schema import DEFAULT_PORT
 class Settings(BaseSettings):
     """The settings. Each is also an environment variable: `SPLATMILL_` and the name in capitals."""
 
-    model_config = SettingsConfigDict(env_prefix="SPLATMILL_", populate_by_name=True, extra="ignore")
+    model_config = SettingsConfigDict(
+        env_prefix="SPLATMILL_", populate_by_name=True, extra="ignore", hide_input_in_errors=True
+    )
 
     redis_url: str = Field(
         default=DEFAULT_URL,
         validation_alias="REDIS_URL",
+        repr=False,  # it may contain a password
         description="Address of Redis: redis://host:port/0 or unix:///path.",
     )
     data: Path = Field(default=Path("splatmill-data"), description="Folder for data on this machine.")

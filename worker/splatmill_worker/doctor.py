@@ -178,6 +178,7 @@ def _redis() -> Iterator[Finding]:
     import redis
 
     from splatmill.backplane.connection import connect
+    from splatmill.backplane.redact import redacted
 
     if os.environ.get("REDIS_URL"):
         url = settings.redis_url()
@@ -185,9 +186,9 @@ def _redis() -> Iterator[Finding]:
             version = connect(url, timeout=3, retries=0).info("server")["redis_version"]
         except redis.RedisError as error:
             advice = "Start Redis there, or unset REDIS_URL, so that `splatmill up` starts its own."
-            yield Finding("redis", "bad", f"Redis at {url} cannot be reached: {error}", advice)
+            yield Finding("redis", "bad", f"Redis at {redacted(url)} cannot be reached: {error}", advice)
         else:
-            yield Finding("redis", "ok", f"{version} at {url}")
+            yield Finding("redis", "ok", f"{version} at {redacted(url)}")
         return
     for name in ("redis-server", "valkey-server"):
         if path := shutil.which(name):
@@ -209,6 +210,7 @@ def _redis() -> Iterator[Finding]:
 
 
 def _storage() -> Iterator[Finding]:
+    from splatmill.backplane.redact import redacted
     from splatmill.backplane.storage import Storage, StorageError
 
     url = settings.storage_url()
@@ -222,7 +224,7 @@ def _storage() -> Iterator[Finding]:
             "storage", "bad", str(error), "Check SPLATMILL_STORAGE, its credentials and their permissions."
         )
     else:
-        yield Finding("storage", "ok", f"{url}, writable")
+        yield Finding("storage", "ok", f"{redacted(url)}, writable")
 
 
 def _gpu() -> Iterator[Finding]:

@@ -8,7 +8,19 @@ from redis.asyncio.retry import Retry as AsyncRetry
 from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
+from splatmill.backplane.redact import redacted
+
 DEFAULT_URL = "redis://127.0.0.1:6379/0"
+
+
+class InvalidRedisUrl(ValueError):
+    """The address of Redis is not valid. The message shows it without its password."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__(
+            f"REDIS_URL, {redacted(url)}, is not the address of a Redis; write it as redis://host:port/0 or "
+            "unix:///path, with the special characters of a password percent-encoded."
+        )
 
 
 def connect(url: str = DEFAULT_URL, *, timeout: float | None = None, retries: int = 3) -> redis.Redis:
@@ -17,24 +29,35 @@ def connect(url: str = DEFAULT_URL, *, timeout: float | None = None, retries: in
     url: `redis://host:port/db` or `unix:///path/to/redis.sock`.
     timeout: seconds to wait for a reply; None waits for ever.
     retries: how often a command is retried after a lost connection. The API, which must answer, uses few.
+
+    Raises InvalidRedisUrl.
     """
-    return redis.Redis.from_url(
-        url,
-        socket_timeout=timeout,
-        health_check_interval=15,
-        retry=Retry(ExponentialBackoff(cap=2, base=0.1), retries),
-        **_connect_timeout(url),
-    )
+    try:
+        return redis.Redis.from_url(
+            url,
+            socket_timeout=timeout,
+            health_check_interval=15,
+            retry=Retry(ExponentialBackoff(cap=2, base=0.1), retries),
+            **_connect_timeout(url),
+        )
+    except ValueError:
+        raise InvalidRedisUrl(url) from None  # the original message may quote a part of the password
 
 
 def connect_async(url: str = DEFAULT_URL) -> redis.asyncio.Redis:
-    """Return an asyncio client for reading streams. It has no timeout, because `XREAD BLOCK` waits by design."""
-    return redis.asyncio.Redis.from_url(
-        url,
-        health_check_interval=15,
-        retry=AsyncRetry(ExponentialBackoff(cap=2, base=0.1), 1),
-        **_connect_timeout(url),
-    )
+    """Return an asyncio client for reading streams. It has no timeout, because `XREAD BLOCK` waits by design.
+
+    Raises InvalidRedisUrl.
+    """
+    try:
+        return redis.asyncio.Redis.from_url(
+            url,
+            health_check_interval=15,
+            retry=AsyncRetry(ExponentialBackoff(cap=2, base=0.1), 1),
+            **_connect_timeout(url),
+        )
+    except ValueError:
+        raise InvalidRedisUrl(url) from None
 
 
 def _connect_timeout(url: str) -> dict[str, Any]:

@@ -18,6 +18,7 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, ObjectStore, from_url
 
+from splatmill.backplane.redact import redacted
 from splatmill.files import replacing
 
 if TYPE_CHECKING:  # These names exist in its stubs alone.
@@ -84,7 +85,7 @@ class Storage:
             self.store = from_url(url, client_options=_s3_client(), retry_config=_S3_RETRY)
         else:
             raise StorageError(
-                f"SPLATMILL_STORAGE={url!r} is neither file:///folder nor s3://bucket/prefix; set it to one."
+                f"SPLATMILL_STORAGE={redacted(url)!r} is neither file:///folder nor s3://bucket/prefix; set it to one."
             )
 
     def local_path(self, path: str) -> Path | None:

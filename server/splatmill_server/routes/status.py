@@ -3,14 +3,13 @@
 from datetime import UTC, datetime
 
 import redis
-from fastapi import APIRouter
+from fastapi import APIRouter, Request
 from rq import Worker
 from starlette.concurrency import run_in_threadpool
-from starlette.responses import JSONResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, Response
 
 import splatmill
 from splatmill.backplane import queue, rendering
-from splatmill.backplane.storage import StorageError
 from splatmill.schema import (
     MAX_PHOTO_PIXELS,
     MAX_RENDER_PIXELS,
@@ -23,6 +22,7 @@ from splatmill.schema import (
     describe_options,
 )
 from splatmill_server import metrics
+from splatmill_server.docs_page import CONTENT_SECURITY_POLICY, docs_page
 from splatmill_server.routes.openapi import problems
 from splatmill_server.service import Service, Shared
 
@@ -53,6 +53,13 @@ def get_info(service: Shared) -> Info:
     )
 
 
+@router.get("/docs", include_in_schema=False)
+def get_docs(request: Request) -> Response:
+    """Get an overview of the endpoints as a web page."""
+    headers = {"Content-Security-Policy": CONTENT_SECURITY_POLICY}
+    return HTMLResponse(docs_page(request.app.openapi()), headers=headers)
+
+
 @router.get("/healthz")
 async def healthz() -> Health:
     """Check that the process runs."""
@@ -68,7 +75,7 @@ async def readyz(service: Shared) -> Response:
     """Check that jobs can be accepted and run. A missing renderer is reported, but jobs do not need it."""
     checks = {
         "redis": await run_in_threadpool(_redis_check, service),
-        "storage": await run_in_threadpool(_storage_check, service),
+        "storage": await run_in_threadpool(service.storage_check.result),
         "renderer": await _renderer_check(service),
     }
     ready = checks["redis"] == checks["storage"] == "ok"
@@ -121,14 +128,6 @@ def _redis_check(service: Service) -> str:
         service.redis.ping()
     except redis.RedisError as error:
         return f"Redis cannot be reached: {error}"
-    return "ok"
-
-
-def _storage_check(service: Service) -> str:
-    try:
-        service.storage.check()
-    except StorageError as error:
-        return str(error)
     return "ok"
 
 

@@ -5,7 +5,8 @@ import time
 
 import redis
 
-from splatmill.backplane.connection import connect
+from splatmill.backplane.connection import InvalidRedisUrl, connect
+from splatmill.backplane.redact import redacted
 from splatmill_worker import settings
 from splatmill_worker.service.rq_worker import STOP_GRACE, AttemptWorker
 
@@ -19,7 +20,11 @@ def serve(stop_grace: float | None) -> int:
     stop_grace: seconds that an attempt has to save its state on such a signal; None means STOP_GRACE.
     """
     url = settings.redis_url()
-    connection = connect(url)
+    try:
+        connection = connect(url)
+    except InvalidRedisUrl as error:
+        print(error, file=sys.stderr)
+        return 1
     deadline = time.monotonic() + REDIS_WAIT
     while True:
         try:
@@ -28,7 +33,7 @@ def serve(stop_grace: float | None) -> int:
         except redis.exceptions.ConnectionError as error:
             if time.monotonic() > deadline:
                 print(
-                    f"Redis could not be reached at {url} within {REDIS_WAIT:g} s: {error}. "
+                    f"Redis could not be reached at {redacted(url)} within {REDIS_WAIT:g} s: {error}. "
                     "Start it there, or set REDIS_URL to the address of a running one.",
                     file=sys.stderr,
                 )
