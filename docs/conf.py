@@ -37,6 +37,8 @@ autodoc_type_aliases = {
     name: name for name in ("AnyPath", "Emit", "Float", "OnBytes", "OnProgress", "Revise", "Tensor")
 }
 
+smartquotes = False  # they would turn the two hyphens of an option into a dash
+
 html_theme = "furo"
 html_title = "Splatmill"
 html_show_sphinx = False

@@ -9,9 +9,9 @@ from splatmill_server.settings import Settings
 
 INTRODUCTION = """# The server's settings
 
-Environment variables of the API process, generated from the program. `splatmill up` sets `REDIS_URL`,
-`SPLATMILL_STORAGE` and `SPLATMILL_RENDERER_URL` for its own processes unless they are set, and takes `--host`, `--port`
-and `--data` in place of the variables.
+Environment variables of the API process, generated from the program. `splatmill up` takes `--host`, `--port` and
+`--data` in place of the variables. It starts a renderer and sets its address, and starts a Redis of its own unless
+`REDIS_URL` is set.
 """
 
 WORKER = """
@@ -34,6 +34,4 @@ def _variable(name: str, field: Any) -> str:
 
 
 def _default(value: Any) -> str:
-    if isinstance(value, int) and not isinstance(value, bool):
-        return code(f"{value:,}") if value > 10**5 else code(value)
-    return code(value) if isinstance(value, float | str | Path) else ""
+    return code(value) if isinstance(value, int | float | str | Path) else ""

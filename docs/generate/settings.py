@@ -11,7 +11,6 @@ from splatmill.schema import (
     Preset,
     describe_options,
     format_bytes,
-    format_duration,
 )
 from splatmill_worker.splat.plan.capacity import PRESET_STEPS
 from splatmill_worker.splat.plan.photos import PRESET_SIZE
@@ -77,7 +76,7 @@ def _values(option: OptionHelp) -> str:
         return "on or off"
     if option.minimum is None or option.maximum is None or option.type == "list":
         return option.type
-    show = {"duration": format_duration, "bytes": format_bytes}.get(option.type, "{:,}".format)
+    show = {"duration": "{:,.0f} s".format, "bytes": format_bytes}.get(option.type, "{:,}".format)
     return f"{option.type}, {show(option.minimum)} to {show(option.maximum)}"
 
 

@@ -16,6 +16,7 @@ from typer.main import get_command
 from splatmill.cli.app import COMMANDS, app
 from splatmill.schema import PROBLEMS, describe_options
 from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.plan.reasons import BY_OPTION
 from tests.support.markdown import blocks, without_blocks
 from tests.support.paths import ROOT
 
@@ -125,3 +126,12 @@ def test_the_report_page_lists_the_decisions_of_the_plan() -> None:
         "forced",
     }
     assert set(Plan.__dataclass_fields__) - about <= named
+    assert BY_OPTION.removesuffix(".") in section
+
+
+def test_the_report_page_has_the_headings_of_the_report() -> None:
+    text = (ROOT / "docs" / "report.md").read_text()
+    page = (ROOT / "worker" / "splatmill_worker" / "splat" / "report" / "page.py").read_text()
+    headings = re.findall(r"<h2>([^<{]+)</h2>", page)
+    assert len(headings) >= 5
+    assert not [heading for heading in headings if heading not in text]
