@@ -103,7 +103,7 @@ class AsyncClient:
             target = read_answer(Capture, response)
         else:
             target = await self.capture(capture)
-        return target, await upload(self.connection, target.id, files, on_progress)
+        return target, await upload(self.connection, target.id, files, on_progress, stored_files=target.files)
 
     async def submit(
         self, capture: str, options: TrainOptions | None = None, *, name: str | None = None

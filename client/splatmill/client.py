@@ -234,6 +234,9 @@ class ModelHandle:
         """Render an image from `camera`. `options` are output, format, background and quality of RenderRequest."""
         return self._loop.run(self._async.render(camera, **options))
 
-    def orbit(self, path: AnyPath, **options: Any) -> Path:
-        """Render a video (MP4) that circles the scene, and write it to `path`. `options` are those of OrbitRequest."""
-        return self._loop.run(self._async.orbit(path, **options))
+    def orbit(self, path: AnyPath, *, timeout: float | None = None, **options: Any) -> Path:
+        """Render a video (MP4) that circles the scene, and write it to `path`. `options` are those of OrbitRequest.
+
+        `timeout` is the number of seconds to wait for the video.
+        """
+        return self._loop.run(self._async.orbit(path, timeout=timeout, **options))

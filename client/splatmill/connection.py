@@ -79,11 +79,14 @@ class Connection:
         body: Body | None = None,
         repeatable: bool | None = None,
         timeout: httpx.Timeout | None = None,
+        costly: bool = False,
     ) -> httpx.Response:
         """Send a request and return the response with its whole body.
 
-        `repeatable` says whether the request is idempotent; left out, the method decides. Raises ConnectionFailed, or
-        the subclass of `Refused` for the problem.
+        `repeatable` says whether the request is idempotent; left out, the method decides. A request that is `costly` is
+        not repeated when it was too slow, because the server may still work on the first one.
+
+        Raises ConnectionFailed, or the subclass of `Refused` for the problem.
         """
         extra: dict[str, Any] = {} if timeout is None else {"timeout": timeout}
         may_repeat = method in REPEATABLE if repeatable is None else repeatable
@@ -103,13 +106,15 @@ class Connection:
                 )
             except httpx.TransportError as error:
                 never_sent = isinstance(error, httpx.ConnectError | httpx.ConnectTimeout | httpx.PoolTimeout)
-                if last or not (may_repeat or never_sent):
+                too_slow = costly and isinstance(error, httpx.ReadTimeout)
+                if last or too_slow or not (may_repeat or never_sent):
                     raise self.lost(error) from error
                 await asyncio.sleep(backoff(tries))
                 continue
             if response.is_success or response.status_code == 304:
                 return response
-            if last or not may_repeat or response.status_code not in TRANSIENT:
+            too_slow = costly and response.status_code == 504
+            if last or too_slow or not may_repeat or response.status_code not in TRANSIENT:
                 raise error_for(read_problem(response))
             await asyncio.sleep(max(backoff(tries), retry_after(response)))
 

@@ -68,14 +68,17 @@ class AsyncModelHandle:
             f"/v1/models/{self.id}/render",
             json=request.model_dump(mode="json", exclude_none=True),
             repeatable=True,
+            costly=True,
             timeout=RENDER_TIMEOUT,
         )
         return response.content
 
-    async def orbit(self, path: AnyPath, **options: Any) -> Path:
+    async def orbit(self, path: AnyPath, *, timeout: float | None = None, **options: Any) -> Path:
         """Render a video (MP4) that circles the scene, write it to `path`, and return the path written.
 
-        `options` are the fields of `OrbitRequest`. Raises InvalidRequest for options that are not valid.
+        `options` are the fields of `OrbitRequest`. `timeout` is the number of seconds to wait for the video; left out,
+        as long as the server does by default. Raises InvalidRequest for options that are not valid, and
+        ConnectionFailed after the timeout.
         """
         try:
             request = OrbitRequest.model_validate(options)
@@ -86,7 +89,8 @@ class AsyncModelHandle:
             f"/v1/models/{self.id}/orbit",
             json=request.model_dump(mode="json", exclude_none=True),
             repeatable=True,
-            timeout=ORBIT_TIMEOUT,
+            costly=True,
+            timeout=ORBIT_TIMEOUT if timeout is None else httpx.Timeout(30.0, read=timeout),
         )
         target = target_of(path, "orbit.mp4")
         atomic_write(target, response.content)

@@ -74,6 +74,14 @@ async def follow_events(
     subclasses of `Refused` at once.
     """
     heard, tries = time.monotonic(), 0
+
+    async def noted(chunks: AsyncIterable[bytes]) -> AsyncIterator[bytes]:
+        # A comment, which the server sends while nothing happens, shows as well that the connection lives.
+        nonlocal heard
+        async for chunk in chunks:
+            heard = time.monotonic()
+            yield chunk
+
     while True:
         tries += 1
         try:
@@ -82,8 +90,7 @@ async def follow_events(
                 headers["Last-Event-ID"] = after
             async with connection.stream("GET", path, headers=headers, timeout=STREAM_TIMEOUT) as response:
                 heard, tries = time.monotonic(), 0
-                async for message in read_messages(response.aiter_bytes()):
-                    heard = time.monotonic()
+                async for message in read_messages(noted(response.aiter_bytes())):
                     after = message.id or after
                     try:
                         record = EventRecord.model_validate_json(message.data)

@@ -3,7 +3,8 @@
 import asyncio
 import hashlib
 import mimetypes
-from collections.abc import AsyncIterator, Callable, Sequence
+import unicodedata
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
@@ -44,8 +45,11 @@ async def upload(
     files: Sequence[LocalFile],
     on_progress: OnProgress | None = None,
     concurrent: int = CONCURRENT,
+    stored_files: Sequence[CaptureFile] = (),
 ) -> Uploaded:
     """Upload `files` to a capture, `concurrent` at a time. A file that is already stored is not stored twice.
+
+    `stored_files` are those that the capture is known to hold; equal files among `files` are not sent.
 
     Raises ConnectionFailed, NothingToUpload for a file that cannot be read, and a subclass of `Refused`, unless it
     concerns one photo and others are left.
@@ -55,13 +59,14 @@ async def upload(
     flawed: list[tuple[str, InvalidRequest]] = []
     done = 0
     # Poses and masks go first: if one is refused, the upload fails before the photos are sent.
+    held = {(file.role, file.name): file for file in stored_files}
     queue = iter(sorted(files, key=lambda file: file.role is Role.images))
 
     async def work() -> None:
         nonlocal done
         for file in queue:
             try:
-                stored.append(await _send(connection, capture_id, file))
+                stored.append(await _send(connection, capture_id, file, held))
             except InvalidRequest as error:
                 if file.role is not Role.images or error.code not in BAD_PHOTO_CODES:
                     raise
@@ -81,8 +86,14 @@ async def upload(
     return Uploaded(tuple(stored), tuple((name, error.problem) for name, error in flawed))
 
 
-async def _send(connection: Connection, capture_id: str, file: LocalFile) -> CaptureFile:
+async def _send(
+    connection: Connection, capture_id: str, file: LocalFile, held: Mapping[tuple[Role, str], CaptureFile]
+) -> CaptureFile:
     digest, size = await asyncio.to_thread(_digest, file.path)
+    # The server stores names in this form of Unicode (see `safe_name`).
+    there = held.get((file.role, unicodedata.normalize("NFC", file.name)))
+    if there is not None and (there.sha256, there.size) == (digest, size):
+        return there
     # The media types of .ply and .bin differ between systems, and the server does not need those of poses.
     known = mimetypes.guess_type(file.name)[0] if file.role is not Role.poses else None
     media_type = known or "application/octet-stream"

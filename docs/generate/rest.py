@@ -14,7 +14,8 @@ from splatmill_server.settings import Settings
 INTRODUCTION = """# REST reference
 
 Every address of the server, generated from its OpenAPI document. A running server has that document at
-`/openapi.json`, and pages to try it at `/docs`. [The REST API](../rest.md) explains how the addresses work together.
+`/openapi.json`, and an overview as a web page at `/docs`. [The REST API](../rest.md) explains how the
+addresses work together.
 
 Answers marked with a code are [problem documents](errors.md). Besides the codes listed, every address can answer with
 `internal_error`, and `/v1/` addresses with `unauthorized` when the server asks for an API key.

@@ -1,5 +1,6 @@
 """Finished models. They are read from storage only, so they stay available if Redis loses its data."""
 
+import json
 import re
 from typing import Any
 
@@ -16,6 +17,7 @@ from splatmill_server.problems import ProblemError
 _HEADER_BYTES = 8192
 _VERTICES = re.compile(rb"^element vertex (\d+)\s*$", re.MULTILINE)
 _REST = re.compile(rb"^property float f_rest_\d+\s*$", re.MULTILINE)
+_SHA256 = re.compile(r"[0-9a-f]{64}")
 _DEGREE = {0: 0, 9: 1, 24: 2, 45: 3}
 """Degree of the spherical harmonics by number of `f_rest` properties, which is 3 ((degree + 1)^2 - 1)."""
 
@@ -65,6 +67,7 @@ class Models:
         }
         try:
             job = read_record(self.storage, model_id)
+            digests = self._digests(model_id)
             gaussians, degree = self._header(model_id, files["model.ply"])
         except (KeyError, ValueError, FileNotFoundError) as error:
             raise ProblemError(
@@ -85,7 +88,12 @@ class Models:
             psnr=psnr,
             ssim=ssim,
             files=[
-                ModelFile(name=name, size=entry.size, media_type=layout.MODEL_FILES[name])
+                ModelFile(
+                    name=name,
+                    size=entry.size,
+                    sha256=digests.get(name),
+                    media_type=layout.MODEL_FILES[name],
+                )
                 for name, entry in sorted(files.items())
                 if name in layout.MODEL_FILES
             ],
@@ -154,6 +162,14 @@ class Models:
         if not marker or count is None:
             raise ValueError(f"model.ply of {model_id} has no valid .ply header")
         return int(count[1]), _DEGREE.get(len(_REST.findall(head)), 0)
+
+    def _digests(self, model_id: str) -> dict[str, str]:
+        """Return the SHA-256 of the files that `job.json` names; earlier versions of the worker named none."""
+        digests = json.loads(self.storage.get(layout.job_record(model_id))).get("sha256")
+        found = digests.items() if isinstance(digests, dict) else ()
+        return {
+            name: digest for name, digest in found if isinstance(digest, str) and _SHA256.fullmatch(digest)
+        }
 
     def _quality(self, model_id: str) -> tuple[Any, Any]:
         """Return PSNR (dB) and SSIM of the last measurement; None if no photos were held out."""

@@ -151,3 +151,38 @@ def test_leaving_the_loop_early_closes_the_stream(peer, reply):
             assert said(record) == "0"
             break
         assert handle.refresh().state == "training"
+
+
+def test_heartbeats_show_that_a_quiet_connection_lives():
+    from splatmill.connection import Connection
+    from splatmill.sse import follow_events
+
+    connections = 0
+    head = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\n\r\n"
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal connections
+        connections += 1
+        await reader.readuntil(b"\r\n\r\n")
+        if connections == 1:
+            writer.write(head.replace(b"\r\n\r\n", b"\r\nContent-Length: 100000\r\n\r\n"))
+            for _ in range(20):  # two seconds in which nothing happens but heartbeats
+                writer.write(b": still here\n\n")
+                await writer.drain()
+                await asyncio.sleep(0.1)
+        elif connections == 3:
+            writer.write(head + message(1, LogEvent(message="line 1")))
+            await writer.drain()
+        writer.close()
+
+    async def run() -> list[str]:
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        connection = Connection(f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}")
+        try:
+            return [said(r) async for r in follow_events(connection, "/v1/jobs/j1/events", give_up=1.5)]
+        finally:
+            await connection.close()
+            server.close()
+
+    assert asyncio.run(run()) == ["line 1"]
+    assert connections == 3

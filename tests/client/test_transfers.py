@@ -3,6 +3,7 @@
 Does not prove the server's side (idempotent PUT, Range); the tests against the real server do.
 """
 
+import asyncio
 import hashlib
 import json
 import random
@@ -10,7 +11,7 @@ import random
 import pytest
 
 from splatmill import Client
-from splatmill.errors import ConnectionFailed, DownloadFailed, InvalidRequest, NotFound
+from splatmill.errors import ConnectionFailed, DownloadFailed, InvalidRequest, NotFound, Unavailable
 from splatmill.schema import SHA256_HEADER, Problem, Progress
 
 DATA = random.Random(0).randbytes(300_000)
@@ -213,3 +214,46 @@ def test_a_callback_that_fails_ends_the_upload(peer, reply, tmp_path):
 
     with Client(peer.url) as client, pytest.raises(RuntimeError, match="enough"):
         client.upload(tmp_path, on_progress=fail)
+
+
+def test_a_file_that_the_capture_holds_is_not_sent_again(peer, reply, tmp_path):
+    photos(tmp_path, 3)
+    paths = sorted(tmp_path.iterdir())
+    held = {"role": "images", "sha256": hashlib.sha256(paths[0].read_bytes()).hexdigest()}
+    files = [held | {"name": paths[0].name, "size": paths[0].stat().st_size}]
+    files += [held | {"name": paths[1].name, "size": paths[1].stat().st_size}]  # other bytes under this name
+    capture = json.dumps(json.loads(CAPTURE) | {"files": files}).encode()
+    peer.answer = lambda seen: reply(body=capture) if seen.method == "GET" else stored(seen, reply)
+    with Client(peer.url) as client:
+        _, uploaded = client.upload(tmp_path, capture="c1")
+    sent = [seen.path.rsplit("/", 1)[-1].replace("%20", " ") for seen in peer.seen if seen.method == "PUT"]
+    assert sorted(sent) == [paths[1].name, paths[2].name]
+    assert sorted(file.name for file in uploaded.files) == sorted(path.name for path in paths)
+
+
+def test_a_slow_rendering_is_not_asked_for_again(peer, reply, tmp_path):
+    too_slow = Problem.of("render_timeout", "The renderer did not answer within 120 seconds.")
+    headers = {"Content-Type": "application/problem+json"}
+    peer.answer = lambda seen: (
+        reply(body=MODEL)
+        if seen.method == "GET"
+        else reply(status=504, body=too_slow.model_dump_json().encode(), headers=headers)
+    )
+    at = {"camera_to_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+    with Client(peer.url) as client:
+        model = client.model("m1")
+        with pytest.raises(Unavailable, match="120 seconds"):
+            model.render(at | {"width": 64, "height": 48, "fov_y_deg": 50})
+        with pytest.raises(Unavailable, match="120 seconds"):
+            model.orbit(tmp_path)
+    assert [seen.method for seen in peer.seen] == ["GET", "POST", "POST"]
+
+
+def test_an_orbit_is_waited_for_as_long_as_asked_and_asked_for_once(peer, reply, tmp_path):
+    async def never(seen):
+        await asyncio.sleep(60)
+
+    peer.answer = lambda seen: reply(body=MODEL) if seen.method == "GET" else never(seen)
+    with Client(peer.url) as client, pytest.raises(ConnectionFailed):
+        client.model("m1").orbit(tmp_path, timeout=0.3)
+    assert [seen.method for seen in peer.seen] == ["GET", "POST"]

@@ -4,6 +4,7 @@ Not proved here: that a model is good, and the pictures themselves (tests/worker
 """
 
 import hashlib
+import json
 
 import pytest
 
@@ -113,3 +114,24 @@ def test_pages_of_models_hold_each_once(app: ServedApp) -> None:
         if (cursor := page["cursor"]) is None:
             break
     assert sorted(seen) == ids
+
+
+def test_files_have_the_digests_that_the_worker_stored(app: ServedApp) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.finish(job_id)
+    path = layout.job_record(job_id)
+    record = json.loads(app.service.storage.get(path))
+    digest = hashlib.sha256(app.service.storage.get(layout.model_file(job_id, "model.ply"))).hexdigest()
+
+    def digests() -> dict[str, str | None]:
+        files = app.http.get(f"/v1/models/{job_id}").json()["files"]
+        return {file["name"]: file["sha256"] for file in files}
+
+    assert set(digests().values()) == {None}
+    app.service.storage.put(
+        path, json.dumps(record | {"sha256": {"model.ply": digest, "report.json": 7}}).encode()
+    )
+    assert {name: found for name, found in digests().items() if found} == {"model.ply": digest}
+    app.service.storage.put(path, json.dumps(record | {"sha256": "x"}).encode())
+    assert set(digests().values()) == {None}

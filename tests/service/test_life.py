@@ -3,6 +3,7 @@
 The pipeline is a stand-in: nothing here says that a model looks like its photos.
 """
 
+import hashlib
 import json
 import time
 
@@ -31,6 +32,10 @@ def test_a_job_becomes_a_model_and_leaves_no_work_behind(service: Up) -> None:
         "cameras.json",
         "job.json",
     }
+    for file in model["files"]:
+        body = service.http.get(f"/v1/models/{job_id}/files/{file['name']}").content
+        known = None if file["name"] in ("job.json", "preview.jpg") else hashlib.sha256(body).hexdigest()
+        assert file["sha256"] == known, file
     record = json.loads((service.data / "storage/models" / job_id / "job.json").read_text())
     assert record["state"] == "succeeded"
     assert service.http.get(f"/v1/jobs/{job_id}/preview").content.startswith(b"\xff\xd8")

@@ -1,5 +1,6 @@
 """Stores a finished model: its files first and `job.json` last, so that a model with that record is complete."""
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from splatmill.backplane.storage import Storage
 from splatmill.schema import JobState
 from splatmill_worker.service.attempt import Attempt
 
-_RECORD = "job.json"
+_RECORD, _PREVIEW = "job.json", "preview.jpg"
 
 
 def is_published(storage: Storage, attempt: Attempt) -> bool:
@@ -32,10 +33,15 @@ def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path) -> None:
     if not (out / "model.ply").is_file():
         raise FileNotFoundError(f"The pipeline ended without writing {out / 'model.ply'}.")
     storage.delete(layout.job_record(attempt.job_id))
+    digests: dict[str, str] = {}
     for name in layout.MODEL_FILES:
         path = out / name
         if name != _RECORD and path.is_file():
             storage.put(layout.model_file(attempt.job_id, name), path)
+            if name == _PREVIEW:
+                continue  # a restarted job replaces it before the other files
+            with path.open("rb") as file:
+                digests[name] = hashlib.file_digest(file, "sha256").hexdigest()
     job = fold(
         row,
         events.read_states(attempt.connection, attempt.job_id),
@@ -52,5 +58,6 @@ def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path) -> None:
     record = ended.model_dump(mode="json", exclude_none=True) | {
         "generation": attempt.generation,
         "format": FORMAT,
+        "sha256": digests,
     }
     storage.put(layout.job_record(attempt.job_id), json.dumps(record, indent=1).encode())
