@@ -24,13 +24,13 @@ def posed_scene(
     on_progress: OnProgress,
     cancelled: Callable[[], bool],
 ) -> Scene:
-    """Return the scene with the cameras that came with the photos, or else with recovered ones.
+    """Return the scene with the cameras that the capture brings, or else with cameras recovered from the photos.
 
     capture: folder with images/, and masks/ and poses/ where they were given; or the folder of a posed data set.
-    workdir: folder for what structure from motion computes; what is there already is used.
-    options: those of structure from motion are read.
-    on_progress: is told how far structure from motion is.
-    cancelled: is asked often; when it returns true, Cancelled is raised.
+    workdir: folder where structure from motion and stereo store their results, and from which they read earlier ones.
+    options: only those of structure from motion are read.
+    on_progress: called with the progress of structure from motion and stereo.
+    cancelled: polled; when it returns true, Cancelled is raised.
 
     Raises Refusal for poses that cannot be used, and SfmFailed.
     """
@@ -67,8 +67,9 @@ def posed_scene(
 def split_views(scene: Scene, options: TrainOptions) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """Return the views to train on and the held-out ones.
 
-    Held out are the photos that `test_views` names; without it, those of the data set's own split; without one, every
-    `holdout`-th. Raises Refusal when a name is unknown or nothing is left to train on.
+    The held-out views are those that the option `test_views` names. Without that option they are chosen by `split`:
+    the test views of the data set, or else every `holdout`-th view. Raises Refusal when a name is unknown or no view is
+    left to train on.
     """
     if options.test_views is not None:
         wanted = set(options.test_views)
@@ -94,8 +95,8 @@ def split_views(scene: Scene, options: TrainOptions) -> tuple[tuple[View, ...], 
     if not train:
         raise Refusal(
             "holdout_empty",
-            f"All {len(test)} photos with a camera are held out, so that none is left to train on.",
-            advice="Hold out fewer photos, by other values of test_views or holdout.",
+            f"All {len(test)} photos with a camera are held out, so no photo is left to train on.",
+            advice="Hold out fewer photos: name fewer in test_views, or set a larger holdout.",
         )
     return train, test
 

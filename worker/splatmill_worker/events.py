@@ -20,16 +20,20 @@ Emit = Callable[[Event], None]
 def progress_events(emit: Emit) -> Callable[[str, int, int, str], None]:
     """A callback (stage, done, total, note) that emits each call as a progress event."""
 
-    def tell(stage: str, done: int, total: int, note: str) -> None:
+    def emit_progress(stage: str, done: int, total: int, note: str) -> None:
         emit(ProgressEvent(stage=stage, done=done, total=total or None, note=note or None))
 
-    return tell
+    return emit_progress
 
 
 class TrainingEvents:
     """Emits the progress, metrics and warnings of a training run, and keeps its preview picture up to date.
 
-    The preview shows `view` and is written to out/preview.jpg below `workdir`. `warnings` collects what was warned of.
+    emit: called with each event.
+    workdir: folder of the run; the preview is written to out/preview.jpg in it.
+    plan: how the preview is rendered.
+    view: the view that the preview shows.
+    warnings: the messages of all warnings so far.
     """
 
     def __init__(self, emit: Emit, workdir: Path, plan: Plan, view: TrainingView) -> None:
@@ -55,7 +59,7 @@ class TrainingEvents:
         )
 
     def evaluated(self, point: CurvePoint, engine: Engine) -> None:
-        """Emit a point of the curve, and renew the preview."""
+        """Emit the metrics of an evaluation, and render the preview anew."""
         self._last = point
         self._emit(
             MetricEvent(
@@ -78,7 +82,7 @@ class TrainingEvents:
         self._emit(LogEvent(level="warning", message=message))
 
     def preview(self, engine: Engine, step: int) -> None:
-        """Render the preview from what `engine` holds, and emit where it is."""
+        """Render the preview from the engine's present Gaussians, write it, and emit its path."""
         color = render_view(engine, self._plan, self._view)
         save_jpeg(self._workdir / "out" / "preview.jpg", color)
         self._emit(PreviewEvent(path="out/preview.jpg", step=step))

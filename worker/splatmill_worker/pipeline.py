@@ -41,14 +41,20 @@ from splatmill_worker.splat.train.snapshot import Snapshot
 from splatmill_worker.splat.views import TrainingView
 
 EXTENT = 1.1
-"""Radius of the cameras in the training world, where the farthest is at 1, with the paper's tenth added."""
+"""Scene extent, which scales the learning rate of the positions, in units of the training world: the farthest camera is
+at distance 1, and the implementation of Kerbl et al. 2023 adds a tenth."""
 
 Revise = Callable[[Plan], Plan]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended: "succeeded" with files in `out`, or "cancelled" with a checkpoint to go on from."""
+    """How a run ended.
+
+    ended: "succeeded" or "cancelled". A cancelled run can be resumed by another run in the same work folder.
+    out: the folder with the model and the reports; they are complete only when the run succeeded.
+    trained: the result of training; None for a cancelled run.
+    """
 
     ended: str
     out: Path
@@ -67,10 +73,11 @@ def run(
     """Train a scene from `capture`, and leave model.ply, cameras.json and the reports in `workdir/out`.
 
     capture: folder with images/, and masks/ and poses/ where they were given.
-    workdir: survives attempts; what an earlier attempt left there is used again.
-    emit: gets each event as it happens. The states are sfm, training and exporting; the final one is the caller's.
-    cancelled: asked often; when it turns true, the run stores a checkpoint and ends.
-    revise: changes the plan once it is made, which is how an ablation takes one decision back.
+    workdir: folder that is kept between attempts; what an earlier attempt stored there is used again.
+    emit: called with each event as it happens. The states emitted are sfm, training and exporting; the caller emits
+        the final one.
+    cancelled: polled; when it returns true, the run ends with "cancelled". Training stores a checkpoint first.
+    revise: returns the plan to use in place of the one that was made; an ablation changes one decision with it.
 
     Raises Refusal, SfmFailed and TrainingFailed (see `errors`).
     """
@@ -100,7 +107,10 @@ def run(
 
 @dataclass(frozen=True)
 class Task:
-    """What was asked for, where it is done, and who is told; the arguments of `run`, with the kernels chosen."""
+    """The arguments of `run`, which describes them, and the kernels chosen for them.
+
+    kernels: the backend of the engine.
+    """
 
     capture: Path
     workdir: Path
@@ -119,10 +129,10 @@ class Task:
 class Cameras:
     """The posed scene in its own world and in the training world, and its split.
 
-    scene: cameras and points in the world that they came in.
-    normalization: from that world to the training world.
+    scene: cameras and points in the world of the given poses or of the reconstruction.
+    normalization: the similarity from that world to the training world.
     world: the scene in the training world.
-    training, held_out: the views to train on and to evaluate on.
+    training, held_out: the views to train on and to evaluate on, in the world of `scene`.
     """
 
     scene: Scene
@@ -147,7 +157,12 @@ class Photos:
 
 @dataclass(frozen=True)
 class Training:
-    """A finished training: its result, its events with the warnings, and its film where one was asked for."""
+    """A finished training.
+
+    trained: its result.
+    events: emits its events and holds its warnings.
+    film: the frames of the progress film; None where the options ask for no film.
+    """
 
     trained: Trained
     events: TrainingEvents
@@ -185,14 +200,14 @@ def _load_photos(cameras: Cameras, size: int, stages: Stages) -> Photos:
 
 
 def _resize_photos(cameras: Cameras, loaded: Photos, plan: Plan, facts: Facts, stages: Stages) -> Photos:
-    """The photos that are `loaded`, or smaller ones where the plan needs no more."""
+    """`loaded`, or the photos loaded again at the plan's image size where that is smaller."""
     if plan.image_size >= max(facts.width, facts.height):
         return loaded
     return _load_photos(cameras, plan.image_size, stages)
 
 
 def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaussians, GivenModel | None]:
-    """The Gaussians to start with, and what is known of the model they are, where one was given."""
+    """The Gaussians to start from, and the assessment of the given model; None where no model was given."""
     path = start_model_path(task.capture, task.workdir, task.options)
     if path is not None:
         given = read_given_model(path, cameras.normalization)
@@ -209,8 +224,9 @@ def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaus
 
 def _doubt_message(start: GivenModel) -> str:
     return (
-        f"The model given shows the training photos at {start.psnr:.1f} dB, hardly better than one colour per photo "
-        f"({start.one_color:.1f} dB). If it is of another scene, train without it."
+        f"The given model renders the training photos with a PSNR of {start.psnr:.1f} dB, hardly more than a constant "
+        f"colour per photo ({start.one_color:.1f} dB). If the model shows another scene, train without the option "
+        "start."
     )
 
 
@@ -225,7 +241,10 @@ def _measure_facts(
 
 
 def _make_plan(task: Task, facts: Facts, revise: Revise) -> Plan:
-    """The plan, made once: an attempt that goes on keeps the one that it started with."""
+    """The plan that an earlier attempt stored for the same options; else a new one, which is stored.
+
+    Raises Refusal for an option that cannot be followed with this scene or these kernels.
+    """
     stored = task.workdir / "plan.json"
     kept = read_plan(stored, task.options)
     if kept is not None:
@@ -285,7 +304,7 @@ def _train(task: Task, engine: Engine, photos: Photos, plan: Plan) -> Training:
 
 
 def _resumable(checkpoints: Path, photos: Photos) -> Snapshot | None:
-    """The checkpoint of an earlier attempt at the same photos."""
+    """The checkpoint of an earlier attempt that trained on the same photos; None without one."""
     snapshot = checkpoint.load(checkpoints)
     names = tuple(view.name for view in photos.training)
     return snapshot if snapshot is not None and snapshot.view_names == names else None
@@ -311,7 +330,7 @@ def _write_files(
         try:
             training.film.develop(task.out / "progress.mp4")
         except (av.FFmpegError, OSError, ValueError) as error:
-            # The model is worth more than its film.
+            # The model is complete: a film that cannot be encoded must not fail the job.
             events.warn(f"The film of the training could not be written: {error}.")
         stages.add("film", training.film.seconds)
     write_report(

@@ -19,7 +19,7 @@ Source = Literal["sfm", "colmap", "transforms", "blender"]
 """Where cameras come from: structure from motion, a COLMAP model, transforms.json, or a Blender data set."""
 
 MIN_DEPTH = 1e-9
-"""World units: a point that is not farther than this in front of a camera has no position on its photo."""
+"""Smallest depth, in world units, at which a point is projected; nearer ones and those behind the camera are not."""
 
 MIN_SPREAD = 1e-3
 """Radius of the cameras over the median distance of the points, up to which the cameras count as one place."""
@@ -196,7 +196,7 @@ class Scene:
     source: where the cameras come from.
     point_errors: mean reprojection error of each point, in pixels of the photos [M]; None: not known.
     track_lengths: number of views that observe each point [M]; None: not known.
-    point_views: which ones; None: not known.
+    point_views: the views that observe each point; None: not known.
     facts: figures about photos, pairs and model, by name.
     left_out: (name, reason) of each photo or file that is not used.
     notes: sentences for the user.
@@ -222,9 +222,10 @@ class Scene:
 def split(scene: Scene, holdout: int = 8) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """Training views and held-out views.
 
-    Every `holdout`-th view in order of the names is held out, from the first one on; 0 holds out none. The split of a
-    data set takes precedence. With fewer than two views none is held out. Raises ValueError when `holdout` is negative,
-    and when it would hold out every view.
+    Where the data set names test views, those are held out. Else every `holdout`-th view in order of the names is held
+    out, from the first one on; of fewer than two views, none is. With a `holdout` of 0 none is held out, and the test
+    views of a data set are left out of both. Raises ValueError when `holdout` is negative, and when it would
+    hold out every view.
     """
     views = sorted(scene.views, key=lambda view: view.name)
     if holdout < 0:
@@ -234,7 +235,7 @@ def split(scene: Scene, holdout: int = 8) -> tuple[tuple[View, ...], tuple[View,
     own = [view for view in views if view.split == "test"]
     if own and holdout:
         return tuple(view for view in views if view.split != "test"), tuple(own)
-    if own or holdout == 0 or len(views) < 2:
+    if holdout == 0 or len(views) < 2:
         return tuple(view for view in views if view.split != "test"), ()
     if holdout == 1:
         raise ValueError("holdout is 1, which holds out every view; give 2 or more, or 0 to hold out none.")

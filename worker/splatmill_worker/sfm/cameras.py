@@ -36,8 +36,8 @@ class CameraGroup:
 def group(photos: Sequence[UsablePhoto]) -> list[CameraGroup]:
     """One camera for all photos that agree in size, make, model, lens and focal length.
 
-    Photos without EXIF share a camera when their sizes agree. A change of zoom among them costs less than one focal
-    length per photo, which a single photo does not determine.
+    Photos without EXIF share a camera when their sizes agree. If the zoom changed among them, the shared focal length
+    is a compromise; one per photo would be worse, because a single photo does not determine its focal length.
     """
     groups: dict[tuple[object, ...], list[int]] = {}
     for index, photo in enumerate(photos):
@@ -66,7 +66,7 @@ def _group(members: tuple[int, ...], photo: UsablePhoto) -> CameraGroup:
 def _focal(photo: UsablePhoto) -> float | None:
     """The focal length over the longest side, by EXIF; None when EXIF does not give it.
 
-    From the 35 mm equivalent, else from the focal length and COLMAP's table of sensors.
+    It is computed from the 35 mm equivalent, or else from the focal length and COLMAP's table of sensor widths.
     """
     longest = max(photo.width, photo.height)
     if photo.exif.focal_in_diagonals is not None:

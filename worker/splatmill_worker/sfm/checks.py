@@ -16,7 +16,7 @@ from splatmill_worker.sfm.matching.pairs import Pair
 from splatmill_worker.sfm.matching.two_view import MIN_INLIERS, ROTATION_CONFIGURATIONS, TwoView
 
 MIN_PHOTOS = 3
-"""Photos from which structure from motion is tried, and registered photos without which a model is refused."""
+"""Least number of photos for which structure from motion is tried, and of registered photos of a usable model."""
 
 MIN_SHARE = 0.3
 """Share of the photos that must be registered, in sets of more than SMALL_SET photos."""
@@ -25,13 +25,13 @@ SMALL_SET_SHARE = 0.5
 """Share of the photos that must be registered in smaller sets."""
 
 SMALL_SET = 10
-"""Photos of a small set, at most."""
+"""Largest number of photos of a small set."""
 
 MIN_POINTS = 60
-"""Points without which a model is refused."""
+"""Least number of points of a usable model."""
 
 MIN_TRIANGULATION_ANGLE = 1.5
-"""Degrees: a model is refused when the median over its points of the largest angle between two rays is smaller."""
+"""Degrees: least median, over the points of a usable model, of the largest angle between two rays to the point."""
 
 MIN_OBSERVED = 12
 """Points that a registered photo must observe; a pose from fewer may fit by chance."""
@@ -43,10 +43,10 @@ RELIABLE_ERROR = 4.0
 """Pixels: largest mean reprojection error of a reliably registered photo."""
 
 MAX_RELATIVE_ERROR = 3.0
-"""Largest mean reprojection error of a photo, over the median photo's."""
+"""Largest mean reprojection error of a photo, over the median of all photos."""
 
 ALLOWED_ERROR = 2.5
-"""Pixels: a mean reprojection error up to this is allowed whatever the median photo's."""
+"""Pixels: a mean reprojection error up to this is allowed whatever the median of all photos is."""
 
 MAX_DISTORTION = 0.7
 """Largest absolute value of the first two distortion coefficients; a fisheye on a radial model stays below 0.5."""
@@ -125,7 +125,7 @@ def deregister_outliers(model: pycolmap.Reconstruction) -> dict[int, str]:
     for image_id, (count, error) in measured.items():
         if count < MIN_OBSERVED:
             reasons[image_id] = (
-                f"its pose rests on {count} points only, at least {MIN_OBSERVED} are needed to trust it"
+                f"its pose was estimated from only {count} points, and at least {MIN_OBSERVED} are needed to trust it"
             )
         elif not error <= bound:
             reasons[image_id] = (
@@ -154,7 +154,13 @@ def triangulation_angles(model: pycolmap.Reconstruction) -> npt.NDArray[np.float
 
 
 def pair_facts(matched: dict[Pair, TwoView]) -> dict[str, Any]:
-    """Facts about the pairs: matched, verified, median inliers, and how many a turning camera would explain."""
+    """Facts about the pairs, by name.
+
+    pairs_matched: number of pairs that were matched.
+    pairs_verified: number of those with at least MIN_INLIERS inliers.
+    inliers_per_pair: median over the verified pairs.
+    pairs_turned_only: number of verified pairs that a turning camera, or a flat scene, would explain.
+    """
     verified = [pair for pair in matched.values() if pair.inliers >= MIN_INLIERS]
     kinds = Counter(pair.configuration for pair in verified)
     return {
@@ -166,7 +172,15 @@ def pair_facts(matched: dict[Pair, TwoView]) -> dict[str, Any]:
 
 
 def model_facts(model: pycolmap.Reconstruction | None, photos: int) -> dict[str, Any]:
-    """Facts about a model of `photos` photos: registered photos, points, tracks, reprojection error and parallax."""
+    """Facts about a model, by name; only the first three without a model.
+
+    photos: number of photos, registered or not.
+    registered: number of registered photos.
+    points: number of points.
+    track_length: mean number of observations of a point.
+    reprojection_pixels: mean reprojection error, pixels.
+    parallax_degrees: median over the points of the largest angle between two rays, degrees.
+    """
     if model is None:
         return {"photos": photos, "registered": 0, "points": 0}
     angles = triangulation_angles(model)

@@ -13,7 +13,7 @@ from splatmill_worker.images.decode import decode
 from splatmill_worker.scene import View
 
 SIDE = 320
-"""Pixels of the longest side that a photo is decoded at, at least; a pixel is then the mean of its surroundings."""
+"""Pixels of the longest side to which a photo is reduced at most: each pixel is then the mean of a small area."""
 
 
 def color_points(model: pycolmap.Reconstruction, views: dict[int, View], pool: ThreadPoolExecutor) -> None:
@@ -24,7 +24,7 @@ def color_points(model: pycolmap.Reconstruction, views: dict[int, View], pool: T
     sums: dict[int, npt.NDArray[np.float64]] = {}
     for point_ids, colors in pool.map(lambda item: _observed(model, *item), views.items()):
         for point_id, color in zip(point_ids, colors, strict=True):
-            entry = sums.setdefault(point_id, np.zeros(4))
+            entry = sums.setdefault(point_id, np.zeros(4))  # red, green, blue, and the number of photos
             entry[:3] += color
             entry[3] += 1.0
     for point_id, entry in sums.items():

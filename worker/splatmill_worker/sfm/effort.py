@@ -14,16 +14,16 @@ from splatmill_worker.sfm.options import LEAN, Effort
 from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest
 
 CONNECTING_ROUNDS = 2
-"""Times that more pairs are matched to connect the components of the view graph."""
+"""Largest number of times that more pairs are matched to connect the components of the view graph."""
 
 ENOUGH_REGISTERED = 0.9
 """Share of the photos, reliably registered, from which neither another mapper nor a higher effort is tried."""
 
 RETRY_PARTNERS = 4
-"""Likely partners of a photo without a reliable pose whose features are extracted anew together with its own."""
+"""Likely partners of each photo without a reliable pose whose features are extracted anew, together with its own."""
 
 RETRY_ALL = 0.8
-"""Share of photos to be extracted anew above which all of them are."""
+"""Share of the photos: where more would be extracted anew, all of them are."""
 
 GLOBAL_MIN_PHOTOS = 400
 """Photos from which the global mapper is tried first, where the view graph is dense."""
@@ -106,7 +106,10 @@ def registered_photos(model: pycolmap.Reconstruction) -> set[int]:
 
 
 def _retried(run: SfmRun, result: EffortResult) -> set[int] | None:
-    """Photos without a reliable pose and the likely partners of each; None when those are nearly all photos."""
+    """Photos whose features the next effort extracts anew: those without a reliable pose, and their likely partners.
+
+    None, for all photos, when these are more than RETRY_ALL of them or when no pairs have been scored.
+    """
     model = result.mapped.largest if result.mapped is not None else None
     reliable = (
         set()
@@ -117,12 +120,15 @@ def _retried(run: SfmRun, result: EffortResult) -> set[int] | None:
     if not run.scores or len(unreliable) > RETRY_ALL * run.count:
         return None
     chosen = pairs.best_pairs_of(unreliable, run.scores, run.count, RETRY_PARTNERS)
-    both = unreliable.union(*chosen)
-    return None if len(both) > RETRY_ALL * run.count else both
+    retried = unreliable.union(*chosen)
+    return None if len(retried) > RETRY_ALL * run.count else retried
 
 
 def _require_features(run: SfmRun, result: EffortResult) -> None:
-    """Raise SfmFailed when half of the photos have too few features; the lean effort is followed by others."""
+    """Raise SfmFailed when half of the photos have too few features.
+
+    At the lean effort nothing is raised: a higher effort, which finds more features, may follow.
+    """
     median = float(np.median([len(found.scales) for found in result.features]))
     least = 2 * two_view.MIN_INLIERS
     if result.effort.name != LEAN.name and median < least:
@@ -130,7 +136,7 @@ def _require_features(run: SfmRun, result: EffortResult) -> None:
             "sfm_no_features",
             f"Half of the {run.count} photos have at most {int(median)} features; at least {least} are needed.",
             {"photos": run.count, "features_per_photo": median},
-            "Plain walls, blur and darkness have no features: take sharp photos of things with texture.",
+            "Plain walls, blur and darkness have no features: take sharp, bright photos of things with texture.",
         )
 
 
@@ -169,7 +175,7 @@ def _select_pairs(run: SfmRun, result: EffortResult) -> set[pairs.Pair]:
                 run.cancelled,
             )
     given_order = matcher in ("sequential", "spatial") and bool(likely)
-    # With a given order, the best few pairs of each photo still close loops.
+    # Neighbours in time or space do not include the other end of a loop: the best few pairs of each photo may.
     return likely | pairs.best_partners(
         run.scores, run.count, pairs.CERTAIN_PARTNERS if given_order else partners
     )

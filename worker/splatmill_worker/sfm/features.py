@@ -114,7 +114,7 @@ def extract(
                 batch = missing[start : start + BATCH]
                 stop_if(cancelled)
                 list(pool.map(lambda index: _reduce(photos[index], effort.side, store, names[index]), batch))
-                # Without it, each call would create a camera of its own for its batch.
+                # COLMAP would otherwise create a new camera for each batch.
                 reader.existing_camera_id = _camera_of(group, names, store.database)
                 with native_token(cancelled) as token:
                     pycolmap.extract_features(
@@ -132,8 +132,8 @@ def extract(
     _set_cameras(groups, names, store.database)
 
 
-def carry_over(source: FeatureStore, target: FeatureStore, again: set[int]) -> None:
-    """Copy the database of `source` to `target`, without the features and pairs of the photos `again`.
+def carry_over(source: FeatureStore, target: FeatureStore, retried: set[int]) -> None:
+    """Copy the database of `source` to `target`, without the features and pairs of the photos `retried`.
 
     Both stores must have reduced photos of the same size. Photos keep their ids. A database that `target` already has
     is left as it is.
@@ -148,13 +148,13 @@ def carry_over(source: FeatureStore, target: FeatureStore, again: set[int]) -> N
         old.backup(new)
         images = new.execute("SELECT image_id, name FROM images")
         ids = {photo_index(name): number for number, name in images}
-        gone = {ids[photo] for photo in again if photo in ids}
+        dropped = {ids[photo] for photo in retried if photo in ids}
         for table in ("matches", "two_view_geometries"):
             pairs = [number for (number,) in new.execute(f"SELECT pair_id FROM {table}")]
-            lost = [(number,) for number in pairs if gone & {number // MAX_IMAGES, number % MAX_IMAGES}]
-            new.executemany(f"DELETE FROM {table} WHERE pair_id = ?", lost)
+            stale = [(number,) for number in pairs if dropped & {number // MAX_IMAGES, number % MAX_IMAGES}]
+            new.executemany(f"DELETE FROM {table} WHERE pair_id = ?", stale)
         for table in ("keypoints", "descriptors"):
-            new.executemany(f"DELETE FROM {table} WHERE image_id = ?", [(number,) for number in gone])
+            new.executemany(f"DELETE FROM {table} WHERE image_id = ?", [(number,) for number in dropped])
         new.commit()
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class SfmOptions:
-    """What can be asked of structure from motion; `auto` is decided from the photos and from what was measured.
+    """Options of structure from motion; `auto` is decided from the photos and their matches.
 
     effort: how thoroughly features are searched for and matched; `auto` starts lean and raises it where needed.
     matcher: how pairs of photos are chosen.
@@ -55,13 +55,14 @@ class Effort:
     partners: int
 
 
-LEAN = Effort("lean", 800, 1500, 0, 1, 10)
-STANDARD = Effort("standard", 800, 2500, -1, 1, 10)
-HIGH = Effort("high", 1400, 6000, -1, 2, 16)
+LEAN = Effort("lean", side=800, features=1500, first_octave=0, orientations=1, partners=10)
+STANDARD = Effort("standard", side=800, features=2500, first_octave=-1, orientations=1, partners=10)
+HIGH = Effort("high", side=1400, features=6000, first_octave=-1, orientations=2, partners=16)
 EFFORTS = {effort.name: effort for effort in (LEAN, STANDARD, HIGH)}
 
 SMALL_SIDE = 700
-"""Pixels of the longest side up to which photos are doubled at any effort: they have few features, and it is cheap."""
+"""Longest side, in pixels, up to which SIFT doubles the size of photos at any effort: small photos have few features,
+and doubling them takes little time."""
 
 
 def fitted(effort: Effort, longest_side: int) -> Effort:

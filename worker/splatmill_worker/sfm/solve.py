@@ -93,7 +93,7 @@ def _require_photos(prepared: Prepared) -> None:
 
 
 def _efforts(options: SfmOptions, longest_side: int) -> list[Effort]:
-    """The efforts to try, in order; one that was asked for, by name, size or number of features, is the only one."""
+    """The efforts to try, in order; a single one where the options name it or set its photo size or features."""
     chosen = [LEAN, STANDARD, HIGH] if options.effort == "auto" else [EFFORTS[options.effort]]
     if options.side is not None or options.features is not None:
         chosen = chosen[:1]
@@ -122,6 +122,6 @@ def _solve(run: SfmRun) -> EffortResult:
         if best_counts[0] >= ENOUGH_REGISTERED * run.count:
             break
         if effort.name != LEAN.name and not verified_pairs(result):
-            break  # no pair matched with three times the features, and still more would not change that
+            break  # the standard effort has about three times the lean one's features; even more would not match
     assert best is not None  # _efforts returns at least one
     return best

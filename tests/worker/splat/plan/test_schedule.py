@@ -60,5 +60,5 @@ def test_view_dependent_colour_travels_as_far_in_any_run_of_3300_to_30000_steps(
 
 
 def test_a_boost_left_to_the_run_is_no_rate() -> None:
-    with pytest.raises(ValueError, match="only a run"):
+    with pytest.raises(ValueError, match="boost is None"):
         RateSchedule(2.0, Annealing(boost=None)).at(0.5)

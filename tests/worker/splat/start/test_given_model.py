@@ -65,14 +65,14 @@ def test_training_starts_from_the_model_and_improves_it(trained: Path, tmp_path:
     outcome, events = run(trained, tmp_path, start="m.ply", steps=250)
     report = report_of(outcome)
     assert report["plan"]["initial"] == "model"
-    assert f"The model given has {before.count} Gaussians" in report["plan"]["reasons"]["initial"]
+    assert f"The given model has {before.count} Gaussians" in report["plan"]["reasons"]["initial"]
     assert report["plan"]["schedule"]["resolution"] == [[0, 1]]
     shown = report["facts"]["start"]["psnr"]
     assert shown > report["facts"]["start"]["one_color"] + 1.0
     assert shown > report["facts"]["start"]["another"] + 3.0
     assert report["result"]["train_psnr"] > shown
     assert report["curve"][0]["gaussians"] <= before.count
-    warned = any(event.type == "log" and "model given shows" in event.message for event in events)
+    warned = any(event.type == "log" and "given model renders" in event.message for event in events)
     assert warned == (shown <= report["facts"]["start"]["one_color"] + 3.0)
 
 

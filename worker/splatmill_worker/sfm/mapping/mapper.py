@@ -18,8 +18,8 @@ Mapper = Literal["incremental", "global"]
 class Mapped:
     """Models that a mapper reconstructed from one view graph.
 
-    mapper: which of the two.
-    models: those with more registered photos first.
+    mapper: the mapper that made them.
+    models: in order of the number of registered photos, the most first.
     merged: number of models that were merged into the first one and are no longer listed.
     notes: sentences for the user.
     """
@@ -147,7 +147,7 @@ def _incremental_options(
 def _global_options(threads: int, seed: int, fixed_intrinsics: bool) -> pycolmap.GlobalPipelineOptions:
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = threads
-    # Each step has a generator of its own; with one of them at its default seed, no two runs agree.
+    # Each step has its own random generator; results are reproducible only when all of them are seeded.
     options.random_seed = options.mapper.random_seed = seed
     options.mapper.global_positioning.random_seed = options.mapper.rotation_averaging.random_seed = seed
     options.mapper.global_positioning.use_gpu = False

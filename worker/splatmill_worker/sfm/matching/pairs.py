@@ -36,7 +36,7 @@ MIN_PREEMPTIVE_MATCHES = 4
 """Preemptive matches below which a pair is not matched in full: so few also occur by chance."""
 
 CERTAIN_PARTNERS = 3
-"""Pairs per photo, those with the most preemptive matches, that are matched in full whatever their number."""
+"""Pairs of each photo with the most preemptive matches that are matched in full even below MIN_PREEMPTIVE_MATCHES."""
 
 SEQUENCE_STEPS = (1, 2, 3, 4, 6, 8)
 """Distances, in frames of a video or positions in an order, of two photos that are matched."""
@@ -45,7 +45,7 @@ NUMBERED_NAME = re.compile(r"(.*?)(\d+)\.[^.]+$")
 """A file name that ends in a number, split into what precedes the number and the number."""
 
 MIN_NUMBERED_RUN = 5
-"""Photos with the same name before the number from which their numbers are taken for the order of shooting."""
+"""Least number of photos with the same name before the number whose numbers are taken as the order of shooting."""
 
 NUMBERED_STEPS = (1, 2)
 """Distances, in positions of that order, of two photos that are matched."""
@@ -78,8 +78,8 @@ def video_sequences(photos: Sequence[UsablePhoto]) -> list[list[int]]:
 def numbered_runs(photos: Sequence[UsablePhoto]) -> list[list[int]]:
     """Photos whose names differ only in their final number, ordered by that number.
 
-    Most photos with consecutive numbers were taken one after the other, so that neighbours are worth matching
-    whatever preemptive matching says.
+    Most photos with consecutive numbers were taken one after the other, so neighbours are matched in full even where
+    preemptive matching finds little.
     """
     runs: dict[str, list[tuple[int, int]]] = {}
     for index, photo in enumerate(photos):
@@ -90,7 +90,10 @@ def numbered_runs(photos: Sequence[UsablePhoto]) -> list[list[int]]:
 
 
 def gps_positions(photos: Sequence[UsablePhoto]) -> npt.NDArray[np.float64]:
-    """East, north and up in metres [n,3], from the mean position; NaN for photos without GPS."""
+    """Positions [n,3] by GPS: metres east and north of the mean position, and altitude in metres above sea level.
+
+    East and north are NaN for photos without GPS; the altitude is 0 where it is unknown.
+    """
     degrees = np.array(
         [(p.exif.latitude or math.nan, p.exif.longitude or math.nan) for p in photos], np.float64
     )

@@ -82,7 +82,8 @@ def fit_to_file(posed: tuple[Camera, Lens | None], name: str, path: Path, mask: 
     """A view with its camera at the size of the file at `path`.
 
     Whether the camera describes the photo before or after its EXIF orientation is applied depends on the tool that
-    made it, and is decided by the aspect ratio. Where both fit, it is the photo as stored, as with most tools.
+    made it, and is decided by the aspect ratio. Where both fit, the camera is taken to describe the photo as stored,
+    as those of most tools do.
     """
     camera, lens = posed
     with Image.open(path) as image:

@@ -1,4 +1,4 @@
-"""Finds the photo that a camera file names, whatever folders its author kept it in."""
+"""Finds the photo that a file of cameras names, also where the folders in its path differ from the capture's."""
 
 from __future__ import annotations
 

@@ -118,8 +118,8 @@ def _view(
         viewmat = world_to_camera(np.array(frame["transform_matrix"], np.float64))
         camera = _colmap_camera(values, photo)
     except (KeyError, TypeError, ValueError) as error:
-        what = f"has no {error}" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"Frame {index} of {path.name} ({name}): {what}") from error
+        fault = f"{error.args[0]} is missing." if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"Frame {index} of {path.name} ({name}): {fault}") from error
     mask = files.mask(relative)
     if mask is None and isinstance(frame.get("mask_path"), str):
         beside = path.parent / frame["mask_path"]
@@ -177,7 +177,7 @@ def _colmap_camera(values: dict[str, Any], photo: Path) -> pycolmap.Camera:
             else fx
         )
     else:
-        raise KeyError("fl_x nor camera_angle_x")
+        raise ValueError("it has no focal length; give fl_x or camera_angle_x.")
     cx, cy = float(values.get("cx", 0.5 * width)), float(values.get("cy", 0.5 * height))
     k1, k2, k3, k4, p1, p2 = (float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if not all(map(math.isfinite, (fx, fy, cx, cy, k1, k2, k3, k4, p1, p2))) or fx <= 0 or fy <= 0:

@@ -42,13 +42,13 @@ MIN_SCORE = 0.85
 """Normalised cross-correlation, averaged over the best neighbours, from which a depth is accepted."""
 
 MIN_MARGIN = 0.08
-"""Correlation by which the best depth must exceed every other that is not adjacent to it."""
+"""Margin by which the best depth's correlation must exceed that of every depth that is not adjacent to it."""
 
 ADJACENT = 2
 """Steps within which two depths count as adjacent."""
 
 MAX_ERROR = 1.0
-"""Pixels between the best position in each agreeing neighbour and the common one, at most on average."""
+"""Pixels: largest mean distance between the best position in each agreeing neighbour and the common one."""
 
 MIN_AHEAD = 1e-6
 """Depth of a patch in the neighbour, in units of its depth in its own photo, up to which it counts as behind."""
@@ -127,7 +127,10 @@ def sweep(
     poses = [other.camera.viewmat @ np.linalg.inv(camera.viewmat) for _, other in neighbours]
     inverse, pixels = _inverse_depths([other.camera for _, other in neighbours], poses, near, far)
     scores = torch.stack(
-        [_scores(rays, patch, inverse, pose, o) for (_, o), pose in zip(neighbours, poses, strict=True)]
+        [
+            _scores(rays, patch, inverse, pose, other)
+            for (_, other), pose in zip(neighbours, poses, strict=True)
+        ]
     )
     best, position, agreeing, error = _peaks(scores, pixels)
     good = torch.isfinite(best).nonzero()[:, 0]

@@ -23,7 +23,7 @@ class StereoPoints:
     errors: mean disagreement of the photos, in pixels of the full-size photos [n].
     seen: which views observe each point [n,views].
     seconds: time that the search took.
-    given_up: whether the search ended after its first photos, where hardly any patch was found again.
+    given_up: whether the search ended without points, because hardly any patch of its first photos was found again.
     """
 
     points: Float
@@ -53,7 +53,7 @@ class StereoPoints:
 
 
 def observations_per_view(scene: Scene) -> float:
-    """Mean number of points that a photo shows: by their tracks, or without tracks by where they project."""
+    """Mean number of points that a photo shows: by the tracks, or without tracks by projecting the points."""
     if not scene.views:
         return 0.0
     if scene.point_views is not None:

@@ -1,7 +1,7 @@
 """The search for points over known cameras: each photo is swept against a few neighbours.
 
-It fills what structure from motion leaves empty, which finds features and not surfaces, and it gives points to captures
-that bring cameras alone (decisions: STEREO_POINTS).
+Structure from motion has points only where photos have features. Stereo adds points between them, and gives points to
+captures that bring cameras without points (decisions: STEREO_POINTS).
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ VERSION = 2
 """Version of the method; points stored under another version are searched for anew."""
 
 ENOUGH_OBSERVATIONS = 1000
-"""Known points that a photo shows on average, from which no more are searched for (decisions: STEREO_POINTS)."""
+"""Mean number of known points per photo from which no more are searched for (decisions: STEREO_POINTS)."""
 
 MIN_VIEWS = 3
-"""Photos without which there is no search."""
+"""Least number of photos for a search."""
 
 SIDE = 320
 """Pixels of the longest side of the photos that are compared."""
@@ -60,7 +60,7 @@ TRIAL_PHOTOS = 4
 """Photos, evenly spread over the capture, after which the search is given up if their yield is too small."""
 
 MIN_YIELD = 0.1
-"""Points per patch compared, below which the search is given up: of so few, most match by chance."""
+"""Points found per patch compared, below which the search is given up: most of so few matched by chance."""
 
 LOADERS = 4
 """Photos decoded at a time; a request to cancel waits for these."""
@@ -95,11 +95,11 @@ def find_points(
 ) -> StereoPoints:
     """Search for points between those of the scene.
 
-    The search is given up, without points, when the first few photos show that hardly any patch is found in their
-    neighbours: cameras that move along their optical axis, and thin or moving things.
+    The search is given up, without points, when hardly any patch of the first few photos is found in their neighbours.
+    This happens with cameras that move along their optical axis, and with thin or moving things.
 
-    Photos that a data set itself holds out for tests take no part. Those that the rule of every n-th photo holds out
-    do, as in structure from motion, which uses all photos.
+    Photos that a data set itself holds out for tests are left out. Those held out as every n-th photo are used, as
+    structure from motion uses them too.
 
     on_progress: called with the stage "stereo" and numbers of photos.
 
@@ -154,7 +154,7 @@ def _used(scene: Scene) -> npt.NDArray[np.int64]:
 
 
 def _grey_views(views: Sequence[View], cancelled: Callable[[], bool]) -> list[GreyView]:
-    """The views' photos at the size of the comparison; requests to cancel are met between two photos."""
+    """The views' photos at the size of the comparison. Raises Cancelled between two photos."""
     pool = ThreadPoolExecutor(min(LOADERS, os.cpu_count() or 1))
     try:
         loaded = []

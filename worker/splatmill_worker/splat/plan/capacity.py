@@ -1,4 +1,4 @@
-"""Decisions on size: how many steps the budget allows, and how many Gaussians are worth having."""
+"""Decisions on size: the number of steps that the budget allows, and the largest number of Gaussians."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class Capacity(NamedTuple):
 class _Limits(NamedTuple):
     """Limits on the number of Gaussians that do not depend on the number of steps.
 
-    photos: as many as the photos resolve.
-    memory: as many as memory holds.
-    overall: no plan of this scene, whatever its steps, has more.
+    photos: number that the photos resolve.
+    memory: number that fits in memory.
+    overall: limit of every plan of this scene, whatever its number of steps.
     """
 
     photos: int
@@ -63,7 +63,7 @@ def decide_capacity(
     initial: int,
     pixels: float,
 ) -> Capacity:
-    """The budget, and the number of Gaussians that pays within it.
+    """The budget of a run, and the largest number of Gaussians that it trains within that budget.
 
     initial: number of Gaussians before the first step.
     pixels: number of pixels of a photo at the training size.
@@ -81,7 +81,7 @@ def decide_densification(
     if initial >= most:
         because = f"Training starts with {initial} Gaussians, as many as are allowed."
     else:
-        because = f"Training starts with {initial} Gaussians of {most} that are allowed."
+        because = f"Training starts with {initial} Gaussians, and {most} are allowed."
     return reasons.switch("densify", options.densify, initial < most, because)
 
 
@@ -108,7 +108,7 @@ def _budget(
         reasons.option("budget")
         reasons.chosen["schedule"] = f"The option steps asks for {options.steps} steps."
         return Budget(options.steps), options.steps
-    # A target ends the run as soon as it is reached, so that the longest preset costs no more than is needed.
+    # A run with a target ends once the target is reached, so the longest preset is no longer than needed.
     preset = Preset.quality if options.target_psnr is not None else options.preset
     steps = PRESET_STEPS[preset]
     reasons.chosen["budget"] = f"No budget was given; the preset {preset.value} allows {steps} steps."
@@ -177,6 +177,7 @@ def _max_gaussians(
         limits.memory: f"Memory holds {limits.memory} Gaussians.",
     }
     reasons.chosen["max_gaussians"] = because.get(
-        most, f"Training starts with {initial} Gaussians, and more would not pay."
+        most,
+        f"Training starts with {initial} Gaussians, more than the steps can train or the photos resolve.",
     )
     return most

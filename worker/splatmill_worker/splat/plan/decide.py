@@ -69,7 +69,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
 
 
 class _Start(NamedTuple):
-    """What the first Gaussians are made from, and how many those are."""
+    """What the first Gaussians are made from, and their number."""
 
     source: Literal["points", "random", "model"]
     gaussians: int
@@ -78,7 +78,7 @@ class _Start(NamedTuple):
 def _start(facts: Facts, reasons: Reasons) -> _Start:
     if facts.start is not None:
         reasons.chosen["initial"] = (
-            f"The model given has {facts.start.gaussians} Gaussians and shows the training photos at "
+            f"The given model has {facts.start.gaussians} Gaussians and shows the training photos at "
             f"{facts.start.psnr:.1f} dB."
         )
         reasons.forced.append("initial")
@@ -111,6 +111,7 @@ def _schedule(
         densify_every=max(40, min(100, steps // 20)),
         densify_until=0.7,
         opacity_decay=OPACITY_DECAY if densify else 1.0,
+        # Half way to the shell, so that all of the shell is spared and most of the scene is not.
         decay_within=0.5 * facts.shell_distance if needs.far_shell and facts.shell_distance else None,
         annealing=_annealing(options, steps, reasons),
         expected_steps=steps,
@@ -157,16 +158,16 @@ def _annealing(options: TrainOptions, steps: int, reasons: Reasons) -> Annealing
 def _warm_start(schedule: Schedule, model: GivenModel, reasons: Reasons) -> Schedule:
     """The schedule for a model that is trained already (decisions: warm-start): full-size photos, no boost.
 
-    Boosted steps would first undo what the model has learnt.
+    With boosted rates, the first steps would make the trained model worse.
     """
-    reasons.left_out["coarse_to_fine"] = "The model given is trained already; reduced photos would blur it."
+    reasons.left_out["coarse_to_fine"] = "The given model is trained already; reduced photos would blur it."
     reasons.chosen["rates"] = (
-        f"The model given is trained already, so learning rates are those of a run of {PAPER_STEPS} steps."
+        f"The given model is trained already, so learning rates are those of a run of {PAPER_STEPS} steps."
     )
     degree = schedule.degree
     if "sh_degree" not in reasons.forced and model.degree > degree:
         degree = model.degree
-        reasons.chosen["sh_degree"] = f"The model given has spherical harmonics of degree {degree}."
+        reasons.chosen["sh_degree"] = f"The given model has spherical harmonics of degree {degree}."
     return replace(
         schedule, resolution=((0, 1),), annealing=replace(schedule.annealing, boost=1.0), degree=degree
     )

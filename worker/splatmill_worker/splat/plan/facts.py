@@ -25,7 +25,7 @@ from splatmill_worker.splat.views import TrainingView
 Float = npt.NDArray[np.float64]
 
 MAX_POINTS = 4000
-"""Points whose observations are compared, evenly chosen: enough for a median, in a fraction of a second."""
+"""Points whose observations are compared, evenly chosen and fewer than twice this number: enough for a median."""
 
 DARK = 4.0
 """Grey levels of 255: darker values count as this one, since their ratios are noise."""
@@ -37,13 +37,13 @@ ITERATIONS = 30
 """Iterations of the reweighted least squares that separates exposures from the brightness of points."""
 
 ENOUGH_OBSERVATIONS = 40
-"""With fewer observations, nothing is said about exposures, angles and distances."""
+"""Number of observations below which exposures, angles and distances are not measured."""
 
 ENOUGH_OF_A_PHOTO = 10
-"""Observations from which the exposure of a photo counts."""
+"""Number of observations of a photo from which its exposure counts."""
 
 ENOUGH_PHOTOS = 3
-"""Photos from which the spread of exposures is measured."""
+"""Number of such photos from which the spread of exposures is measured."""
 
 
 @dataclass(frozen=True)
@@ -240,24 +240,25 @@ def tint_spread(seen: _Observations) -> float | None:
 
 
 def _spread(seen: _Observations, log: Float) -> float | None:
-    """Robust standard deviation over photos of the photo's part of `log`, one value per observation.
+    """Robust standard deviation of the photos' offsets in `log`, which has one value per observation.
 
-    Each value is the sum of a point's part and a photo's part. Both are solved for by reweighted least squares in
-    alternation. The weights fall with the residual, so that outliers (highlights, occlusions) move little.
-    None where fewer than ENOUGH_PHOTOS photos have ENOUGH_OF_A_PHOTO observations.
+    Each value is modelled as the sum of an offset of its point and an offset of its photo. Both are solved for in
+    alternation, by reweighted least squares: weights fall with the residual, so that outliers (highlights, occlusions)
+    have little influence. None where fewer than ENOUGH_PHOTOS photos have ENOUGH_OF_A_PHOTO observations.
     """
-    share = np.zeros(seen.photos)
+    of_photo = np.zeros(seen.photos)
     weight = np.ones(len(log))
     for _ in range(ITERATIONS):
-        point = _group_mean(log - share[seen.photo], weight, seen.point, seen.points)
-        share = _group_mean(log - point[seen.point], weight, seen.photo, seen.photos)
-        share -= np.median(share)
-        left = log - point[seen.point] - share[seen.photo]
-        weight = 1.0 / np.maximum(np.abs(left), RESIDUAL_FLOOR)
+        of_point = _group_mean(log - of_photo[seen.photo], weight, seen.point, seen.points)
+        of_photo = _group_mean(log - of_point[seen.point], weight, seen.photo, seen.photos)
+        of_photo -= np.median(of_photo)
+        residual = log - of_point[seen.point] - of_photo[seen.photo]
+        weight = 1.0 / np.maximum(np.abs(residual), RESIDUAL_FLOOR)
     enough = np.bincount(seen.photo, minlength=seen.photos) >= ENOUGH_OF_A_PHOTO
     if enough.sum() < ENOUGH_PHOTOS:
         return None
-    return float(1.4826 * np.median(np.abs(share[enough] - np.median(share[enough]))))
+    # 1.4826 times the median absolute deviation is the standard deviation of a normal distribution.
+    return float(1.4826 * np.median(np.abs(of_photo[enough] - np.median(of_photo[enough]))))
 
 
 @dataclass(frozen=True)

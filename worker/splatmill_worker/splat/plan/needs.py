@@ -10,16 +10,17 @@ from splatmill_worker.splat.plan.plan import Kernels
 from splatmill_worker.splat.plan.reasons import Reasons
 
 MUCH_SKY = 0.05
-"""Share of the photos' area: less may be a window or a white wall."""
+"""Share of the photos' area from which sky counts: a smaller one may be a window or a white wall."""
 
 MANY_GAPS = 0.1
-"""Share of the photos' area, sky excluded: fewer gaps are left to densification."""
+"""Share of the photos' area, sky excluded, from which gaps are filled; smaller ones are left to densification."""
 
 FEW_VIEWS = 12
-"""Training photos: fewer do not correct depths that were guessed (decisions: FEW_VIEWS)."""
+"""Number of training photos below which training does not correct guessed depths (decisions: FEW_VIEWS)."""
 
-POSES_OFF = 1.0
-"""Reprojection error, pixels at the training size: the photos do not resolve smaller errors of the cameras."""
+MIN_POSE_ERROR = 1.0
+"""Reprojection error, in pixels at the training size, from which cameras are corrected: the photos do not resolve
+smaller errors."""
 
 
 class Needs(NamedTuple):
@@ -28,7 +29,7 @@ class Needs(NamedTuple):
     far_shell: Gaussians behind the scene, wherever photos look.
     gaps: Gaussians where photos show something that no point describes.
     pose_refinement: training cameras are corrected.
-    added: number of Gaussians that far shell and gaps add before the first step.
+    added: number of Gaussians that the far shell and the gaps add before the first step.
     """
 
     far_shell: bool
@@ -96,28 +97,31 @@ def _check_poses(facts: Facts, kernels: Kernels) -> None:
 
 def _far_shell(facts: Facts) -> tuple[bool, str]:
     if facts.start is not None:
-        return False, "The model given is kept as it is."
+        return False, "The given model is kept as it is."
     if facts.transparent:
         return False, f"{facts.transparent} photos are transparent, so nothing stands behind the scene."
     if facts.sky_share is None:
         return False, "There are too few points to tell how far the scene extends."
     seen = f"{100 * facts.sky_share:.0f} % of the photos look like sky"
     if facts.views < FEW_VIEWS and facts.sky_share < MUCH_SKY:
-        return False, f"{seen}, and {facts.views} photos are too few to tell what else is as far away."
+        return (
+            False,
+            f"{seen}, and {facts.views} photos are too few to tell whether anything else is as far away.",
+        )
     return (
         True,
-        f"{seen}: {facts.shell_points} Gaussians on a far shell stand for the sky and show through holes.",
+        f"{seen}: {facts.shell_points} Gaussians on a far shell represent the sky and what shows through holes.",
     )
 
 
 def _gaps(facts: Facts) -> tuple[bool, str]:
     if facts.start is not None:
-        return False, "The model given is kept as it is."
+        return False, "The given model is kept as it is."
     if facts.gap_share is None:
         if facts.transparent:
             return (
                 False,
-                f"{facts.transparent} photos are transparent: where points are missing, nothing may stand.",
+                f"{facts.transparent} photos are transparent, so a place without points may be empty.",
             )
         return False, "There are too few points to tell where points are missing."
     seen = f"{100 * facts.gap_share:.0f} % of what the photos show has no point near it"
@@ -137,8 +141,8 @@ def _poses(facts: Facts, kernels: Kernels, scale: float) -> tuple[bool, str]:
     if facts.views < 2:
         return False, "A model of one photo fits any camera."
     seen = f"The median reprojection error is {error:.2f} pixels"
-    if error < POSES_OFF:
-        return False, f"{seen}; cameras are corrected from {POSES_OFF:g} pixel."
+    if error < MIN_POSE_ERROR:
+        return False, f"{seen}; cameras are corrected from {MIN_POSE_ERROR:g} pixel."
     if kernels == "gpu":
         return False, f"{seen}, which calls for correcting the cameras, but the gpu kernels cannot do so."
     return True, f"{seen}, so the cameras of training photos are corrected."

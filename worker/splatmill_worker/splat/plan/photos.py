@@ -18,7 +18,7 @@ PRESET_SIZE: dict[Kernels, dict[Preset, int]] = {
 """Longest side of the photos, pixels."""
 
 BLURRED = 1.5
-"""Grey levels of 255: photos that lose less by halving are halved. The noise of a phone's photo is larger."""
+"""Grey levels of 255: photos whose RMS change by halving is smaller are halved; a phone photo's noise is larger."""
 
 HALVED_FROM = 256
 """Pixels: photos whose longest side is shorter are not halved."""
@@ -30,7 +30,7 @@ TINTS_DIFFER = 0.1
 """Natural logarithm of red over green, or of blue over green: white balances that spread more are compensated."""
 
 DISTANCES_DIFFER = 4.0
-"""Ratio of the distances from which the same point is seen: above, Gaussians are anti-aliased."""
+"""Ratio of the distances from which the same point is seen, above which Gaussians are anti-aliased."""
 
 
 def loading_size(options: TrainOptions, kernels: Kernels) -> int:
@@ -86,8 +86,8 @@ def decide_background(
     reasons.left_out["alpha"] = "No photo is transparent."
     if facts.views < FEW_VIEWS:
         reasons.chosen["background"] = (
-            f"No photo is transparent, and {facts.views} photos are too few to place surfaces in depth by making them "
-            "opaque."
+            f"No photo is transparent. With only {facts.views} photos, a random background would make surfaces opaque "
+            "at wrong depths."
         )
         return "black"
     reasons.chosen["background"] = (

@@ -27,7 +27,7 @@ class Plan:
     image_size: longest side of the photos, pixels.
     max_gaussians: largest number of Gaussians.
     densify: Gaussians are added in training.
-    initial: what the first Gaussians are made from: points, random places, or a model given.
+    initial: what the first Gaussians are made from: points, random places, or a given model.
     kernels: the backend of the engine.
     background: colour behind Gaussians and transparent photos in training.
     exposure: an affine colour transform is fitted for each photo.

@@ -12,7 +12,7 @@ from splatmill_worker.splat.plan.plan import Plan
 
 
 def read_plan(path: Path, options: TrainOptions) -> Plan | None:
-    """The plan stored for the same options; None where there is none, or only one of another version."""
+    """The plan stored for these options; None without one, or where it is of other options or another version."""
     if not path.is_file():
         return None
     stored = json.loads(path.read_text())

@@ -16,27 +16,30 @@ ZERO_RATES = Rates(means=0.0, log_scales=0.0, quats=0.0, logit_opacities=0.0, sh
 """Steps with these rates change no parameter."""
 
 REPEATS = 3
-"""Timed steps per size, after one that warms up; the fastest counts."""
+"""Steps per size after the first one, which also warms up; the fastest of all counts."""
 
 SMALL = 4
 """Reduction of the photo of the second measurement."""
 
 
 def probe(engine: Engine, views: Sequence[TrainingView]) -> Speed:
-    """The time of a step as a part per pixel and a part per Gaussian; the engine is left as it was.
+    """The time of a training step, divided into a part per pixel and a part per Gaussian.
+
+    The parameters of the engine are the same afterwards.
 
     Two sizes of the same photo are timed: the difference is the pixels' part, the rest is the Gaussians'. The
     fastest of a few steps counts, since other programs can only add to the time.
     """
-    middle = views[len(views) // 2]
-    small, full = middle.reduced(SMALL), middle.full
+    view = views[len(views) // 2]
+    small, full = view.reduced(SMALL), view.full
     parameters = engine.parameters()
     fast, slow = _seconds(engine, small), _seconds(engine, full)
     engine.replace(parameters, None, None)
     pixels = full.camera.width * full.camera.height
-    fewer = small.camera.width * small.camera.height
-    per_pixel = max(slow - fast, 1e-3 * slow) / max(1, pixels - fewer)
-    per_gaussian = max(fast - per_pixel * fewer, 0.05 * fast) / max(1, engine.count)
+    small_pixels = small.camera.width * small.camera.height
+    # The lower bounds keep both parts positive when the noise of the timing exceeds their difference.
+    per_pixel = max(slow - fast, 1e-3 * slow) / max(1, pixels - small_pixels)
+    per_gaussian = max(fast - per_pixel * small_pixels, 0.05 * fast) / max(1, engine.count)
     return Speed(per_pixel, per_gaussian)
 
 

@@ -14,7 +14,7 @@ SH_REST = 1.25e-4
 """Rate per step of the spherical harmonics above degree 0, as in the paper."""
 
 PAPER_STEPS = 30_000
-"""Steps of the run for which the paper's rates are made."""
+"""Number of steps of the runs in the paper, for which its rates were chosen."""
 
 MOST_BOOST = 8.0
 """Largest factor on the paper's rates (decisions: MOST_BOOST)."""
@@ -31,9 +31,10 @@ class Annealing:
     The rate of the positions falls exponentially over the whole run. The others stay constant, then fall by half a
     cosine: with Adam, the last step size remains as noise in the parameters.
 
-    boost: factor on the paper's rates. A parameter travels at most rate times steps with Adam, so that a shorter run
-        than the paper's needs larger steps. Opacities take the root of the factor, since they saturate; spherical
-        harmonics above degree 0 take more (see MOST_SH). None: `boost_of` the steps that a time budget allows.
+    boost: factor on the paper's rates. With Adam, a parameter moves by at most about its rate in each step, so a run
+        shorter than the paper's needs higher rates. Opacities take the root of the factor, since they saturate;
+        spherical harmonics above degree 0 take more (see MOST_SH). None: `boost_of` the number of steps that a time
+        budget is measured to allow.
     position_fall: last rate of the positions over the first.
     hold: share of the budget for which the other rates stay constant.
     rest_fall: last value of the other rates over the first.
@@ -64,15 +65,16 @@ class RateSchedule:
     scale: float = 1.0
 
     def at(self, progress: float) -> Rates:
-        """Rates at `progress`, 0 to 1. Raises ValueError where the boost is None, which only a run can determine."""
+        """Rates at `progress`, 0 to 1. Raises ValueError where the boost is None: the training run has to set it."""
         fall = self.annealing
         boost = fall.boost
         if boost is None:
-            raise ValueError("the boost is None, which only a run can determine; give a number.")
+            raise ValueError("annealing.boost is None; set it by boost_of(steps) before asking for rates.")
         factor = self.scale * boost
         position = POSITION_START * self.extent * math.exp(math.log(fall.position_fall) * progress)
         late = min(1.0, max(0.0, (progress - fall.hold) / (1.0 - fall.hold)))
         rest = factor * (fall.rest_fall + (1.0 - fall.rest_fall) * 0.5 * (1.0 + math.cos(math.pi * late)))
+        # The constants are the rates of Kerbl et al. 2023.
         return Rates(
             means=factor * position,
             log_scales=rest * 5e-3,

@@ -1,4 +1,4 @@
-"""A far shell of Gaussians behind the scene, for the sky and for whatever no point describes (decisions: far-shell)."""
+"""A far shell of Gaussians behind the scene, for the sky and for background without points (decisions: far-shell)."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from splatmill_worker.splat.start.cells import Cells, Float, Pixels
 
 DISTANCE = 5.0
-"""Radius of the shell over the distance of the farthest tenth of the points: parallax on it is below a cell."""
+"""Radius of the shell, over the distance from the cameras' mean within which nine points in ten lie."""
 
 OPACITY = 0.7
-"""Opacity of the shell at the first step: high, since nothing stands behind it."""
+"""Opacity of the shell at the first step: high, because there is nothing behind it to show through."""
 
 PATCH_CELLS = 2.0
 """Side of the patch that becomes a Gaussian, in cells (decisions: PATCH_CELLS)."""
 
 BORDER_CELLS = 6
-"""Cells by which every photo is extended past its border: held-out photos look a little past the others."""
+"""Cells by which every photo is extended past its border, because held-out photos show more than the others."""
 
 BORDER_WEIGHT = 0.05
 """Weight of an extended cell's colour in the mean; that of a cell which a photo shows is 1."""
@@ -37,28 +37,29 @@ def shell_points(cells: Sequence[Cells], points: Float) -> tuple[Float, Pixels]:
     spread = float(np.linalg.norm(centers - middle, axis=1).max())
     reach = float(np.percentile(np.linalg.norm(points - middle, axis=1), 90)) if len(points) else 0.0
     radius = DISTANCE * max(reach, spread, 1e-6)
-    places, colors, weights = [], [], []
+    positions, colors, weights = [], [], []
     for grid in cells:
         height, width = grid.used.shape
-        there = (
+        extended = (
             np.argwhere(np.ones((height + 2 * BORDER_CELLS, width + 2 * BORDER_CELLS), bool)) - BORDER_CELLS
         )
-        inside = there.clip(0, (height - 1, width - 1))
-        used = grid.used[inside[:, 0], inside[:, 1]]
-        there, inside = there[used], inside[used]
-        away = grid.unproject(there, np.ones(len(there))) - grid.camera.center
-        away /= np.linalg.norm(away, axis=1, keepdims=True)
-        # The intersection of the sphere with the ray of a camera that is not at its centre.
+        # Each cell outside the photo takes the colour and the mask of the nearest cell inside.
+        nearest = extended.clip(0, (height - 1, width - 1))
+        used = grid.used[nearest[:, 0], nearest[:, 1]]
+        extended, nearest = extended[used], nearest[used]
+        rays = grid.unproject(extended, np.ones(len(extended))) - grid.camera.center
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        # The intersection of each ray with the sphere: the camera is inside, but not at its centre.
         start = grid.camera.center - middle
-        along = away @ start
-        places.append(start + (np.sqrt(along**2 + radius**2 - start @ start) - along)[:, None] * away)
-        colors.append(grid.color[inside[:, 0], inside[:, 1]].astype(np.float64))
-        weights.append(np.where((there == inside).all(axis=1), 1.0, BORDER_WEIGHT))
-    place, color, weight = np.concatenate(places), np.concatenate(colors), np.concatenate(weights)
+        along = rays @ start
+        positions.append(start + (np.sqrt(along**2 + radius**2 - start @ start) - along)[:, None] * rays)
+        colors.append(grid.color[nearest[:, 0], nearest[:, 1]].astype(np.float64))
+        weights.append(np.where((extended == nearest).all(axis=1), 1.0, BORDER_WEIGHT))
+    position, color, weight = np.concatenate(positions), np.concatenate(colors), np.concatenate(weights)
     patch = PATCH_CELLS * radius * float(np.median([1.0 / grid.camera.fx for grid in cells]))
-    _, group = np.unique(np.floor(place / patch).astype(np.int64), axis=0, return_inverse=True)
+    _, group = np.unique(np.floor(position / patch).astype(np.int64), axis=0, return_inverse=True)
     group = group.reshape(-1)
     total = np.bincount(group, weight)[:, None]
-    mean = np.stack([np.bincount(group, weight * column) for column in place.T], axis=1) / total
-    shade = np.stack([np.bincount(group, weight * column) for column in color.T], axis=1) / total
-    return middle + mean, (shade + 0.5).astype(np.uint8)
+    mean_position = np.stack([np.bincount(group, weight * column) for column in position.T], axis=1) / total
+    mean_color = np.stack([np.bincount(group, weight * column) for column in color.T], axis=1) / total
+    return middle + mean_position, (mean_color + 0.5).astype(np.uint8)

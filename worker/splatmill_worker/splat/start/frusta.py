@@ -24,19 +24,20 @@ CANDIDATES = 4
 """Points drawn for each one kept."""
 
 HULL_VIEWS = 32
-"""Photos against which every candidate is tested, at least, where there are as many."""
+"""Least number of photos against which every candidate is tested; all of them where there are fewer."""
 
 SEEN_THROUGH = 4.0
-"""Weight of a photo that is transparent at a point, over one that shows something there."""
+"""Weight of a photo that is transparent at a point, relative to one that shows something there."""
 
 
 def sample_frusta(targets: Sequence[Target], count: int, seed: int) -> tuple[Tensor, Tensor]:
     """Random points [count, 3] and colours uint8 [count, 3] where cameras look, for scenes without points.
 
-    Candidates are drawn along the rays of random pixels, at 0.2 to 1.8 times the distance of the point that the cameras
-    look at. Those that most cameras see are kept. A camera whose photo is transparent at a candidate counts against it,
-    so that an object on a transparent background starts as its visual hull: candidates are then drawn again, in the
-    box around those in the hull. The colour of a point is the mean of what the photos show there.
+    Candidates are drawn along the rays of random pixels. Their depths are 0.2 to 1.8 times the median distance of the
+    cameras from the point that they look at. Those that most cameras see are kept. A camera whose photo is transparent
+    at a candidate counts against it, so that an object on a transparent background starts as its visual hull:
+    candidates are then drawn again, in the box around those in the hull. The colour of a point is the mean of what the
+    photos show there.
     """
     random = np.random.default_rng(seed)
     some = targets[:: max(1, len(targets) // HULL_VIEWS)]
@@ -51,6 +52,7 @@ def sample_frusta(targets: Sequence[Target], count: int, seed: int) -> tuple[Ten
         margin = 0.1 * (high - low)
         points = random.uniform(low - margin, high + margin, (CANDIDATES * count, 3))
         score, color = _scored(some, points)
+    # The random term breaks ties: the scores of opaque photos are whole numbers.
     order = np.argsort(-score - random.uniform(0.0, 0.5, len(score)), kind="stable")[:count]
     return torch.from_numpy(points[order]).float(), torch.from_numpy(color[order])
 
@@ -81,7 +83,7 @@ def median_distance(centers: Float, target: Float) -> float:
 
 
 def _along_rays(cameras: Sequence[Camera], distance: float, count: int, random: np.random.Generator) -> Float:
-    """Points [count, 3] along the rays of random pixels, uniform in the volume that the cameras see."""
+    """Points [count, 3] along the rays of random pixels, uniform in the volume of each camera's frustum."""
     points = np.empty((count, 3))
     pick = random.integers(len(cameras), size=count)
     for i, camera in enumerate(cameras):

@@ -12,8 +12,8 @@ from splatmill_worker.splat.start.sky import sky_of
 NEIGHBOURS = 3
 """Nearest points whose inverse depths are averaged: on a plane, inverse depth is linear in pixels."""
 
-AGREES = 1.5
-"""Depths within this factor of each other are taken to be on the same surface."""
+MAX_DEPTH_RATIO = 1.5
+"""Largest ratio of two depths that are taken to be on the same surface."""
 
 
 def gap_share(cells: Sequence[Cells]) -> float:
@@ -25,8 +25,8 @@ def gap_share(cells: Sequence[Cells]) -> float:
 def gap_points(cells: Sequence[Cells]) -> tuple[Float, Pixels]:
     """Points [k, 3] and colours uint8 [k, 3] for the cells that show neither sky nor a point (decisions: gaps).
 
-    A point is placed at the mean inverse depth of the nearest points in its photo. The photos are processed in order;
-    a cell gets no point where one from an earlier photo lies at about the same depth.
+    A point is placed at the mean inverse depth of the nearest points in its photo. The photos are processed in order:
+    a cell gets no point where a gap point of an earlier photo lies in it at about the same depth.
     """
     points: list[Float] = [np.empty((0, 3))]
     colors: list[Pixels] = [np.empty((0, 3), np.uint8)]
@@ -38,8 +38,9 @@ def gap_points(cells: Sequence[Cells]) -> tuple[Float, Pixels]:
         wanted = np.full(grid.covered.shape, np.inf)
         wanted[rows[:, 0], rows[:, 1]] = depth
         earlier = projected(grid.camera, np.concatenate(points))
-        there = wanted[earlier[:, 1].astype(np.int64), earlier[:, 0].astype(np.int64)]
-        agree = (earlier[:, 2] < AGREES * there) & (earlier[:, 2] > there / AGREES)
+        # Infinite where no depth is wanted, so that no earlier point agrees there.
+        expected = wanted[earlier[:, 1].astype(np.int64), earlier[:, 0].astype(np.int64)]
+        agree = (earlier[:, 2] < MAX_DEPTH_RATIO * expected) & (earlier[:, 2] > expected / MAX_DEPTH_RATIO)
         taken = cells_near(earlier[agree], grid.color.shape[:2], spread=0)
         free = ~taken[rows[:, 0], rows[:, 1]]
         points.append(grid.unproject(rows[free], depth[free]))
@@ -53,7 +54,7 @@ def _gaps(grid: Cells) -> Flags:
 
 
 def _one_per_cell(points: Float) -> Float:
-    """Rows of `points` (column, row, depth), at most one per cell: stereo gives thousands of points."""
+    """Rows of `points` (column, row, depth), at most one per cell: the search for neighbours compares all pairs."""
     _, first = np.unique(points[:, :2].astype(np.int64), axis=0, return_index=True)
     rows: Float = points[first]
     return rows

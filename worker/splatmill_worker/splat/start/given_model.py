@@ -19,10 +19,11 @@ from splatmill_worker.splat.render import render
 from splatmill_worker.splat.views import TrainingView
 
 ASSESSED_VIEWS = 8
-"""Training views on which a model is assessed: at least so many, where there are."""
+"""Least number of training views on which a model is assessed; all of them where there are fewer."""
 
 DOUBTFUL_MARGIN = 3.0
-"""dB above the baseline of one colour per photo: a trained model in the right world exceeds it by far."""
+"""dB of PSNR over the baseline of one colour per photo, up to which a model is doubtful: a trained model in the right
+world exceeds it by far."""
 
 OWN_PHOTO_MARGIN = 1.0
 """dB by which the views of a doubtful model have to be nearer to their own photos than to others, or the model lies in
@@ -53,7 +54,7 @@ class GivenModel:
 
     @property
     def misaligned(self) -> bool:
-        """Whether the model's views have nothing to do with the cameras: it lies in another world."""
+        """Whether the model lies in another world: its views match their own photos no better than other photos."""
         return self.doubtful and self.another is not None and not self.psnr > self.another + OWN_PHOTO_MARGIN
 
 
@@ -77,7 +78,10 @@ def read_given_model(path: Path, normalization: Normalization) -> Gaussians:
 
 
 def assess(gaussians: Gaussians, views: Sequence[TrainingView]) -> GivenModel:
-    """How well `gaussians` show some of `views`. Raises StartUnusable where they lie in another world."""
+    """Compare renderings of `gaussians` with the photos of some of `views`.
+
+    Raises StartUnusable where the Gaussians lie in another world.
+    """
     some = views[:: max(1, len(views) // ASSESSED_VIEWS)]
     background = benchmark_background(views)
     own: list[float] = []

@@ -11,7 +11,7 @@ from splatmill_worker.kernels import ops
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 
 ENOUGH_POINTS = 20
-"""Fewer points of the reconstruction say too little about where surfaces are; Gaussians then start at random."""
+"""Number of points of the reconstruction below which Gaussians start at random places instead."""
 
 INITIAL_OPACITY = 0.1
 """Opacity of the first Gaussians (Kerbl et al. 2023)."""
@@ -28,6 +28,7 @@ def from_points(points: Tensor, colors: Tensor, *, backend: ops.Backend | None =
     points = points.float()
     width = ops.knn(points, backend=backend)
     positive = width[width > 0]
+    # 1e-3 is used where all points coincide.
     floor = float(torch.quantile(positive, 0.001)) if len(positive) else 1e-3
     return isotropic(points, width.clamp_min(floor), colors)
 

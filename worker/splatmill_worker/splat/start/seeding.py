@@ -1,4 +1,4 @@
-"""Seeding: which Gaussians training starts with, beside and beyond those made from points."""
+"""Seeding: Gaussians in gaps and on a far shell, added to those made from points, within the limit on their number."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ def add_seeds(
 ) -> Gaussians:
     """`gaussians`, which were made from the points of `scene`, with more in the gaps between them and on a far shell.
 
-    No more than `max_gaussians` result. What exceeds them is left out evenly, in the gaps first.
+    At most `max_gaussians` result. Where there would be more, those added are thinned evenly: those in the gaps first,
+    then those on the shell.
     """
     if not (fill_gaps or add_far_shell):
         return gaussians
@@ -49,7 +50,7 @@ def add_seeds(
         points, colors = _at_most(room, points, colors)
         room -= len(points)
         if len(points) > 1:
-            # Their widths follow from the distances to each other, and not to points of the reconstruction.
+            # Made apart from `gaussians`, so that their widths follow from the distances between the added points.
             more = from_points(torch.from_numpy(points), torch.from_numpy(colors), backend=backend)
             parts.append(replace(more, logit_opacities=torch.full((more.count,), logit(opacity))))
     return concatenate(*parts)
@@ -64,7 +65,7 @@ def most_opaque(gaussians: Gaussians, limit: int) -> Gaussians:
 
 
 def _at_most(room: int, points: Float, colors: Pixels) -> tuple[Float, Pixels]:
-    """The rows, or `room` of them, evenly chosen, where there are more."""
+    """All points and colours, or `room` of them, evenly chosen, where there are more."""
     if len(points) <= room:
         return points, colors
     rows = np.linspace(0, len(points), room, endpoint=False).astype(np.int64)

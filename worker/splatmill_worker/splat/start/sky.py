@@ -14,6 +14,9 @@ BLUE, BLUE_BRIGHT = 8.0, 90.0
 GREY, GREY_BRIGHT = 30.0, 150.0
 """Largest difference between channels, and least brightness, of a cloud, grey levels of 255."""
 
+MAX_RED_EXCESS = 4.0
+"""Largest excess of red over blue of a cloud, grey levels of 255."""
+
 
 def sky_of(color: Pixels, used: Flags) -> Flags:
     """bool [h, w]: the cells of a coarse photo uint8 [h, w, 3] that show the sky.
@@ -27,7 +30,9 @@ def sky_of(color: Pixels, used: Flags) -> Flags:
     mean = channels.mean(axis=2)
     clear = (blue >= red + BLUE) & (blue >= green) & (mean >= BLUE_BRIGHT)
     cloud = (
-        (channels.max(axis=2) - channels.min(axis=2) <= GREY) & (mean >= GREY_BRIGHT) & (blue >= red - 4.0)
+        (channels.max(axis=2) - channels.min(axis=2) <= GREY)
+        & (mean >= GREY_BRIGHT)
+        & (blue >= red - MAX_RED_EXCESS)
     )
     upper: Flags = np.logical_and.accumulate(clear | cloud | ~used, axis=0) & used
     return upper
