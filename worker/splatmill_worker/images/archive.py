@@ -1,4 +1,4 @@
-"""Unpacks zips of strangers: names that leave the target folder, links and zip bombs are refused."""
+"""Unpacks zips from untrusted sources: names that leave the target folder, links and zip bombs are refused."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAX_TOTAL_BYTES = 16 * 2**30
 """Bytes of all unpacked files, at most."""
 
 MAX_RATIO = 100
-"""Unpacked over packed size of a file, at most: photos and videos hardly compress, a zip bomb does by a thousand."""
+"""Largest ratio of a file's unpacked to packed size: photos and videos hardly compress, a zip bomb 1000 to 1."""
 
 RATIO_FLOOR = 2**20
 """Bytes of an unpacked file up to which its ratio is not limited."""
@@ -35,7 +35,7 @@ class UnsafeArchive(ValueError):
 def unpack(path: Path, target: Path, cancelled: Callable[[], bool] = lambda: False) -> list[Path]:
     """Write the archive's files under `target` and return their paths, in the archive's order.
 
-    Sizes are checked as declared before anything is written, and as they are while writing. Hidden files and the
+    The declared sizes are checked before anything is written, and the real ones while writing. Hidden files and the
     resource forks of macOS are left out.
 
     Raises UnsafeArchive for absolute names, names with `..`, links, encrypted files, zip bombs, too many files, and
@@ -98,7 +98,7 @@ def _check_declared(entries: list[zipfile.ZipInfo]) -> None:
 def _write(
     archive: zipfile.ZipFile, entry: zipfile.ZipInfo, place: Path, total: int, cancelled: Callable[[], bool]
 ) -> int:
-    """Write one entry to `place`; returns `total` plus the bytes written, counted and not as the header declares."""
+    """Write one entry to `place`; returns `total` plus the number of bytes that were really written."""
     size = 0
     with archive.open(entry) as source, place.open("wb") as sink:
         while chunk := source.read(CHUNK):

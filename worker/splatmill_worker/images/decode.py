@@ -71,7 +71,7 @@ def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool
             factor = _factor(image.size, want, range(MAX_REDUCTION, 0, -1))
             if factor > 1:
                 photo = photo.reduce(factor)
-        # Leaving the block closes `image`.
+        # `image` is closed at the end of the block, so it must not be returned itself.
         return photo.copy() if photo is image else photo
 
 

@@ -20,7 +20,7 @@ POLYNOMIAL_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """COLMAP's camera models that are a pinhole when all distortion coefficients are zero; fisheye models are not."""
 
 MIN_ZOOM, MAX_ZOOM = 0.4, 2.0
-"""Bounds of the focal length of the undistorted photo over that of the photo: no pinhole shows all of a fisheye's."""
+"""Bounds of the undistorted photo's focal length over the photo's: no pinhole camera shows all of a fisheye photo."""
 
 BORDER_SAMPLES = 64
 """Points on each side of the undistorted photo that must lie within the photo."""
@@ -72,7 +72,7 @@ def _pinhole_of(lens: Lens) -> tuple[float, float, float, float, float]:
         """Whether the border at this zoom lies within the photo, and its largest distance from the principal point."""
         seen = distort(camera, rays / zoom)
         low, high = seen.min(axis=0), seen.max(axis=0)
-        # Half a pixel beyond the border, border pixels are still the nearest.
+        # Up to half a pixel beyond the border, the nearest pixel is still one of the border.
         inside = bool(low.min() >= -0.5 and high[0] <= lens.width + 0.5 and high[1] <= lens.height + 0.5)
         return inside, float(np.linalg.norm(seen - (cx, cy), axis=1).max())
 

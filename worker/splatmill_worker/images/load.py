@@ -19,10 +19,10 @@ from splatmill_worker.images.decode import Pixels, decode
 from splatmill_worker.scene import Camera, Lens, View
 
 MAX_SAMPLES = 4
-"""Look-ups per pixel and axis when a photo is undistorted; a larger one is reduced before."""
+"""Largest number of look-ups per pixel and axis when a photo is undistorted; a larger photo is reduced first."""
 
 MIN_COVER = 127.5
-"""Mean of a mask, 0 to 255, from which a reduced pixel counts."""
+"""Mean of the mask over a reduced pixel, 0 to 255, from which the pixel is trained on."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +127,7 @@ def _check_shape(view: View, path: Path, size: tuple[int, int]) -> None:
     """Raise ValueError for a photo or mask whose aspect ratio differs from the camera's by more than rounding."""
     width, height = size
     expected = view.camera.width / view.camera.height
+    # Reduced sizes are rounded to whole pixels, which changes the aspect ratio of small photos the most.
     if abs(width / height / expected - 1.0) > 0.02 + 2.0 / min(width, height):
         raise ValueError(
             f"{path.name} has {width} x {height} pixels, a different shape from the {view.camera.width} x "
@@ -189,8 +190,10 @@ def _look_up(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Where `samples` x `samples` positions in each pixel of a pinhole camera lie on the photo.
 
-    intrinsics: fx, fy, cx, cy of the camera in pixels. Returns the grid [samples * height, samples * width, 2] in
-    grid_sample's -1 to 1, and the pixels of which the photo covers every position [height, width].
+    intrinsics: fx, fy, cx, cy of the camera in pixels.
+
+    Returns the positions [samples * height, samples * width, 2] in the range of grid_sample, -1 to 1, and the pixels
+    [height, width] of which the photo covers every position.
     """
     x, y = Camera(width, height, *intrinsics, np.eye(4)).normalized(
         (np.arange(width * samples) + 0.5) / samples, (np.arange(height * samples) + 0.5) / samples

@@ -102,9 +102,9 @@ def prepare(
 ) -> Prepared:
     """Examine the files under `images`.
 
-    Zips are unpacked into `workdir`, and `frames` frames of each video are stored there. These files are skipped, each
-    with its reason: those that are no image or do not decode completely, images that are too small or too large (by the
-    size in their header; they are not decoded), and copies of a file.
+    Zips are unpacked into `workdir`, and `frames` frames of each video are stored there. Files are skipped, each
+    with its reason, when they are no image or do not decode completely, when their header gives too small or too large
+    a size (they are then not decoded), and when their content is that of another file.
 
     masks: folder of the masks, if there is one; a mask may also lie beside its photo as name.jpg.png.
     on_progress: called as ("images", files examined, files in all, name of the file).
@@ -141,7 +141,7 @@ def prepare(
 
 
 def _files(images: Path) -> list[Path]:
-    """Regular files, no links, nothing hidden, sorted by name."""
+    """The regular files under `images`, sorted by name; links and hidden files are left out."""
     if not images.is_dir():
         return []
     return [
@@ -165,7 +165,9 @@ def _expand(
 ) -> None:
     """Add a file, or the content of a zip or video, to `found`.
 
-    inside: name of the zip that holds the file, if there is one. Unpacked content is kept under the hash of its file.
+    inside: name of the zip that holds the file, if there is one.
+
+    What is unpacked is kept in `workdir`, in a folder named by the hash of the zip or video.
     """
     suffix = path.suffix.lower()
     try:

@@ -34,7 +34,7 @@ def sharpest_frames(
 
     The frame with the largest variance of its Laplacian is taken from each of `count` intervals of equal length; a
     video with fewer frames gives all of them. The files are called <stem>_<frame number>.jpg. The rotation in the video
-    is applied. A video that breaks off gives the frames before that.
+    is applied. Of a video with a damaged end, the frames before the damage are used.
 
     Raises ValueError when the file has no video that decodes, and Cancelled.
     """
@@ -67,7 +67,6 @@ def sharpest_frames(
             if best is not None:
                 written.append(_save(best, target, path.stem))
     except av.FFmpegError as error:
-        # The frames before a broken end are usable.
         if not written:
             raise ValueError(f"it does not decode as video ({error})") from error
     if not written:

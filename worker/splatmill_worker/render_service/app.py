@@ -46,6 +46,7 @@ Body = TypeVar("Body", bound=BaseModel)
 class RenderApp:
     """The endpoints for the models of one storage.
 
+    storage: where the models are.
     cache_bytes: bound on the memory of cached models.
     backend: the kernels to render with; None means those of the CPU.
     """
@@ -110,9 +111,8 @@ class RenderApp:
         except StorageError as error:
             advice = "Check SPLATMILL_STORAGE and try again."
             return _problem_response(Problem.of("storage_unavailable", str(error), advice=advice))
-        except (
-            Exception
-        ) as error:  # whatever it is, the client gets a problem document and the log a traceback
+        except Exception as error:
+            # The client receives a problem document for any error, and the log receives the traceback.
             traceback.print_exception(error)
             return _problem_response(_problem_of_unexpected(error))
 

@@ -1,4 +1,4 @@
-"""Stored models in memory, of which the least recently used ones are dropped when they exceed a number of bytes."""
+"""Stored models in memory; the least recently used ones are dropped when all together exceed a number of bytes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class LoadedModel:
 
 
 class ModelCache:
-    """The models that were used last, by id. One that has changed in storage is read again.
+    """The models that were used last, by id. A model that has changed in storage is read again.
 
     storage: where the models are.
     max_bytes: bound on the memory of all models; a single larger one is kept nevertheless.

@@ -15,14 +15,14 @@ from splatmill_worker.scene import Camera, looked_at, viewmat_of
 Float = npt.NDArray[np.float64]
 
 FULL_CIRCLE = math.radians(220)
-"""Radians of azimuth that photos must cover for a full circle. If they cover less, the camera swings to and fro within
-the arc of the photos, because nothing was seen from outside of it."""
+"""Radians of azimuth that photos must cover for a full circle. If they cover less, the camera swings back and forth
+within the arc of the photos, because no photo shows the model from outside of it."""
 
 DEFAULT_FOV = 50.0
 """Vertical field of view in degrees where neither the request nor the photos give one."""
 
 _SWING_RISE = 0.15
-"""Rise and fall of a swinging camera, as a share of the path's radius."""
+"""Largest rise and fall of a swinging camera over the path's height, as a share of the path's radius."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def _nearest_to_axes(centers: Float, forwards: Float) -> Float:
     alignment = np.linalg.eigvalsh(forwards.T @ forwards / len(forwards))[-1]  # 1 for parallel axes
     if alignment < 1.0 - 1e-3:
         nearest = looked_at(centers, forwards, ridge=0.0)
-        # Where the axes do not really meet, the nearest point lies behind the cameras.
+        # Axes that do not converge can have their nearest point behind the cameras.
         if np.median(np.einsum("nj,nj->n", nearest - centers, forwards)) > 0.1 * spread:
             return nearest
     middle: Float = centers.mean(axis=0)

@@ -11,11 +11,11 @@ Result = TypeVar("Result")
 
 
 class QueueFull(Exception):
-    """As many requests wait as the queue admits."""
+    """The queue has no place for another request."""
 
 
 class RenderQueue:
-    """Runs one piece of work at a time, which then has all cores, and admits `max_waiting` requests beside it."""
+    """Runs one piece of work at a time, so that it has all cores, and lets at most `max_waiting` more requests wait."""
 
     def __init__(self, max_waiting: int) -> None:
         self._max_admitted = max_waiting + 1

@@ -16,7 +16,7 @@ from splatmill_worker.service.lock import JobLock
 _LOCK_POLL_SECONDS = 0.2
 
 LONGEST_MESSAGE = 20_000
-"""Characters of a log line that are kept."""
+"""Largest number of characters of a log message; the rest is cut off."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Attempt:
 
     connection: the service's Redis.
     job_id: the job.
-    generation: how often the job has been started or restarted by a client, from 1.
+    generation: number of times that a client has started or restarted the job.
     number: number of the attempt, from 1 over all generations.
     lock: the job's lock, under the token of this attempt.
     """
@@ -57,9 +57,10 @@ def start_attempt(connection: redis.Redis, entry_id: str, token: str) -> Attempt
     entry_id: id of the queue entry.
     token: the lock's token, which the parent process knows as well.
 
-    Waits while another process holds the lock. That happens when the queue gave the job away because a machine was
-    suspended; the process there ends itself at its next heartbeat. Raises HandedBack when the worker is stopped
-    meanwhile.
+    Waits while another process holds the lock. This happens when a machine was suspended and the queue gave its job to
+    another worker; the process on the suspended machine is killed at its next heartbeat.
+
+    Raises HandedBack when the worker is stopped meanwhile.
     """
     job_id, generation = split_rq_id(entry_id)
     lock = JobLock(connection, job_id, token)

@@ -34,7 +34,8 @@ class JobFolder:
 
     storage: where the capture lies and the model goes.
     path: the folder.
-    capture, run: the two folders that the pipeline is given.
+    capture: the folder of the photos, which the pipeline reads.
+    run: the folder that the pipeline writes to.
 
     Raises FolderInUse when another process holds the lock for longer than LOCK_SECONDS.
     """
@@ -83,9 +84,9 @@ class JobFolder:
             _link_or_copy(source, target)
 
     def restore(self) -> list[str]:
-        """Fetch what an attempt on another machine stored, if this machine has nothing. Return the names.
+        """Download the files that an attempt on another machine stored, if this machine has none. Return their names.
 
-        Without a checkpoint the training begins anew. Film frames of the earlier training are then deleted from
+        Without a checkpoint the training starts anew, so film frames of the earlier training are first deleted from
         storage.
         """
         if self.storage.root is not None:
@@ -110,7 +111,7 @@ class JobFolder:
         self._delete_stored()
 
     def reset(self) -> None:
-        """Delete all that led to a failure, so that a restarted job trains anew. The recovered cameras stay."""
+        """Delete what the failed attempt stored, except the recovered cameras, so that a restarted job trains anew."""
         for path in self.run.iterdir() if self.run.is_dir() else ():
             if path.name != _CAMERAS:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -136,7 +137,7 @@ def in_use(folder: Path) -> bool:
 def _locked(path: Path) -> int:
     """Lock a file exclusively and return its descriptor. The lock ends when that is closed, also by a kill."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
-    path.touch()  # its modification time is the begin of the last attempt
+    path.touch()  # its modification time is the start of the last attempt
     deadline = time.monotonic() + LOCK_SECONDS
     while True:
         try:

@@ -9,7 +9,7 @@ from splatmill.backplane.storage import StorageError
 from splatmill_worker.service.job_folder import CHECKPOINTS, FILM, START, JobFolder
 
 INTERVAL = 15.0
-"""Seconds between two looks for new files. A machine that dies loses this much more than its last checkpoint."""
+"""Seconds between two copies. A checkpoint written less than this before the machine fails may be lost."""
 
 MIRRORED = (START, CHECKPOINTS, "plan.json", "stages.json", FILM)
 """Files and folders of `run` that are copied. The recovered cameras are not among them: `sfm_cache` stores those."""
@@ -18,7 +18,7 @@ MIRRORED = (START, CHECKPOINTS, "plan.json", "stages.json", FILM)
 class Mirror:
     """The thread that copies new files of `folder.run` to storage while the pipeline runs.
 
-    Without work where storage is a folder of this machine. A failed copy is reported to `warn` and tried again.
+    Where storage is a folder of this machine, nothing is copied. A failed copy is reported to `warn` and tried again.
     """
 
     def __init__(self, folder: JobFolder, warn: Callable[[str], None]) -> None:
@@ -52,7 +52,7 @@ class Mirror:
                 continue
             version = (state.st_mtime_ns, state.st_size)
             if path.name.startswith(".") or self._copied.get(path) == version:
-                continue  # names with a leading dot are of files that are still being written
+                continue  # a leading dot marks a file that is still being written
             name = path.relative_to(run).as_posix()
             try:
                 storage.put(f"{layout.job_work(self._folder.job_id)}/{name}", path)

@@ -20,7 +20,7 @@ class ProcessExit:
     """How a process exited.
 
     wait_status: the status that wait(2) returned.
-    peak_bytes: largest resident set size of the process.
+    peak_bytes: largest resident set size of the process, bytes.
     oom_kills: number of processes on this machine that the kernel killed for memory while the process ran.
     """
 
@@ -73,7 +73,7 @@ class ProcessExit:
         if self.out_of_memory:
             return Problem.of(
                 "out_of_memory",
-                f"{detail}. It held up to {format_bytes(self.peak_bytes)}.",
+                f"{detail}. Its peak memory was {format_bytes(self.peak_bytes)}.",
                 facts=facts,
                 advice="Set a smaller image_size, max_gaussians or max_memory, or use a machine with more memory.",
             )
@@ -81,7 +81,7 @@ class ProcessExit:
             "attempts_exhausted",
             f"{detail}.",
             facts=facts,
-            advice="Look for the cause in the worker's log, and restart the job once it is removed.",
+            advice="Look for the cause in the worker's log, correct it, and restart the job.",
         )
 
     @property

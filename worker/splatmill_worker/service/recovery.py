@@ -60,8 +60,8 @@ def requeue_orphans(worker: Worker) -> None:
     for entry_id, execution_id in queue.started_job_registry.get_job_and_execution_ids(cleanup=False):
         _requeue_if_orphaned(worker, queue, entry_id, execution_id)
     if set(others) == dead:
-        # A worker can die after it has taken an entry and before it has registered it. With no other worker alive,
-        # every entry in that state is one.
+        # A worker can die between taking an entry and registering it. With no other worker alive, every entry in that
+        # state belonged to a dead one.
         for entry_id in queue.intermediate_queue.get_job_ids():
             if worker.connection.lrem(queue.intermediate_queue_key, 1, entry_id):
                 queue.push_job_id(entry_id, at_front=True)

@@ -35,10 +35,10 @@ from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, ProcessExi
 from splatmill_worker.service.run_attempt import run_attempt
 
 STOP_GRACE = 15.0
-"""Seconds that an attempt has to save its state when the worker is told to stop. Then it is killed, and the next one
-resumes from the checkpoint before."""
+"""Seconds that an attempt has to save its state when the worker is told to stop. Then it is killed, and the next
+attempt resumes from the last checkpoint that was stored."""
 
-_REDIS_AWAY = (RedisConnectionError, RedisTimeoutError)
+_REDIS_UNREACHABLE = (RedisConnectionError, RedisTimeoutError)
 _RETRY_SECONDS = 0.5
 _REMOVAL_INTERVAL = 3600.0
 
@@ -46,8 +46,8 @@ _REMOVAL_INTERVAL = 3600.0
 class AttemptEntry(backplane.QueueEntry):
     """An entry of the queue that runs `run_attempt`, whatever function name and arguments it carries.
 
-    RQ imports and calls the function that an entry names. Here nothing that lies in Redis decides what runs, and
-    entries of servers that know the function by another name still run.
+    RQ imports and calls the function that an entry names. Here the content of Redis does not decide which function
+    runs, and entries of servers that know the function by another name still run.
 
     attempt: the attempt at the job, set in its process before it runs.
     """
@@ -106,14 +106,14 @@ class AttemptWorker(Worker):
         return backplane.MONITORING_INTERVAL + backplane.HEARTBEAT_SLACK
 
     def _heartbeat(self, job: Job) -> None:
-        """Send the heartbeats of an attempt, or kill it if the queue or the lock has gone to another one meanwhile."""
+        """Send the heartbeats of an attempt; kill it if another attempt has taken its queue entry or its lock."""
         try:
             self.maintain_heartbeats(job)
             assert self.execution is not None
             registered = self.connection.zscore(job.started_job_registry.key, self.execution.composite_key)
             lock = self._lock.refresh() if self._lock else LockState.held
-        except _REDIS_AWAY as error:
-            # The attempt needs no Redis to compute, and its outbox keeps its events.
+        except _REDIS_UNREACHABLE as error:
+            # The attempt can compute without Redis, and its outbox keeps the events.
             self.log.warning(
                 "Worker %s: Redis cannot be reached, so no heartbeat was sent: %s", self.name, error
             )
@@ -196,7 +196,7 @@ class AttemptWorker(Worker):
             finally:
                 os._exit(1)
         with suppress(OSError):
-            # Parent and child both set it, so that a kill can at no time hit the worker's own group.
+            # Parent and child both set the group, so that a kill never reaches the worker's own group.
             os.setpgid(child, child)
         self._horse_pid = child
         signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
@@ -229,7 +229,7 @@ class AttemptWorker(Worker):
         self._until_redis_answers(lambda: self._settle(job, queue, process_exit))
 
     def _wait(self, job: Job) -> tuple[int, Any]:
-        """Wait for the attempt's process, sending heartbeats, and kill it when the grace of a stop is over.
+        """Wait for the attempt's process, sending heartbeats, and kill it at the end of the grace period of a stop.
 
         Returns the wait status and the resource usage of the process.
         """
@@ -254,7 +254,7 @@ class AttemptWorker(Worker):
                 os.close(handle)
 
     def _settle(self, job: Job, queue: Queue, process_exit: ProcessExit) -> None:
-        """Report the end of an attempt, and update its entry, as far as its process has not done so."""
+        """Report how an attempt ended and update its queue entry, unless its process has done so itself."""
         assert self._lock is not None
         holder = self._lock.holder()
         ours = holder if holder and holder.token == self._lock.token else None
@@ -286,6 +286,6 @@ class AttemptWorker(Worker):
             try:
                 action()
                 return
-            except _REDIS_AWAY as error:
+            except _REDIS_UNREACHABLE as error:
                 self.log.warning("Worker %s: waiting for Redis: %s", self.name, error)
                 time.sleep(_RETRY_SECONDS)

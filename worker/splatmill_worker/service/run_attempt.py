@@ -1,7 +1,7 @@
 """One attempt at a job: stages the capture, runs the pipeline, reports its events and stores the model.
 
-It runs in a process of its own (see rq_worker). Each failure becomes a named problem, and one that would happen again
-is not retried. When the process is killed, its parent reports that.
+It runs in a process of its own (see rq_worker). Each failure becomes a named problem, and only transient ones are
+retried. When the process is killed, its parent reports the failure.
 """
 
 import importlib
@@ -32,7 +32,7 @@ from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, WITHDRAWN_
 from splatmill_worker.settings import storage_url
 
 PIPELINE = os.environ.get("SPLATMILL_PIPELINE", "splatmill_worker.pipeline")
-"""The module whose `run` does the work. The service's tests put a stand-in in its place."""
+"""The module whose `run` does the work; tests of the service name another one."""
 
 RETRY_SECONDS = 5.0
 """Seconds between a transient failure and the end of its attempt, after which the queue tries again."""
@@ -49,7 +49,8 @@ class PipelineResult(Protocol):
 
 
 Pipeline = Callable[[Path, Path, TrainOptions, Callable[[Event], None], Callable[[], bool]], PipelineResult]
-"""Arguments: capture folder, run folder, options, what takes the events, and what tells whether to stop."""
+"""Arguments: the capture folder, the run folder, the options, a function that takes each event, and a function that
+returns whether to stop."""
 
 log = logging.getLogger("splatmill_worker")
 
@@ -142,7 +143,7 @@ def _train_and_publish(attempt: Attempt, row: JobRow, storage: Storage, outbox: 
 
 
 def _forward(event: Event, folder: JobFolder, outbox: Outbox) -> None:
-    """Send an event of the pipeline, with what belongs to it.
+    """Send an event of the pipeline, and store the files that belong to it.
 
     A preview is stored before it is announced. When training begins, the recovered cameras are stored for other jobs.
     Final states are dropped: the service reports them once the model is stored.
@@ -162,7 +163,7 @@ def _forward(event: Event, folder: JobFolder, outbox: Outbox) -> None:
         try:
             sfm_cache.store(folder.storage, folder.capture_id, folder.run)
         except StorageError as error:
-            # The job itself does not need them there.
+            # The job itself has the cameras in its folder.
             message = f"The recovered cameras could not be stored for other jobs on this capture: {error}"
             outbox.put(LogEvent(level="warning", message=message))
 

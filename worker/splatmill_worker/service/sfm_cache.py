@@ -11,7 +11,7 @@ from splatmill.backplane.storage import Storage
 
 _FOLDER = "sfm"
 _LAST_FILE = "facts.json"
-"""The file of a model that is copied last, in both directions: a folder without it is incomplete and is not used."""
+"""The file of a model that is copied last, to and from storage: a folder without it is incomplete and is not used."""
 
 
 def fetch(storage: Storage, capture_id: str, run: Path) -> int:
