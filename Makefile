@@ -32,7 +32,7 @@ quick: $(VENV)/.installed-dev ## run the tests that most changes need (not those
 	$(PYTEST) -m "not slow" $(PYTEST_ARGS)
 
 test: $(VENV)/.installed-dev ## run all tests and print their coverage (PYTEST_ARGS="..." chooses)
-	$(PYTEST) $(PYTEST_ARGS)
+	$(PYTEST) --cov $(PYTEST_ARGS)
 
 check: $(VENV)/.installed-dev ## ruff, mypy, import rules
 	$(BIN)/ruff check .

@@ -84,6 +84,7 @@ def test_an_address_that_is_not_valid_is_refused_without_its_password(url: str) 
 
 
 # Only the doctor does not wait for a Redis that does not answer.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("program", "url"),
     [("doctor", f"redis://:{PASSWORD}@127.0.0.1:1/0")]

@@ -130,6 +130,7 @@ def test_a_checkpoint_of_the_code_before_snapshots_is_resumed(tmp_path: Path) ->
     assert bool(torch.isfinite(run.engine.parameters()["means"]).all())
 
 
+@pytest.mark.slow
 def test_the_file_has_the_keys_and_the_format_of_before(tmp_path: Path) -> None:
     checkpoint.save(tmp_path, advanced(a_run(course()), 3).snapshot())
     stored = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
