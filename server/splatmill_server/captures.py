@@ -8,17 +8,20 @@ import shutil
 from collections.abc import AsyncIterator, Sequence
 from datetime import UTC, datetime
 
+import structlog
 from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane import layout
 from splatmill.backplane.records import FORMAT, UnreadableRecord, check_format, reason, warn
-from splatmill.backplane.storage import Entry, Storage
+from splatmill.backplane.storage import Entry, Storage, StorageError
 from splatmill.schema import PHOTO_SUFFIXES, Capture, CaptureFile, CapturePage, Role, format_bytes, safe_name
 from splatmill.schema.tolerant import keep_readable
 from splatmill_server.metrics import Metrics
 from splatmill_server.paging import read_cursor, write_cursor
-from splatmill_server.problems import ProblemError
+from splatmill_server.problems import ProblemError, problem_of_storage
 from splatmill_server.settings import Settings
+
+log = structlog.get_logger()
 
 _CONCURRENT_READS = 32
 _COUNTED_CAPTURES = 1000
@@ -164,9 +167,29 @@ class Captures:
 
         A file that is already stored with the same bytes is not stored again. Raises UnsafeName, and problems for
         other bytes under the name (409), a digest that differs (422), an empty file (422), a file that is too large
-        (413), too many files (413) and full storage (507). After an error or a lost connection, storage is unchanged.
+        (413), too many files (413) and full storage (507), which all name the file. After an error or a lost
+        connection, storage is unchanged.
         """
         name = safe_name(name)
+        try:
+            return await self._store(capture_id, role, name, chunks, announced_sha256, announced_size)
+        except ProblemError as error:
+            raise error.about_file(f"{role.value}/{name}") from error
+        except StorageError as error:
+            problem = problem_of_storage(error)
+            log.warning("storage error", error=str(error), file=f"{role.value}/{name}", capture=capture_id)
+            named = ProblemError(problem.code, problem.detail, advice=problem.advice, facts=problem.facts)
+            raise named.about_file(f"{role.value}/{name}") from error
+
+    async def _store(
+        self,
+        capture_id: str,
+        role: Role,
+        name: str,
+        chunks: AsyncIterator[bytes],
+        announced_sha256: str | None,
+        announced_size: int | None,
+    ) -> tuple[CaptureFile, bool]:
         await run_in_threadpool(self._check_room, capture_id, announced_size)
         taken = await run_in_threadpool(self._taken, capture_id, role, name)
         body = _Counted(chunks, self.settings.max_file_bytes)

@@ -36,6 +36,13 @@ class ProblemError(HTTPException):
         super().__init__(PROBLEMS[code].status, detail, headers)
         self.problem = Problem.of(code, detail, facts=dict(facts or {}), advice=advice)
 
+    def about_file(self, name: str) -> "ProblemError":
+        """Return the same error with the name of the file that it concerns, in the detail and among the facts."""
+        found = self.problem
+        detail = found.detail if name in found.detail else f"{name}: {found.detail}"
+        facts = found.facts | {"file": name}
+        return ProblemError(found.code, detail, advice=found.advice, facts=facts, headers=self.headers)
+
 
 class ProblemResponse(Response):
     """A response with a problem document. `instance` is the path of the request."""

@@ -15,6 +15,7 @@ from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
+import httpx
 import pytest
 
 from splatmill.backplane import layout
@@ -216,3 +217,43 @@ def test_an_upload_into_a_capture_that_is_deleted_meanwhile_leaves_nothing(app: 
     answer = app.http.put(f"/v1/captures/{capture_id}/images/late.jpg", content=body())
     problem(answer, 404, "capture_not_found")
     assert stored(app) == []
+
+
+def test_every_error_of_an_upload_names_its_file(serve: Serve, tmp_path: Path) -> None:
+    app = serve(max_file_bytes=1000, max_files_per_capture=2)
+    capture_id = app.http.post("/v1/captures", json={}).json()["id"]
+    address = f"/v1/captures/{capture_id}/images/sub/a.jpg"
+    assert app.http.put(address, content=PHOTO).status_code == 201
+    wrong = {"X-Content-SHA256": "0" * 64}
+
+    def named(answer: httpx.Response, status: int, code: str, name: str) -> None:
+        found = problem(answer, status, code)
+        assert name in found["detail"]
+        assert found["facts"]["file"] == name
+
+    named(app.http.put(address, content=b"other"), 409, "name_taken", "images/sub/a.jpg")
+    empty = address.replace("images/sub/a.jpg", "poses/points3D.txt")
+    named(app.http.put(empty, content=b""), 422, "file_empty", "poses/points3D.txt")
+    named(app.http.put(empty, content=b"x" * 2000), 413, "body_too_large", "poses/points3D.txt")
+    named(app.http.put(empty, content=b"x", headers=wrong), 422, "digest_mismatch", "poses/points3D.txt")
+    gone = "/v1/captures/0123456789abcdef/images/a.jpg"
+    named(app.http.put(gone, content=PHOTO), 404, "capture_not_found", "images/a.jpg")
+    refused = app.http.put(address, content=PHOTO, headers={"Content-Type": "text/html"})
+    assert "images/sub/a.jpg" in problem(refused, 415, "unsupported_media_type")["detail"]
+    assert app.http.put(address.replace("a.jpg", "b.jpg"), content=PHOTO).status_code == 201
+    named(
+        app.http.put(address.replace("a.jpg", "c.jpg"), content=PHOTO),
+        413,
+        "body_too_large",
+        "images/sub/c.jpg",
+    )
+
+    # In a form of many files, the name is all that tells which one was refused.
+    files = [("images", ("a.jpg", PHOTO)), ("masks", ("b.png", b"")), ("images", ("c.jpg", PHOTO))]
+    named(app.http.post("/v1/jobs", files=files), 422, "file_empty", "masks/b.png")
+
+    # So it does where storage fails.
+    other = app.http.post("/v1/captures", json={}).json()["id"]
+    (tmp_path / "data" / "storage" / "captures" / other / "incoming").write_text("in the way")
+    answer = app.http.put(f"/v1/captures/{other}/images/d.jpg", content=PHOTO)
+    named(answer, 503, "storage_unavailable", "images/d.jpg")

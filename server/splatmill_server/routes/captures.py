@@ -116,7 +116,7 @@ async def put_file(
     if not media_type.startswith(_ACCEPTED[role]):
         raise ProblemError(
             "unsupported_media_type",
-            f"The content type {media_type[:80]!r} is not accepted for {role.value}.",
+            f"The content type {media_type[:80]!r} is not accepted for {role.value}/{name[:200]}.",
             advice="Send the bytes of the file with Content-Type: application/octet-stream.",
             facts={"accepted": list(_ACCEPTED[role])},
         )
