@@ -18,6 +18,8 @@ from tests.support.formats import job_ids, restore_redis, restore_storage
 from tests.support.served_app import Serve, ServedApp, problem
 from tests.support.server_events import brief, follow
 
+pytestmark = pytest.mark.slow  # a server for each case
+
 
 @pytest.fixture
 def stored_copy(serve: Serve, connection: redis.Redis, tmp_path: Path) -> ServedApp:

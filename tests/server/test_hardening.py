@@ -16,6 +16,8 @@ from splatmill_server import service
 from splatmill_server.settings import Settings
 from tests.support.served_app import Serve, ServedApp
 
+pytestmark = pytest.mark.slow  # a server for each case
+
 PHOTO = b"\xff\xd8\xff a photo"
 PASSWORD = "hunter2"
 
@@ -84,7 +86,6 @@ def test_an_address_that_is_not_valid_is_refused_without_its_password(url: str) 
 
 
 # Only the doctor does not wait for a Redis that does not answer.
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("program", "url"),
     [("doctor", f"redis://:{PASSWORD}@127.0.0.1:1/0")]
