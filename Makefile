@@ -15,7 +15,7 @@ PARTS := constraints.txt $(wildcard */pyproject.toml) client/splatmill/__init__.
 # The tests run in this many processes, a file in one process.
 WORKERS ?= 2
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
-PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --cov
+PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 .PHONY: help install demo quick test check wheels docs bench serve sanitize clean
 
