@@ -5,6 +5,7 @@ Does not prove that the design is good, only that the code still follows it.
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -69,3 +70,9 @@ def test_every_test_file_says_what_it_proves():
         if '"""' not in p.read_text()[:8]
     ]
     assert not mute
+
+
+def test_every_type_ignore_has_its_reason():
+    bare = re.compile(r"# type: ignore(\[[a-z, -]+\])?\s*$", re.M)
+    places = [str(p.relative_to(ROOT)) for p in sources() if p.suffix == ".py" and bare.search(p.read_text())]
+    assert not places

@@ -106,7 +106,7 @@ class GsplatTrainer:
         if densify:
             self.strategy.step_pre_backward(self.params, self.optimizers, self._state, number, info)
         loss = ops.loss(color.contiguous(), self._on_device(target).rgb)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
         for optimizer in self.optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)

@@ -105,9 +105,9 @@ def build(name: str) -> Iterator[None]:
     modules = [m for k, m in sys.modules.items() if k.startswith(prefix) and hasattr(m, "engine")]
     before = [m.engine for m in modules]
     for m in modules:
-        m.engine = engine  # type: ignore[attr-defined]
+        m.engine = engine  # type: ignore[attr-defined]  # modules have no declared attributes
     try:
         yield
     finally:
         for m, old in zip(modules, before, strict=True):
-            m.engine = old  # type: ignore[attr-defined]
+            m.engine = old  # type: ignore[attr-defined]  # modules have no declared attributes

@@ -29,6 +29,7 @@ from splatmill_worker.pipeline import EXTENT
 from splatmill_worker.scene import Camera, Normalization, split
 from splatmill_worker.sfm import posed
 from splatmill_worker.splat.engine.open import open_engine
+from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.evaluate import evaluate
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.decide import decide
@@ -111,8 +112,8 @@ def equal(counts: Sequence[int]) -> list[Row]:
         here = gaussians.map(lambda value: value.cuda())
         late = 3 * _gsplat.DEGREE_EVERY  # all of SH is in use
 
-        def our_step(engine: object = ours, seen: Target = target) -> None:
-            engine.train_photo(seen.viewmat, seen.K, seen.rgb, degree=3, rates=ZERO_RATES, step=1)  # type: ignore[attr-defined]
+        def our_step(engine: Engine = ours, seen: Target = target) -> None:
+            engine.train_photo(seen.viewmat, seen.K, seen.rgb, degree=3, rates=ZERO_RATES, step=1)
 
         def our_view(scene: Gaussians = here, seen: Target = target) -> None:
             with torch.no_grad():

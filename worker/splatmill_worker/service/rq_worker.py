@@ -96,7 +96,7 @@ class AttemptWorker(Worker):
         recovery.requeue_orphans(self)
 
     def run_maintenance_tasks(self) -> None:
-        super().run_maintenance_tasks()  # type: ignore[no-untyped-call]
+        super().run_maintenance_tasks()  # type: ignore[no-untyped-call]  # RQ leaves it untyped
         if time.monotonic() >= self._remove_at:
             self._remove_at = time.monotonic() + _REMOVAL_INTERVAL
             for job_id in remove_abandoned(self.connection):
@@ -130,7 +130,7 @@ class AttemptWorker(Worker):
     def handle_payload(self, message: dict[str, Any]) -> None:
         payload = parse_payload(message)
         if payload["command"] != "stop-job":
-            super().handle_payload(message)  # type: ignore[no-untyped-call]
+            super().handle_payload(message)  # type: ignore[no-untyped-call]  # RQ leaves it untyped
         elif payload.get("job_id") == self._entry_id and self.horse_pid:
             # RQ compares with the current job in Redis, which is written later than the attempt begins.
             self._stopped_job_id = self._entry_id
@@ -143,7 +143,7 @@ class AttemptWorker(Worker):
                 os.killpg(self.horse_pid, sig)
 
     def handle_warm_shutdown_request(self) -> None:
-        super().handle_warm_shutdown_request()  # type: ignore[no-untyped-call]
+        super().handle_warm_shutdown_request()  # type: ignore[no-untyped-call]  # RQ leaves it untyped
         if self.horse_pid:
             self._kill_at = time.monotonic() + self._grace
             with suppress(ProcessLookupError):

@@ -73,7 +73,7 @@ def random() -> torch.Generator:
 
 
 def doubled(engine: Held, allowed: int = 1000) -> Change:
-    return densify(engine, random(), extent=1.0, allowed=allowed)  # type: ignore[arg-type]
+    return densify(engine, random(), extent=1.0, allowed=allowed)  # type: ignore[arg-type]  # a stand-in with what densify reads
 
 
 def test_small_ones_are_cloned_and_keep_their_moments() -> None:
@@ -123,7 +123,7 @@ def test_decayed_opacities_are_multiplied() -> None:
 def test_what_is_far_keeps_its_opacity() -> None:
     engine = Held(gaussians(4), torch.zeros(4))
     engine.held.means[:] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 9.0, 0.0], [2.0, 2.0, 0.0], [-8.0, 0.0, 0.0]])
-    densify(engine, random(), extent=1.0, allowed=4, opacity_decay=0.9, decay_within=5.0)  # type: ignore[arg-type]
+    densify(engine, random(), extent=1.0, allowed=4, opacity_decay=0.9, decay_within=5.0)  # type: ignore[arg-type]  # a stand-in with what densify reads
     assert torch.sigmoid(engine.held.logit_opacities).tolist() == pytest.approx([0.45, 0.5, 0.45, 0.5])
 
 

@@ -18,7 +18,7 @@ def composite(
     """Blend the lists into color [H,W,3], alpha [H,W] and depth [H,W], as `reference.composite` defines it."""
     if background is None:
         background = torch.zeros(3)
-    image = _Composite.apply(  # type: ignore[no-untyped-call]
+    image = _Composite.apply(  # type: ignore[no-untyped-call]  # torch leaves it untyped
         *projected, bins.offsets, bins.ids, background, width, height
     )
     return image[0], image[1], image[2]

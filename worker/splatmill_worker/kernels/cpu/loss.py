@@ -59,7 +59,7 @@ def loss(
     """
     if stats is None:
         stats = photo_stats(photo, mask=mask)
-    value: Tensor = _Loss.apply(color, stats, dssim_weight)  # type: ignore[no-untyped-call]
+    value: Tensor = _Loss.apply(color, stats, dssim_weight)  # type: ignore[no-untyped-call]  # torch leaves it untyped
     return value
 
 

@@ -28,7 +28,7 @@ def project(
     antialias: bool = False,
 ) -> Projected:
     """Project Gaussians into one pinhole camera, as `reference.project` defines it; float32."""
-    rows = _Project.apply(  # type: ignore[no-untyped-call]
+    rows = _Project.apply(  # type: ignore[no-untyped-call]  # torch leaves it untyped
         means, log_scales, quats, logit_opacities, sh, viewmat, K, width, height, degree, near, antialias
     )
     return Projected(*rows)
