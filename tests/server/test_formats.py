@@ -6,6 +6,7 @@ what the first version stored (tests/worker/test_formats.py reads it).
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from splatmill.schema import EVENT, JobState, LogEvent, ProgressEvent, StateEven
 from tests.support.formats import job_ids, restore_redis, restore_storage
 from tests.support.served_app import Serve, ServedApp, problem
 from tests.support.server_events import brief, follow
+from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow  # a server for each case
 
@@ -70,13 +72,20 @@ def test_events_logs_models_and_captures_of_the_first_version_are_served(stored_
     assert len(http.get(f"/v1/captures/{model_capture(stored_copy, done)}").json()["files"]) == 9
 
 
+def has_state(app: ServedApp, path: str, state: str) -> bool:
+    return bool(app.http.get(path).json()["state"] == state)
+
+
 def test_the_reaper_finds_the_jobs_of_the_first_version_in_the_queue(stored_copy: ServedApp) -> None:
     stored_copy.service.reaper.tick()
     ids = job_ids()
     assert queue.waiting(stored_copy.redis) == {"train": 2}
     assert stored_copy.redis.smembers(keys.ACTIVE) == {ids["interrupted"].encode(), ids["queued"].encode()}
     for name in ("interrupted", "queued"):
-        assert stored_copy.http.post(f"/v1/jobs/{ids[name]}/cancel").json()["state"] == "cancelled"
+        path = f"/v1/jobs/{ids[name]}"
+        assert stored_copy.http.post(f"{path}/cancel").status_code == 202
+        # The server's own reaper may be at the job at this moment; then its next tick cancels the job.
+        wait_for(partial(has_state, stored_copy, path, "cancelled"))
     assert stored_copy.http.post(f"/v1/jobs/{ids['failed']}/restart").json()["state"] == "queued"
     for job_id in (ids["succeeded"], ids["cancelled"]):
         assert stored_copy.http.delete(f"/v1/jobs/{job_id}").status_code == 204
