@@ -5,6 +5,7 @@
     │   ├── EmptyCapture     the capture has no files
     │   ├── StartNotStored   the model to start from is not in storage
     │   └── StartUnusable    the file to start from is not a usable 3D Gaussian model
+    ├── CaptureIncomplete    files of the capture did not reach the training
     ├── SfmFailed            structure from motion ended without a usable scene
     ├── TrainingFailed       training ended with a numerical failure
     ├── ModelNotFound        there is no finished model with the requested id
@@ -86,6 +87,18 @@ class StartUnusable(Refusal):
                 "Start from a 3D Gaussian .ply file that was trained on the cameras of this capture, "
                 "or leave out the option start."
             ),
+        )
+
+
+class CaptureIncomplete(WorkerError):
+    """Files of the capture did not reach the training, and no reason for leaving them out is known."""
+
+    def __init__(self, place: str, missing: list[str], count: int) -> None:
+        super().__init__(
+            "capture_incomplete",
+            f"{len(missing)} of the {count} files of {place} did not reach the training, such as {missing[0]!r}.",
+            facts={"missing": missing[:20], "files": count},
+            advice="Check that the capture is whole and that the worker may read the storage, then restart the job.",
         )
 
 

@@ -84,6 +84,7 @@ PROBLEMS: dict[str, Kind] = {
     "worker_lost": Kind(500, "The worker ended without reporting a result"),
     "attempts_exhausted": Kind(500, "Every attempt at the job ended early"),
     "render_failed": Kind(500, "The image could not be rendered"),
+    "capture_incomplete": Kind(500, "Not all files of the capture reached the training"),
     "job_corrupt": Kind(500, "The stored record of the job cannot be read"),
     "model_corrupt": Kind(500, "The stored model cannot be read"),
     "internal_error": Kind(500, "The service failed to handle the request"),

@@ -4,11 +4,13 @@ orientation, alpha, masks, videos, zips, undistortion.
 Not proven here: colour management (profiles are ignored by design) and cameras' raw formats.
 """
 
+import importlib
 import io
 import struct
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -16,6 +18,7 @@ import pytest
 from PIL import Image
 
 from splatmill_worker import images
+from splatmill_worker.errors import CaptureIncomplete
 from splatmill_worker.images import archive, decode, lens
 from splatmill_worker.scene import Camera, Lens, View
 
@@ -70,6 +73,31 @@ def test_unusable_files_are_named_with_their_reason(photos: Path, tmp_path: Path
     assert "empty" in found["empty.png"]
     assert "does not decode completely" in found["cut.jpg"]
     assert "too small" in found["one.png"]
+
+
+def test_a_link_is_named_and_its_target_not_read(photos: Path, tmp_path: Path) -> None:
+    picture().save(tmp_path / "outside.png")
+    (photos / "link.png").symlink_to(tmp_path / "outside.png")
+    result = prepared(photos, tmp_path)
+    assert result.photos == ()
+    assert "link" in reasons(result)["link.png"]
+
+
+def test_files_that_are_neither_used_nor_skipped_are_a_failure(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def expand(
+        name: str, path: Path, inside: object, workdir: Path, frames: int, found: Any, _: object
+    ) -> None:
+        if name != "b.png":
+            found.files.append((name, path, None))
+
+    for seed, name in enumerate(("a.png", "b.png")):
+        picture(seed=seed).save(photos / name)
+    module = importlib.import_module("splatmill_worker.images.prepare")
+    monkeypatch.setattr(module, "_expand", expand)
+    with pytest.raises(CaptureIncomplete, match=r"1 of the 2 files of images/ .* 'b\.png'"):
+        prepared(photos, tmp_path)
 
 
 def test_an_oversized_photo_is_refused_by_its_header(photos: Path, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Role
 from tests.support.jobs import CAPTURE
+from tests.support.other_file_system import other_file_system as other_file_system
 from tests.support.redis_server import connection as connection
 from tests.support.redis_server import redis_server as redis_server
 
@@ -19,7 +20,18 @@ from tests.support.redis_server import redis_server as redis_server
 def local(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Storage:
     """Storage in a folder of this machine, with two photos and a mask in CAPTURE."""
     monkeypatch.setenv("SPLATMILL_DATA", str(tmp_path / "data"))
-    storage = Storage((tmp_path / "storage").as_uri())
+    return with_capture(tmp_path / "storage")
+
+
+@pytest.fixture
+def elsewhere(other_file_system: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Storage:
+    """The same storage on another file system than the work folder."""
+    monkeypatch.setenv("SPLATMILL_DATA", str(tmp_path / "data"))
+    return with_capture(other_file_system / "storage")
+
+
+def with_capture(folder: Path) -> Storage:
+    storage = Storage(folder.as_uri())
     for name in ("a.jpg", "deep/b.jpg"):
         storage.put(layout.capture_file(CAPTURE, Role.images, name), name.encode())
     storage.put(layout.capture_file(CAPTURE, Role.masks, "a.png"), b"mask")

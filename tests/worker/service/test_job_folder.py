@@ -3,8 +3,6 @@
 Does not prove that S3 works: tests/server/test_storage does where there is a bucket.
 """
 
-import errno
-import os
 from pathlib import Path
 
 import pytest
@@ -12,7 +10,7 @@ import pytest
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import Role
-from splatmill_worker.errors import FolderInUse, StartNotStored
+from splatmill_worker.errors import CaptureIncomplete, FolderInUse, StartNotStored
 from splatmill_worker.service import job_folder
 from splatmill_worker.service.job_folder import JobFolder, in_use
 from splatmill_worker.service.mirror import Mirror
@@ -153,16 +151,41 @@ def test_a_stored_model_is_brought_along_to_start_from(where: str, request: pyte
     folder.close()
 
 
-def test_a_model_to_start_from_is_copied_where_links_cannot_be_made(
-    local: Storage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(source: Path, target: Path) -> None:
-        raise OSError(errno.EXDEV, "Invalid cross-device link")
-
-    monkeypatch.setattr(os, "link", refuse)  # storage on another file system than the work folder
-    local.put(layout.model_file("model001", "model.ply"), b"splats")
-    folder = JobFolder(local, JOB, CAPTURE)
+def test_a_model_to_start_from_is_copied_where_links_cannot_be_made(elsewhere: Storage) -> None:
+    elsewhere.put(layout.model_file("model001", "model.ply"), b"splats")
+    folder = JobFolder(elsewhere, JOB, CAPTURE)
     folder.stage_start("model001")
-    local.delete(layout.model_file("model001", "model.ply"))
+    elsewhere.delete(layout.model_file("model001", "model.ply"))
     assert [path.name for path in folder.run.iterdir()] == ["start.ply"]
     assert (folder.run / "start.ply").read_bytes() == b"splats"
+
+
+def test_a_capture_on_another_file_system_is_copied_and_outlives_its_deletion(elsewhere: Storage) -> None:
+    folder = JobFolder(elsewhere, JOB, CAPTURE)
+    assert folder.stage_capture() == 3
+    assert not any(path.is_symlink() for path in folder.capture.rglob("*"))
+    elsewhere.delete_prefix(layout.capture(CAPTURE))
+    assert staged(folder) == EXPECTED
+
+
+def test_links_that_an_earlier_version_staged_become_files(elsewhere: Storage) -> None:
+    folder = JobFolder(elsewhere, JOB, CAPTURE)
+    source = elsewhere.local_path(layout.capture_file(CAPTURE, Role.images, "a.jpg"))
+    assert source is not None
+    (folder.capture / "images").mkdir(parents=True)
+    (folder.capture / "images/a.jpg").symlink_to(source)
+    folder.stage_capture()
+    assert not (folder.capture / "images/a.jpg").is_symlink()
+    assert staged(folder) == EXPECTED
+
+
+def test_a_stored_file_that_vanishes_while_it_is_staged_is_named(
+    local: Storage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed = list(local.entries(layout.capture_files(CAPTURE)))
+    monkeypatch.setattr(local, "entries", lambda prefix: listed)
+    local.delete(layout.capture_file(CAPTURE, Role.images, "a.jpg"))
+    with pytest.raises(CaptureIncomplete) as caught:
+        JobFolder(local, JOB, CAPTURE).stage_capture()
+    assert problem_of(caught.value).code == "capture_incomplete"
+    assert caught.value.facts == {"missing": ["images/a.jpg"], "files": 3}

@@ -1,4 +1,5 @@
-"""Proves how an attempt that storage refuses ends: queued again while it can be retried, failed by name when not.
+"""Proves how an attempt that storage refuses ends: queued again while it can be retried, failed by name when not; and
+that photos reach structure from motion from a storage on another file system.
 
 Does not prove what happens to the processes: tests/service does.
 """
@@ -8,12 +9,15 @@ from pathlib import Path
 
 import pytest
 import redis
+from PIL import Image
 
-from splatmill.backplane.storage import StorageError
+from splatmill.backplane import layout
+from splatmill.backplane.storage import Storage, StorageError
+from splatmill.schema import Role
 from splatmill_worker.service import run_attempt as module
 from splatmill_worker.service.attempt import Attempt, start_attempt
 from splatmill_worker.service.run_attempt import run_attempt
-from tests.support.jobs import messages, read_job, write_row
+from tests.support.jobs import CAPTURE, messages, read_job, write_row
 
 JOB = "job00001"
 
@@ -49,3 +53,19 @@ def test_a_transient_failure_without_retries_left_is_the_jobs_problem(
     assert job.problem.code == "storage_unavailable"
     assert job.problem.sentence in messages(connection, JOB)
     assert refused.lock.holder() is None
+
+
+def test_photos_reach_structure_from_motion_from_another_file_system(
+    elsewhere: Storage, connection: redis.Redis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPLATMILL_STORAGE", elsewhere.url)
+    monkeypatch.setattr(logging.getLogger("splatmill_worker"), "level", logging.WARNING)
+    elsewhere.delete_prefix(layout.capture(CAPTURE))
+    for grey in range(4):
+        Image.new("RGB", (64, 48), 3 * (grey,)).save(tmp_path / "plain.png")
+        elsewhere.put(layout.capture_file(CAPTURE, Role.images, f"{grey}.png"), tmp_path / "plain.png")
+    write_row(connection, JOB)
+    run_attempt(start_attempt(connection, f"{JOB}-1", "token"), can_retry=False)
+    problem = read_job(connection, JOB).problem
+    assert problem is not None
+    assert (problem.code, problem.facts["photos"]) == ("sfm_no_features", 4), problem.detail

@@ -14,7 +14,7 @@ from pathlib import Path
 from PIL import Image, UnidentifiedImageError
 
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, MAX_PHOTO_PIXELS, MIN_PHOTO_SIDE, VIDEO_SUFFIXES
-from splatmill_worker.errors import Cancelled
+from splatmill_worker.errors import Cancelled, CaptureIncomplete
 from splatmill_worker.images import archive, exif, video
 from splatmill_worker.images.decode import upright_size
 from splatmill_worker.images.masks import mask_of, masks_under
@@ -83,10 +83,12 @@ class _Found:
     """Files found so far.
 
     files: name, path, and name of the video that the file is a frame of.
+    opened: names of the zips and videos whose content is among the files.
     skipped, notes: as in `Prepared`.
     """
 
     files: list[tuple[str, Path, str | None]] = field(default_factory=list)
+    opened: set[str] = field(default_factory=set)
     skipped: list[tuple[str, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -109,10 +111,11 @@ def prepare(
     masks: folder of the masks, if there is one; a mask may also lie beside its photo as name.jpg.png.
     on_progress: called as ("images", files examined, files in all, name of the file).
 
-    Raises Cancelled.
+    Raises CaptureIncomplete when a file is neither used nor skipped, and Cancelled.
     """
     found = _Found()
-    for path in _files(images):
+    given = _files(images)
+    for path in given:
         _expand(path.relative_to(images).as_posix(), path, None, workdir, frames, found, cancelled)
     beside = {name: path for name, path, _ in found.files}
     mask_files = masks_under(masks) if masks is not None and masks.is_dir() else {}
@@ -137,18 +140,21 @@ def prepare(
                 mask = beside[f"{name}.png"]
             photos[result.sha256] = _with_mask(result, mask, found)
     ordered = tuple(sorted(photos.values(), key=lambda photo: photo.name))
+    known = {photo.name for photo in ordered} | {name for name, _ in found.skipped} | own_masks | found.opened
+    lost = [name for path in given if (name := path.relative_to(images).as_posix()) not in known]
+    if lost:
+        raise CaptureIncomplete(f"{images.name}/", lost, len(given))
     return Prepared(ordered, tuple(found.skipped), tuple(found.notes))
 
 
 def _files(images: Path) -> list[Path]:
-    """The regular files under `images`, sorted by name; links and hidden files are left out."""
+    """What lies under `images` and is no folder, sorted by name; hidden files are left out."""
     if not images.is_dir():
         return []
     return [
         path
         for path in sorted(images.rglob("*"))
-        if path.is_file()
-        and not path.is_symlink()
+        if (path.is_symlink() or not path.is_dir())
         and path.name.lower() not in IGNORED_NAMES
         and not any(part.startswith(IGNORED_PREFIXES) for part in path.relative_to(images).parts)
     ]
@@ -171,7 +177,9 @@ def _expand(
     """
     suffix = path.suffix.lower()
     try:
-        if suffix in ARCHIVE_SUFFIXES and inside is None:
+        if path.is_symlink() or not path.is_file():
+            found.skipped.append((name, "it is a link or a device, not a file"))
+        elif suffix in ARCHIVE_SUFFIXES and inside is None:
             folder = _filled_once(
                 workdir / "unpacked" / _sha256(path)[:24],
                 lambda place: archive.unpack(path, place, cancelled),
@@ -179,6 +187,7 @@ def _expand(
             for inner in _files(folder):
                 inner_name = f"{Path(name).with_suffix('').as_posix()}/{inner.relative_to(folder).as_posix()}"
                 _expand(inner_name, inner, name, workdir, frames, found, cancelled)
+            found.opened.add(name)
         elif suffix in ARCHIVE_SUFFIXES:
             found.skipped.append((name, "a zip inside a zip is not unpacked; give its photos themselves"))
         elif suffix in VIDEO_SUFFIXES:
@@ -189,6 +198,7 @@ def _expand(
             pictures = _files(folder)
             prefix = Path(name).with_suffix("").as_posix()
             found.files += [(f"{prefix}_{p.stem.rpartition('_')[2]}.jpg", p, name) for p in pictures]
+            found.opened.add(name)
             found.notes.append(f"{len(pictures)} frames were taken from the video {name}.")
         else:
             found.files.append((name, path, None))

@@ -7,6 +7,7 @@ from pathlib import Path
 import uvicorn
 
 from splatmill.backplane.storage import Storage, StorageError
+from splatmill.schema import parse_bytes
 from splatmill_worker.render_service.app import RenderApp
 from splatmill_worker.settings import storage_url
 
@@ -20,13 +21,11 @@ def serve(host: str, port: int, uds: Path | None, backend: str | None = None) ->
     host, port: the address to listen on; `uds`, the path of a unix socket, takes its place.
     backend: the kernels to render with; None means those of the CPU.
 
-    SPLATMILL_RENDER_CACHE, in bytes, limits the memory of cached models.
+    SPLATMILL_RENDER_CACHE, a size such as 500MB, limits the memory of cached models.
     """
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    cache_bytes = int(os.environ.get("SPLATMILL_RENDER_CACHE") or min(MAX_CACHE_BYTES, memory // 8))
     try:
-        app = RenderApp(Storage(storage_url()), cache_bytes, backend)
-    except StorageError as error:
+        app = RenderApp(Storage(storage_url()), _cache_bytes(), backend)
+    except (StorageError, ValueError) as error:
         print(error, file=sys.stderr)
         return 1
     config = uvicorn.Config(
@@ -44,3 +43,15 @@ def serve(host: str, port: int, uds: Path | None, backend: str | None = None) ->
     server = uvicorn.Server(config)
     server.run()
     return 0 if server.started else 1
+
+
+def _cache_bytes() -> int:
+    """Bytes of memory for cached models. Raises ValueError where SPLATMILL_RENDER_CACHE is not a size."""
+    given = os.environ.get("SPLATMILL_RENDER_CACHE")
+    if not given:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        return min(MAX_CACHE_BYTES, memory // 8)
+    try:
+        return int(parse_bytes(given))
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f"SPLATMILL_RENDER_CACHE cannot be used: {error}.") from error

@@ -1,6 +1,6 @@
 """The local folder of a job: its photos, its checkpoints, and the model to be stored.
 
-    work/{job}/capture/{images,masks,poses}/...   the capture, linked or downloaded
+    work/{job}/capture/{images,masks,poses}/...   the capture, linked, copied or downloaded
     work/{job}/run/...                            what the pipeline writes: checkpoints, cameras, out/
     work/{job}/lock                               locked by the attempt's process, independently of Redis
 
@@ -12,12 +12,13 @@ import fcntl
 import os
 import shutil
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
-from splatmill.files import replacing
-from splatmill_worker.errors import FolderInUse, StartNotStored
+from splatmill.backplane.storage import Entry, Storage
+from splatmill_worker.errors import CaptureIncomplete, FolderInUse, StartNotStored
+from splatmill_worker.service.own_copy import link_or_copy
 from splatmill_worker.settings import work_folder
 
 LOCK_SECONDS = 10.0
@@ -51,7 +52,11 @@ class JobFolder:
         self._lock = _locked(self.path / "lock")
 
     def stage_capture(self) -> int:
-        """Make the capture folder equal to the stored capture, by links where storage is local. Return its files."""
+        """Make the capture folder equal to the stored capture; return the number of its files.
+
+        Files of a local storage are linked, or copied where it lies on another file system. Raises CaptureIncomplete
+        when a stored file is not in the folder afterwards.
+        """
         prefix = layout.capture_files(self.capture_id)
         entries = list(self.storage.entries(prefix))
         wanted = {entry.path[len(prefix) + 1 :]: entry for entry in entries}
@@ -60,13 +65,17 @@ class JobFolder:
                 path.unlink()
         for name, entry in wanted.items():
             target = self.capture / name
-            if target.is_file() and target.stat().st_size == entry.size:
+            if _is_whole(target, entry):
                 continue
             source = self.storage.local_path(entry.path)
-            if source is None:
-                self.storage.download(entry.path, target)
-            else:
-                _link_or_symlink(source, target)
+            with suppress(FileNotFoundError):  # deleted meanwhile: it is missed below
+                if source is None:
+                    self.storage.download(entry.path, target)
+                else:
+                    link_or_copy(source, target)
+        missing = [name for name, entry in wanted.items() if not _is_whole(self.capture / name, entry)]
+        if missing:
+            raise CaptureIncomplete(self.capture_id, missing, len(entries))
         return len(entries)
 
     def stage_start(self, model_id: str) -> None:
@@ -81,7 +90,7 @@ class JobFolder:
         if source is None:
             self.storage.download(path, target)
         else:
-            _link_or_copy(source, target)
+            link_or_copy(source, target)
 
     def restore(self) -> list[str]:
         """Download the files that an attempt on another machine stored, if this machine has none. Return their names.
@@ -134,6 +143,11 @@ def in_use(folder: Path) -> bool:
     return False
 
 
+def _is_whole(path: Path, entry: Entry) -> bool:
+    """Whether `path` is a file of its own, not a symbolic link, with the size of the stored one."""
+    return path.is_file() and not path.is_symlink() and path.stat().st_size == entry.size
+
+
 def _locked(path: Path) -> int:
     """Lock a file exclusively and return its descriptor. The lock ends when that is closed, also by a kill."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
@@ -148,23 +162,3 @@ def _locked(path: Path) -> int:
                 os.close(descriptor)
                 raise FolderInUse(path.parent) from None
             time.sleep(0.05)
-
-
-def _link_or_symlink(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.unlink(missing_ok=True)
-    try:
-        # A hard link stays readable when the capture is deleted while the job runs.
-        os.link(source, target)
-    except OSError:
-        target.symlink_to(source)
-
-
-def _link_or_copy(source: Path, target: Path) -> None:
-    """Link `source` to `target`, or copy it where no hard link can be made: later attempts need it if it is deleted."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source, target)
-    except OSError:
-        with replacing(target) as part:
-            shutil.copy2(source, part)

@@ -24,6 +24,14 @@ def test_gps_neighbours_are_the_nearest_ones() -> None:
     assert all(index != 6 for pair in pairs.spatial(places, 3) for index in pair)
 
 
+@pytest.mark.parametrize(("latitude", "longitude"), [(0.0, 1e-4), (1e-4, 0.0)])
+def test_the_equator_and_the_prime_meridian_are_places(latitude: float, longitude: float) -> None:
+    photos = [usable("a", latitude=latitude, longitude=longitude), usable("b", latitude=1e-4, longitude=1e-4)]
+    places = pairs.gps_positions(photos)
+    assert np.linalg.norm(places[1] - places[0]) == pytest.approx(11.1, rel=0.01)
+    assert pairs.spatial(places, 1) == {(0, 1)}
+
+
 def test_numbered_photos_are_followed_in_order() -> None:
     names = [f"walk/IMG_{k}.jpg" for k in (10, 9, 8, 11, 12)] + ["other.jpg", "IMG_1.jpg"]
     assert pairs.numbered_runs([usable(name) for name in names]) == [[2, 1, 0, 3, 4]]

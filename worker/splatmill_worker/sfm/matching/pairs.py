@@ -94,9 +94,8 @@ def gps_positions(photos: Sequence[UsablePhoto]) -> npt.NDArray[np.float64]:
 
     East and north are NaN for photos without GPS; the altitude is 0 where it is unknown.
     """
-    degrees = np.array(
-        [(p.exif.latitude or math.nan, p.exif.longitude or math.nan) for p in photos], np.float64
-    )
+    # None becomes NaN; 0 is a place on the equator or on the prime meridian.
+    degrees = np.array([(p.exif.latitude, p.exif.longitude) for p in photos], np.float64)
     radians = np.radians(degrees.reshape(-1, 2))
     up = np.array([p.exif.altitude if p.exif.altitude is not None else 0.0 for p in photos])
     if np.isnan(radians).all():
