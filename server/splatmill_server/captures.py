@@ -42,9 +42,9 @@ class Captures:
         # Number of files per capture, as last seen: listing the folder at each upload would take quadratic time.
         self._counts: dict[str, int] = {}
 
-    def create(self, name: str | None = None) -> Capture:
+    def create(self, name: str | None = None, *, owner: str) -> Capture:
         """Create an empty capture."""
-        capture = Capture(id=secrets.token_hex(8), name=name, created_at=datetime.now(UTC))
+        capture = Capture(id=secrets.token_hex(8), name=name, owner=owner, created_at=datetime.now(UTC))
         self.storage.put(
             layout.capture_record(capture.id),
             json.dumps(capture.model_dump(mode="json", exclude={"files"}) | {"format": FORMAT}).encode(),
@@ -58,11 +58,7 @@ class Captures:
                 return _read(self.storage.get(layout.capture_record(capture_id)), capture_id)
             except FileNotFoundError:
                 pass
-        raise ProblemError(
-            "capture_not_found",
-            f"There is no capture {capture_id[:80]!r}.",
-            advice="List captures with GET /v1/captures, or create one with POST /v1/captures.",
-        )
+        raise capture_not_found(capture_id)
 
     async def read(self, capture_id: str) -> Capture:
         """Return the record with all files and their digests. Raises a 404 problem."""
@@ -85,8 +81,11 @@ class Captures:
         files = await asyncio.gather(*(describe(entry) for entry in found))
         return capture.model_copy(update={"files": [file for file in files if file is not None]})
 
-    def page(self, cursor: str | None, limit: int) -> CapturePage:
-        """Return a page of captures, newest first. Raises a 422 problem for a cursor that is not valid."""
+    def page(self, cursor: str | None, limit: int, *, owner: str | None = None) -> CapturePage:
+        """Return a page of captures, newest first; with `owner`, only theirs.
+
+        Raises a 422 problem for a cursor that is not valid.
+        """
         records = []
         for capture_id in self.storage.children(layout.captures()):
             try:
@@ -95,7 +94,10 @@ class Captures:
                 continue  # it is being created or deleted
             except UnreadableRecord as error:
                 warn(f"capture {capture_id} is not listed", str(error))
-        keyed = sorted(((int(c.created_at.timestamp() * 1000), c.id, c) for c in records), reverse=True)
+        keyed = sorted(
+            ((int(c.created_at.timestamp() * 1000), c.id, c) for c in records if owner in (None, c.owner)),
+            reverse=True,
+        )
         if cursor is not None:
             after = read_cursor(cursor)
             keyed = [entry for entry in keyed if entry[:2] < after]
@@ -328,6 +330,15 @@ def _read(record: bytes, capture_id: str) -> Capture:
     if left_out:
         warn(layout.capture_record(capture_id), f"left out what cannot be read: {'; '.join(left_out)[:300]}")
     return capture
+
+
+def capture_not_found(capture_id: str) -> ProblemError:
+    """Return the 404 problem for an id without a capture."""
+    return ProblemError(
+        "capture_not_found",
+        f"There is no capture {capture_id[:80]!r}.",
+        advice="List captures with GET /v1/captures, or create one with POST /v1/captures.",
+    )
 
 
 def _too_large(size: int, limit: int) -> ProblemError:

@@ -7,29 +7,35 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 
 from splatmill.schema import CaptureFile, CreateJob, Job, Role
+from splatmill_server.caller import Caller
 from splatmill_server.captures import fingerprints
 from splatmill_server.multipart import Part, read_parts
+from splatmill_server.ownership import check_model
 from splatmill_server.problems import ProblemError
 from splatmill_server.service import Service
 
 _FIELDS = ("name", "options")
 
 
-async def create_from_form(service: Service, request: Request, key: str | None) -> tuple[Job, bool]:
+async def create_from_form(
+    service: Service, who: Caller, request: Request, key: str | None
+) -> tuple[Job, bool]:
     """Store the files of a form in a new capture and start a job on it; return the job, and whether it is new.
 
     The files are the parts `images`, `masks` and `poses`; the field `options` is JSON, and `name` is text. If any part
     is refused, the capture is deleted.
     """
-    capture = await run_in_threadpool(service.captures.create)
+    capture = await run_in_threadpool(lambda: service.captures.create(owner=who.owner))
     kept = False
     try:
         files, fields = await _receive(service, request, capture.id)
         create = _request(capture.id, fields)
         await run_in_threadpool(service.captures.check_trainable, capture.id)
-        await run_in_threadpool(check_start_model, service, create)
+        await run_in_threadpool(check_start_model, service, who, create)
         described = create.model_dump_json(exclude={"capture"}) + "\n".join(fingerprints(files))
-        job, new = await run_in_threadpool(lambda: service.jobs.create(create, key=key, body=described))
+        job, new = await run_in_threadpool(
+            lambda: service.jobs.create(create, owner=who.owner, key=key, body=described)
+        )
         kept = job.capture == capture.id
         return job, new
     finally:
@@ -37,12 +43,13 @@ async def create_from_form(service: Service, request: Request, key: str | None) 
             await run_in_threadpool(service.captures.delete, capture.id)
 
 
-def check_start_model(service: Service, create: CreateJob) -> None:
-    """Raise a problem if the model to start from, where the request names one, does not exist."""
+def check_start_model(service: Service, who: Caller, create: CreateJob) -> None:
+    """Raise a problem if the model to start from, where the request names one, is not there for the caller."""
     options = create.options
     if options.start_file is not None:
         service.captures.check_start_file(create.capture, options.start_file)
     elif options.start_model is not None:
+        check_model(service, who, options.start_model)
         service.models.check(options.start_model)
 
 

@@ -7,7 +7,7 @@ API processes and workers never overwrite each other's changes.
 import hashlib
 import json
 import secrets
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, cast
 
 import redis
@@ -17,7 +17,7 @@ from splatmill.backplane.fold import fold
 from splatmill.backplane.records import UnreadableRecord, check_format, reason, warn
 from splatmill.backplane.row import JobRow, Verdict
 from splatmill.backplane.storage import Storage
-from splatmill.schema import CreateJob, Job, JobPage, JobState, Problem
+from splatmill.schema import DEFAULT_OWNER, CreateJob, Job, JobPage, JobState, Problem
 from splatmill.schema.tolerant import keep_readable
 from splatmill_server.metrics import Metrics
 from splatmill_server.paging import read_cursor, write_cursor
@@ -36,20 +36,23 @@ class Jobs:
         self.storage = storage
         self.metrics = metrics
 
-    def create(self, request: CreateJob, *, key: str | None = None, body: str = "") -> tuple[Job, bool]:
+    def create(
+        self, request: CreateJob, *, owner: str, key: str | None = None, body: str = ""
+    ) -> tuple[Job, bool]:
         """Create a job; return it, and whether it is new.
 
-        With an `Idempotency-Key` that was used before, return the job of that request. `body` identifies the request:
-        the same key with another body raises a 409 problem.
+        With an `Idempotency-Key` that this owner used before, return the job of that request. `body` identifies the
+        request: the same key with another body raises a 409 problem.
         """
         job_id = secrets.token_hex(8)
         if key is not None:
-            job_id = self._claim_key(key, hashlib.sha256(body.encode()).hexdigest(), job_id)
+            job_id = self._claim_key(owner, key, hashlib.sha256(body.encode()).hexdigest(), job_id)
         moment = row.now()
         new = JobRow(
             id=job_id,
             capture=request.capture,
             name=request.name,
+            owner=owner,
             options=request.options,
             created_at=moment,
             queued_at=moment,
@@ -74,9 +77,9 @@ class Jobs:
         self.metrics.created.inc()
         return self._job(new), True
 
-    def id_of_key(self, key: str) -> str | None:
-        """Return the id of the job that an `Idempotency-Key` was first used for, or None."""
-        stored = cast(bytes | None, self.connection.get(keys.idempotency(_digest(key))))
+    def id_of_key(self, owner: str, key: str) -> str | None:
+        """Return the id of the job that the owner first used an `Idempotency-Key` for, or None."""
+        stored = cast(bytes | None, self.connection.get(keys.idempotency(_digest(owner, key))))
         return cast(str, json.loads(stored)["job"]) if stored else None
 
     def row(self, job_id: str) -> JobRow:
@@ -91,12 +94,29 @@ class Jobs:
                 "job.",
             ) from error
         if found is None:
-            raise ProblemError(
-                "job_not_found",
-                f"There is no job {job_id[:80]!r}.",
-                advice="List the jobs with GET /v1/jobs.",
-            )
+            raise job_not_found(job_id)
         return found
+
+    def owner(self, job_id: str) -> str | None:
+        """Return the owner of a job, or None if there is no such job or its owner cannot be read."""
+        if not layout.is_id(job_id):
+            return None
+        known, owner = self._owners([job_id])[0]
+        if known:
+            return owner
+        stored = self.stored(job_id)
+        return stored.owner if stored is not None else None
+
+    def _owners(self, job_ids: Sequence[str]) -> list[tuple[bool, str]]:
+        """Return, for each id, whether there is a row, and its owner. A row that is not readable has its owner too."""
+        with self.connection.pipeline(transaction=False) as pipe:
+            for job_id in job_ids:
+                pipe.hmget(keys.job(job_id), "id", "owner")
+            replies = pipe.execute()
+        return [
+            (known is not None, owner.decode("utf-8", "replace") if owner is not None else DEFAULT_OWNER)
+            for known, owner in replies
+        ]
 
     def get(self, job_id: str) -> Job:
         """Return the job as clients see it. A finished job is read from storage if Redis has lost it."""
@@ -119,19 +139,29 @@ class Jobs:
             warn(layout.job_record(job_id), str(error))
             return None
 
-    def page(self, cursor: str | None, limit: int, state: JobState | None = None) -> JobPage:
-        """Return a page of jobs, newest first; with `state`, only those in this state."""
+    def page(
+        self, cursor: str | None, limit: int, state: JobState | None = None, *, owner: str | None = None
+    ) -> JobPage:
+        """Return a page of jobs, newest first; with `state`, only those in this state, with `owner`, only theirs."""
         found: list[tuple[int, Job]] = []
         after = read_cursor(cursor) if cursor is not None else None
         while len(found) <= limit:
             batch = self._ids(after, limit + 1)
             if not batch:
                 break
+            whole = len(batch) > limit
             after = batch[-1]
+            if owner is not None:
+                owners = self._owners([job_id for _, job_id in batch])
+                batch = [
+                    entry
+                    for entry, found_owner in zip(batch, owners, strict=True)
+                    if found_owner == (True, owner)
+                ]
             for (moment, _), job in zip(batch, self.get_many([job_id for _, job_id in batch]), strict=True):
                 if job is not None and (state is None or job.state is state):
                     found.append((moment, job))
-            if len(batch) <= limit:
+            if not whole:
                 break
         page = found[:limit]
         following = write_cursor(page[-1][0], page[-1][1].id) if len(found) > limit else None
@@ -333,8 +363,8 @@ class Jobs:
         pairs = [(int(score), member.decode()) for member, score in cast(list[tuple[bytes, float]], reply)]
         return [pair for pair in pairs if after is None or pair < after][:count]
 
-    def _claim_key(self, key: str, body: str, job_id: str) -> str:
-        name = keys.idempotency(_digest(key))
+    def _claim_key(self, owner: str, key: str, body: str, job_id: str) -> str:
+        name = keys.idempotency(_digest(owner, key))
         value = json.dumps({"job": job_id, "body": body})
         if self.connection.set(name, value, nx=True, ex=IDEMPOTENCY_DAYS * 86400):
             return job_id
@@ -388,5 +418,16 @@ def _ended(job: Job) -> str:
     return "was cancelled" if job.state is JobState.cancelled else job.state.value
 
 
-def _digest(key: str) -> str:
-    return hashlib.sha256(key.encode()).hexdigest()
+def job_not_found(job_id: str) -> ProblemError:
+    """Return the 404 problem for an id without a job."""
+    return ProblemError(
+        "job_not_found",
+        f"There is no job {job_id[:80]!r}.",
+        advice="List the jobs with GET /v1/jobs.",
+    )
+
+
+def _digest(owner: str, key: str) -> str:
+    # Keys stored before there were owners have no owner in their digest. No header value has a NUL.
+    named = key if owner == DEFAULT_OWNER else f"{owner}\0{key}"
+    return hashlib.sha256(named.encode()).hexdigest()

@@ -15,6 +15,7 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from splatmill.schema import Problem, format_bytes
+from splatmill_server.caller import BOOTSTRAP, KEYLESS
 from splatmill_server.metrics import Metrics
 from splatmill_server.problems import ProblemError, ProblemResponse
 from splatmill_server.settings import Settings
@@ -53,6 +54,7 @@ class RequestMiddleware:
                 marked["X-Content-Type-Options"] = "nosniff"
             await send(message)
 
+        scope.setdefault("state", {})["caller"] = BOOTSTRAP if self.key is not None else KEYLESS
         try:
             with structlog.contextvars.bound_contextvars(request=request_id):
                 refused = self._refusal(scope, headers)

@@ -1,5 +1,6 @@
 """Finished models. They are read from storage only, so they stay available if Redis loses its data."""
 
+import itertools
 import json
 import re
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from splatmill.backplane import layout
-from splatmill.backplane.records import warn
+from splatmill.backplane.records import UnreadableRecord, warn
 from splatmill.backplane.storage import Entry, Storage
 from splatmill.schema import JobState, Model, ModelCameras, ModelFile, ModelPage, Report
 from splatmill_server.jobs import Jobs, read_record
@@ -53,11 +54,19 @@ class Models:
                 f"The job {job.id} ended as {job.state.value}, so it has no model.",
                 facts={"job": job.id, "state": job.state.value},
             )
-        raise ProblemError(
-            "model_not_found",
-            f"There is no model {model_id[:80]!r}.",
-            advice="List the models with GET /v1/models.",
-        )
+        raise model_not_found(model_id)
+
+    def owner(self, model_id: str) -> str | None:
+        """Return the owner of a model, or of the job that is to make it, or None if it cannot be read.
+
+        The record in storage comes first, so that models can be read while Redis cannot be reached.
+        """
+        if not layout.is_id(model_id):
+            return None
+        try:
+            return read_record(self.storage, model_id).owner
+        except (FileNotFoundError, UnreadableRecord):
+            return self.jobs.owner(model_id)
 
     def get(self, model_id: str) -> Model:
         """Return a model with its files. Raises 404 and 409 problems, and 500 if its files cannot be read."""
@@ -81,6 +90,7 @@ class Models:
             id=model_id,
             job=model_id,
             name=job.name,
+            owner=job.owner,
             created_at=job.finished_at or files["job.json"].modified,
             gaussians=gaussians,
             bytes=files["model.ply"].size,
@@ -108,8 +118,8 @@ class Models:
             },
         )
 
-    def page(self, cursor: str | None, limit: int) -> ModelPage:
-        """Return a page of models, the most recently stored first."""
+    def page(self, cursor: str | None, limit: int, *, owner: str | None = None) -> ModelPage:
+        """Return a page of models, the most recently stored first; with `owner`, only theirs."""
         records = [
             entry for entry in self.storage.entries(layout.models()) if entry.path.endswith("/job.json")
         ]
@@ -120,7 +130,9 @@ class Models:
         if cursor is not None:
             after = read_cursor(cursor)
             keyed = [entry for entry in keyed if entry < after]
-        page, models = keyed[:limit], []
+        wanted = (entry for entry in keyed if owner is None or self.owner(entry[1]) == owner)
+        found = list(itertools.islice(wanted, limit + 1))
+        page, models = found[:limit], []
         for _, model_id in page:
             try:
                 models.append(self.get(model_id))
@@ -129,7 +141,7 @@ class Models:
             ) as error:  # deleted meanwhile or corrupt, which must not hide the other models
                 if error.problem.code == "model_corrupt":
                     warn(f"model {model_id} is not listed", error.problem.detail)
-        return ModelPage(models=models, cursor=write_cursor(*page[-1]) if len(keyed) > limit else None)
+        return ModelPage(models=models, cursor=write_cursor(*page[-1]) if len(found) > limit else None)
 
     def file(self, model_id: str, name: str) -> Entry:
         """Return the entry of a file of a model. Raises 404 and 409 problems."""
@@ -179,3 +191,12 @@ class Models:
             return None, None
         measured = [point for point in report.curve if point.psnr is not None]
         return (measured[-1].psnr, measured[-1].ssim) if measured else (None, None)
+
+
+def model_not_found(model_id: str) -> ProblemError:
+    """Return the 404 problem for an id without a model."""
+    return ProblemError(
+        "model_not_found",
+        f"There is no model {model_id[:80]!r}.",
+        advice="List the models with GET /v1/models.",
+    )

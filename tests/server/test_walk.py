@@ -53,7 +53,7 @@ class Walk(RuleBasedStateMachine):
 
     @rule(target=jobs)
     def create(self) -> str:
-        job, new = self.service.jobs.create(CreateJob(capture=CAPTURE))
+        job, new = self.service.jobs.create(CreateJob(capture=CAPTURE), owner="default")
         assert new
         assert job.state is JobState.queued
         self.known.add(job.id)

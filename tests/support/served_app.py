@@ -12,6 +12,7 @@ from typing import Any
 import httpx
 import redis
 import uvicorn
+from fastapi import FastAPI
 
 from splatmill.backplane import events, layout, row
 from splatmill.schema import Event, JobState, StateEvent, TrainOptions
@@ -23,13 +24,14 @@ from tests.support.waiting import wait_for
 
 @dataclass
 class ServedApp:
-    """A served app: `http` to talk to it, `service` to look behind it, `address` for raw sockets."""
+    """A served app: `http` to talk to it, `service` and `asgi` to look behind it, `address` for raw sockets."""
 
     http: httpx.Client
     service: Service
     address: tuple[str, int]
     settings: Settings
     redis: redis.Redis
+    asgi: FastAPI
     _attempts: dict[str, int] = field(default_factory=dict)
 
     def capture(self, *names: str) -> str:
@@ -89,7 +91,7 @@ def served_app(settings: Settings, connection: redis.Redis) -> Iterator[ServedAp
     try:
         base = f"http://{address[0]}:{address[1]}"
         with httpx.Client(base_url=base, headers=headers, timeout=20, trust_env=False) as http:
-            yield ServedApp(http, app.state.service, address, settings, connection)
+            yield ServedApp(http, app.state.service, address, settings, connection, app)
     finally:
         app.state.service.closing.set()
         server.should_exit = True

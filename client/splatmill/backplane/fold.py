@@ -79,6 +79,7 @@ class Fold:
             id=row.id,
             capture=row.capture,
             name=row.name,
+            owner=row.owner,
             state=self.state,
             options=row.options,
             created_at=row.created_at,

@@ -38,7 +38,10 @@ def lock(job_id: str) -> str:
 
 
 def idempotency(key_digest: str) -> str:
-    """Return the key of a string with the job id and the body digest that an `Idempotency-Key` was first used for."""
+    """Return the key of a string with the job id and the body digest that an `Idempotency-Key` was first used for.
+
+    key_digest: SHA-256 in hex of the owner and the `Idempotency-Key`.
+    """
     return f"{PREFIX}idempotency:{key_digest}"
 
 

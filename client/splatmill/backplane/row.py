@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from splatmill.backplane import keys
 from splatmill.backplane.records import FORMAT, UnreadableRecord, check_format, reason, warn
-from splatmill.schema import Problem, Time, TrainOptions
+from splatmill.schema import DEFAULT_OWNER, Owner, Problem, Time, TrainOptions
 from splatmill.schema.tolerant import keep_readable
 
 
@@ -41,6 +41,7 @@ class JobRow(BaseModel):
     id: str
     capture: str
     name: str | None = None
+    owner: Owner = DEFAULT_OWNER
     options: TrainOptions
     created_at: Time
     queued_at: Time

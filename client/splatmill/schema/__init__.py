@@ -1,5 +1,6 @@
 """The wire schema: every request, response, event, option and problem of the service."""
 
+from splatmill.schema.access import DEFAULT_OWNER, KeyLimits, Owner, Scope
 from splatmill.schema.base import (
     Measured,
     Request,
@@ -118,6 +119,7 @@ from splatmill.schema.quantities import (
 
 __all__ = [
     "ARCHIVE_SUFFIXES",
+    "DEFAULT_OWNER",
     "DEFAULT_PORT",
     "DEPTH_SCALE_HEADER",
     "EVENT",
@@ -162,6 +164,7 @@ __all__ = [
     "Job",
     "JobPage",
     "JobState",
+    "KeyLimits",
     "Kind",
     "Limits",
     "LogEvent",
@@ -183,6 +186,7 @@ __all__ = [
     "OptionType",
     "OrbitRequest",
     "Output",
+    "Owner",
     "PlanEvent",
     "Preset",
     "PreviewEvent",
@@ -195,6 +199,7 @@ __all__ = [
     "Request",
     "Response",
     "Role",
+    "Scope",
     "Side",
     "StageSeconds",
     "StateEvent",

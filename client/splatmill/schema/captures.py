@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
+from splatmill.schema.access import DEFAULT_OWNER, Owner
 from splatmill.schema.base import Request, Response, Time
 
 SHA256_HEADER = "X-Content-SHA256"
@@ -96,6 +97,7 @@ class Capture(Response):
 
     id: str
     name: str | None = None
+    owner: Owner = DEFAULT_OWNER
     created_at: Time
     files: list[CaptureFile] = Field(default_factory=list)
 

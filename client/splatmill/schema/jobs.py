@@ -4,6 +4,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
+from splatmill.schema.access import DEFAULT_OWNER, Owner
 from splatmill.schema.base import Request, Response, Time
 from splatmill.schema.events import JobState, LogEvent, Progress
 from splatmill.schema.options import TrainOptions
@@ -34,6 +35,7 @@ class Job(Response):
     id: str
     capture: str
     name: str | None = None
+    owner: Owner = DEFAULT_OWNER
     state: JobState
     options: Annotated[TrainOptions, BeforeValidator(_readable_options)]
     created_at: Time

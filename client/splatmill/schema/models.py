@@ -4,6 +4,7 @@ from typing import Any
 
 from pydantic import ConfigDict, Field
 
+from splatmill.schema.access import DEFAULT_OWNER, Owner
 from splatmill.schema.base import Measured, Response, Time
 from splatmill.schema.cameras import CameraSpec
 from splatmill.schema.events import CurveRow
@@ -24,6 +25,7 @@ class Model(Response):
     id: str
     job: str
     name: str | None = None
+    owner: Owner = DEFAULT_OWNER
     created_at: Time
     gaussians: int = Field(ge=0, description="Number of Gaussians.")
     bytes: int = Field(ge=0, description="Size of model.ply in bytes.")

@@ -6,6 +6,8 @@ from fastapi import APIRouter, Body, Header, Path, Request
 from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import SHA256_HEADER, Capture, CaptureFile, CapturePage, CreateCapture, Role
+from splatmill_server.caller import Who
+from splatmill_server.ownership import CaptureId, ListedOwner
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.problems import ProblemError
 from splatmill_server.routes.openapi import CAPTURE_EXAMPLE, answer, example, problems
@@ -13,8 +15,6 @@ from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/captures", tags=["captures"])
-
-CaptureId = Annotated[str, Path(description="Id of the capture.")]
 
 _ACCEPTED = {
     Role.images: ("image/", "video/", "application/zip", "application/x-zip", "application/octet-stream"),
@@ -32,19 +32,22 @@ _ACCEPTED = {
 )
 def create_capture(
     service: Shared,
+    who: Who,
     response: Response,
     request: Annotated[CreateCapture | None, Body(examples=[{"name": "garden"}])] = None,
 ) -> Capture:
     """Create an empty capture. Its files are uploaded one by one afterwards."""
-    capture = service.captures.create(request.name if request is not None else None)
+    capture = service.captures.create(request.name if request is not None else None, owner=who.owner)
     response.headers["Location"] = f"/v1/captures/{capture.id}"
     return capture
 
 
 @router.get("", responses=problems("cursor_invalid"))
-def list_captures(service: Shared, cursor: Cursor = None, limit: Limit = DEFAULT_LIMIT) -> CapturePage:
+def list_captures(
+    service: Shared, owner: ListedOwner, cursor: Cursor = None, limit: Limit = DEFAULT_LIMIT
+) -> CapturePage:
     """List captures, newest first, without their files."""
-    return service.captures.page(cursor, limit)
+    return service.captures.page(cursor, limit, owner=owner)
 
 
 @router.get(

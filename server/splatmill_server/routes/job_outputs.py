@@ -10,8 +10,8 @@ from starlette.responses import Response, StreamingResponse
 from splatmill.backplane import events, layout
 from splatmill.schema import LogEvent, LogLine, LogPage, PreviewEvent, Report
 from splatmill_server.files import file_response
+from splatmill_server.ownership import JobId
 from splatmill_server.problems import ProblemError
-from splatmill_server.routes.jobs import JobId
 from splatmill_server.routes.openapi import answer, binary, problems
 from splatmill_server.service import Service, Shared
 from splatmill_server.sse import Follower, Position, event_stream, stored_stream

@@ -2,14 +2,16 @@
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Path, Query, Request
+from fastapi import APIRouter, Header, Query, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import IDEMPOTENCY_HEADER, CreateJob, Job, JobPage, JobState
+from splatmill_server.caller import Caller, Who
 from splatmill_server.job_form import check_start_model, create_from_form
+from splatmill_server.ownership import JobId, ListedOwner, check_capture
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.problems import ProblemError
 from splatmill_server.routes.openapi import JOB_REQUESTS, answer, problems
@@ -17,8 +19,6 @@ from splatmill_server.routes.requests import Cursor, Limit
 from splatmill_server.service import Service, Shared
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
-
-JobId = Annotated[str, Path(description="Id of the job.")]
 
 _LOCATION = {"Location": {"schema": {"type": "string"}, "description": "Address of the job."}}
 _FORM = {
@@ -70,6 +70,7 @@ _FORM = {
 )
 async def create_job(
     service: Shared,
+    who: Who,
     request: Request,
     key: Annotated[
         str | None,
@@ -85,9 +86,9 @@ async def create_job(
     """Create a job that trains a capture, or upload photos as a form and train them in one request."""
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type == "multipart/form-data":
-        job, new = await create_from_form(service, request, key)
+        job, new = await create_from_form(service, who, request, key)
     elif media_type == "application/json" or media_type.endswith("+json"):
-        job, new = await _create_from_json(service, await request.body(), key)
+        job, new = await _create_from_json(service, who, await request.body(), key)
     else:
         raise ProblemError(
             "unsupported_media_type",
@@ -99,7 +100,7 @@ async def create_job(
     return JSONResponse(job.model_dump(mode="json"), 202, headers)
 
 
-async def _create_from_json(service: Service, body: bytes, key: str | None) -> tuple[Job, bool]:
+async def _create_from_json(service: Service, who: Caller, body: bytes, key: str | None) -> tuple[Job, bool]:
     try:
         create = CreateJob.model_validate_json(body)
     except ValidationError as error:
@@ -107,10 +108,11 @@ async def _create_from_json(service: Service, body: bytes, key: str | None) -> t
 
     def make() -> tuple[Job, bool]:
         # A repeated request returns its job even if the capture was deleted meanwhile.
-        if key is None or service.jobs.id_of_key(key) is None:
+        if key is None or service.jobs.id_of_key(who.owner, key) is None:
+            check_capture(service, who, create.capture)
             service.captures.check_trainable(create.capture)
-            check_start_model(service, create)
-        return service.jobs.create(create, key=key, body=create.model_dump_json())
+            check_start_model(service, who, create)
+        return service.jobs.create(create, owner=who.owner, key=key, body=create.model_dump_json())
 
     return await run_in_threadpool(make)
 
@@ -122,12 +124,13 @@ def _located(error: ValidationError) -> list[Any]:
 @router.get("", responses=problems("cursor_invalid"))
 def list_jobs(
     service: Shared,
+    owner: ListedOwner,
     cursor: Cursor = None,
     limit: Limit = DEFAULT_LIMIT,
     state: Annotated[JobState | None, Query(description="List only jobs in this state.")] = None,
 ) -> JobPage:
     """List jobs, newest first."""
-    return service.jobs.page(cursor, limit, state)
+    return service.jobs.page(cursor, limit, state, owner=owner)
 
 
 @router.get("/{job_id}", responses=problems("job_not_found"))

@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Path, Request
+from fastapi import APIRouter, Body, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
@@ -12,14 +12,13 @@ from splatmill.backplane import layout, rendering
 from splatmill.schema import Model, ModelCameras, ModelPage, OrbitRequest, RenderRequest
 from splatmill_server.files import file_response
 from splatmill_server.forward import forward
+from splatmill_server.ownership import ListedOwner, ModelId
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.routes.openapi import CAMERA, RENDER_REQUESTS, answer, binary, problems
 from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
-
-ModelId = Annotated[str, Path(description="Id of the model, which is that of its job.")]
 
 _RENDERED = binary("The image", "image/png", "image/jpeg", "image/webp", "application/x-npy") | {
     304: {"description": "The image with the ETag in `If-None-Match` is unchanged."}
@@ -63,9 +62,11 @@ _CAMERA_QUERY = [
 
 
 @router.get("", responses=problems("cursor_invalid"))
-def list_models(service: Shared, cursor: Cursor = None, limit: Limit = DEFAULT_LIMIT) -> ModelPage:
+def list_models(
+    service: Shared, owner: ListedOwner, cursor: Cursor = None, limit: Limit = DEFAULT_LIMIT
+) -> ModelPage:
     """List finished models, newest first."""
-    return service.models.page(cursor, limit)
+    return service.models.page(cursor, limit, owner=owner)
 
 
 @router.get("/{model_id}", responses=problems("model_not_found", "model_not_ready", "model_corrupt"))

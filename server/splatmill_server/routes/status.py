@@ -22,6 +22,7 @@ from splatmill.schema import (
     describe_options,
 )
 from splatmill_server import metrics
+from splatmill_server.caller import Caller, Who
 from splatmill_server.docs_page import CONTENT_SECURITY_POLICY, docs_page
 from splatmill_server.routes.openapi import problems
 from splatmill_server.service import Service, Shared
@@ -36,12 +37,12 @@ def get_options() -> OptionList:
 
 
 @router.get("/v1/info", responses=problems())
-def get_info(service: Shared) -> Info:
+def get_info(service: Shared, who: Who) -> Info:
     """Get the version, the limits, the workers and the number of waiting jobs."""
     return Info(
         version=splatmill.__version__,
         storage="file" if service.storage.root is not None else "s3",
-        workers=_workers(service),
+        workers=[_seen_by(service, who, worker) for worker in _workers(service)],
         queued=sum(queue.waiting(service.redis).values()),
         limits=Limits(
             max_file_bytes=service.settings.max_file_bytes,
@@ -110,6 +111,13 @@ def _workers(service: Service) -> list[WorkerInfo]:
         )
         for worker in found
     ]
+
+
+def _seen_by(service: Service, who: Caller, worker: WorkerInfo) -> WorkerInfo:
+    """Return what the caller may know of a worker: not the id of a job of another owner."""
+    if worker.job is None or who.admin or who.may_see(service.jobs.owner(worker.job)):
+        return worker
+    return worker.model_copy(update={"job": None})
 
 
 def _job_of(rq_id: str | None) -> str | None:
