@@ -4,6 +4,9 @@ Not proved here: S3. The same calls reach a bucket through obstore, but no bucke
 """
 
 import asyncio
+import os
+import subprocess
+import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -110,3 +113,26 @@ def test_errors_are_sentences_without_a_dump(storage: Storage) -> None:
 def test_only_ids_reach_paths(text: str) -> None:
     assert not layout.is_id(text)
     assert layout.is_id("0123456789abcdef")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become a user without the right to write")
+def test_what_only_reads_needs_no_right_to_write(storage: Storage, tmp_path: Path) -> None:
+    storage.put("models/a.ply", b"bytes")
+    assert storage.root is not None
+    for folder in (tmp_path, *tmp_path.parents[:2]):
+        folder.chmod(0o755)
+    program = """
+import os, sys
+from splatmill.backplane.storage import Storage, StorageError
+os.setuid(65534)
+try:
+    Storage(sys.argv[1])
+except StorageError as error:
+    print(error)
+print(Storage(sys.argv[1], read_only=True).get("models/a.ply"))
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", program, storage.url], capture_output=True, text=True, check=True
+    )
+    assert f"{storage.root} is not writable by this user" in told.stdout
+    assert told.stdout.splitlines()[-1] == "b'bytes'"

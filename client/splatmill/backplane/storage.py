@@ -62,23 +62,17 @@ class Storage:
 
     `url` is `file:///folder`, the path of a folder (created if missing), or `s3://bucket/prefix` with the usual `AWS_*`
     environment variables. Raises StorageError if it cannot be opened.
+
+    read_only: for a process that only reads, and need not have the right to write to the folder.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, *, read_only: bool = False) -> None:
         self.url = url
         self.root: Path | None = None
         parts = urlsplit(url)
         if parts.scheme in ("", "file"):
             self.root = Path(unquote(parts.path)).expanduser().absolute()
-            try:
-                self.root.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise StorageError(f"The storage folder {self.root} cannot be created: {error}.") from error
-            if not os.access(self.root, os.W_OK | os.X_OK):
-                raise StorageError(
-                    f"The storage folder {self.root} is not writable by this user; change its permissions, "
-                    "or set SPLATMILL_STORAGE to another folder."
-                )
+            _check_folder(self.root, read_only)
             # A folder is removed with its last file, so that a deleted capture leaves no empty folders.
             self.store: ObjectStore = LocalStore(self.root, automatic_cleanup=True)
         elif parts.scheme == "s3":
@@ -209,6 +203,19 @@ class Storage:
         path = f"health/{os.getpid()}"
         self.put(path, b"ok")
         self.delete(path)
+
+
+def _check_folder(root: Path, read_only: bool) -> None:
+    """Create the folder if it is missing. Raise StorageError if it cannot be used."""
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"The storage folder {root} cannot be created: {error}.") from error
+    if not os.access(root, os.X_OK | (os.R_OK if read_only else os.W_OK)):
+        raise StorageError(
+            f"The storage folder {root} is not {'readable' if read_only else 'writable'} by this user; change its "
+            "permissions, or set SPLATMILL_STORAGE to another folder."
+        )
 
 
 @contextmanager

@@ -24,7 +24,7 @@ def serve(host: str, port: int, uds: Path | None, backend: str | None = None) ->
     SPLATMILL_RENDER_CACHE, a size such as 500MB, limits the memory of cached models.
     """
     try:
-        app = RenderApp(Storage(storage_url()), _cache_bytes(), backend)
+        app = RenderApp(Storage(storage_url(), read_only=True), _cache_bytes(), backend)
     except (StorageError, ValueError) as error:
         print(error, file=sys.stderr)
         return 1
