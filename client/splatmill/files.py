@@ -41,13 +41,14 @@ def move_into_place(part: Path, target: Path, *, sync: bool = False) -> None:
     With `sync`, the contents reach the disk before the rename, and the rename before the call returns.
     """
     if sync:
-        _sync(part)
+        sync_to_disk(part)
     part.replace(target)
     if sync:
-        _sync(target.parent)
+        sync_to_disk(target.parent)
 
 
-def _sync(path: Path) -> None:
+def sync_to_disk(path: Path) -> None:
+    """Return once a file, or the entries of a folder, survive a power cut. Raises OSError."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

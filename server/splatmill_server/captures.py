@@ -25,7 +25,7 @@ log = structlog.get_logger()
 
 _CONCURRENT_READS = 32
 _COUNTED_CAPTURES = 1000
-_STALE_SECONDS = 24 * 3600
+STALE_SECONDS = 24 * 3600
 """Age at which an unfinished upload counts as abandoned."""
 
 _CLAIM_SECONDS = 60
@@ -113,11 +113,13 @@ class Captures:
         self._counts.pop(capture_id, None)
 
     def delete_abandoned_uploads(self) -> int:
-        """Delete the files of uploads that a killed server left unfinished, and return their number."""
+        """Delete the files of uploads that nobody has gone on with for STALE_SECONDS, and return their number."""
         deleted = 0
         for capture_id in self.storage.children(layout.captures()):
             folder = layout.capture_incoming(capture_id)
-            deleted += self.storage.delete_stale(folder, _STALE_SECONDS)
+            deleted += self.storage.delete_stale(folder, STALE_SECONDS)
+            for upload_id in self.storage.children(layout.capture_uploads(capture_id)):
+                deleted += self.storage.delete_unused(layout.upload(capture_id, upload_id), STALE_SECONDS)
         return deleted
 
     def check_trainable(self, capture_id: str) -> None:
@@ -192,36 +194,40 @@ class Captures:
         announced_sha256: str | None,
         announced_size: int | None,
     ) -> tuple[CaptureFile, bool]:
-        await run_in_threadpool(self._check_room, capture_id, announced_size)
-        taken = await run_in_threadpool(self._taken, capture_id, role, name)
+        await run_in_threadpool(self.check_room, capture_id, announced_size)
+        taken = await run_in_threadpool(self.digest_of, capture_id, role, name)
         body = _Counted(chunks, self.settings.max_file_bytes)
         incoming = layout.capture_incoming(capture_id, secrets.token_hex(8))
         if not await body.begin():
-            _check_whole(body, announced_sha256, announced_size)
+            check_whole(body.digest.hexdigest(), body.size, announced_sha256, announced_size)
         try:
             if taken is None:
                 await self.storage.stream_put(incoming, body)
             else:
                 async for _ in body:
                     pass
-            _check_whole(body, announced_sha256, announced_size)
+            check_whole(body.digest.hexdigest(), body.size, announced_sha256, announced_size)
             file = CaptureFile(role=role, name=name, size=body.size, sha256=body.digest.hexdigest())
-            new = taken is None and await run_in_threadpool(self._claim, capture_id, file, incoming)
+            return file, await self.adopt(capture_id, file, incoming, taken)
         finally:
             if taken is None:
                 await run_in_threadpool(self.storage.delete, incoming)
-        owner = file.sha256 if new else await run_in_threadpool(self._digest, capture_id, role, name)
-        if owner != file.sha256:
-            raise ProblemError(
-                "name_taken",
-                f"The capture already holds {role.value}/{name} with other bytes, which were not replaced.",
-                advice="Upload this file under another name.",
-                facts={"stored_sha256": owner, "sent_sha256": file.sha256},
-            )
+
+    async def adopt(self, capture_id: str, file: CaptureFile, incoming: str, taken: str | None) -> bool:
+        """Give the bytes at `incoming` their name; return False if the same bytes already have it.
+
+        `taken` is the digest of the file that had the name before, or None. Raises a 409 problem for other bytes.
+        """
+        new = taken is None and await run_in_threadpool(self._claim, capture_id, file, incoming)
+        stored = (
+            file.sha256 if new else await run_in_threadpool(self._digest, capture_id, file.role, file.name)
+        )
+        if stored != file.sha256:
+            raise name_taken(file.role, file.name, stored, file.sha256)
         if new:
             self.metrics.uploaded.inc(file.size)
             self._counts[capture_id] = self._counts.get(capture_id, 0) + 1
-        return file, new
+        return new
 
     def _claim(self, capture_id: str, file: CaptureFile, incoming: str) -> bool:
         """Give an upload its name; return False if another upload has the name.
@@ -249,7 +255,7 @@ class Captures:
             self.record(capture_id)
         return True
 
-    def _taken(self, capture_id: str, role: Role, name: str) -> str | None:
+    def digest_of(self, capture_id: str, role: Role, name: str) -> str | None:
         """Return the digest of the file with this name, or None if the name is free."""
         digest = self._digest(capture_id, role, name)
         return digest if digest and self.storage.exists(layout.capture_file(capture_id, role, name)) else None
@@ -260,7 +266,12 @@ class Captures:
         except FileNotFoundError:
             return None
 
-    def _check_room(self, capture_id: str, announced_size: int | None) -> None:
+    def check_room(self, capture_id: str, announced_size: int | None, held: int = 0) -> None:
+        """Raise a problem if the capture does not exist (404), is full (413), or cannot take a file of this size.
+
+        A file may be larger than the limit (413), or than what the disk has left (507). `held` is the number of its
+        bytes that are stored already.
+        """
         self.record(capture_id)
         limit = self.settings.max_files_per_capture
         if capture_id not in self._counts:
@@ -274,10 +285,10 @@ class Captures:
                 facts={"limit": limit},
             )
         if announced_size is not None and announced_size > self.settings.max_file_bytes:
-            raise _too_large(announced_size, self.settings.max_file_bytes)
+            raise too_large(announced_size, self.settings.max_file_bytes)
         if self.storage.root is not None:
             free = shutil.disk_usage(self.storage.root).free
-            needed = (announced_size or 0) + self.settings.min_free_bytes
+            needed = max((announced_size or 0) - held, 0) + self.settings.min_free_bytes
             if free < needed:
                 raise ProblemError(
                     "storage_full",
@@ -315,7 +326,7 @@ class _Counted:
             chunk = await anext(self._chunks)
         self.size += len(chunk)
         if self.size > self._limit:
-            raise _too_large(self.size, self._limit)
+            raise too_large(self.size, self._limit)
         self.digest.update(chunk)
         return chunk
 
@@ -341,7 +352,17 @@ def capture_not_found(capture_id: str) -> ProblemError:
     )
 
 
-def _too_large(size: int, limit: int) -> ProblemError:
+def name_taken(role: Role, name: str, stored: str | None, sent: str) -> ProblemError:
+    """Return the problem for a file whose name other bytes have."""
+    return ProblemError(
+        "name_taken",
+        f"The capture already holds {role.value}/{name} with other bytes, which were not replaced.",
+        advice="Upload this file under another name.",
+        facts={"stored_sha256": stored, "sent_sha256": sent},
+    )
+
+
+def too_large(size: int, limit: int) -> ProblemError:
     return ProblemError(
         "body_too_large",
         f"The file has {format_bytes(size)} or more; at most {format_bytes(limit)} are accepted.",
@@ -350,22 +371,23 @@ def _too_large(size: int, limit: int) -> ProblemError:
     )
 
 
-def _check_whole(body: _Counted, sha256: str | None, size: int | None) -> None:
-    if size is not None and body.size != size:
+def check_whole(digest: str, size: int, announced_sha256: str | None, announced_size: int | None) -> None:
+    """Raise a problem if received bytes are not those that were announced (422), too few (400), or none (422)."""
+    if announced_size is not None and size != announced_size:
         raise ProblemError(
             "body_cut_off",
-            f"Only {body.size} of {size} bytes arrived; nothing was stored.",
+            f"Only {size} of {announced_size} bytes arrived; nothing was stored.",
             advice="Send the file again.",
-            facts={"received": body.size, "announced": size},
+            facts={"received": size, "announced": announced_size},
         )
-    if body.size == 0:
+    if size == 0:
         raise ProblemError("file_empty", "The file has no bytes; nothing was stored.")
-    if sha256 is not None and body.digest.hexdigest() != sha256.strip().lower():
+    if announced_sha256 is not None and digest != announced_sha256.strip().lower():
         raise ProblemError(
             "digest_mismatch",
             "The SHA-256 of the received bytes differs from the announced one; nothing was stored.",
             advice="Send the file again.",
-            facts={"announced": sha256[:100], "received": body.digest.hexdigest()},
+            facts={"announced": announced_sha256[:100], "received": digest},
         )
 
 

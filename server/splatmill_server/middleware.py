@@ -153,6 +153,6 @@ class RequestMiddleware:
 def _streams(scope: Scope, headers: Headers) -> bool:
     """Return whether the endpoint streams the body and limits its files itself."""
     multipart = headers.get("content-type", "").lower().startswith("multipart/form-data")
-    return (scope["method"] == "PUT" and scope["path"].startswith("/v1/captures/")) or (
+    return (scope["method"] in ("PUT", "PATCH") and scope["path"].startswith("/v1/captures/")) or (
         scope["method"] == "POST" and scope["path"] == "/v1/jobs" and multipart
     )

@@ -18,6 +18,7 @@ from splatmill_server.captures import Captures
 from splatmill_server.jobs import Jobs
 from splatmill_server.metrics import Metrics
 from splatmill_server.models import Models
+from splatmill_server.partial_uploads import PartialUploads
 from splatmill_server.reaper import Reaper
 from splatmill_server.settings import Settings
 
@@ -59,6 +60,7 @@ class Service:
     renderer: httpx.AsyncClient | None
     metrics: Metrics
     captures: Captures
+    partial_uploads: PartialUploads
     jobs: Jobs
     models: Models
     reaper: Reaper
@@ -72,6 +74,7 @@ class Service:
         connection = connect(settings.redis_url, timeout=settings.redis_timeout, retries=1)
         metrics = Metrics()
         jobs = Jobs(connection, storage, metrics)
+        captures = Captures(storage, settings, metrics)
         return cls(
             settings=settings,
             redis=connection,
@@ -80,7 +83,8 @@ class Service:
             storage_check=StorageCheck(storage),
             renderer=_renderer(settings),
             metrics=metrics,
-            captures=Captures(storage, settings, metrics),
+            captures=captures,
+            partial_uploads=PartialUploads(storage, captures),
             jobs=jobs,
             models=Models(storage, jobs),
             reaper=Reaper(connection, jobs, metrics, settings),

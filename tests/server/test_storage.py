@@ -1,6 +1,6 @@
 """Storage on a local folder: atomic writes, ranges, listing, and errors as sentences.
 
-Not proved here: S3. The same calls reach a bucket through obstore, but no bucket runs in these tests.
+Not proved here: S3. A bucket runs in test_partial_uploads.
 """
 
 import asyncio

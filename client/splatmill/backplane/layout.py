@@ -4,6 +4,9 @@ captures/{id}/capture.json                  record of the capture
 captures/{id}/files/{role}/{name}           uploaded file; role is images, masks or poses, name a `safe_name`
 captures/{id}/sha256/{role}/{name}          hex digest of that file; written first, so that it claims the name
 captures/{id}/incoming/{token}              upload in progress; renamed into files/ when complete
+captures/{id}/uploads/{upload}/record.json  upload that arrives in several requests: what it will be
+captures/{id}/uploads/{upload}/part         its bytes so far, in a local folder
+captures/{id}/uploads/{upload}/blocks/...   its bytes so far, in a bucket: objects named by their offset
 captures/{id}/sfm/...                       reconstruction, shared by the jobs of the capture
 jobs/{id}/work/...                          checkpoints and other files from which another machine can resume
 models/{id}/{file}                          model.ply, report.json, report.png, report.html, cameras.json, ...
@@ -63,6 +66,27 @@ def capture_incoming(capture_id: str, token: str | None = None) -> str:
     """Return the folder of uploads in progress, or the path of one of them."""
     folder = f"captures/{capture_id}/incoming"
     return folder if token is None else f"{folder}/{token}"
+
+
+def capture_uploads(capture_id: str) -> str:
+    """Return the folder of the uploads that arrive in several requests."""
+    return f"captures/{capture_id}/uploads"
+
+
+def upload(capture_id: str, upload_id: str) -> str:
+    return f"captures/{capture_id}/uploads/{upload_id}"
+
+
+def upload_record(capture_id: str, upload_id: str) -> str:
+    return f"captures/{capture_id}/uploads/{upload_id}/record.json"
+
+
+def upload_part(capture_id: str, upload_id: str) -> str:
+    return f"captures/{capture_id}/uploads/{upload_id}/part"
+
+
+def upload_blocks(capture_id: str, upload_id: str) -> str:
+    return f"captures/{capture_id}/uploads/{upload_id}/blocks"
 
 
 def capture_sfm(capture_id: str) -> str:

@@ -88,7 +88,7 @@ class Storage:
 
     def head(self, path: str) -> Entry | None:
         """Return the entry at `path`, or None if there is none."""
-        with _storage_errors("read", path):
+        with storage_errors("read", path):
             try:
                 return _entry(obstore.head(self.store, path))
             except FileNotFoundError:
@@ -99,7 +99,7 @@ class Storage:
 
     def get(self, path: str, start: int = 0, end: int | None = None) -> bytes:
         """Return the bytes [start, end) of a file, all in memory. Raises FileNotFoundError."""
-        with _storage_errors("read", path):
+        with storage_errors("read", path):
             if start == 0 and end is None:
                 return bytes(obstore.get(self.store, path).bytes())
             stop = end if end is not None else obstore.head(self.store, path)["size"]
@@ -107,12 +107,12 @@ class Storage:
 
     def put(self, path: str, data: bytes | Path) -> None:
         """Store bytes, or a local file, which is streamed. An existing file is replaced."""
-        with _storage_errors("write", path):
+        with storage_errors("write", path):
             obstore.put(self.store, path, data)
 
     def put_new(self, path: str, data: bytes) -> bool:
         """Store bytes if `path` is free; return False if it is not. Of several writers, exactly one succeeds."""
-        with _storage_errors("write", path):
+        with storage_errors("write", path):
             try:
                 obstore.put(self.store, path, data, mode="create")
             except AlreadyExistsError:
@@ -121,12 +121,12 @@ class Storage:
 
     async def stream_put(self, path: str, chunks: AsyncIterator[bytes]) -> None:
         """Store the bytes that `chunks` yields. If it raises, nothing is stored and the exception is passed on."""
-        with _storage_errors("write", path):
+        with storage_errors("write", path):
             await obstore.put_async(self.store, path, chunks, chunk_size=8 * CHUNK, max_concurrency=2)
 
     async def stream_get(self, path: str, start: int = 0, end: int | None = None) -> AsyncIterator[bytes]:
         """Yield the bytes [start, end) in pieces of about CHUNK. Raises FileNotFoundError before the first piece."""
-        with _storage_errors("read", path):
+        with storage_errors("read", path):
             if end is not None:
                 result = await obstore.get_async(self.store, path, options={"range": (start, end)})
             elif start:
@@ -138,24 +138,24 @@ class Storage:
 
     def rename(self, source: str, target: str) -> None:
         """Move a file. Raises FileNotFoundError."""
-        with _storage_errors("write", target):
+        with storage_errors("write", target):
             obstore.rename(self.store, source, target)
 
     def entries(self, prefix: str) -> Iterator[Entry]:
         """Yield all files under the folder `prefix`, sorted by path."""
-        with _storage_errors("list", prefix):
+        with storage_errors("list", prefix):
             found = [_entry(meta) for page in obstore.list(self.store, prefix) for meta in page]
         yield from sorted(found, key=lambda entry: entry.path)
 
     def children(self, prefix: str) -> list[str]:
         """Return the names of the folders directly under `prefix`, sorted."""
-        with _storage_errors("list", prefix):
+        with storage_errors("list", prefix):
             result = obstore.list_with_delimiter(self.store, prefix)
         return sorted(folder.rsplit("/", 1)[-1] for folder in result["common_prefixes"])
 
     def delete(self, path: str) -> None:
         """Delete a file, if it exists."""
-        with _storage_errors("delete", path), suppress(FileNotFoundError):
+        with storage_errors("delete", path), suppress(FileNotFoundError):
             obstore.delete(self.store, path)
 
     def delete_prefix(self, prefix: str) -> int:
@@ -181,9 +181,19 @@ class Storage:
             file.unlink(missing_ok=True)
         return len(stale) + len(left)
 
+    def delete_unused(self, prefix: str, seconds: float) -> int:
+        """Delete all files under a folder if none was written in the last `seconds`, and return their number."""
+        before = datetime.now(UTC).timestamp() - seconds
+        entries = list(self.entries(prefix))
+        if any(entry.modified.timestamp() >= before for entry in entries):
+            return 0
+        for entry in entries:
+            self.delete(entry.path)
+        return len(entries)
+
     def download(self, path: str, target: Path) -> None:
         """Copy a stored file to a local path, atomically. Raises FileNotFoundError."""
-        with _storage_errors("read", path), replacing(target) as part, part.open("wb") as file:
+        with storage_errors("read", path), replacing(target) as part, part.open("wb") as file:
             for chunk in obstore.get(self.store, path).stream(min_chunk_size=CHUNK):
                 file.write(chunk)
 
@@ -219,7 +229,7 @@ def _check_folder(root: Path, read_only: bool) -> None:
 
 
 @contextmanager
-def _storage_errors(verb: str, path: str) -> Iterator[None]:
+def storage_errors(verb: str, path: str) -> Iterator[None]:
     """Convert errors of obstore, which contain Rust debug output, into a StorageError with one sentence."""
     try:
         yield

@@ -38,6 +38,7 @@ PROBLEMS: dict[str, Kind] = {
     "size_out_of_range": Kind(422, "The image size is outside its range"),
     "name_invalid": Kind(422, "The file name is not accepted"),
     "cursor_invalid": Kind(422, "The page cursor is not valid"),
+    "upload_length_differs": Kind(400, "The upload has another length than was announced"),
     "idempotency_conflict": Kind(409, "This Idempotency-Key was used for another request"),
     "too_many_requests": Kind(429, "Too many requests"),
     # Resources that do not exist, do not exist yet, or are in the wrong state.
@@ -45,6 +46,9 @@ PROBLEMS: dict[str, Kind] = {
     "job_not_found": Kind(404, "There is no such job"),
     "model_not_found": Kind(404, "There is no such model"),
     "file_not_found": Kind(404, "There is no such file"),
+    "upload_not_found": Kind(404, "There is no such upload"),
+    "upload_offset_differs": Kind(409, "The upload does not stand at this offset"),
+    "upload_completed": Kind(409, "The upload is already complete"),
     "preview_not_ready": Kind(404, "There is no preview yet"),
     "report_not_ready": Kind(404, "There is no report yet"),
     "model_not_ready": Kind(409, "The model is not finished yet"),

@@ -6,10 +6,12 @@ from fastapi import APIRouter, Body, Header, Path, Request
 from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import SHA256_HEADER, Capture, CaptureFile, CapturePage, CreateCapture, Role
+from splatmill.schema.uploads import UPLOAD_COMPLETE, UPLOAD_LENGTH, read_boolean
 from splatmill_server.caller import Who
 from splatmill_server.ownership import CaptureId, ListedOwner
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.problems import ProblemError
+from splatmill_server.routes import uploads
 from splatmill_server.routes.openapi import CAPTURE_EXAMPLE, answer, example, problems
 from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit
 from splatmill_server.service import Shared
@@ -79,9 +81,11 @@ def delete_capture(service: Shared, capture_id: CaptureId) -> Response:
     status_code=201,
     response_model=CaptureFile,
     responses=answer(200, "The same bytes were already stored", model=CaptureFile)
+    | uploads.CREATED
     | problems(
         "capture_not_found",
         "name_taken",
+        "upload_offset_differs",
         "name_invalid",
         "file_empty",
         "digest_mismatch",
@@ -111,8 +115,23 @@ async def put_file(
         str | None,
         Header(alias=SHA256_HEADER, description="SHA-256 of the bytes in hex; checked if given."),
     ] = None,
+    complete: Annotated[
+        str | None,
+        Header(
+            alias=UPLOAD_COMPLETE,
+            description="`?0` begins an upload in several requests; the body may be empty, or the first bytes.",
+        ),
+    ] = None,
+    total: Annotated[
+        str | None,
+        Header(alias=UPLOAD_LENGTH, description="With `Upload-Complete: ?0`, the size of the file."),
+    ] = None,
 ) -> Response:
-    """Upload a file. The same bytes may be sent again; other bytes under the same name are refused."""
+    """Upload a file. The same bytes may be sent again; other bytes under the same name are refused.
+
+    With `Upload-Complete: ?0`, the file arrives in several requests, and can be continued after a break. The same file
+    (name, `Upload-Length` and digest) is then the same upload, and `Upload-Offset` tells where to go on.
+    """
     media_type = (
         request.headers.get("content-type", "application/octet-stream").partition(";")[0].strip().lower()
     )
@@ -123,6 +142,8 @@ async def put_file(
             advice="Send the bytes of the file with Content-Type: application/octet-stream.",
             facts={"accepted": list(_ACCEPTED[role])},
         )
+    if read_boolean(complete) is False:
+        return await uploads.begin(service, request, capture_id, role, name, digest, total)
     length = request.headers.get("content-length", "")
     file, new = await service.captures.store(
         capture_id,
