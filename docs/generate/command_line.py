@@ -37,7 +37,7 @@ MEANINGS = {
     Exit.unauthorized: "The API key is missing or wrong.",
     Exit.not_found: "There is no such job, model or file, or it is in a state that does not allow the request.",
     Exit.no_service: "The service on this machine could not be started.",
-    Exit.cancelled: "The job was cancelled, by Ctrl-C, SIGTERM or another client.",
+    Exit.cancelled: "The command was stopped by Ctrl-C or SIGTERM, or the job was cancelled by another client.",
 }
 
 

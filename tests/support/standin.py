@@ -1,7 +1,7 @@
 """A stand-in for the pipeline, with the same interface, which a test can slow down and crash at a chosen step.
 
 It stores a checkpoint after each step and resumes from it, so that a test can tell a resumed attempt from a new one.
-The capture's `images/script.json` controls it:
+The capture's `images/script.json` controls it, or without one the environment variable STANDIN_SCRIPT:
 
     steps: number of steps.
     pause: seconds per step.
@@ -44,7 +44,8 @@ def run(
     cancelled: Callable[[], bool],
 ) -> SimpleNamespace:
     """Follow the script and leave a ball of Gaussians as the model. The photos are not read."""
-    script = json.loads((capture / "images" / "script.json").read_text())
+    own = capture / "images" / "script.json"
+    script = json.loads(own.read_text() if own.is_file() else os.environ["STANDIN_SCRIPT"])
     workdir.mkdir(parents=True, exist_ok=True)
     checkpoint = workdir / "checkpoints" / "state.json"
     diary = Path(script["diary"])

@@ -5,20 +5,23 @@ import json
 import os
 import secrets
 import select
-import shutil
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 
+from splatmill.cli.follow import ONE_SIGNAL_SECONDS
 from splatmill.errors import ServiceFailed
 
 SUPERVISOR = "splatmill_server.up"
 START_SECONDS = 90.0  # a first start may read several hundred megabytes of libraries from disk
-STOP_SECONDS = 20.0  # a worker that is stopped first writes a checkpoint
+STOP_SECONDS = 45.0  # a worker that is stopped first writes a checkpoint, and then Redis is stopped
 
 ALL_PARTS = "pip install splatmill splatmill-server[embedded] splatmill-worker"
 
@@ -41,29 +44,58 @@ def require(part: str, needed_for: str) -> None:
 
 
 @contextmanager
-def embedded_service(data: Path) -> Iterator[ServiceAddress]:
-    """Run the service while the context is open. Its files are in the folder `data`, which is removed afterwards.
+def embedded_service(data: Path, lock: int) -> Iterator[ServiceAddress]:
+    """Run the service while the context is open, with its files in the folder `data`, which is kept.
+
+    A job that runs at the end saves its state, and goes on when the service is started on the same folder again.
+
+    lock: file descriptor of the folder's lock (`folder_lock`). The service inherits it, so that the folder stays locked
+        until the service has ended, also when this process is killed.
 
     Raises ServiceFailed, with the end of the service's log, if it does not start.
     """
     for part in ("splatmill_server", "splatmill_worker"):
         require(part, "Training on this machine")
-    with _owned(data):
-        log = data / "service.log"
-        with log.open("wb") as errors:
-            process = subprocess.Popen(
-                [sys.executable, "-m", SUPERVISOR, "--json-ready", "--port", "0", "--data", str(data)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                env=_environment(),
-                # Ctrl-C must reach this process only, which cancels the job before it stops the service.
-                start_new_session=True,
-            )
-        try:
-            yield _wait_ready(process, log)
-        finally:
+    log = data / "service.log"
+    with log.open("wb") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", SUPERVISOR, "--json-ready", "--port", "0", "--data", str(data)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            env=_environment(),
+            pass_fds=(lock,),
+            # Ctrl-C must reach this process only, which decides what becomes of the job.
+            start_new_session=True,
+        )
+    try:
+        yield _wait_ready(process, log)
+    finally:
+        with _signals_hasten(process):
             _stop(process)
+
+
+@contextmanager
+def _signals_hasten(process: subprocess.Popen[bytes]) -> Iterator[None]:
+    """While the service stops, pass a signal to it: it then stops without writing a checkpoint.
+
+    The training loses what it has done since its last checkpoint.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    began = time.monotonic()
+
+    def hasten(number: int, frame: FrameType | None) -> None:
+        if time.monotonic() - began > ONE_SIGNAL_SECONDS:
+            process.terminate()
+
+    before = {number: signal.signal(number, hasten) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _environment() -> dict[str, str]:
@@ -75,30 +107,6 @@ def _environment() -> dict[str, str]:
     foreign = ("REDIS_URL", "SPLATMILL_STORAGE", "SPLATMILL_DATA", "SPLATMILL_RENDERER_URL", "SPLATMILL_UDS")
     kept = {name: value for name, value in os.environ.items() if name not in foreign}
     return kept | {"SPLATMILL_API_KEY": secrets.token_urlsafe(24)}
-
-
-@contextmanager
-def _owned(data: Path) -> Iterator[None]:
-    """Hold a lock on `data` and start with it empty: an earlier command that was killed may have left files."""
-    import fcntl  # missing on Windows, where only --server works
-
-    data.parent.mkdir(parents=True, exist_ok=True)
-    lock_path = data.with_name(data.name + ".lock")
-    with lock_path.open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise ServiceFailed(
-                f"Another `splatmill train` is writing to {data.parent}.",
-                "Choose another folder with -o, or wait until it has ended.",
-            ) from error
-        shutil.rmtree(data, ignore_errors=True)
-        data.mkdir()
-        try:
-            yield
-        finally:
-            shutil.rmtree(data, ignore_errors=True)
-            lock_path.unlink(missing_ok=True)
 
 
 def _wait_ready(process: subprocess.Popen[bytes], log: Path) -> ServiceAddress:

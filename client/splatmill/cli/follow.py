@@ -1,4 +1,4 @@
-"""Shows the events of a job until it ends, and cancels the job on Ctrl-C.
+"""Shows the events of a job until it ends. On Ctrl-C, it cancels the job or leaves it to be gone on with.
 
 A KeyboardInterrupt could be raised between any two steps, for example when a job has just been created or while a
 stream is opened. Therefore a signal is put into the same queue as the events, and handled where these are handled.
@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import datetime
 from queue import SimpleQueue
 from types import FrameType
 
@@ -40,31 +41,49 @@ class StoppedWaiting(Exception):
     """A second signal arrived: the command does not wait until the job is cancelled."""
 
 
-def follow_job(start: Callable[[], JobHandle], *, verbose: bool) -> ModelHandle:
+class Interrupted(Exception):
+    """A signal arrived that is not to cancel the job."""
+
+
+def follow_job(
+    start: Callable[[], JobHandle], *, verbose: bool, cancels: bool = True, since: datetime | None = None
+) -> ModelHandle:
     """Start a job, show its events until it ends, and return its model.
 
-    The first signal (SIGINT or SIGTERM) cancels the job. Raises JobFailed, JobCancelled, StoppedWaiting after a second
-    signal, and the errors of the SDK.
+    cancels: the first signal (SIGINT or SIGTERM) cancels the job. Otherwise, it raises Interrupted.
+    since: earlier events are not shown.
+
+    Raises JobFailed, JobCancelled, Interrupted, StoppedWaiting after a second signal, and the errors of the SDK.
     """
     inbox: SimpleQueue[Item] = SimpleQueue()
     with _signals_into(inbox):
         job = start()
         _in_background(lambda: _read_events(job, inbox))
         with make_display() as display:
-            _until_ended(job, inbox, display, verbose)
+            _until_ended(job, inbox, display, verbose, cancels, since)
         return job.result()
 
 
-def _until_ended(job: JobHandle, inbox: SimpleQueue[Item], display: Display, verbose: bool) -> None:
+def _until_ended(
+    job: JobHandle,
+    inbox: SimpleQueue[Item],
+    display: Display,
+    verbose: bool,
+    cancels: bool,
+    since: datetime | None,
+) -> None:
     cancelling: Interruption | None = None
     while True:
         item = inbox.get()
         if isinstance(item, EventRecord):
-            show(item, display, verbose=verbose)
+            if since is None or item.at >= since:
+                show(item, display, verbose=verbose)
         elif isinstance(item, EventsEnded):
             return
         elif isinstance(item, Exception):
             raise item
+        elif not cancels:
+            raise Interrupted
         elif cancelling is not None:
             if item.at - cancelling.at > ONE_SIGNAL_SECONDS:
                 raise StoppedWaiting

@@ -1,8 +1,10 @@
 """`splatmill train`: trains a model from photos, on a server or on this machine."""
 
+import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -11,15 +13,20 @@ import typer
 
 from splatmill.cli.embedded import embedded_service
 from splatmill.cli.exits import Exit
-from splatmill.cli.follow import StoppedWaiting, follow_job
+from splatmill.cli.folder_lock import locked
+from splatmill.cli.follow import Interrupted, StoppedWaiting, follow_job
 from splatmill.cli.models import download_files, write_novel_view
 from splatmill.cli.progress import make_display
 from splatmill.cli.schema_options import with_training_options
 from splatmill.cli.servers import open_client
-from splatmill.client import Client, ModelHandle
+from splatmill.cli.unfinished import Unfinished, size_text
+from splatmill.client import Client, JobHandle, ModelHandle
 from splatmill.errors import JobCancelled
-from splatmill.local_capture import Found, find_files
+from splatmill.local_capture import Found, LocalFile, find_files, start_model
 from splatmill.schema import Capture, Role, TrainOptions, format_bytes
+
+DATA = ".splatmill"
+"""Name of the folder for the data of a training on this machine, in the folder of its results."""
 
 
 @with_training_options
@@ -60,12 +67,23 @@ def train(
             "--novel-view", help="Also write novel_view.png, an image from half-way between two cameras."
         ),
     ] = False,
+    fresh: Annotated[
+        bool,
+        typer.Option(
+            "--fresh",
+            help="Discard what an interrupted or failed training on this machine left in DIR, and start over.",
+        ),
+    ] = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Show the plan and all log lines.")
     ] = False,
     **options: Any,
 ) -> None:
-    """Train Gaussian splats from photos; write model.ply and its report to DIR."""
+    """Train Gaussian splats from photos; write model.ply and its report to DIR.
+
+    Without a server, a training that is interrupted (Ctrl-C, kill, power cut) is kept in DIR/.splatmill, and the same
+    command goes on where it stopped.
+    """
     from splatmill.aio import train_options, with_start_model
 
     given = {key: value for key, value in options.items() if value is not None and value != []}
@@ -77,21 +95,35 @@ def train(
             "--detach needs --server: without a server, the job ends with this command.",
             param_hint="--detach",
         )
+    if fresh and server is not None:
+        raise typer.BadParameter(
+            "--fresh discards a training on this machine; with --server, every command starts a new job.",
+            param_hint="--fresh",
+        )
     out.mkdir(parents=True, exist_ok=True)
     _announce(found)
-    with _sigterm_as_interrupt(), _client(server, out) as client:
-        title = name or path.expanduser().resolve().name
-        capture = _upload(client, path, title, start)
-        if detach:
-            typer.echo(client.submit(capture.id, checked, name=title).id)
-            return
-        model = _follow(client, capture, title, checked, verbose)
+    title = name or path.expanduser().resolve().name
+
+    def outputs(model: ModelHandle) -> None:
         written = download_files(model, out)
         if novel_view:
             written.append(write_novel_view(model, out / "novel_view.png"))
         if orbit:
             written.append(model.orbit(out / "orbit.mp4"))
-    _summary(model, written)
+        _summary(model, written)
+
+    with _sigterm_as_interrupt():
+        if server is None:
+            files = [*found.files, *([start_model(start)] if start is not None else [])]
+            with _kept_service(out / DATA, path, files, checked, fresh) as (client, unfinished):
+                outputs(_train_here(client, unfinished, path, title, checked, start, verbose))
+            return
+        with open_client(server) as client:
+            capture = _upload(client, path, title, start)
+            if detach:
+                typer.echo(client.submit(capture.id, checked, name=title).id)
+                return
+            outputs(_follow(lambda: client.submit(capture.id, checked, name=title), verbose))
 
 
 def _announce(found: Found) -> None:
@@ -104,31 +136,80 @@ def _announce(found: Found) -> None:
 
 
 @contextmanager
-def _client(server: str | None, out: Path) -> Iterator[Client]:
-    if server is not None:
-        with open_client(server) as client:
-            yield client
-        return
-    with (
-        embedded_service(out / ".splatmill") as service,
-        Client(service.url, api_key=service.api_key) as client,
-    ):
-        yield client
+def _kept_service(
+    data: Path, path: Path, files: list[LocalFile], options: TrainOptions, fresh: bool
+) -> Iterator[tuple[Client, Unfinished]]:
+    """Run the service on this machine. Its data is removed when the block succeeds, and kept when it raises."""
+    with locked(data) as lock:
+        unfinished = Unfinished.open(data, path, files, options, fresh=fresh)
+        try:
+            with (
+                embedded_service(data, lock) as service,
+                Client(service.url, api_key=service.api_key) as client,
+            ):
+                yield client, unfinished
+        except BaseException:
+            if unfinished.trainings:
+                typer.echo(
+                    f"The training is kept in {data} ({size_text(data)}). The same command goes on where it "
+                    "stopped; other options use its cameras again; --fresh discards it and starts over.",
+                    err=True,
+                )
+            else:
+                shutil.rmtree(data, ignore_errors=True)
+            raise
+        shutil.rmtree(data, ignore_errors=True)
 
 
-def _upload(client: Client, path: Path, name: str, start: Path | None) -> Capture:
+def _train_here(
+    client: Client,
+    unfinished: Unfinished,
+    path: Path,
+    name: str,
+    options: TrainOptions,
+    start: Path | None,
+    verbose: bool,
+) -> ModelHandle:
+    """Go on with the training that an earlier command left, or begin one; return its model."""
+    began = datetime.now(UTC)
+    unfinished.stop_others(client)
+    known = unfinished.capture(client)
+    capture = _upload(client, path, name, start, known)
+
+    def job() -> JobHandle:
+        if (same := unfinished.job(client)) is not None:
+            typer.echo("going on with the training that was stopped")
+            return same
+        if known is not None:
+            typer.echo("using the stored photos, and their cameras if these were recovered")
+        new = client.submit(capture.id, options, name=name)
+        unfinished.remember(capture.id, new.id)
+        return new
+
+    return _follow(job, verbose, cancels=False, since=began)
+
+
+def _upload(
+    client: Client, path: Path, name: str, start: Path | None, known: Capture | None = None
+) -> Capture:
     with make_display() as display:
-        capture, uploaded = client.upload(path, name=name, on_progress=display.progress, model=start)
+        capture, uploaded = client.upload(
+            path, name=name, capture=known.id if known else None, on_progress=display.progress, model=start
+        )
     for photo, problem in uploaded.refused:
         typer.echo(f"left out: {photo}: {problem.detail}", err=True)
     return capture
 
 
-def _follow(client: Client, capture: Capture, name: str, options: TrainOptions, verbose: bool) -> ModelHandle:
+def _follow(
+    start: Callable[[], JobHandle], verbose: bool, cancels: bool = True, since: datetime | None = None
+) -> ModelHandle:
     try:
-        return follow_job(lambda: client.submit(capture.id, options, name=name), verbose=verbose)
+        return follow_job(start, verbose=verbose, cancels=cancels, since=since)
     except JobCancelled as cancelled:
         typer.echo(f"The job {cancelled.job_id} was cancelled.")
+    except Interrupted:
+        typer.echo("Stopping; the training saves its state. A second Ctrl-C stops it at once.", err=True)
     except StoppedWaiting:
         typer.echo("The job is being cancelled; this command does not wait for its end.", err=True)
     raise typer.Exit(Exit.cancelled)

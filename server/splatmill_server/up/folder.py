@@ -4,6 +4,7 @@ import fcntl
 import hashlib
 import os
 import shutil
+import socket
 import tempfile
 import time
 from pathlib import Path
@@ -102,7 +103,7 @@ class DataFolder:
         os.pwrite(self.lock, f"{os.getpid()}\n".encode(), 0)
 
     def _socket_folder(self) -> Path:
-        if len(os.fsencode(self.path / "renderer.sock")) <= _SOCKET_LIMIT:
+        if len(os.fsencode(self.path / "renderer.sock")) <= _SOCKET_LIMIT and _holds_sockets(self.path):
             return self.path
         digest = hashlib.sha256(os.fsencode(self.path)).hexdigest()[:12]
         folder = Path(tempfile.gettempdir()) / f"splatmill-{os.getuid()}-{digest}"
@@ -115,3 +116,16 @@ class DataFolder:
                 "remove it."
             )
         return folder
+
+
+def _holds_sockets(folder: Path) -> bool:
+    """Return whether a unix socket can be made in a folder; some network file systems allow none."""
+    path = folder / f".probe-{os.getpid()}.sock"
+    try:
+        with socket.socket(socket.AF_UNIX) as probe:
+            probe.bind(str(path))
+    except OSError:
+        return False
+    finally:
+        path.unlink(missing_ok=True)
+    return True

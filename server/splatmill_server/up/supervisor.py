@@ -104,6 +104,7 @@ class Supervisor:
                         with suppress(BlockingIOError):
                             self._wake.recv(4096)
                     elif not os.read(key.fd, 4096):
+                        self._signals += 1  # counts as the first request to stop
                         return
         finally:
             waiting.close()

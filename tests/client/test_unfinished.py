@@ -1,0 +1,266 @@
+"""`splatmill train` without a server: a training that is interrupted in any way is kept, and the same command goes on.
+
+The pipeline is a stand-in, except in the last test, which recovers cameras and trains.
+"""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from splatmill.cli.exits import Exit
+from splatmill.cli.follow import ONE_SIGNAL_SECONDS
+from splatmill.cli.unfinished import Unfinished
+from splatmill.errors import ServiceFailed
+from splatmill.local_capture import find_files
+from splatmill.schema import TrainOptions
+from splatmill_worker.synthetic import capture
+from tests.support.up import STANDIN
+from tests.support.waiting import wait_for
+
+
+class Command:
+    """`splatmill train PHOTOS -o OUT`, as often as a test wants."""
+
+    def __init__(self, folder: Path, **script: Any) -> None:
+        self.photos = folder / "photos"
+        self.photos.mkdir()
+        for n in range(3):
+            (self.photos / f"{n}.jpg").write_text(f"photo {n}")
+        self.out = folder / "out"
+        self.data = self.out / ".splatmill"
+        self._diary = folder / "diary"
+        self.script = {"steps": 60, "pause": 0.05, "diary": str(self._diary)} | script
+
+    def start(self, *options: str, photos: Path | None = None) -> subprocess.Popen[str]:
+        environment = os.environ | STANDIN | {"STANDIN_SCRIPT": json.dumps(self.script), "NO_COLOR": "1"}
+        environment.pop("SPLATMILL_SERVER", None)
+        command = [
+            sys.executable,
+            "-m",
+            "splatmill",
+            "train",
+            str(photos or self.photos),
+            "-o",
+            str(self.out),
+        ]
+        return subprocess.Popen(
+            [*command, *options], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+
+    def run(self, *options: str, photos: Path | None = None) -> tuple[int, str]:
+        """Return the exit code and all output."""
+        process = self.start(*options, photos=photos)
+        said, _ = process.communicate(timeout=120)
+        return process.returncode, said
+
+    def interrupted(self, sent: signal.Signals, options: tuple[str, ...] = ()) -> tuple[int, str]:
+        """Start, send a signal once a new job has stored some steps, and return as `run` does."""
+        known, _ = self.steps()
+        process = self.start(*options)
+
+        def trained() -> bool:
+            job, step = self.steps()
+            return job != known and step >= 5
+
+        wait_for(trained, 60)
+        process.send_signal(sent)
+        said, _ = process.communicate(timeout=120)
+        return process.returncode, said
+
+    def diary(self) -> list[Any]:
+        """What each attempt wrote when it began."""
+        return (
+            [json.loads(line) for line in self._diary.read_text().splitlines()]
+            if self._diary.exists()
+            else []
+        )
+
+    def jobs(self) -> list[Any]:
+        """The trainings on record."""
+        return list(json.loads((self.data / "training.json").read_text())["trainings"])
+
+    def steps(self) -> tuple[str, int]:
+        """The job that was recorded last, and its stored steps."""
+        if not (self.data / "training.json").is_file():
+            return "", 0
+        job = self.jobs()[-1]["job"]
+        stored = self.data / "work" / job / "run/checkpoints/state.json"
+        return job, json.loads(stored.read_text())["step"] if stored.is_file() else 0
+
+
+@pytest.fixture
+def command(tmp_path: Path) -> Command:
+    return Command(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_the_same_command_goes_on_after_a_signal(command: Command, sent: signal.Signals) -> None:
+    code, said = command.interrupted(sent)
+    assert code == (-signal.SIGKILL if sent is signal.SIGKILL else Exit.cancelled)
+    if sent is not signal.SIGKILL:
+        assert f"The training is kept in {command.data} (" in said
+        assert "The same command goes on" in said
+    code, said = command.run()
+    assert code == 0, said
+    assert "going on with the training that was stopped" in said
+    first, *others = command.diary()
+    assert first["from"] == 0
+    assert all(attempt["from"] >= 5 for attempt in others)
+    assert not any(attempt["overlap"] for attempt in command.diary())
+    assert (command.out / "model.ply").is_file()
+    assert not command.data.exists()
+    assert not (command.out / ".splatmill.lock").exists()
+
+
+@pytest.mark.slow
+def test_a_second_ctrl_c_loses_only_what_follows_the_last_checkpoint(tmp_path: Path) -> None:
+    # The step after the fifth is one call of native code, which cannot save its state.
+    command = Command(tmp_path, do="native", at=6)
+    process = command.start()
+    wait_for(lambda: command.steps()[1] == 5, 60)
+    while process.poll() is None:
+        process.send_signal(signal.SIGINT)
+        time.sleep(2 * ONE_SIGNAL_SECONDS)
+    said, _ = process.communicate()
+    assert process.returncode == Exit.cancelled, said
+    command.script["do"] = "nothing"
+    code, said = command.run()
+    assert code == 0, said
+    assert command.diary()[-1]["from"] == 5
+
+
+@pytest.mark.slow
+def test_other_options_train_on_the_same_capture_and_the_first_ones_go_on_later(command: Command) -> None:
+    command.interrupted(signal.SIGINT, options=("--seed", "1"))
+    code, said = command.interrupted(signal.SIGINT, options=("--seed", "2"))
+    assert code == Exit.cancelled, said
+    one, two = command.jobs()
+    assert (one["options"], two["options"]) == ({"seed": 1}, {"seed": 2})
+    assert one["capture"] == two["capture"]
+    assert one["job"] != two["job"]
+    code, said = command.run("--seed", "1")
+    assert code == 0, said
+    assert command.diary()[-1]["from"] >= 5
+    assert not command.data.exists()
+
+
+@pytest.mark.slow
+def test_added_photos_join_the_capture_and_changed_ones_begin_another(command: Command) -> None:
+    command.interrupted(signal.SIGINT)
+    (command.photos / "3.jpg").write_text("photo 3")
+    command.interrupted(signal.SIGINT)
+    (command.photos / "0.jpg").write_text("another photo 0")
+    command.interrupted(signal.SIGINT)
+    first, added, changed = (training["capture"] for training in command.jobs())
+    assert first == added != changed
+
+
+@pytest.mark.slow
+def test_fresh_starts_over(command: Command) -> None:
+    command.interrupted(signal.SIGINT)
+    code, said = command.run("--fresh")
+    assert code == 0, said
+    assert "going on" not in said
+    assert [attempt["from"] for attempt in command.diary()] == [0, 0]
+
+
+@pytest.mark.slow
+def test_a_second_command_on_the_folder_is_refused_while_the_first_runs(command: Command) -> None:
+    first = command.start()
+    wait_for(command.diary, 60)
+    code, said = command.run()
+    assert code == Exit.no_service
+    assert f"Another `splatmill train` (process {first.pid}) is writing to {command.out}" in said
+    said, _ = first.communicate(timeout=120)
+    assert first.returncode == 0, said
+
+
+@pytest.mark.slow
+def test_a_folder_with_a_training_of_other_photos_is_refused_and_kept(
+    command: Command, tmp_path: Path
+) -> None:
+    command.interrupted(signal.SIGINT)
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "0.jpg").write_text("photo 0")
+    code, said = command.run(photos=other)
+    assert code == Exit.no_service
+    assert f"{command.data} holds an unfinished training of other photos, {command.photos}" in said
+    assert "--fresh" in said
+    code, said = command.run()
+    assert code == 0, said
+    assert command.diary()[-1]["from"] >= 5
+
+
+def test_a_record_of_a_later_version_is_refused_and_kept(tmp_path: Path) -> None:
+    data = tmp_path / ".splatmill"
+    data.mkdir()
+    (data / "training.json").write_text('{"format": 2}')
+    (tmp_path / "0.jpg").write_text("photo")
+    files = find_files(tmp_path).files
+    with pytest.raises(ServiceFailed, match=r"training\.json: it has format 2"):
+        Unfinished.open(data, tmp_path, files, TrainOptions(), fresh=False)
+    assert (data / "training.json").is_file()
+    assert Unfinished.open(data, tmp_path, files, TrainOptions(), fresh=True).trainings == []
+    assert list(data.iterdir()) == []
+
+
+def test_a_folder_without_a_record_is_emptied(tmp_path: Path) -> None:
+    data = tmp_path / ".splatmill"
+    (data / "storage").mkdir(parents=True)
+    (tmp_path / "0.jpg").write_text("photo")
+    Unfinished.open(data, tmp_path, find_files(tmp_path).files, TrainOptions(), fresh=False)
+    assert list(data.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_real_training_goes_on_at_its_checkpoint_with_its_cameras(tmp_path: Path) -> None:
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    capture(photos, 24, 320, 240, 0)
+    command = [
+        sys.executable,
+        "-m",
+        "splatmill",
+        "train",
+        str(photos),
+        "-o",
+        str(out),
+        "--time-budget",
+        "20s",
+    ]
+    environment = os.environ | {"NO_COLOR": "1", "PYTHONUNBUFFERED": "1"}
+    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "env": environment}
+    with subprocess.Popen(command, **pipes) as first:
+        assert first.stdout is not None
+        lines = []
+        for line in first.stdout:
+            lines.append(line)
+            if _step(line) > 0:
+                first.send_signal(signal.SIGINT)
+                break
+        lines += list(first.stdout)
+    said = "".join(lines)
+    assert first.returncode == Exit.cancelled, said
+    assert "matching" in said
+    done = subprocess.run(command, **pipes, timeout=300)
+    assert done.returncode == 0, done.stdout
+    assert "matching" not in done.stdout
+    assert "mapping" not in done.stdout
+    steps = [step for line in done.stdout.splitlines() if (step := _step(line)) > 0]
+    assert steps[0] >= max(_step(line) for line in lines)
+    assert (out / "model.ply").is_file()
+
+
+def _step(line: str) -> int:
+    """The step in a line of progress, or 0."""
+    found = re.match(r"training  (\d+)/", line)
+    return int(found[1]) if found else 0
