@@ -13,7 +13,7 @@ import redis
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import queue
+from splatmill.backplane import leases, queue
 from splatmill.backplane.row import JobRow
 from splatmill.schema import Problem
 from splatmill_server.jobs import Jobs, last_stage
@@ -34,6 +34,7 @@ class Reaper:
         self.connection = connection
         self.jobs = jobs
         self.metrics = metrics
+        self.leases = leases.Reclaim(connection)
         self.interval = settings.reaper_interval
         self.stop_interval = settings.stop_interval
         self._wake = asyncio.Event()
@@ -63,7 +64,7 @@ class Reaper:
 
     def tick(self) -> bool:
         """Check every unfinished job once; return True while one is being cancelled."""
-        queue.reclaim(self.connection)
+        self.leases.run()
         active = self.jobs.active()
         cancelling = [row for row in active if row.cancel_requested_at is not None]
         unfinished = [row for row in cancelling if not _safely(self.cancel, row, True)]
@@ -103,11 +104,22 @@ class Reaper:
     def _give_up(self, row: JobRow, found: queue.QueueStatus) -> None:
         job = self.jobs.get(row.id)
         facts = {"attempts": job.attempt, "stage": last_stage(job), "reason": found.reason}
-        if found.state == "failed":
+        lost = leases.lost(self.connection, queue.rq_id(row.id, row.generation))
+        during = f" during {facts['stage']}" if facts["stage"] else ""
+        if found.state == "failed" and lost >= leases.MAX_LOST:
+            problem = Problem.of(
+                "attempts_exhausted",
+                f"The worker that ran the job was lost {lost} times in a row{during}, each time without a new "
+                "checkpoint.",
+                advice="Probably the job itself ends the worker or its machine, by taking all memory: start a new job "
+                "with a smaller image_size or max_gaussians, or give the worker a limit of memory.",
+                facts=facts | {"lost_workers": lost},
+            )
+        elif found.state == "failed":
             problem = Problem.of(
                 "attempts_exhausted",
                 f"The job's process ended unexpectedly in each of {job.attempt} attempts"
-                + (f", the last time during {facts['stage']}" if facts["stage"] else "")
+                + (f", the last time{during}" if during else "")
                 + (f" ({found.reason})" if found.reason else "")
                 + ".",
                 advice="Often the machine has run out of memory: start a new job with a smaller "

@@ -10,13 +10,14 @@ import sys
 import textwrap
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from rq.job import Job, JobStatus
 
-from splatmill.backplane import keys, queue, row
+from splatmill.backplane import keys, leases, queue, row
 from splatmill.schema import JobState, ProgressEvent, StateEvent
 from tests.support.served_app import Serve, ServedApp
 from tests.support.waiting import wait_for
@@ -46,6 +47,13 @@ WORKER = textwrap.dedent(
     worker.work(burst=sys.argv[3] != "sleep", logging_level="ERROR")
     """
 )
+
+
+@pytest.fixture
+def quick_leases(app: ServedApp, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Redis that has been there for longer than a lease."""
+    monkeypatch.setattr(leases, "LEASE", 2)
+    wait_for(lambda: app.redis.info("server")["uptime_in_seconds"] >= 2)
 
 
 @contextmanager
@@ -110,7 +118,7 @@ def test_a_final_state_that_comes_after_the_verdict_is_too_late(app: ServedApp) 
     assert app.state(job_id) == "queued"
 
 
-def test_a_dead_workers_attempt_is_queued_again(app: ServedApp, tmp_path: Path) -> None:
+def test_a_dead_workers_attempt_is_queued_again(app: ServedApp, tmp_path: Path, quick_leases: None) -> None:
     job_id = app.job()
     pid_file = tmp_path / "pid"
     with worker(app, pid_file) as process:
@@ -176,23 +184,34 @@ def test_a_wish_that_outlived_the_server_is_fulfilled_by_the_next_one(serve: Ser
     wait_for(lambda: app.state(job_id) == "cancelled")
 
 
-def test_two_reapers_at_once_requeue_an_attempt_once(app: ServedApp) -> None:
+def test_two_reapers_at_once_requeue_an_attempt_once(app: ServedApp, quick_leases: None) -> None:
     job_id = app.job()
     entry = Job.fetch(queue.rq_id(job_id, 1), connection=app.redis, serializer=queue.SERIALIZER)
-    registry = queue.open_queue(app.redis).started_job_registry
     app.redis.lrem(queue.open_queue(app.redis).key, 0, entry.id)
     entry.set_status(JobStatus.STARTED)
-    app.redis.zadd(registry.key, {f"{entry.id}:x": 1})
-    # Another process is cleaning: this one must not.
-    app.redis.set(queue.open_queue(app.redis).registry_cleaning_key, 1, ex=899)
-    queue.reclaim(app.redis)
-    assert queue.waiting(app.redis) == {"train": 0}
-    # It was killed while it cleaned: its lock is broken after a while, and the next look mends the job.
-    app.redis.expire(queue.open_queue(app.redis).registry_cleaning_key, 800)
-    queue.reclaim(app.redis)
-    queue.reclaim(app.redis)
-    queue.reclaim(app.redis)
+    app.redis.zadd(leases.key(), {f"{entry.id}:x": 1})
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: leases.Reclaim(app.redis).run(), range(8)))
+    assert [became for runs in found for _, became in runs] == ["waiting"]
     assert queue.waiting(app.redis) == {"train": 1}
+
+
+def test_a_job_whose_worker_is_lost_again_and_again_fails_by_name(app: ServedApp) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.say(job_id, StateEvent(state=JobState.sfm), ProgressEvent(stage="features", done=3))
+    lease = leases.Lease(queue.rq_id(job_id, 1), "x")
+    for _ in range(leases.MAX_LOST):
+        leases.hold(app.redis, lease)
+        leases.requeue(app.redis, lease, if_expired=False)
+    app.service.reaper.tick()
+    problem = app.http.get(f"/v1/jobs/{job_id}").json()["problem"]
+    assert problem["code"] == "attempts_exhausted"
+    assert "lost 4 times in a row during features" in problem["detail"]
+    assert problem["facts"]["lost_workers"] == leases.MAX_LOST
+    # A restart is a new generation, which may lose as many.
+    assert app.http.post(f"/v1/jobs/{job_id}/restart").json()["state"] == "queued"
+    assert leases.lost(app.redis, queue.rq_id(job_id, 2)) == 0
 
 
 def test_the_reaper_looks_at_unfinished_jobs_alone_and_at_all_of_them(app: ServedApp) -> None:

@@ -6,12 +6,11 @@ Does not cover the loss of a machine among several: there the heartbeat decides,
 
 import os
 import signal
-from functools import partial
 
 import httpx
 import pytest
 
-from splatmill.backplane import queue
+from splatmill.backplane import leases, queue
 from tests.support.up import Up
 from tests.support.waiting import gone, wait_for
 
@@ -48,18 +47,30 @@ def test_a_killed_worker_takes_its_trainer_along_and_is_followed(service: Up) ->
     check_resumed(service, job_id)
 
 
-def test_a_worker_killed_again_and_again_does_not_use_up_the_tries(service: Up) -> None:
-    job_id = service.submit(steps=60)
+def test_a_worker_killed_again_and_again_does_not_use_up_the_tries_of_a_job_that_gets_on(service: Up) -> None:
+    job_id = service.submit(steps=700, pause=0.05)
 
-    def began(attempts: int) -> bool:
-        return len(service.diary(job_id)) == attempts
+    def nothing_lost() -> bool:
+        with service.redis() as connection:
+            return leases.lost(connection, queue.rq_id(job_id, 1)) == 0
 
-    for attempt in range(1, queue.MAX_RETRIES + 2):
-        wait_for(partial(began, attempt))
+    for _ in range(leases.MAX_LOST + 1):
+        service.reached(job_id, service.job(job_id)["progress"]["step"] + 5 if service.diary(job_id) else 5)
+        wait_for(nothing_lost)  # a heartbeat has seen a new checkpoint
         os.kill(service.worker, signal.SIGKILL)
     job = service.ended(job_id)
     assert job["state"] == "succeeded", job
     assert not any(entry["overlap"] for entry in service.diary(job_id))
+
+
+def test_a_job_that_ends_its_worker_each_time_is_given_up(service: Up) -> None:
+    job_id = service.submit(steps=10, do="kill worker", at=1)
+    other = service.submit(steps=1)
+    job = service.ended(job_id)
+    assert job["problem"]["code"] == "attempts_exhausted"
+    assert job["problem"]["facts"]["lost_workers"] == len(service.diary(job_id)) == leases.MAX_LOST
+    # It went behind the job that waited, whose first attempt it would have delayed for ever.
+    assert service.ended(other)["finished_at"] < job["finished_at"]
 
 
 @pytest.mark.parametrize("children", [True, False], ids=["with its children", "alone"])

@@ -105,6 +105,9 @@ def _act(script: dict[str, object], step: int) -> None:
             raise MemoryError("the stand-in was told to run out of memory")
         case "segv":
             os.kill(os.getpid(), signal.SIGSEGV)
+        case "kill worker":
+            os.kill(os.getppid(), signal.SIGKILL)
+            time.sleep(30)  # the kernel ends this process as well
         case "native":
             # One call that does not return to the interpreter for many seconds, like a mapper's.
             np.linalg.svd(np.random.default_rng(0).normal(size=(6000, 6000)))

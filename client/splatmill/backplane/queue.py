@@ -37,25 +37,21 @@ WORKER_TTL = 30
 """Seconds after which an idle worker that has disappeared is no longer listed (RQ's default is 420)."""
 
 MAINTENANCE_INTERVAL = 10
-"""Seconds between the clean-ups of an idle worker (RQ's default is 600)."""
+"""Seconds between two looks of an idle worker for expired leases (RQ's default is 600)."""
 
 MONITORING_INTERVAL = 5
-"""Seconds between the heartbeats of a busy worker (RQ's default is 30)."""
+"""Seconds between the heartbeats of a busy worker, each of which prolongs its lease (RQ's default is 30)."""
 
 HEARTBEAT_SLACK = 10
 """Seconds by which a heartbeat may be late before the attempt counts as lost (RQ's constant is 60). If a machine
-dies, its job is requeued after MONITORING_INTERVAL + HEARTBEAT_SLACK and one interval of the reaper."""
+dies, its job is requeued when its lease has expired (see `leases`), after at most one more interval of the reaper."""
 
 KEEP_FINISHED = 24 * 3600
 """Seconds for which RQ keeps its record of a finished job. Splatmill's own stays until the job is deleted."""
 
 QueueState = Literal["waiting", "running", "finished", "failed", "stopped", "absent"]
-"""State of a generation in the queue. `failed`: all attempts were used up. `stopped`: it was killed on request or
-withdrawn, and no process of it is left. `absent`: RQ has no record of it."""
-
-_OUR_LOCK = 30
-_RQ_LOCK = 899
-"""Seconds after which the lock on cleaning a queue expires when `reclaim` or RQ itself holds it."""
+"""State of a generation in the queue. `failed`: all attempts were used up, or its worker was lost too often. `stopped`:
+it was killed on request or withdrawn, and no process of it is left. `absent`: RQ has no record of it."""
 
 _STATES: dict[JobStatus, QueueState] = {
     JobStatus.QUEUED: "waiting",
@@ -179,24 +175,6 @@ def forget(connection: redis.Redis, job_id: str, generation: int) -> None:
     job = _fetch(connection, job_id, generation)
     if job is not None:
         job.delete()
-
-
-def reclaim(connection: redis.Redis) -> None:
-    """Requeue the generations whose worker stopped sending heartbeats, and fail those without attempts left.
-
-    RQ does this only in idle workers, so the API process calls it every few seconds.
-    """
-    for name in QUEUES:
-        queue = open_queue(connection, name)
-        # Idle workers use the same lock: two clean-ups at the same time would requeue a job twice.
-        if connection.set(queue.registry_cleaning_key, 1, nx=True, ex=_OUR_LOCK):
-            try:
-                queue.started_job_registry.cleanup()
-            finally:
-                connection.delete(queue.registry_cleaning_key)
-        elif _OUR_LOCK < connection.ttl(queue.registry_cleaning_key) < _RQ_LOCK - _OUR_LOCK:
-            # The lock is older than any clean-up takes: the worker that held it was killed.
-            connection.delete(queue.registry_cleaning_key)
 
 
 def waiting(connection: redis.Redis) -> dict[str, int]:

@@ -11,11 +11,12 @@ import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from rq.job import Callback
 
-from splatmill.backplane import layout, queue
+from splatmill.backplane import layout, leases, queue
 from splatmill.backplane.row import now
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Job, Role
@@ -34,9 +35,21 @@ def storage(tmp_path: Path) -> Storage:
     return storage
 
 
+SHIFTED = """
+import datetime, sys, time, rq.utils
+real_time, real_now, ahead = time.time, rq.utils.now, float(sys.argv[1])
+time.time = lambda: real_time() + ahead
+rq.utils.now = lambda: real_now() + datetime.timedelta(seconds=ahead)
+from splatmill_worker.__main__ import main
+sys.exit(main(["train"]))
+"""
+
+
 @contextlib.contextmanager
-def worker(server: RedisServer, storage: Storage, folder: Path) -> Iterator[None]:
-    """A worker whose Python also finds the modules in `folder`."""
+def worker(
+    server: RedisServer, storage: Storage, folder: Path, clock_ahead: float = 0.0
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A worker whose Python also finds the modules in `folder`, and whose clock is this many seconds ahead."""
     environment = dict(os.environ) | {
         **STANDIN,
         "PYTHONPATH": f"{STANDIN['PYTHONPATH']}{os.pathsep}{folder}",
@@ -44,9 +57,9 @@ def worker(server: RedisServer, storage: Storage, folder: Path) -> Iterator[None
         "SPLATMILL_STORAGE": storage.url,
         "SPLATMILL_DATA": str(folder / "data"),
     }
-    process = subprocess.Popen([sys.executable, "-m", "splatmill_worker", "train"], env=environment)
+    process = subprocess.Popen([sys.executable, "-c", SHIFTED, str(clock_ahead)], env=environment)
     try:
-        yield
+        yield process
     finally:
         process.terminate()
         process.wait(30)
@@ -103,3 +116,42 @@ def test_a_job_that_was_cancelled_while_it_waited_is_not_begun(
         wait_for(stopped)
     assert read_job(connection, "job00001").state == "queued", "the server says that it is cancelled"
     assert not (tmp_path / "diary").exists()
+
+
+def test_an_entry_that_belongs_to_no_job_is_removed_and_the_next_one_runs(
+    redis_server: RedisServer, storage: Storage, tmp_path: Path
+) -> None:
+    connection = redis_server.connection
+    foreign = ["nonsense", "job-x", "-1"]
+    for entry in foreign:
+        queue.open_queue(connection).enqueue_call(queue.ATTEMPT, args=["?"], job_id=entry)
+    connection.zadd(leases.key(), {"nonsense:x": 1, "more nonsense": 1})
+    write_row(connection, "job00001")
+    assert queue.enqueue(connection, "job00001", 1)
+    with worker(redis_server, storage, tmp_path) as process:
+        assert wait_for(partial(ended, redis_server, "job00001")).state == "succeeded"
+        assert process.poll() is None
+    assert queue.waiting(connection) == {"train": 0}
+    assert connection.zcard(leases.key()) == 0
+    assert not any(connection.exists(f"rq:job:{entry}") for entry in foreign)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ahead", [3600.0, -3600.0])
+def test_a_worker_whose_clock_is_off_runs_its_job_once(
+    redis_server: RedisServer, storage: Storage, tmp_path: Path, ahead: float
+) -> None:
+    connection = redis_server.connection
+    script = {"steps": 16, "pause": 0.5, "diary": str(tmp_path / "diary")}
+    storage.put(layout.capture_file(CAPTURE, Role.images, "script.json"), json.dumps(script).encode())
+    write_row(connection, "job00001")
+    assert queue.enqueue(connection, "job00001", 1)
+    with worker(redis_server, storage, tmp_path, clock_ahead=ahead):
+        wait_for(lambda: connection.zcard(leases.key()))
+        first = connection.zrange(leases.key(), 0, -1, withscores=True)
+        wait_for(lambda: connection.zrange(leases.key(), 0, -1, withscores=True) != first)
+        # Prolonged by a heartbeat, by the clock of Redis.
+        expires = cast(list[Any], connection.zrange(leases.key(), 0, -1, withscores=True))[0][1]
+        assert 0 < expires - connection.time()[0] <= leases.LEASE
+        job = wait_for(partial(ended, redis_server, "job00001"))
+    assert (job.state, job.attempt) == ("succeeded", 1)

@@ -16,7 +16,8 @@ from rq.executions import Execution
 from rq.job import Job
 from rq.worker_registration import get_keys
 
-from splatmill.backplane import keys
+from splatmill.backplane import keys, leases
+from splatmill.backplane.leases import Lease
 from splatmill.backplane.process import ProcessIdentity, wait_gone
 from splatmill.backplane.queue import QueueEntry, split_rq_id
 from splatmill_worker.service.attempt import Attempt
@@ -57,8 +58,13 @@ def requeue_orphans(worker: Worker) -> None:
     queue = worker.queues[0]
     others = [key for key in get_keys(queue) if key != worker.key]
     dead = {key for key in others if _worker_is_dead(worker.connection, key)}
-    for entry_id, execution_id in queue.started_job_registry.get_job_and_execution_ids(cleanup=False):
-        _requeue_if_orphaned(worker, queue, entry_id, execution_id)
+    for lease in leases.held(worker.connection):
+        try:
+            split_rq_id(lease.entry)
+        except ValueError:
+            drop_foreign(worker, lease.entry)
+        else:
+            _requeue_if_orphaned(worker, lease)
     if set(others) == dead:
         # A worker can die between taking an entry and registering it. With no other worker alive, every entry in that
         # state belonged to a dead one.
@@ -73,6 +79,24 @@ def requeue_orphans(worker: Worker) -> None:
             pipeline.execute()
 
 
+def drop_foreign(worker: Worker, entry_id: str) -> None:
+    """Remove an entry that belongs to no job of this service, and log it."""
+    queue = worker.queues[0]
+    with worker.connection.pipeline() as pipeline:
+        pipeline.lrem(queue.key, 0, entry_id)
+        pipeline.lrem(queue.intermediate_queue_key, 0, entry_id)
+        for lease in leases.held(worker.connection):
+            if lease.entry == entry_id:
+                pipeline.zrem(leases.key(), lease.member)
+        pipeline.delete(QueueEntry.key_for(entry_id))
+        pipeline.execute()
+    worker.log.warning(
+        "Worker %s: removed the entry %r from the queue, because it is not '<job>-<generation>'",
+        worker.name,
+        entry_id[:200],
+    )
+
+
 def _worker_is_dead(connection: redis.Redis, worker_key: str) -> bool:
     """Return whether a registered worker is certainly dead, or has been silent until its record expired."""
     recorded = cast(bytes | None, connection.hget(worker_key, _PROCESS_FIELD))
@@ -81,29 +105,22 @@ def _worker_is_dead(connection: redis.Redis, worker_key: str) -> bool:
     return ProcessIdentity.load(json.loads(recorded)).dead()
 
 
-def _requeue_if_orphaned(worker: Worker, queue: Queue, entry_id: str, execution_id: str) -> None:
+def _requeue_if_orphaned(worker: Worker, lease: Lease) -> None:
     connection = worker.connection
-    job_id, _ = split_rq_id(entry_id)
+    job_id, _ = split_rq_id(lease.entry)
     lock = JobLock(connection, job_id, token="")
     holder = lock.holder()
     try:
-        owner = Execution.fetch(execution_id, entry_id, connection).worker_name
+        owner = Execution.fetch(lease.execution, lease.entry, connection).worker_name
         orphaned = _worker_is_dead(connection, worker.redis_worker_namespace_prefix + owner)
     except ValueError:
         # The record of the execution has expired. The lock has not, and it names the process.
         orphaned = holder is not None and holder.process.visible() and holder.process.dead()
     if not orphaned or not (holder is None or _has_ended(holder)):
         return
-    registry = queue.started_job_registry
-    if not connection.zrem(registry.key, f"{entry_id}:{execution_id}"):
-        return  # another worker, or the server, has requeued it
-    if not QueueEntry.exists(entry_id, connection):
-        return
-    entry = QueueEntry.fetch(entry_id, connection=connection, serializer=worker.serializer)
-    ended_attempt(connection, entry_id, lock, holder).report_requeued(
-        "The worker ended during this attempt. The job was put back at the head of the queue."
-    )
-    queue.enqueue_job(entry, at_front=True)
+    ended = ended_attempt(connection, lease.entry, lock, holder)
+    if leases.requeue(connection, lease, if_expired=False) == "waiting":
+        ended.report_requeued("The worker ended during this attempt. The job was put back into the queue.")
 
 
 def _has_ended(holder: Holder) -> bool:

@@ -21,10 +21,15 @@ from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import TimeoutError as RedisTimeoutError
 from rq import Queue, Worker
 from rq.command import parse_payload
+from rq.executions import Execution
 from rq.job import Job, JobStatus
 from rq.utils import now
+from rq.worker.base import WorkerStatus
+from rq.worker_registration import clean_worker_registry
 
+from splatmill.backplane import leases
 from splatmill.backplane import queue as backplane
+from splatmill.backplane.leases import Lease, Reclaim
 from splatmill.backplane.process import die_with_parent
 from splatmill_worker.service import hand_back, recovery
 from splatmill_worker.service.abandoned_folders import remove_abandoned
@@ -33,6 +38,7 @@ from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.lock import JobLock, LockState
 from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, ProcessExit, oom_kill_count
 from splatmill_worker.service.run_attempt import run_attempt
+from splatmill_worker.service.saved_progress import SavedProgress
 
 STOP_GRACE = 15.0
 """Seconds that an attempt has to save its state when the worker is told to stop. Then it is killed, and the next
@@ -82,8 +88,10 @@ class AttemptWorker(Worker):
             job_monitoring_interval=backplane.MONITORING_INTERVAL,
         )
         self._grace = stop_grace
+        self._reclaim = Reclaim(connection)
         self._entry_id: str | None = None
         self._lock: JobLock | None = None
+        self._saved: SavedProgress | None = None
         self._kill_at: float | None = None
         self._superseded = False
         self._remove_at = 0.0
@@ -102,23 +110,38 @@ class AttemptWorker(Worker):
             for job_id in remove_abandoned(self.connection):
                 self.log.info("Worker %s: removed the folder of the deleted job %s", self.name, job_id)
 
+    def clean_registries(self) -> None:
+        """Requeue what lost workers held, and clean RQ's lists of finished entries and of workers."""
+        self._reclaim.run()
+        queue = self.queues[0]
+        queue.finished_job_registry.cleanup()
+        queue.failed_job_registry.cleanup()
+        clean_worker_registry(queue)
+        self.last_cleaned_at = now()  # type: ignore[assignment]  # RQ types it as None
+
     def get_heartbeat_ttl(self, job: Job) -> int:
-        return backplane.MONITORING_INTERVAL + backplane.HEARTBEAT_SLACK
+        return leases.LEASE
+
+    @property
+    def _lease(self) -> Lease:
+        assert self.execution is not None
+        return Lease(self.execution.job_id, self.execution.id)
 
     def _heartbeat(self, job: Job) -> None:
         """Send the heartbeats of an attempt; kill it if another attempt has taken its queue entry or its lock."""
         try:
-            self.maintain_heartbeats(job)
-            assert self.execution is not None
-            registered = self.connection.zscore(job.started_job_registry.key, self.execution.composite_key)
+            self.heartbeat(backplane.WORKER_TTL)
+            holds = leases.prolong(self.connection, self._lease)
             lock = self._lock.refresh() if self._lock else LockState.held
+            if self._saved is not None and self._saved.advanced():
+                leases.advanced(self.connection, job.id)
         except _REDIS_UNREACHABLE as error:
             # The attempt can compute without Redis, and its outbox keeps the events.
             self.log.warning(
                 "Worker %s: Redis cannot be reached, so no heartbeat was sent: %s", self.name, error
             )
             return
-        if lock is LockState.lost or registered is None:
+        if lock is LockState.lost or not holds:
             self.log.warning(
                 "Worker %s: another attempt at job %s has begun; killing this one", self.name, job.id
             )
@@ -164,9 +187,16 @@ class AttemptWorker(Worker):
     # One attempt
 
     def execute_job(self, job: Job, queue: Queue) -> None:
-        self.prepare_execution(job)
+        try:
+            backplane.split_rq_id(job.id)
+        except ValueError:
+            recovery.drop_foreign(self, job.id)
+            return
         with self.connection.pipeline() as pipeline:
-            # From here on the registry holds the job. With the worker's name in it, a stop request finds the worker.
+            # From here on the lease holds the job. With the worker's name in it, a stop request finds the worker.
+            self.execution = Execution.create(job, leases.LEASE, pipeline, worker_name=self.name)
+            leases.hold(pipeline, self._lease)
+            self.set_state(WorkerStatus.BUSY, pipeline=pipeline)
             job.prepare_for_execution(self.name, pipeline=pipeline)
             pipeline.lrem(queue.intermediate_queue_key, 1, job.id)
             pipeline.execute()
@@ -181,6 +211,7 @@ class AttemptWorker(Worker):
     def fork_work_horse(self, job: Job, queue: Queue) -> None:
         job_id, _ = backplane.split_rq_id(job.id)
         self._lock = JobLock(self.connection, job_id, uuid4().hex)
+        self._saved = SavedProgress(job_id)
         parent = os.getpid()
         signals = {signal.SIGTERM, signal.SIGINT, hand_back.SIGNAL}
         # Until the child has set up its own handlers, a signal would run those of the worker in the child.

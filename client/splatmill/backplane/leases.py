@@ -1,0 +1,184 @@
+"""Leases: until when a worker holds an entry of the queue that it has taken, by the clock of Redis alone.
+
+The leases are the members of RQ's sorted set of started entries, `<entry>:<execution>`, scored by the time at which
+they expire. RQ itself takes these times from the clock of whichever machine calls it, so that two clocks that differ by
+more than a heartbeat would requeue an attempt that runs. Every time here is that of Redis, read in the same step.
+"""
+
+import logging
+import time
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+import redis
+from rq.registry import StartedJobRegistry
+
+from splatmill.backplane.queue import HEARTBEAT_SLACK, KEEP_FINISHED, MONITORING_INTERVAL, TRAIN, open_queue
+
+LEASE = MONITORING_INTERVAL + HEARTBEAT_SLACK
+"""Seconds for which a heartbeat holds an entry."""
+
+MAX_LOST = 4
+"""Number of attempts in a row that may end with their worker and without a new checkpoint. Then the job fails, because
+it probably ends the worker itself, by taking all memory of its machine."""
+
+Requeued = Literal["waiting", "failed", "absent", "kept"]
+"""What became of an entry whose worker was lost. `waiting`: it is in the queue again. `failed`: it has been lost
+MAX_LOST times. `absent`: it was deleted. `kept`: its lease was prolonged or given up meanwhile."""
+
+_HOLD = """
+redis.call('ZADD', KEYS[1], tonumber(redis.call('TIME')[1]) + ARGV[2], ARGV[1])
+return 1
+"""
+
+_PROLONG = """
+if not redis.call('ZSCORE', KEYS[1], ARGV[1]) then return 0 end
+redis.call('ZADD', KEYS[1], tonumber(redis.call('TIME')[1]) + ARGV[2], ARGV[1])
+if redis.call('EXISTS', KEYS[2]) == 1 then redis.call('EXPIRE', KEYS[2], ARGV[2]) end
+return 1
+"""
+
+_EXPIRED = """
+return redis.call('ZRANGEBYSCORE', KEYS[1], '-inf', redis.call('TIME')[1])
+"""
+
+# KEYS: leases, RQ's record of the entry, queue. ARGV: member, entry, whether only if expired, limit, seconds to keep,
+# execution.
+_REQUEUE = """
+local expires = redis.call('ZSCORE', KEYS[1], ARGV[1])
+if not expires then return 'kept' end
+if ARGV[3] == '1' and tonumber(expires) > tonumber(redis.call('TIME')[1]) then return 'kept' end
+redis.call('ZREM', KEYS[1], ARGV[1])
+redis.call('DEL', 'rq:execution:' .. ARGV[1])
+redis.call('ZREM', 'rq:executions:' .. ARGV[2], ARGV[6])
+if redis.call('EXISTS', KEYS[2]) == 0 then return 'absent' end
+local lost = redis.call('HINCRBY', KEYS[2], 'splatmill_lost', 1)
+if lost >= tonumber(ARGV[4]) then
+  redis.call('HSET', KEYS[2], 'status', 'failed')
+  redis.call('EXPIRE', KEYS[2], ARGV[5])
+  return 'failed'
+end
+redis.call('HSET', KEYS[2], 'status', 'queued', 'worker_name', '')
+redis.call('RPUSH', KEYS[3], ARGV[2])
+return 'waiting'
+"""
+
+log = logging.getLogger("splatmill.queue")
+
+
+@dataclass(frozen=True)
+class Lease:
+    """The lease of one execution of an entry."""
+
+    entry: str
+    execution: str
+
+    @property
+    def member(self) -> str:
+        return f"{self.entry}:{self.execution}"
+
+
+def key(name: str = TRAIN) -> str:
+    """Return the key of the leases: RQ's sorted set of started entries of a queue."""
+    return StartedJobRegistry.key_template.format(name)
+
+
+def hold(connection: redis.Redis, lease: Lease) -> None:
+    """Begin a lease. `connection` may be a pipeline, so that other keys change in the same transaction."""
+    connection.eval(_HOLD, 1, key(), lease.member, LEASE)
+
+
+def prolong(connection: redis.Redis, lease: Lease) -> bool:
+    """Prolong a lease by a heartbeat. Return False if it is not held any more: another worker may run the entry."""
+    execution = f"rq:execution:{lease.member}"
+    return bool(connection.eval(_PROLONG, 2, key(), execution, lease.member, LEASE))
+
+
+def advanced(connection: redis.Redis, entry: str) -> None:
+    """Record that an attempt has stored a new checkpoint: workers that were lost before it do not count any more."""
+    connection.hdel(f"rq:job:{entry}", "splatmill_lost")
+
+
+def lost(connection: redis.Redis, entry: str) -> int:
+    """Return how many attempts in a row have ended with their worker and without a new checkpoint."""
+    return int(cast(Any, connection.hget(f"rq:job:{entry}", "splatmill_lost")) or 0)
+
+
+def held(connection: redis.Redis) -> list[Lease]:
+    """Return all leases, also the expired ones. A member of another form is removed and logged."""
+    return _leases(connection, cast(list[bytes], connection.zrange(key(), 0, -1)))
+
+
+def requeue(connection: redis.Redis, lease: Lease, *, if_expired: bool) -> Requeued:
+    """Put an entry whose worker was lost at the end of its queue, or fail it after MAX_LOST times, in one step."""
+    answer = connection.eval(
+        _REQUEUE,
+        3,
+        key(),
+        f"rq:job:{lease.entry}",
+        open_queue(connection).key,
+        lease.member,
+        lease.entry,
+        int(if_expired),
+        MAX_LOST,
+        KEEP_FINISHED,
+        lease.execution,
+    )
+    return cast(Requeued, cast(bytes, answer).decode())
+
+
+class Reclaim:
+    """Requeues the entries whose leases have expired, as one process that watches them does.
+
+    Nothing is requeued for LEASE seconds after Redis was away, as far as this process can tell: it started anew, did
+    not answer, answered late, was replaced, or its clock jumped (a suspended machine). The workers could not prolong
+    their leases then, and get the time for it.
+    """
+
+    def __init__(self, connection: redis.Redis) -> None:
+        self._connection = connection
+        self._troubled_at = float("-inf")
+        self._run_id: object = None
+        self._offset: float | None = None
+
+    def run(self) -> list[tuple[Lease, Requeued]]:
+        """Requeue what has expired, and return what became of each. Raises redis.RedisError."""
+        if not self._trusted():
+            return []
+        members = cast(list[bytes], self._connection.eval(_EXPIRED, 1, key()))
+        found: list[tuple[Lease, Requeued]] = []
+        for lease in _leases(self._connection, members):
+            became = requeue(self._connection, lease, if_expired=True)
+            if became != "kept":
+                log.warning("the worker of %s was lost; the entry is now %s", lease.entry, became)
+                found.append((lease, became))
+        return found
+
+    def _trusted(self) -> bool:
+        """Return whether Redis has been there for so long that every living worker has prolonged its lease."""
+        asked = time.monotonic()
+        try:
+            info = self._connection.info("server")
+            seconds, micros = self._connection.time()
+        except redis.RedisError:
+            self._troubled_at = time.monotonic()
+            raise
+        answered = time.monotonic()
+        offset = seconds + micros / 1e6 - answered
+        jumped = self._offset is not None and abs(offset - self._offset) > MONITORING_INTERVAL
+        replaced = self._run_id is not None and info["run_id"] != self._run_id
+        if jumped or replaced or answered - asked > MONITORING_INTERVAL:
+            self._troubled_at = answered
+        self._run_id, self._offset = info["run_id"], offset
+        return answered - self._troubled_at >= LEASE and int(info["uptime_in_seconds"]) >= LEASE
+
+
+def _leases(connection: redis.Redis, members: list[bytes]) -> list[Lease]:
+    found = []
+    for member in members:
+        entry, separator, execution = member.decode("utf-8", "replace").rpartition(":")
+        if separator and entry:
+            found.append(Lease(entry, execution))
+        elif connection.zrem(key(), member):
+            log.warning("removed %r from the leases, because it is not '<entry>:<execution>'", member)
+    return found

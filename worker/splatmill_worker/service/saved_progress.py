@@ -1,0 +1,40 @@
+"""Whether an attempt has stored a new checkpoint, as its parent process sees it in the job's folder."""
+
+from pathlib import Path
+
+from splatmill_worker.service.job_folder import CHECKPOINTS
+from splatmill_worker.settings import work_folder
+
+
+class SavedProgress:
+    """The checkpoints of one attempt, from before its process begins.
+
+    A job that this machine has no folder of may begin with a download of the last checkpoint, which is no progress:
+    the first one to appear is then not counted.
+    """
+
+    def __init__(self, job_id: str) -> None:
+        run = work_folder(job_id) / "run"
+        self._folder = run / CHECKPOINTS
+        self._may_download = not run.is_dir()
+        self._seen = self._newest()
+
+    def advanced(self) -> bool:
+        """Return whether the attempt has stored a checkpoint since the last call."""
+        newest = self._newest()
+        if newest == self._seen:
+            return False
+        self._seen = newest
+        downloaded, self._may_download = self._may_download, False
+        return not downloaded
+
+    def _newest(self) -> int:
+        """Return the newest modification time of a checkpoint in nanoseconds; 0 without one."""
+        return max((_modified(path) for path in self._folder.glob("[!.]*")), default=0)
+
+
+def _modified(path: Path) -> int:
+    try:
+        return path.stat().st_mtime_ns
+    except FileNotFoundError:
+        return 0  # replaced at this moment
