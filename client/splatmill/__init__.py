@@ -12,7 +12,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from splatmill.aio import AsyncClient
     from splatmill.client import Client, JobHandle, ModelHandle
-    from splatmill.errors import JobCancelled, JobFailed, SplatmillError
+    from splatmill.errors import JobCancelled, JobFailed, SplatmillError, WaitTimeout
     from splatmill.job import AsyncJobHandle
     from splatmill.model import AsyncModelHandle
     from splatmill.schema import CameraSpec, OrbitRequest, RenderRequest, TrainOptions
@@ -31,6 +31,7 @@ _MODULES = {
     "RenderRequest": "splatmill.schema",
     "SplatmillError": "splatmill.errors",
     "TrainOptions": "splatmill.schema",
+    "WaitTimeout": "splatmill.errors",
 }
 
 __all__ = [
@@ -47,6 +48,7 @@ __all__ = [
     "RenderRequest",
     "SplatmillError",
     "TrainOptions",
+    "WaitTimeout",
     "__version__",
 ]
 

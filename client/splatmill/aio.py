@@ -1,9 +1,9 @@
 """The asynchronous SDK: `AsyncClient`."""
 
 import uuid
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import httpx
 from pydantic import ValidationError
@@ -17,6 +17,7 @@ from splatmill.model import AsyncModelHandle, find_model
 from splatmill.schema import (
     IDEMPOTENCY_HEADER,
     Capture,
+    CapturePage,
     Info,
     Job,
     JobPage,
@@ -28,6 +29,12 @@ from splatmill.schema import (
     TrainOptions,
 )
 from splatmill.uploads import OnProgress, Uploaded, upload
+
+PAGE = 100
+"""Largest number of entries that are requested at once of a list."""
+
+P = TypeVar("P", CapturePage, JobPage, ModelPage)
+T = TypeVar("T")
 
 
 class AsyncClient:
@@ -62,6 +69,11 @@ class AsyncClient:
     async def close(self) -> None:
         """Close the connections."""
         await self.connection.close()
+
+    @property
+    def server(self) -> str:
+        """The address of the server."""
+        return self.connection.server
 
     async def train(
         self, path: AnyPath, *, name: str | None = None, on_progress: OnProgress | None = None, **options: Any
@@ -126,42 +138,49 @@ class AsyncClient:
         response = await self.connection.request("GET", f"/v1/captures/{capture_id}")
         return read_answer(Capture, response)
 
+    def captures(self, *, limit: int | None = None, name: str | None = None) -> AsyncIterator[Capture]:
+        """Yield the captures without their files, newest first, at most `limit` of them.
+
+        `name` leaves those whose name contains this text, in any case of letters. Pages are requested as needed.
+        """
+        return self._entries(CapturePage, "/v1/captures", lambda page: page.captures, limit, {"name": name})
+
+    async def delete_capture(self, capture_id: str) -> None:
+        """Delete a capture and its files. Raises Conflict while an unfinished job uses it."""
+        await self.connection.request("DELETE", f"/v1/captures/{capture_id}")
+
     async def job(self, job_id: str) -> AsyncJobHandle:
         """Return the job with this id."""
         response = await self.connection.request("GET", f"/v1/jobs/{job_id}")
         return AsyncJobHandle(self.connection, read_answer(Job, response))
 
-    async def jobs(self, *, limit: int | None = None) -> AsyncIterator[Job]:
-        """Yield the jobs, newest first, at most `limit` of them. Pages are requested as needed."""
-        cursor: str | None = None
-        left = limit
-        while left is None or left > 0:
-            params = {"limit": min(left or 100, 100)} | ({"cursor": cursor} if cursor else {})
-            response = await self.connection.request("GET", "/v1/jobs", params=params)
-            page = read_answer(JobPage, response)
-            for job in page.jobs[:left]:
-                yield job
-            left = None if left is None else left - len(page.jobs)
-            cursor = page.cursor
-            if cursor is None:
-                return
+    def jobs(
+        self,
+        *,
+        limit: int | None = None,
+        state: str | Iterable[str] | None = None,
+        name: str | None = None,
+        capture: str | None = None,
+    ) -> AsyncIterator[Job]:
+        """Yield the jobs, newest first, at most `limit` of them.
+
+        `state` leaves those in this state, or in one of several. `name` leaves those whose name contains this text, in
+        any case of letters, and `capture` those on the capture with this id. Pages are requested as needed.
+        """
+        states = [state] if isinstance(state, str) else list(state or ())
+        wanted = {"state": states or None, "name": name, "capture": capture}
+        return self._entries(JobPage, "/v1/jobs", lambda page: page.jobs, limit, wanted)
 
     async def model(self, model_id: str) -> AsyncModelHandle:
         """Return the finished model with this id, which is that of its job."""
         return await find_model(self.connection, model_id)
 
-    async def models(self) -> AsyncIterator[Model]:
-        """Yield the finished models, newest first."""
-        cursor: str | None = None
-        while True:
-            params = {"cursor": cursor} if cursor else None
-            response = await self.connection.request("GET", "/v1/models", params=params)
-            page = read_answer(ModelPage, response)
-            for model in page.models:
-                yield model
-            cursor = page.cursor
-            if cursor is None:
-                return
+    def models(self, *, limit: int | None = None, name: str | None = None) -> AsyncIterator[Model]:
+        """Yield the finished models, newest first, at most `limit` of them.
+
+        `name` leaves those whose name contains this text, in any case of letters. Pages are requested as needed.
+        """
+        return self._entries(ModelPage, "/v1/models", lambda page: page.models, limit, {"name": name})
 
     async def options(self) -> list[OptionHelp]:
         """Return the training options of the server, with type, default, range and help."""
@@ -182,6 +201,29 @@ class AsyncClient:
         except httpx.TransportError as error:
             raise self.connection.lost(error) from error
         return read_answer(Ready, response)
+
+    async def _entries(
+        self,
+        kind: type[P],
+        path: str,
+        entries: Callable[[P], list[T]],
+        limit: int | None,
+        wanted: Mapping[str, Any],
+    ) -> AsyncIterator[T]:
+        """Yield at most `limit` entries of the list at `path`, which comes in pages of the type `kind`."""
+        cursor: str | None = None
+        left = limit
+        while left is None or left > 0:
+            size = PAGE if left is None else min(left, PAGE)
+            params = {"limit": size, "cursor": cursor, **wanted}
+            given = {key: value for key, value in params.items() if value is not None}
+            page = read_answer(kind, await self.connection.request("GET", path, params=given))
+            for entry in entries(page)[:left]:
+                yield entry
+            left = None if left is None else left - len(entries(page))
+            cursor = page.cursor
+            if cursor is None:
+                return
 
 
 def with_start_model(options: Mapping[str, Any], folder: AnyPath) -> tuple[dict[str, Any], Path | None]:

@@ -1,6 +1,6 @@
 """The synchronous SDK. Each method waits for the one of the same name in `aio`, `job` or `model`; see there."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -90,7 +90,10 @@ class Client:
         on_progress: OnProgress | None = None,
         model: Path | None = None,
     ) -> tuple[Capture, Uploaded]:
-        """Upload the capture at `path`, and `model`, a .ply file to start from, into a new capture or `capture`."""
+        """Upload the capture at `path` into a new capture, or into the one with the id `capture`.
+
+        `model` is the path of a .ply file to start from, which is uploaded with the poses.
+        """
         return self._loop.run_reporting(
             lambda report: self._async.upload(
                 path, name=name, capture=capture, on_progress=report, model=model
@@ -108,21 +111,46 @@ class Client:
         """Return a stored capture with its files."""
         return self._loop.run(self._async.capture(capture_id))
 
+    def captures(self, *, limit: int | None = None, name: str | None = None) -> Iterator[Capture]:
+        """Yield the captures without their files, newest first, at most `limit` of them.
+
+        `name` leaves those whose name contains this text, in any case of letters.
+        """
+        return self._loop.iterate(self._async.captures(limit=limit, name=name))
+
+    def delete_capture(self, capture_id: str) -> None:
+        """Delete a capture and its files. Raises Conflict while an unfinished job uses it."""
+        self._loop.run(self._async.delete_capture(capture_id))
+
     def job(self, job_id: str) -> "JobHandle":
         """Return the job with this id."""
         return JobHandle(self._loop, self._loop.run(self._async.job(job_id)))
 
-    def jobs(self, *, limit: int | None = None) -> Iterator[Job]:
-        """Yield the jobs, newest first, at most `limit` of them."""
-        return self._loop.iterate(self._async.jobs(limit=limit))
+    def jobs(
+        self,
+        *,
+        limit: int | None = None,
+        state: str | Iterable[str] | None = None,
+        name: str | None = None,
+        capture: str | None = None,
+    ) -> Iterator[Job]:
+        """Yield the jobs, newest first, at most `limit` of them.
+
+        `state` leaves those in this state, or in one of several. `name` leaves those whose name contains this text, in
+        any case of letters, and `capture` those on the capture with this id.
+        """
+        return self._loop.iterate(self._async.jobs(limit=limit, state=state, name=name, capture=capture))
 
     def model(self, model_id: str) -> "ModelHandle":
         """Return the finished model with this id, which is that of its job."""
         return ModelHandle(self._loop, self._loop.run(self._async.model(model_id)))
 
-    def models(self) -> Iterator[Model]:
-        """Yield the finished models, newest first."""
-        return self._loop.iterate(self._async.models())
+    def models(self, *, limit: int | None = None, name: str | None = None) -> Iterator[Model]:
+        """Yield the finished models, newest first, at most `limit` of them.
+
+        `name` leaves those whose name contains this text, in any case of letters.
+        """
+        return self._loop.iterate(self._async.models(limit=limit, name=name))
 
     def options(self) -> list[OptionHelp]:
         """Return the training options of the server, with type, default, range and help."""
@@ -172,9 +200,16 @@ class JobHandle:
         """Yield the events of the job until it ends. A lost connection is restored without losing events."""
         return self._loop.iterate(self._async.events(after))
 
-    def wait(self, on_progress: OnProgress | None = None) -> "ModelHandle":
-        """Wait for the job to end and return its model. Raises JobFailed or JobCancelled when it ends without one."""
-        return ModelHandle(self._loop, self._loop.run_reporting(self._async.wait, on_progress))
+    def wait(self, on_progress: OnProgress | None = None, *, timeout: float | None = None) -> "ModelHandle":
+        """Wait for the job to end and return its model. Raises JobFailed or JobCancelled when it ends without one.
+
+        `on_progress` is called with each step of progress. `timeout` is the number of seconds to wait; left out, as
+        long as the job takes. Raises WaitTimeout after the timeout, and the job continues.
+        """
+        waited = self._loop.run_reporting(
+            lambda report: self._async.wait(report, timeout=timeout), on_progress
+        )
+        return ModelHandle(self._loop, waited)
 
     def result(self) -> "ModelHandle":
         """Return the model of a job that has ended. Raises JobFailed, JobCancelled, or Conflict while it runs."""
@@ -223,20 +258,31 @@ class ModelHandle:
         return self._async.model
 
     def download(self, path: AnyPath, *, file: str = "model.ply", on_bytes: OnBytes | None = None) -> Path:
-        """Download a file of the model to `path`, a file or an existing folder. A partial download is resumed."""
+        """Download a file of the model to `path`, a file or an existing folder, and return the path written.
+
+        A partial download is resumed. `on_bytes` is called with the bytes received and the size, where it is known.
+        """
         return self._loop.run(self._async.download(path, file=file, on_bytes=on_bytes))
+
+    def delete(self) -> None:
+        """Delete the model with its job, its report and its files. The capture is kept."""
+        self._loop.run(self._async.delete())
 
     def cameras(self) -> list[ModelCamera]:
         """Return the cameras of the capture in the coordinates of the model; `split` marks the held-out ones."""
         return self._loop.run(self._async.cameras())
 
     def render(self, camera: CameraSpec | Mapping[str, Any], **options: Any) -> bytes:
-        """Render an image from `camera`. `options` are output, format, background and quality of RenderRequest."""
+        """Render an image from `camera`, and return the bytes of the file.
+
+        `options` are output, format, background and quality of `RenderRequest`.
+        """
         return self._loop.run(self._async.render(camera, **options))
 
     def orbit(self, path: AnyPath, *, timeout: float | None = None, **options: Any) -> Path:
-        """Render a video (MP4) that circles the scene, and write it to `path`. `options` are those of OrbitRequest.
+        """Render a video (MP4) that circles the scene, write it to `path`, and return the path written.
 
-        `timeout` is the number of seconds to wait for the video.
+        `options` are the fields of `OrbitRequest`. `timeout` is the number of seconds to wait for the video; left out,
+        as long as the server does by default.
         """
         return self._loop.run(self._async.orbit(path, timeout=timeout, **options))

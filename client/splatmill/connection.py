@@ -5,6 +5,8 @@ import os
 import random
 from collections.abc import AsyncIterable, AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
 from typing import Any, TypeVar
 
 import httpx
@@ -23,6 +25,9 @@ TIMEOUT = httpx.Timeout(60.0, connect=10.0)
 RETRIES = 4
 FIRST_PAUSE = 0.25  # seconds; doubled after each retry, with jitter so that clients do not retry in step
 LONGEST_PAUSE = 8.0  # seconds
+LONGEST_WISH = 60.0
+"""Longest time in seconds, named by a server in Retry-After, that a request waits for before it is sent again."""
+
 TRANSIENT = frozenset({429, 502, 503, 504})
 REPEATABLE = frozenset({"GET", "HEAD", "PUT", "DELETE"})
 
@@ -36,7 +41,8 @@ class Connection:
     """Sends requests to one server, and retries those that failed.
 
     A request is retried after a lost connection or a transient refusal (429, 502, 503, 504) if it is idempotent. A
-    request that never reached the server is retried in any case.
+    request that never reached the server is retried in any case, and so is one that was refused with 429 and a time to
+    wait. When the server names a longer time than LONGEST_WISH, the request is not retried.
     """
 
     def __init__(
@@ -114,9 +120,12 @@ class Connection:
             if response.is_success or response.status_code == 304:
                 return response
             too_slow = costly and response.status_code == 504
-            if last or too_slow or not may_repeat or response.status_code not in TRANSIENT:
-                raise error_for(read_problem(response))
-            await asyncio.sleep(max(backoff(tries), retry_after(response)))
+            wish = retry_after(response)
+            unhandled = response.status_code == 429 and wish is not None
+            repeats = (may_repeat or unhandled) and response.status_code in TRANSIENT
+            if last or too_slow or not repeats or (wish or 0.0) > LONGEST_WISH:
+                raise error_for(read_problem(response), wish)
+            await asyncio.sleep(max(backoff(tries), wish or 0.0))
 
     @asynccontextmanager
     async def stream(
@@ -136,7 +145,7 @@ class Connection:
         async with self.http.stream(method, path, json=json, headers=headers, **extra) as response:
             if not response.is_success:
                 await response.aread()
-                raise error_for(read_problem(response))
+                raise error_for(read_problem(response), retry_after(response))
             yield response
 
     def lost(self, error: httpx.TransportError) -> ConnectionFailed:
@@ -170,10 +179,17 @@ def backoff(tries: int) -> float:
     return min(FIRST_PAUSE * 2.0 ** (tries - 1), LONGEST_PAUSE) * random.uniform(0.5, 1.0)
 
 
-def retry_after(response: httpx.Response) -> float:
-    """Return the seconds of the header Retry-After, at most 30; 0 without it, or where it holds a date."""
+def retry_after(response: httpx.Response) -> float | None:
+    """Return the seconds to wait that the header Retry-After names, as a number or as a date; None without it."""
     text = response.headers.get("Retry-After", "")
-    return min(float(text), 30.0) if text.isascii() and text.isdigit() else 0.0
+    if text.isascii() and text.isdigit():
+        return float(text)
+    try:
+        moment = parsedate_to_datetime(text)
+    except ValueError:
+        return None
+    aware = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+    return max((aware - datetime.now(UTC)).total_seconds(), 0.0)
 
 
 def read_problem(response: httpx.Response) -> Problem:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import httpx
 
-from splatmill.connection import Connection, backoff
+from splatmill.connection import LONGEST_WISH, Connection, backoff
 from splatmill.errors import DownloadFailed, InvalidRequest, Unavailable
 from splatmill.files import move_into_place
 from splatmill.schema.captures import SHA256_HEADER
@@ -56,7 +56,8 @@ async def download(
                 tries = 1  # count only attempts that received nothing
             if tries > connection.retries:
                 raise connection.lost(error) if isinstance(error, httpx.TransportError) else error from error
-            await asyncio.sleep(backoff(tries))
+            wish = error.retry_after if isinstance(error, Unavailable) else None
+            await asyncio.sleep(max(backoff(tries), min(wish or 0.0, LONGEST_WISH)))
         except InvalidRequest as error:
             # Either all bytes had arrived and only the rename was missing, or the file has changed: start again.
             if error.problem.status != 416 or not before:

@@ -4,13 +4,16 @@ SplatmillError
 ├── ConnectionFailed          the server does not answer, or the connection was lost
 ├── Refused                   the server refused the request (`.problem` says why)
 │   ├── InvalidRequest        the request or the uploaded file is not valid
-│   ├── Unauthorized          the API key is missing or wrong, or does not permit the request
-│   ├── NotFound              there is no such capture, job, model or file
+│   ├── Unauthorized          the API key is missing or wrong
+│   │   └── Forbidden         the API key does not permit the request
+│   ├── NotFound              there is no such capture, job, model or file, or it was deleted
 │   ├── Conflict              the job or model is in the wrong state, or the name is taken
 │   ├── Unavailable           a part of the service is down or full; try again later
+│   │   └── TooManyRequests   the caller has sent more than it may (`.retry_after` says when to go on)
 │   └── ServerError           the service failed to handle the request
 ├── JobFailed                 the job ended without a model (`.problem` says why)
 ├── JobCancelled              the job was cancelled
+├── WaitTimeout               the job has not ended within the given time; it continues
 ├── NothingToUpload           the path holds no photos, video or zip archive
 ├── DownloadFailed            the downloaded bytes are not those of the file
 └── ServiceFailed             the embedded service could not be started
@@ -58,11 +61,15 @@ class InvalidRequest(Refused):
 
 
 class Unauthorized(Refused):
-    """The API key is missing or wrong, or does not permit the request."""
+    """The API key is missing or wrong, or does not permit the request (`Forbidden`)."""
+
+
+class Forbidden(Unauthorized):
+    """The API key is valid and does not permit the request."""
 
 
 class NotFound(Refused):
-    """There is no such capture, job, model or file."""
+    """There is no such capture, job, model or file, or it was deleted."""
 
 
 class Conflict(Refused):
@@ -70,7 +77,18 @@ class Conflict(Refused):
 
 
 class Unavailable(Refused):
-    """A part of the service is down or full. Try again later."""
+    """A part of the service is down or full. Try again later.
+
+    `retry_after` is the number of seconds after which the server asks to try again, or None if it named no time.
+    """
+
+    def __init__(self, problem: Problem, retry_after: float | None = None) -> None:
+        super().__init__(problem)
+        self.retry_after = retry_after
+
+
+class TooManyRequests(Unavailable):
+    """The caller has sent more requests than it may. Try again after `retry_after` seconds."""
 
 
 class ServerError(Refused):
@@ -99,6 +117,19 @@ class JobCancelled(SplatmillError):
         self.job_id = job_id
 
 
+class WaitTimeout(SplatmillError, TimeoutError):
+    """The job has not ended within the given time. It continues; `state` is what it was last seen in."""
+
+    def __init__(self, job_id: str, state: str, seconds: float) -> None:
+        super().__init__(
+            f"The job {job_id} has not ended within {seconds:g} seconds; its state is {state}.",
+            "It continues on the server; wait for it again, or cancel it.",
+        )
+        self.job_id = job_id
+        self.state = state
+        self.seconds = seconds
+
+
 class NothingToUpload(SplatmillError):
     """The path holds no photos, video or zip archive, or a file that cannot be read or uploaded."""
 
@@ -113,20 +144,23 @@ class ServiceFailed(SplatmillError):
 
 _BY_STATUS: dict[int, type[Refused]] = {
     401: Unauthorized,
-    403: Unauthorized,
+    403: Forbidden,
     404: NotFound,
     409: Conflict,
-    429: Unavailable,
+    429: TooManyRequests,
     503: Unavailable,
     504: Unavailable,
     507: Unavailable,
 }
 
 
-def error_for(problem: Problem) -> Refused:
-    """Return the error for a problem. Its class follows from the HTTP status, which is fixed for each code."""
+def error_for(problem: Problem, retry_after: float | None = None) -> Refused:
+    """Return the error for a problem. Its class follows from the HTTP status, which is fixed for each code.
+
+    retry_after: seconds after which the server asks to try again, if it named a time.
+    """
     kind = _BY_STATUS.get(problem.status) or (InvalidRequest if problem.status < 500 else ServerError)
-    return kind(problem)
+    return kind(problem, retry_after) if issubclass(kind, Unavailable) else kind(problem)
 
 
 def invalid_request(error: "ValidationError", code: str = "invalid_request") -> InvalidRequest:

@@ -5,7 +5,7 @@ import time
 from collections.abc import AsyncIterator
 
 from splatmill.connection import Connection, backoff, read_answer
-from splatmill.errors import Conflict, ConnectionFailed, JobCancelled, JobFailed, Unavailable
+from splatmill.errors import Conflict, ConnectionFailed, JobCancelled, JobFailed, Unavailable, WaitTimeout
 from splatmill.model import AsyncModelHandle, find_model
 from splatmill.schema import (
     EventRecord,
@@ -17,6 +17,7 @@ from splatmill.schema import (
     Progress,
     ProgressEvent,
     Report,
+    StateEvent,
 )
 from splatmill.sse import GIVE_UP_SECONDS, follow_events
 from splatmill.uploads import OnProgress
@@ -41,7 +42,7 @@ class AsyncJobHandle:
 
     @property
     def state(self) -> JobState:
-        """The state as of the last request."""
+        """The state, as of the last request."""
         return self.job.state
 
     async def refresh(self) -> Job:
@@ -72,16 +73,30 @@ class AsyncJobHandle:
         while True:
             try:
                 return await self.refresh()
-            except (Unavailable, ConnectionFailed):
+            except (Unavailable, ConnectionFailed):  # `refresh` has waited as the server asked to
                 if time.monotonic() > end:
                     raise
                 await asyncio.sleep(backoff(self.connection.retries + 1))
 
-    async def wait(self, on_progress: OnProgress | None = None) -> AsyncModelHandle:
-        """Wait for the job to end and return its model. Raises JobFailed or JobCancelled when it ends without one."""
-        async for record in self.events():
-            if on_progress is not None and isinstance(record.event, ProgressEvent):
-                on_progress(Progress.model_validate(record.event.model_dump(exclude={"type"})))
+    async def wait(
+        self, on_progress: OnProgress | None = None, *, timeout: float | None = None
+    ) -> AsyncModelHandle:
+        """Wait for the job to end and return its model. Raises JobFailed or JobCancelled when it ends without one.
+
+        `on_progress` is called with each step of progress. `timeout` is the number of seconds to wait; left out, as
+        long as the job takes. Raises WaitTimeout after the timeout, and the job continues.
+        """
+        try:
+            async with asyncio.timeout(timeout) as limit:
+                async for record in self.events():
+                    if isinstance(record.event, StateEvent):
+                        self.job = self.job.model_copy(update={"state": record.event.state})
+                    if on_progress is not None and isinstance(record.event, ProgressEvent):
+                        on_progress(Progress.model_validate(record.event.model_dump(exclude={"type"})))
+        except TimeoutError as error:
+            if not limit.expired() or timeout is None:
+                raise
+            raise WaitTimeout(self.id, self.state.value, timeout) from error
         return await self.result()
 
     async def result(self) -> AsyncModelHandle:

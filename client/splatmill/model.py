@@ -48,6 +48,10 @@ class AsyncModelHandle:
             on_bytes=on_bytes,
         )
 
+    async def delete(self) -> None:
+        """Delete the model with its job, its report and its files. The capture is kept."""
+        await self.connection.request("DELETE", f"/v1/jobs/{self.model.job}")
+
     async def cameras(self) -> list[ModelCamera]:
         """Return the cameras of the capture in the coordinates of the model; `split` marks the held-out ones."""
         response = await self.connection.request("GET", f"/v1/models/{self.id}/cameras")

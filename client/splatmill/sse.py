@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import httpx
 from pydantic import ValidationError
 
-from splatmill.connection import Connection, backoff
+from splatmill.connection import LONGEST_WISH, Connection, backoff
 from splatmill.errors import Unavailable
 from splatmill.schema.events import EventRecord
 
@@ -84,6 +84,7 @@ async def follow_events(
 
     while True:
         tries += 1
+        wish = 0.0  # seconds that the server asks to wait
         try:
             headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
             if after is not None:
@@ -101,7 +102,8 @@ async def follow_events(
         except httpx.TransportError as error:
             if time.monotonic() - heard > give_up:
                 raise connection.lost(error) from error
-        except Unavailable:
+        except Unavailable as error:
             if time.monotonic() - heard > give_up:
                 raise
-        await asyncio.sleep(backoff(tries))
+            wish = min(error.retry_after or 0.0, LONGEST_WISH)
+        await asyncio.sleep(max(backoff(tries), wish))

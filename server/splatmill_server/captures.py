@@ -16,6 +16,7 @@ from splatmill.backplane.records import FORMAT, UnreadableRecord, check_format, 
 from splatmill.backplane.storage import Entry, Storage, StorageError
 from splatmill.schema import PHOTO_SUFFIXES, Capture, CaptureFile, CapturePage, Role, format_bytes, safe_name
 from splatmill.schema.tolerant import keep_readable
+from splatmill_server.filters import Filter
 from splatmill_server.metrics import Metrics
 from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError, problem_of_storage
@@ -81,12 +82,12 @@ class Captures:
         files = await asyncio.gather(*(describe(entry) for entry in found))
         return capture.model_copy(update={"files": [file for file in files if file is not None]})
 
-    def page(self, cursor: str | None, limit: int, *, owner: str | None = None) -> CapturePage:
-        """Return a page of captures, newest first; with `owner`, only theirs.
+    def page(self, cursor: str | None, limit: int, wanted: Filter | None = None) -> CapturePage:
+        """Return a page of the captures that `wanted` admits, newest first.
 
         Raises a 422 problem for a cursor that is not valid.
         """
-        records = []
+        wanted, records = wanted or Filter(), []
         for capture_id in self.storage.children(layout.captures()):
             try:
                 records.append(self.record(capture_id))
@@ -95,7 +96,11 @@ class Captures:
             except UnreadableRecord as error:
                 warn(f"capture {capture_id} is not listed", str(error))
         keyed = sorted(
-            ((int(c.created_at.timestamp() * 1000), c.id, c) for c in records if owner in (None, c.owner)),
+            (
+                (int(c.created_at.timestamp() * 1000), c.id, c)
+                for c in records
+                if wanted.admits(c.owner, c.name)
+            ),
             reverse=True,
         )
         if cursor is not None:

@@ -7,25 +7,36 @@ API processes and workers never overwrite each other's changes.
 import hashlib
 import json
 import secrets
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import redis
 
 from splatmill.backplane import events, keys, layout, queue, row
+from splatmill.backplane.events import StoredEvent
 from splatmill.backplane.fold import fold
 from splatmill.backplane.records import UnreadableRecord, check_format, reason, warn
 from splatmill.backplane.row import JobRow, Verdict
 from splatmill.backplane.storage import Storage
 from splatmill.schema import DEFAULT_OWNER, CreateJob, Job, JobPage, JobState, Problem
 from splatmill.schema.tolerant import keep_readable
+from splatmill_server.filters import JobFilter
 from splatmill_server.metrics import Metrics
 from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError
 
 IDEMPOTENCY_DAYS = 7
+SCANNED = 2000
+"""Largest number of jobs that are looked at for one page of a list."""
+
+_BATCH = 200
+"""Number of jobs that are looked at together for a list that does not hold all of them."""
+
 _TIES = 16
 """Number of jobs that may be created in one millisecond without being lost between two pages."""
+
+_Read = tuple[JobRow, list[StoredEvent]]
+"""The row and the states of a job."""
 
 
 class Jobs:
@@ -139,53 +150,58 @@ class Jobs:
             warn(layout.job_record(job_id), str(error))
             return None
 
-    def page(
-        self, cursor: str | None, limit: int, state: JobState | None = None, *, owner: str | None = None
-    ) -> JobPage:
-        """Return a page of jobs, newest first; with `state`, only those in this state, with `owner`, only theirs."""
-        found: list[tuple[int, Job]] = []
-        after = read_cursor(cursor) if cursor is not None else None
-        while len(found) <= limit:
-            batch = self._ids(after, limit + 1)
-            if not batch:
-                break
-            whole = len(batch) > limit
-            after = batch[-1]
-            if owner is not None:
-                owners = self._owners([job_id for _, job_id in batch])
-                batch = [
-                    entry
-                    for entry, found_owner in zip(batch, owners, strict=True)
-                    if found_owner == (True, owner)
-                ]
-            for (moment, _), job in zip(batch, self.get_many([job_id for _, job_id in batch]), strict=True):
-                if job is not None and (state is None or job.state is state):
-                    found.append((moment, job))
-            if not whole:
-                break
-        page = found[:limit]
-        following = write_cursor(page[-1][0], page[-1][1].id) if len(found) > limit else None
-        return JobPage(jobs=[job for _, job in page], cursor=following)
+    def page(self, cursor: str | None, limit: int, wanted: JobFilter | None = None) -> JobPage:
+        """Return a page of the jobs that `wanted` admits, newest first.
 
-    def get_many(self, job_ids: Iterable[str]) -> list[Job | None]:
-        """Return several jobs, with None for those that were deleted or whose row is not readable."""
-        wanted = list(job_ids)
+        At most SCANNED jobs are looked at; a page then holds fewer than `limit`, and has a cursor all the same.
+        """
+        wanted = wanted or JobFilter()
+        found: list[tuple[int, _Read]] = []
+        after = read_cursor(cursor) if cursor is not None else None
+        scanned, ended = 0, False
+        while len(found) <= limit and scanned < SCANNED and not ended:
+            size = limit + 1 if wanted == JobFilter() else max(limit + 1, _BATCH)
+            batch = self._ids(after, size)
+            ended = len(batch) < size
+            scanned += len(batch)
+            after = batch[-1] if batch else after
+            admitted = self._admitted([job_id for _, job_id in batch], wanted)
+            found += [(moment, admitted[job_id]) for moment, job_id in batch if job_id in admitted]
+        page = found[:limit]
+        following = None
+        if len(found) > limit:
+            following = write_cursor(page[-1][0], page[-1][1][0].id)
+        elif not ended and after is not None:
+            following = write_cursor(*after)
+        return JobPage(jobs=[self._job(read, states) for _, (read, states) in page], cursor=following)
+
+    def _admitted(self, job_ids: Sequence[str], wanted: JobFilter) -> dict[str, _Read]:
+        """Return the rows and states of those jobs that `wanted` admits, by id.
+
+        Jobs whose row is not readable are left out.
+        """
+        if wanted.by_row:
+            with self.connection.pipeline(transaction=False) as pipe:
+                for job_id in job_ids:
+                    pipe.hmget(keys.job(job_id), *JobFilter.FIELDS)
+                rows = [dict(zip(JobFilter.FIELDS, reply, strict=True)) for reply in pipe.execute()]
+            job_ids = [job_id for job_id, row in zip(job_ids, rows, strict=True) if wanted.admits_row(row)]
         with self.connection.pipeline(transaction=False) as pipe:
-            for job_id in wanted:
+            for job_id in job_ids:
                 pipe.hgetall(keys.job(job_id))
                 pipe.xrange(keys.states(job_id))
             replies = pipe.execute()
-        jobs: list[Job | None] = []
-        for index, job_id in enumerate(wanted):
+        admitted = {}
+        for index, job_id in enumerate(job_ids):
             try:
                 found = JobRow.of(replies[2 * index])
             except UnreadableRecord as error:
                 warn(f"job {job_id} is not listed", str(error))
-                found = None
+                continue
             states = events.decode(replies[2 * index + 1], keys.states(job_id))
-            latest = events.last_progress(self.connection, job_id) if found is not None else None
-            jobs.append(with_links(fold(found, states, latest)) if found is not None else None)
-        return jobs
+            if found is not None and (wanted.states is None or fold(found, states).state in wanted.states):
+                admitted[job_id] = (found, states)
+        return admitted
 
     def active(self) -> list[JobRow]:
         """Return the rows of all unfinished jobs. A job whose row is not readable stays active, but is left out."""
@@ -328,8 +344,8 @@ class Jobs:
         self._change(expected.id, verdict)
         return given
 
-    def _job(self, found: JobRow) -> Job:
-        states = events.read_states(self.connection, found.id)
+    def _job(self, found: JobRow, states: list[StoredEvent] | None = None) -> Job:
+        states = events.read_states(self.connection, found.id) if states is None else states
         return with_links(fold(found, states, events.last_progress(self.connection, found.id)))
 
     def _change(self, job_id: str, decide: Callable[[JobRow, Job], dict[str, str] | None]) -> Job:

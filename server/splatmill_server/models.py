@@ -11,6 +11,7 @@ from splatmill.backplane import layout
 from splatmill.backplane.records import UnreadableRecord, warn
 from splatmill.backplane.storage import Entry, Storage
 from splatmill.schema import JobState, Model, ModelCameras, ModelFile, ModelPage, Report
+from splatmill_server.filters import Filter
 from splatmill_server.jobs import Jobs, read_record
 from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError
@@ -118,8 +119,8 @@ class Models:
             },
         )
 
-    def page(self, cursor: str | None, limit: int, *, owner: str | None = None) -> ModelPage:
-        """Return a page of models, the most recently stored first; with `owner`, only theirs."""
+    def page(self, cursor: str | None, limit: int, wanted: Filter | None = None) -> ModelPage:
+        """Return a page of the models that `wanted` admits, the most recently stored first."""
         records = [
             entry for entry in self.storage.entries(layout.models()) if entry.path.endswith("/job.json")
         ]
@@ -130,8 +131,8 @@ class Models:
         if cursor is not None:
             after = read_cursor(cursor)
             keyed = [entry for entry in keyed if entry < after]
-        wanted = (entry for entry in keyed if owner is None or self.owner(entry[1]) == owner)
-        found = list(itertools.islice(wanted, limit + 1))
+        admitted = (entry for entry in keyed if wanted is None or self._admits(wanted, entry[1]))
+        found = list(itertools.islice(admitted, limit + 1))
         page, models = found[:limit], []
         for _, model_id in page:
             try:
@@ -142,6 +143,15 @@ class Models:
                 if error.problem.code == "model_corrupt":
                     warn(f"model {model_id} is not listed", error.problem.detail)
         return ModelPage(models=models, cursor=write_cursor(*page[-1]) if len(found) > limit else None)
+
+    def _admits(self, wanted: Filter, model_id: str) -> bool:
+        if wanted == Filter():
+            return True
+        try:
+            record = read_record(self.storage, model_id)
+        except (FileNotFoundError, UnreadableRecord):
+            return False  # deleted meanwhile or corrupt
+        return wanted.admits(record.owner, record.name)
 
     def file(self, model_id: str, name: str) -> Entry:
         """Return the entry of a file of a model. Raises 404 and 409 problems."""

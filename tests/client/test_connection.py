@@ -10,7 +10,8 @@ import httpx
 import pytest
 
 from splatmill import Client
-from splatmill.errors import ConnectionFailed, NotFound, Refused, ServerError, Unavailable
+from splatmill.connection import retry_after
+from splatmill.errors import ConnectionFailed, NotFound, Refused, ServerError, TooManyRequests, Unavailable
 from splatmill.schema import IDEMPOTENCY_HEADER, Problem
 
 JOB = {
@@ -48,6 +49,43 @@ def test_it_gives_up_with_the_last_reason(peer, reply):
         client.job("j1")
     assert error.value.code == "queue_unavailable"
     assert len(peer.seen) == 3
+
+
+def test_a_request_that_was_not_handled_is_sent_again_when_the_server_says_so(peer, reply, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(b"x")
+    busy = problem("too_many_requests")
+    busy["headers"] |= {"Retry-After": "0"}
+    capture = json.dumps({"id": "c1", "created_at": JOB["created_at"]}).encode()
+    file = json.dumps({"role": "images", "name": "a.jpg", "size": 1, "sha256": "0" * 64}).encode()
+    peer.script(reply(**busy), reply(status=201, body=capture), reply(status=201, body=file))
+    with Client(peer.url) as client:
+        assert client.upload(tmp_path)[0].id == "c1"
+    assert [seen.method for seen in peer.seen] == ["POST", "POST", "PUT"]
+
+
+def test_a_long_time_to_wait_is_told_and_not_slept_through(peer, reply):
+    busy = problem("too_many_requests")
+    busy["headers"] |= {"Retry-After": "3600"}
+    peer.answer = lambda _: reply(**busy)
+    with Client(peer.url) as client, pytest.raises(TooManyRequests) as error:
+        client.job("j1")
+    assert error.value.retry_after == 3600
+    assert len(peer.seen) == 1
+
+
+@pytest.mark.parametrize(
+    ("header", "seconds"),
+    [
+        ("7", 7.0),
+        ("Wed, 21 Oct 2015 07:28:00 GMT", 0.0),
+        ("Wed, 21 Oct 2015 07:28:00", 0.0),
+        ("soon", None),
+        ("-3", None),
+        ("", None),
+    ],
+)
+def test_the_time_to_wait_is_a_number_or_a_date(header, seconds):
+    assert retry_after(httpx.Response(429, headers={"Retry-After": header})) == seconds
 
 
 def test_creating_a_capture_is_sent_once(peer, reply, tmp_path):

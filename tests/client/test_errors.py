@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from splatmill import errors
 from splatmill.aio import train_options
+from splatmill.cli.exits import Exit, print_error
 from splatmill.schema import PROBLEMS, CameraSpec, Problem
 
 
@@ -17,10 +18,10 @@ def test_every_problem_has_its_error(code: str):
     error = errors.error_for(Problem.of(code, "It was so.", advice="Do that."))
     expected = {
         401: errors.Unauthorized,
-        403: errors.Unauthorized,
+        403: errors.Forbidden,
         404: errors.NotFound,
         409: errors.Conflict,
-        429: errors.Unavailable,
+        429: errors.TooManyRequests,
         500: errors.ServerError,
         503: errors.Unavailable,
         504: errors.Unavailable,
@@ -29,6 +30,26 @@ def test_every_problem_has_its_error(code: str):
     assert type(error) is expected
     assert error.code == code
     assert str(error) == "It was so. Do that."
+
+
+@pytest.mark.parametrize(
+    ("code", "status", "waits"),
+    [
+        ("unauthorized", Exit.unauthorized, ""),
+        ("forbidden", Exit.unauthorized, ""),
+        ("job_not_found", Exit.not_found, ""),
+        ("job_running", Exit.not_found, ""),
+        ("too_many_requests", Exit.unreachable, "The server asks to try again in 1m30s.\n"),
+        ("queue_unavailable", Exit.unreachable, "The server asks to try again in 1m30s.\n"),
+        ("storage_full", Exit.unreachable, "The server asks to try again in 1m30s.\n"),
+        ("invalid_request", Exit.refused, ""),
+        ("internal_error", Exit.error, ""),
+    ],
+)
+def test_the_command_line_prints_the_sentence_and_ends_with_its_status(capsys, code, status, waits):
+    error = errors.error_for(Problem.of(code, "It was so.", advice="Do that."), 90.0)
+    assert print_error(error) is status
+    assert capsys.readouterr().err == f"Error: It was so.\nDo that.\n{waits}"
 
 
 def test_the_tree_drawn_at_the_top_is_the_tree():

@@ -14,7 +14,7 @@ import httpx
 import pytest
 from pydantic import SecretStr
 
-from splatmill import AsyncClient, Client, JobCancelled, JobFailed
+from splatmill import AsyncClient, Client, JobCancelled, JobFailed, WaitTimeout
 from splatmill.errors import Conflict, InvalidRequest, NotFound, NothingToUpload, Unauthorized
 from splatmill.schema import (
     JobState,
@@ -125,6 +125,98 @@ def test_cancelling(service, photos):
         with pytest.raises(JobCancelled, match=job.id):
             job.wait()
         assert job.cancel().state is JobState.cancelled, "wishing twice is wishing once"
+
+
+def test_waiting_has_a_limit_and_the_job_continues(service, photos):
+    with Client(service.url) as client:
+        job = client.train(photos)
+        service.begin(job.id)
+        with pytest.raises(WaitTimeout, match=f"The job {job.id} has not ended within 0.3 seconds") as late:
+            job.wait(timeout=0.3)
+        assert isinstance(late.value, TimeoutError)
+        assert (late.value.job_id, late.value.state, late.value.seconds) == (job.id, "preparing", 0.3)
+        assert job.refresh().state is JobState.preparing
+        service.finish(job.id, PLY)
+        assert job.wait(timeout=30).id == job.id
+
+    async def impatient() -> None:
+        async with AsyncClient(service.url) as client:
+            await (await client.submit(job.job.capture)).wait(timeout=0.1)
+
+    with pytest.raises(WaitTimeout, match="queued"):
+        asyncio.run(impatient())
+
+
+def test_a_timeout_of_the_callers_own_is_not_taken_for_the_limit(service, photos):
+    def fail(_: Progress) -> None:
+        raise TimeoutError("mine")
+
+    with Client(service.url) as client:
+        job = client.train(photos)
+        service.begin(job.id)
+        service.say(job.id, ProgressEvent(stage="training", done=1, total=3))
+        with pytest.raises(TimeoutError, match="mine"):
+            job.wait(fail, timeout=30)
+
+
+def test_a_job_that_is_deleted_while_it_is_followed(service, photos):
+    with Client(service.url) as client:
+        job = client.train(photos)
+        service.begin(job.id)
+        events = job.events()
+        next(events)
+        service.fail(job.id, Problem.of("diverged", "It diverged."))
+        client.job(job.id).delete()
+        with pytest.raises(NotFound) as gone:
+            for _ in events:
+                pass
+        assert gone.value.code == "job_not_found"
+
+
+def test_lists_can_be_narrowed(service, photos):
+    with Client(service.url) as client:
+        kitchen, _ = client.upload(photos, name="Kitchen, 2nd floor")
+        garden, _ = client.upload(photos, name="garden")
+        made = [client.submit(kitchen.id, name=f"kitchen {n}").id for n in range(4)]
+        other = client.submit(garden.id, name="GARDEN")
+        unnamed = client.submit(garden.id).id
+        client.job(made[0]).cancel()
+        service.begin(other.id)
+        service.finish(other.id, PLY)
+
+        def jobs(**wanted) -> list[str]:
+            return [job.id for job in client.jobs(**wanted)]
+
+        assert jobs(name="KITCHEN") == made[::-1]
+        assert jobs(name="garden") == [other.id]
+        assert jobs(capture=garden.id) == [unnamed, other.id]
+        assert jobs(state="cancelled") == [made[0]]
+        assert jobs(state=[JobState.cancelled, "succeeded"]) == [other.id, made[0]]
+        assert jobs(state="queued", name="kitchen", limit=2) == made[:1:-1]
+        assert jobs(name="no such") == []
+        with pytest.raises(InvalidRequest, match="state"):
+            jobs(state="sleeping")
+        assert [found.id for found in client.captures()] == [garden.id, kitchen.id]
+        assert [found.id for found in client.captures(limit=1)] == [garden.id]
+        assert [found.id for found in client.captures(name="2ND")] == [kitchen.id]
+        assert [found.id for found in client.models(name="gard")] == [other.id]
+        assert list(client.models(name="kitchen")) == []
+
+
+def test_deleting_captures_and_models(service, photos):
+    with Client(service.url) as client:
+        job = client.train(photos)
+        with pytest.raises(Conflict) as used:
+            client.delete_capture(job.job.capture)
+        assert used.value.problem.facts == {"job": job.id}
+        service.begin(job.id)
+        service.finish(job.id, PLY)
+        job.wait().delete()
+        with pytest.raises(NotFound):
+            job.refresh()
+        client.delete_capture(job.job.capture)
+        with pytest.raises(NotFound):
+            client.capture(job.job.capture)
 
 
 def test_all_jobs_page_by_page(service, photos):

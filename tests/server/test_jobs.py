@@ -12,6 +12,7 @@ import pytest
 
 from splatmill.backplane import layout, queue, row
 from splatmill.schema import JobState, Problem, ProgressEvent, StateEvent
+from splatmill_server import jobs
 from tests.support.served_app import ServedApp, problem, raw, stored
 
 PHOTO = b"\xff\xd8\xff a photo"
@@ -162,6 +163,22 @@ def pages(app: ServedApp, **params: Any) -> list[str]:
         if page["cursor"] is None:
             return seen
         params["cursor"] = page["cursor"]
+
+
+def test_a_page_of_a_narrowed_list_looks_at_a_limited_number_of_jobs(
+    app: ServedApp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jobs, "SCANNED", 3)
+    monkeypatch.setattr(jobs, "_BATCH", 2)
+    capture_id = app.capture()
+    made = [app.job(capture_id) for _ in range(9)]
+    oldest = sorted(made, key=lambda i: created(app, i))[0]
+    app.begin(oldest)
+    assert pages(app, limit=1, state="preparing") == [oldest]
+    assert len(pages(app, limit=2, state="queued")) == 8
+    page = app.http.get("/v1/jobs", params={"state": "preparing", "limit": 1}).json()
+    assert page["jobs"] == []
+    assert page["cursor"] is not None, "only some of the jobs were looked at"
 
 
 def test_a_running_job_can_be_neither_deleted_nor_restarted(app: ServedApp) -> None:

@@ -63,6 +63,10 @@ def print_error(error: Exception) -> Exit:
                 print(f"  {line}", file=sys.stderr)
     if advice:
         print(advice, file=sys.stderr)
+    if isinstance(error, errors.Unavailable) and error.retry_after:
+        from splatmill.schema import format_duration
+
+        print(f"The server asks to try again in {format_duration(error.retry_after)}.", file=sys.stderr)
     return code_of(error)
 
 

@@ -8,12 +8,13 @@ from starlette.responses import JSONResponse, Response
 from splatmill.schema import SHA256_HEADER, Capture, CaptureFile, CapturePage, CreateCapture, Role
 from splatmill.schema.uploads import UPLOAD_COMPLETE, UPLOAD_LENGTH, read_boolean
 from splatmill_server.caller import Who
+from splatmill_server.filters import Filter
 from splatmill_server.ownership import CaptureId, ListedOwner
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.problems import ProblemError
 from splatmill_server.routes import uploads
 from splatmill_server.routes.openapi import CAPTURE_EXAMPLE, answer, example, problems
-from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit
+from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit, NamePart
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/captures", tags=["captures"])
@@ -46,10 +47,14 @@ def create_capture(
 
 @router.get("", responses=problems("cursor_invalid"))
 def list_captures(
-    service: Shared, owner: ListedOwner, cursor: Cursor = None, limit: Limit = DEFAULT_LIMIT
+    service: Shared,
+    owner: ListedOwner,
+    cursor: Cursor = None,
+    limit: Limit = DEFAULT_LIMIT,
+    name: NamePart = None,
 ) -> CapturePage:
     """List captures, newest first, without their files."""
-    return service.captures.page(cursor, limit, owner=owner)
+    return service.captures.page(cursor, limit, Filter(owner, name))
 
 
 @router.get(

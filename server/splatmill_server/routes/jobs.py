@@ -10,12 +10,13 @@ from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import IDEMPOTENCY_HEADER, CreateJob, Job, JobPage, JobState
 from splatmill_server.caller import Caller, Who
+from splatmill_server.filters import JobFilter
 from splatmill_server.job_form import check_start_model, create_from_form
 from splatmill_server.ownership import JobId, ListedOwner, check_capture
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.problems import ProblemError
 from splatmill_server.routes.openapi import JOB_REQUESTS, answer, problems
-from splatmill_server.routes.requests import Cursor, Limit
+from splatmill_server.routes.requests import Cursor, Limit, NamePart
 from splatmill_server.service import Service, Shared
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -127,10 +128,18 @@ def list_jobs(
     owner: ListedOwner,
     cursor: Cursor = None,
     limit: Limit = DEFAULT_LIMIT,
-    state: Annotated[JobState | None, Query(description="List only jobs in this state.")] = None,
+    state: Annotated[
+        list[JobState] | None,
+        Query(description="List only jobs in this state; repeat it for several states."),
+    ] = None,
+    name: NamePart = None,
+    capture: Annotated[
+        str | None, Query(max_length=64, description="List only jobs on the capture with this id.")
+    ] = None,
 ) -> JobPage:
-    """List jobs, newest first."""
-    return service.jobs.page(cursor, limit, state, owner=owner)
+    """List jobs, newest first. A page of a filtered list may hold fewer than `limit` although it has a `cursor`."""
+    states = frozenset(state) if state else None
+    return service.jobs.page(cursor, limit, JobFilter(owner, name, capture, states))
 
 
 @router.get("/{job_id}", responses=problems("job_not_found"))

@@ -11,11 +11,12 @@ from starlette.responses import Response
 from splatmill.backplane import layout, rendering
 from splatmill.schema import Model, ModelCameras, ModelPage, OrbitRequest, RenderRequest
 from splatmill_server.files import file_response
+from splatmill_server.filters import Filter
 from splatmill_server.forward import forward
 from splatmill_server.ownership import ListedOwner, ModelId
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.routes.openapi import CAMERA, RENDER_REQUESTS, answer, binary, problems
-from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit
+from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit, NamePart
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
@@ -63,10 +64,14 @@ _CAMERA_QUERY = [
 
 @router.get("", responses=problems("cursor_invalid"))
 def list_models(
-    service: Shared, owner: ListedOwner, cursor: Cursor = None, limit: Limit = DEFAULT_LIMIT
+    service: Shared,
+    owner: ListedOwner,
+    cursor: Cursor = None,
+    limit: Limit = DEFAULT_LIMIT,
+    name: NamePart = None,
 ) -> ModelPage:
     """List finished models, newest first."""
-    return service.models.page(cursor, limit, owner=owner)
+    return service.models.page(cursor, limit, Filter(owner, name))
 
 
 @router.get("/{model_id}", responses=problems("model_not_found", "model_not_ready", "model_corrupt"))

@@ -12,6 +12,12 @@ Cursor = Annotated[
     Query(max_length=200, description="The `cursor` of the previous page. Left out, the first page."),
 ]
 Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Largest number of entries in a page.")]
+NamePart = Annotated[
+    str | None,
+    Query(
+        max_length=200, description="List only records whose name contains this text, in any case of letters."
+    ),
+]
 
 
 def _json_only(request: Request) -> None:
