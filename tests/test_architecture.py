@@ -5,6 +5,7 @@ Does not prove that the design is good, only that the code still follows it.
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
@@ -61,6 +62,37 @@ def test_importing_stays_cheap(module: str, forbidden: set[str]):
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120
     )
     assert forbidden.isdisjoint(done.stdout.split())
+
+
+def test_untrusted_files_are_opened_in_one_place():
+    """`Image.open` and `av.open` for reading, and other decoders: pictures and videos come from strangers."""
+    guarded = PARTS["splatmill_worker"] / "images" / "guarded.py"
+    decoders = {"cv2", "imageio", "skimage", "tifffile", "rawpy", "torchvision", "decord", "moviepy", "wand"}
+    found = []
+    for path in [
+        *(p for part in PARTS.values() for p in part.rglob("*.py")),
+        *(ROOT / "worker/bench").rglob("*.py"),
+    ]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            match node:
+                case ast.Call(func=ast.Attribute(attr="open", value=ast.Name(id="Image"))) if path != guarded:
+                    found.append(f"{path}:{node.lineno}")
+                case ast.Call(func=ast.Attribute(attr="open", value=ast.Name(id="av"))) if path != guarded:
+                    if [arg.value for arg in node.args[1:2] if isinstance(arg, ast.Constant)] != ["w"]:
+                        found.append(f"{path}:{node.lineno}")
+                case ast.ImportFrom(module="PIL.Image" | "av" | "av.container"):
+                    found.append(f"{path}:{node.lineno}")
+                case ast.Import() | ast.ImportFrom():
+                    names = [getattr(node, "module", None) or "", *(alias.name for alias in node.names)]
+                    if decoders & {name.partition(".")[0] for name in names}:
+                        found.append(f"{path}:{node.lineno}")
+    assert not found
+
+
+def test_the_server_and_the_client_open_no_pictures():
+    for part in ("splatmill", "splatmill_server"):
+        for path in PARTS[part].rglob("*.py"):
+            assert not re.search(r"^\s*(from|import) (PIL|av|numpy)\b", path.read_text(), re.M), path
 
 
 def test_every_test_file_says_what_it_proves():

@@ -4,7 +4,9 @@
     ├── Refusal              the job cannot be done as it was requested
     │   ├── EmptyCapture     the capture has no files
     │   ├── StartNotStored   the model to start from is not in storage
-    │   └── StartUnusable    the file to start from is not a usable 3D Gaussian model
+    │   ├── StartUnusable    the file to start from is not a usable 3D Gaussian model
+    │   ├── UnusablePicture  a picture cannot be read, or exceeds a limit
+    │   └── UnusableVideo    a video cannot be read, or exceeds a limit
     ├── CaptureIncomplete    files of the capture did not reach the training
     ├── SfmFailed            structure from motion ended without a usable scene
     ├── TrainingFailed       training ended with a numerical failure
@@ -88,6 +90,36 @@ class StartUnusable(Refusal):
                 "or leave out the option start."
             ),
         )
+
+
+class UnusablePicture(Refusal):
+    """A picture cannot be read, or exceeds a limit.
+
+    code: file_empty, not_an_image, image_truncated, image_too_small or image_too_large.
+    reason: what is wrong with it, as a part of a sentence.
+    """
+
+    def __init__(self, code: str, name: str, reason: str) -> None:
+        super().__init__(
+            code,
+            f"{name}: {reason}.",
+            facts={"file": name},
+            advice="Leave the file out, or give it as a whole JPEG, PNG, WebP, TIFF or HEIC picture.",
+        )
+        self.reason = reason
+
+
+class UnusableVideo(Refusal):
+    """A video cannot be read, or exceeds a limit; `reason` is a part of a sentence."""
+
+    def __init__(self, name: str, reason: str) -> None:
+        super().__init__(
+            "video_unreadable",
+            f"{name}: {reason}.",
+            facts={"file": name},
+            advice="Leave the file out, or give it as an MP4 video.",
+        )
+        self.reason = reason
 
 
 class CaptureIncomplete(WorkerError):

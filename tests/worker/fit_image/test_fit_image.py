@@ -129,9 +129,9 @@ def test_files_of_many_kinds_are_read(tmp_path: Path) -> None:
     assert np.abs(read.numpy().astype(int)[:, :, 0] - pixels()[:, :, 0]).max() <= 1
     said: list[str] = []
     still = Image.fromarray(pixels())
-    still.save(tmp_path / "moving.gif", save_all=True, append_images=[still.rotate(180)])
-    assert load(tmp_path / "moving.gif", 1024, said.append).full.rgb.shape == (HEIGHT, WIDTH, 3)
-    assert any("2 pictures" in line for line in said)
+    still.save(tmp_path / "moving.webp", save_all=True, append_images=[still.rotate(180)])
+    assert load(tmp_path / "moving.webp", 1024, said.append).full.rgb.shape == (HEIGHT, WIDTH, 3)
+    assert any("several pictures" in line for line in said)
     Image.fromarray(pixels()).convert("CMYK").save(tmp_path / "print.jpg")
     assert load(tmp_path / "print.jpg", 1024).full.rgb.shape == (HEIGHT, WIDTH, 3)
     Image.new("L", (3000, 2000), 90).save(tmp_path / "large.png")
@@ -230,7 +230,7 @@ def write_bad(path: Path, kind: str) -> Path:
     ("kind", "code"),
     [
         ("text", "not_an_image"),
-        ("empty", "not_an_image"),
+        ("empty", "file_empty"),
         ("cut", "image_truncated"),
         ("dot", "image_too_small"),
         ("clear", "not_an_image"),
@@ -260,6 +260,6 @@ def test_the_command_fits_and_refuses_with_the_documented_codes(tmp_path: Path) 
     assert (tmp_path / "out" / "model.ply").is_file()
     refused = run(str(write_bad(tmp_path / "t.png", "text")))
     assert refused.returncode == 5
-    assert "not a picture" in refused.stderr
+    assert "not an image" in refused.stderr
     assert "Traceback" not in refused.stderr
     assert run("p.png", "--time-budget", "soon").returncode == 2

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from splatmill_worker.images.guarded import own_picture
+
 SPREAD = 0.3
 """Standard deviation of the natural logarithm of the exposure (0.3 is 0.43 stops)."""
 
@@ -21,7 +23,7 @@ def expose(folder: Path, seed: int = 0) -> None:
         gain = float(np.exp(SPREAD * random.standard_normal()))
         if number % EVERY == 0:
             continue
-        with Image.open(path) as photo:
+        with own_picture(path) as photo:
             values, exif = np.asarray(photo, dtype=np.float32), photo.getexif()
         Image.fromarray((values * gain).clip(0, 255).round().astype(np.uint8)).save(
             path, quality=95, exif=exif

@@ -6,18 +6,25 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
-from splatmill.schema.photos import MAX_PHOTO_PIXELS, MIN_PHOTO_SIDE
-from splatmill_worker.errors import Refusal
+from splatmill.schema.photos import MIN_PHOTO_SIDE
+from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.fit_image.plane import camera_before
-from splatmill_worker.images import load_view
+from splatmill_worker.images import guarded, load_view
 from splatmill_worker.images.decode import upright_size
 from splatmill_worker.scene import Normalization, View
 from splatmill_worker.splat.views import TrainingView
 
 Say = Callable[[str], None]
 """Gets each line for the user."""
+
+
+ADVICE = {
+    "not_an_image": "Give a JPEG, PNG, WebP, TIFF or HEIC file.",
+    "file_empty": "Give a JPEG, PNG, WebP, TIFF or HEIC file.",
+    "image_truncated": "Save the picture again from the program it came from.",
+    "image_too_large": "Scale the picture down first.",
+}
 
 
 def load(path: Path, image_size: int, say: Say = lambda _: None) -> TrainingView:
@@ -30,21 +37,11 @@ def load(path: Path, image_size: int, say: Say = lambda _: None) -> TrainingView
         if max(width, height) > image_size:
             say(f"The picture is {width} x {height} pixels; it is scaled down to {image_size}.")
         photo = load_view(View(path.name, camera_before(width, height), path), image_size)
-    except UnidentifiedImageError as error:
-        raise Refusal(
-            "not_an_image",
-            f"{path} is not a picture that can be read.",
-            advice="Give a JPEG, PNG, WebP, TIFF or HEIC file.",
-        ) from error
-    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+    except UnusablePicture as error:
+        raise Refusal(error.code, f"{path}: {error.reason}.", advice=ADVICE[error.code]) from error
+    except OSError as error:
         raise Refusal(
             "not_an_image", f"{path} cannot be read: {error.strerror}.", advice="Give one picture file."
-        ) from error
-    except (OSError, ValueError, SyntaxError, EOFError, IndexError) as error:
-        raise Refusal(
-            "image_truncated",
-            f"{path} does not decode to its end: {error}.",
-            advice="Save the picture again from the program it came from.",
         ) from error
     if photo.alpha is not None and not photo.alpha.any():
         raise Refusal(
@@ -57,21 +54,15 @@ def load(path: Path, image_size: int, say: Say = lambda _: None) -> TrainingView
 
 def _size(path: Path, say: Say) -> tuple[int, int]:
     """Upright width and height from the header. Raises Refusal for a size that cannot be fitted."""
-    with Image.open(path) as image:
+    with guarded.opened(path) as image:
         width, height = upright_size(image)
-        pictures = getattr(image, "n_frames", 1)
+        several = guarded.several(image)
     if min(width, height) < MIN_PHOTO_SIDE:
         raise Refusal(
             "image_too_small",
             f"{path} is {width} x {height} pixels; sides of {MIN_PHOTO_SIDE} pixels at least are needed.",
             advice="Give a larger picture, or enlarge this one.",
         )
-    if width * height > MAX_PHOTO_PIXELS:
-        raise Refusal(
-            "image_too_large",
-            f"{path} is {width} x {height} pixels; at most {MAX_PHOTO_PIXELS // 10**6} million are decoded.",
-            advice="Scale the picture down first.",
-        )
-    if pictures > 1:
-        say(f"{path.name} holds {pictures} pictures; the first one is fitted.")
+    if several:
+        say(f"{path.name} holds several pictures; the first one is fitted.")
     return width, height

@@ -2,27 +2,42 @@
 
 from __future__ import annotations
 
+import io
+import lzma
 import stat
+import struct
 import zipfile
+import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import IO, cast
 
-from splatmill_worker.errors import Cancelled
+from splatmill_worker.errors import Cancelled, Refusal
 
 MAX_ENTRIES = 20_000
-"""Files in an archive, at most."""
+"""Files in all archives of a capture, at most."""
 
 MAX_FILE_BYTES = 2 * 2**30
 """Bytes of an unpacked file, at most."""
 
 MAX_TOTAL_BYTES = 16 * 2**30
-"""Bytes of all unpacked files, at most."""
+"""Bytes of all unpacked files of a capture, at most."""
+
+MAX_DIRECTORY_BYTES = 256 * MAX_ENTRIES
+"""Bytes of an archive's list of files. It is read at once, and takes ten times the memory."""
 
 MAX_RATIO = 100
 """Largest ratio of a file's unpacked to packed size: photos and videos hardly compress, a zip bomb 1000 to 1."""
 
 RATIO_FLOOR = 2**20
 """Bytes of an unpacked file up to which its ratio is not limited."""
+
+_LOCAL_HEADER_BYTES = 30
+"""Bytes before a packed file, without its name."""
+
+_DAMAGED = (zipfile.BadZipFile, NotImplementedError, EOFError, zlib.error, lzma.LZMAError, struct.error)
+"""What zipfile raises for damaged archives and for packing methods that it does not know."""
 
 CHUNK = 2**20
 """Bytes written at a time; size and cancellation are checked in between."""
@@ -32,19 +47,54 @@ class UnsafeArchive(ValueError):
     """The whole archive is refused; the message is the reason."""
 
 
-def unpack(path: Path, target: Path, cancelled: Callable[[], bool] = lambda: False) -> list[Path]:
+@dataclass
+class Allowance:
+    """What the archives of a capture may still unpack to, together.
+
+    files: number of files.
+    bytes: of all files.
+    """
+
+    files: int = MAX_ENTRIES
+    bytes: int = MAX_TOTAL_BYTES
+
+    def take(self, archive: str, files: int, size: int) -> None:
+        """Subtract `files` with `size` bytes. Raises Refusal, naming the archive, when that is more than is left."""
+        if files > self.files or size > self.bytes:
+            raise Refusal(
+                "archive_bomb",
+                f"With {archive}, the archives of the capture unpack to more than {MAX_ENTRIES} files or "
+                f"{MAX_TOTAL_BYTES} bytes: it has {files} files and {size} bytes, where {self.files} and {self.bytes} "
+                "are left.",
+                facts={"file": archive, "files": files, "bytes": size},
+                advice="Give fewer or smaller photos.",
+            )
+        self.files -= files
+        self.bytes -= size
+
+
+def unpack(
+    path: Path,
+    target: Path,
+    cancelled: Callable[[], bool] = lambda: False,
+    allowance: Allowance | None = None,
+) -> list[Path]:
     """Write the archive's files under `target` and return their paths, in the archive's order.
 
     The declared sizes are checked before anything is written, and the real ones while writing. Hidden files and the
-    resource forks of macOS are left out.
+    resource forks of macOS are left out. What is written is taken from `allowance`, before it is written.
 
-    Raises UnsafeArchive for absolute names, names with `..`, links, encrypted files, zip bombs, too many files, and
-    files that are no complete zip; Cancelled when `cancelled()` turns true.
+    Raises UnsafeArchive for absolute names, names with `..`, links, encrypted files, files that overlap, zip bombs, too
+    many files, and files that are no complete zip; Refusal when the allowance is exceeded; Cancelled when
+    `cancelled()` turns true.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with _BoundedReads(io.FileIO(path)) as file, zipfile.ZipFile(cast(IO[bytes], file)) as archive:
+            _check_places(archive)
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
             _check_declared(entries)
+            if allowance is not None:
+                allowance.take(path.name, len(entries), sum(entry.file_size for entry in entries))
             written: list[Path] = []
             total = 0
             for entry in entries:
@@ -56,8 +106,35 @@ def unpack(path: Path, target: Path, cancelled: Callable[[], bool] = lambda: Fal
                 total = _write(archive, entry, place, total, cancelled)
                 written.append(place)
             return written
-    except (zipfile.BadZipFile, NotImplementedError, EOFError) as error:
+    except UnsafeArchive:
+        raise
+    except (*_DAMAGED, RuntimeError, ValueError) as error:
         raise UnsafeArchive(f"it is not a complete zip file ({error})") from error
+
+
+class _BoundedReads(io.BufferedReader):
+    """A file of which no single read takes more than MAX_DIRECTORY_BYTES into memory."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is None or size < 0:
+            here = self.tell()
+            size = self.seek(0, io.SEEK_END) - here
+            self.seek(here)
+        if size > MAX_DIRECTORY_BYTES:
+            raise UnsafeArchive(
+                f"its list of files has {size} bytes; at most {MAX_DIRECTORY_BYTES} are allowed, for {MAX_ENTRIES} "
+                "files"
+            )
+        return super().read(size)
+
+
+def _check_places(archive: zipfile.ZipFile) -> None:
+    """Raise UnsafeArchive when two entries share bytes of the file: the trick of zip bombs that nest nothing."""
+    placed = sorted(archive.infolist(), key=lambda entry: entry.header_offset)
+    ends = [entry.header_offset for entry in placed[1:]] + [archive.start_dir]
+    for entry, end in zip(placed, ends, strict=True):
+        if entry.header_offset + _LOCAL_HEADER_BYTES + entry.compress_size > end:
+            raise UnsafeArchive(f"{entry.filename!r} overlaps with another file; it may be a zip bomb")
 
 
 def _check_declared(entries: list[zipfile.ZipInfo]) -> None:

@@ -7,23 +7,30 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import pillow_heif
-from PIL import Image, ImageOps
+from PIL import Image
 
-pillow_heif.register_heif_opener()
+from splatmill_worker.images import guarded
 
 Pixels = npt.NDArray[np.uint8]
 ORIENTATION = 0x0112
 """EXIF tag."""
+
+UPRIGHT = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What makes a photo of each EXIF orientation upright."""
 
 TURNED = (5, 6, 7, 8)
 """EXIF orientations that swap width and height."""
 
 MAX_REDUCTION = 64
 """Largest factor by which a decoded photo is reduced."""
-
-# `prepare` refuses decompression bombs by the size in their header; Pillow's limit would only add a warning.
-Image.MAX_IMAGE_PIXELS = None
 
 
 def upright_size(image: Image.Image) -> tuple[int, int]:
@@ -39,10 +46,16 @@ def orientation(image: Image.Image) -> int:
 
 
 def tags(image: Image.Image) -> Image.Exif:
-    """The EXIF tags that precede the pixels; to find tags behind them, Pillow would decode a whole PNG."""
+    """The EXIF tags that precede the pixels, none where they are damaged.
+
+    To find tags behind the pixels, Pillow would decode a whole PNG.
+    """
     if image.format == "PNG" and not image.info.keys() & {"exif", "Raw profile type exif"}:
         return Image.Exif()
-    return image.getexif()
+    try:
+        return image.getexif()
+    except guarded.DECODE_ERRORS:
+        return Image.Exif()
 
 
 def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool = True) -> Image.Image:
@@ -53,26 +66,38 @@ def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool
         both sides are used, because a cropped border would shift the principal point.
     upright: apply the EXIF orientation.
 
-    Raises OSError or ValueError when the file does not decode.
+    Raises UnusablePicture when the file is no picture, exceeds a limit or does not decode, and FileNotFoundError.
     """
-    with Image.open(path) as image:
-        turn = upright and orientation(image) != 1
+    with guarded.opened(path) as image:
+        turn = UPRIGHT.get(orientation(image)) if upright else None
         want = at_least
-        if want is not None and turn and orientation(image) in TURNED:
+        if want is not None and turn is not None and orientation(image) in TURNED:
             want = want[1], want[0]
         if want is not None and image.format == "JPEG":
             factor = _factor(image.size, want, (8, 4, 2, 1))
             if factor > 1:
                 image.draft(None, (image.width // factor, image.height // factor))
+        with guarded.room(image):
+            photo = whole(image, path.name)
+            if turn is not None:
+                photo = photo.transpose(turn)
+            # Pillow would reduce RGBA in premultiplied steps of 8 bits, which loses colour.
+            if want is not None and photo.mode != "RGBA":
+                factor = _factor(image.size, want, range(MAX_REDUCTION, 0, -1))
+                if factor > 1:
+                    photo = photo.reduce(factor)
+            # `image` is closed at the end of the block, so it must not be returned itself.
+            return photo.copy() if photo is image else photo
+
+
+def whole(image: Image.Image, name: str) -> Image.Image:
+    """An opened picture decoded to its end, as RGB, RGBA or grey with 8 bits per channel, as stored.
+
+    Raises UnusablePicture, about the file `name`, when it does not decode.
+    """
+    with guarded.damage(name):
         image.load()
-        photo = _plain_mode(ImageOps.exif_transpose(image) if turn else image)
-        # Pillow would reduce RGBA in premultiplied steps of 8 bits, which loses colour.
-        if want is not None and photo.mode != "RGBA":
-            factor = _factor(image.size, want, range(MAX_REDUCTION, 0, -1))
-            if factor > 1:
-                photo = photo.reduce(factor)
-        # `image` is closed at the end of the block, so it must not be returned itself.
-        return photo.copy() if photo is image else photo
+        return _plain_mode(image)
 
 
 def _factor(size: tuple[int, int], at_least: tuple[int, int], choices: Iterable[int]) -> int:

@@ -9,10 +9,14 @@ from typing import Any
 from PIL import Image
 
 from splatmill_worker.images.decode import tags
+from splatmill_worker.images.guarded import DECODE_ERRORS
 
 MAKE, MODEL, EXIF_IFD, GPS_IFD = 0x010F, 0x0110, 0x8769, 0x8825
 FOCAL_LENGTH, FOCAL_LENGTH_35MM, LENS_MODEL = 0x920A, 0xA405, 0xA434
 """EXIF tags."""
+
+MAX_TEXT = 200
+"""Characters of a name that are read; EXIF allows megabytes."""
 
 FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)
 """Millimetres; the 35 mm equivalent focal length refers to this diagonal."""
@@ -41,10 +45,10 @@ class Exif:
 
 def read(image: Image.Image) -> Exif:
     """The tags of an opened image; unreadable EXIF counts as absent."""
+    found = tags(image)
     try:
-        found = tags(image)
         details, gps = found.get_ifd(EXIF_IFD), found.get_ifd(GPS_IFD)
-    except (OSError, ValueError, SyntaxError, KeyError, TypeError):
+    except DECODE_ERRORS:
         return Exif()
     equivalent = _positive(details.get(FOCAL_LENGTH_35MM))
     latitude, longitude = (
@@ -70,7 +74,7 @@ def read(image: Image.Image) -> Exif:
 
 
 def _text(value: Any) -> str | None:
-    text = str(value).strip("\x00 ") if value is not None else ""
+    text = str(value)[:MAX_TEXT].strip("\x00 ") if value is not None else ""
     return text or None
 
 

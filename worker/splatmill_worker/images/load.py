@@ -64,8 +64,8 @@ def load_views(
     background: RGB, 0 to 1, behind transparent pixels; None keeps their stored colours.
     threads: photos loaded at a time; None: one per core.
 
-    Raises OSError for a file that is missing or does not decode, and ValueError for one whose shape differs from its
-    camera's.
+    Raises UnusablePicture for a file that does not decode, OSError for one that is missing, and ValueError for one
+    whose shape differs from its camera's.
     """
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
         return list(pool.map(lambda view: load_view(view, longest_side, background=background), views))

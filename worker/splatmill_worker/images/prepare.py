@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import shutil
@@ -11,13 +12,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from PIL import Image, UnidentifiedImageError
-
-from splatmill.schema.photos import ARCHIVE_SUFFIXES, MAX_PHOTO_PIXELS, MIN_PHOTO_SIDE, VIDEO_SUFFIXES
-from splatmill_worker.errors import Cancelled, CaptureIncomplete
-from splatmill_worker.images import archive, exif, video
-from splatmill_worker.images.decode import upright_size
-from splatmill_worker.images.masks import mask_of, masks_under
+from splatmill.schema.photos import ARCHIVE_SUFFIXES, MIN_PHOTO_SIDE, VIDEO_SUFFIXES
+from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
+from splatmill_worker.images import archive, exif, guarded, video
+from splatmill_worker.images.decode import upright_size, whole
+from splatmill_worker.images.masks import mask_fault, mask_of, masks_under
 
 IGNORED_PREFIXES = (".", "__MACOSX")
 """Beginnings of the names of files and folders that are left out without mention."""
@@ -25,8 +24,10 @@ IGNORED_PREFIXES = (".", "__MACOSX")
 IGNORED_NAMES = ("thumbs.db", "desktop.ini")
 """Names, in lower case, of files that are left out without mention."""
 
-MAX_ASPECT_ERROR = 0.02
-"""Relative difference of aspect ratios up to which a mask fits its photo."""
+MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+"""Errors of the operating system that say nothing about the file: they end the attempt."""
+
+GIVE = "; give JPEG, PNG, WebP, TIFF or HEIC photos, videos or zips"
 
 DEFAULT_FRAMES = 100
 """Frames taken from a video."""
@@ -43,6 +44,7 @@ class UsablePhoto:
     exif: the tags that structure from motion uses.
     mask: path of the mask, if there is one.
     sequence: name of the video that the photo is a frame of, if it is one.
+    several: whether the file holds further pictures, which are not used.
     """
 
     name: str
@@ -53,6 +55,7 @@ class UsablePhoto:
     exif: exif.Exif
     mask: Path | None = None
     sequence: str | None = None
+    several: bool = False
 
 
 @dataclass(frozen=True)
@@ -84,11 +87,13 @@ class _Found:
 
     files: name, path, and name of the video that the file is a frame of.
     opened: names of the zips and videos whose content is among the files.
+    allowance: what further zips may unpack to.
     skipped, notes: as in `Prepared`.
     """
 
     files: list[tuple[str, Path, str | None]] = field(default_factory=list)
     opened: set[str] = field(default_factory=set)
+    allowance: archive.Allowance = field(default_factory=archive.Allowance)
     skipped: list[tuple[str, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -106,12 +111,14 @@ def prepare(
 
     Zips are unpacked into `workdir`, and `frames` frames of each video are stored there. Files are skipped, each
     with its reason, when they are no image or do not decode completely, when their header gives too small or too large
-    a size (they are then not decoded), and when their content is that of another file.
+    a size (they are then not decoded), and when their content is that of another file. Of a file with several pictures,
+    the first is used.
 
     masks: folder of the masks, if there is one; a mask may also lie beside its photo as name.jpg.png.
     on_progress: called as ("images", files examined, files in all, name of the file).
 
-    Raises CaptureIncomplete when a file is neither used nor skipped, and Cancelled.
+    Raises Refusal for a mask that is too large to be decoded and for archives that together exceed `archive.Allowance`,
+    CaptureIncomplete when a file is neither used nor skipped, and Cancelled.
     """
     found = _Found()
     given = _files(images)
@@ -139,6 +146,8 @@ def prepare(
             if mask is None and f"{name}.png" in own_masks:
                 mask = beside[f"{name}.png"]
             photos[result.sha256] = _with_mask(result, mask, found)
+            if result.several:
+                found.notes.append(f"{name} holds several pictures; the first one is used.")
     ordered = tuple(sorted(photos.values(), key=lambda photo: photo.name))
     known = {photo.name for photo in ordered} | {name for name, _ in found.skipped} | own_masks | found.opened
     lost = [name for path in given if (name := path.relative_to(images).as_posix()) not in known]
@@ -180,10 +189,11 @@ def _expand(
         if path.is_symlink() or not path.is_file():
             found.skipped.append((name, "it is a link or a device, not a file"))
         elif suffix in ARCHIVE_SUFFIXES and inside is None:
-            folder = _filled_once(
-                workdir / "unpacked" / _sha256(path)[:24],
-                lambda place: archive.unpack(path, place, cancelled),
-            )
+            folder = workdir / "unpacked" / _sha256(path)[:24]
+            if folder.is_dir():  # of an earlier attempt
+                unpacked = _files(folder)
+                found.allowance.take(name, len(unpacked), sum(inner.stat().st_size for inner in unpacked))
+            _filled_once(folder, lambda place: archive.unpack(path, place, cancelled, found.allowance))
             for inner in _files(folder):
                 inner_name = f"{Path(name).with_suffix('').as_posix()}/{inner.relative_to(folder).as_posix()}"
                 _expand(inner_name, inner, name, workdir, frames, found, cancelled)
@@ -202,9 +212,13 @@ def _expand(
             found.notes.append(f"{len(pictures)} frames were taken from the video {name}.")
         else:
             found.files.append((name, path, None))
-    except Cancelled:
-        raise
-    except (ValueError, OSError) as error:
+    except UnusableVideo as error:
+        found.skipped.append((name, error.reason))
+    except ValueError as error:
+        found.skipped.append((name, str(error)))
+    except OSError as error:
+        if error.errno in MACHINE_ERRORS:
+            raise
         found.skipped.append((name, str(error)))
 
 
@@ -229,54 +243,37 @@ def _filled_once(folder: Path, make: Callable[[Path], object]) -> Path:
 def _inspect(name: str, path: Path, sequence: str | None) -> UsablePhoto | str:
     """The photo, or the reason why the file is left out."""
     try:
-        if path.stat().st_size == 0:
-            return "the file is empty"
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow warns of broken EXIF, with which a photo is usable
-            with Image.open(path) as image:
+            with guarded.opened(path) as image:
                 width, height = image.size
                 if min(width, height) < MIN_PHOTO_SIDE:
                     return (
                         f"it has {width} x {height} pixels, which is too small: each side needs at least "
                         f"{MIN_PHOTO_SIDE}"
                     )
-                if width * height > MAX_PHOTO_PIXELS:
-                    limit = MAX_PHOTO_PIXELS // 10**6
-                    return f"it has {width} x {height} pixels; at most {limit} million are decoded"
                 width, height = upright_size(image)
                 tags = exif.read(image)
+                several = guarded.several(image)
                 if image.format == "JPEG":
-                    image.draft(
-                        None, (1, 1)
-                    )  # decodes at the smallest DCT scale, and still reads the whole file
-                image.load()
-    except UnidentifiedImageError:
-        return (
-            "it is not an image, or its format is not supported; give JPEG, PNG, WebP, TIFF or HEIC photos, videos or "
-            "zips"
-        )
-    except Image.DecompressionBombError as error:
-        return str(error)
-    except (OSError, ValueError, SyntaxError, EOFError, IndexError) as error:
-        return f"it does not decode completely: {error}"
-    return UsablePhoto(name, path, _sha256(path), width, height, tags, sequence=sequence)
+                    # This decodes at the smallest DCT scale, and still reads the whole file.
+                    image.draft(None, (1, 1))
+                with guarded.room(image):
+                    whole(image, name)
+    except UnusablePicture as error:
+        return error.reason + (GIVE if error.code == "not_an_image" else "")
+    except OSError as error:
+        return f"it cannot be read: {error}"
+    return UsablePhoto(name, path, _sha256(path), width, height, tags, sequence=sequence, several=several)
 
 
 def _with_mask(photo: UsablePhoto, mask: Path | None, found: _Found) -> UsablePhoto:
     """The photo with `mask`, or without it and with a note when it is unreadable or has another shape."""
     if mask is None:
         return photo
-    try:
-        with Image.open(mask) as image:
-            width, height = upright_size(image)
-    except (OSError, ValueError, SyntaxError) as error:
-        found.notes.append(f"The mask of {photo.name} is not used: it cannot be read ({error}).")
-        return photo
-    if abs(width / height / (photo.width / photo.height) - 1.0) > MAX_ASPECT_ERROR:
-        found.notes.append(
-            f"The mask of {photo.name} is not used: its shape differs from the photo's ({width} x {height} and "
-            f"{photo.width} x {photo.height} pixels)."
-        )
+    fault = mask_fault(mask, (photo.width, photo.height))
+    if fault is not None:
+        found.notes.append(f"The mask of {photo.name} is not used: {fault}.")
         return photo
     return replace(photo, mask=mask)
 

@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from splatmill_worker.errors import Cancelled
+from splatmill_worker.errors import Cancelled, UnusableVideo
+from splatmill_worker.images import guarded
 
 SHARPNESS_SIDE = 480
 """Pixels of the longest side of the reduced frame on which sharpness is measured."""
@@ -36,22 +37,19 @@ def sharpest_frames(
     video with fewer frames gives all of them. The files are called <stem>_<frame number>.jpg. The rotation in the video
     is applied. Of a video with a damaged end, the frames before the damage are used.
 
-    Raises ValueError when the file has no video that decodes, and Cancelled.
+    Raises UnusableVideo when the file has no video that decodes or exceeds a limit, and Cancelled.
     """
     if count < 1:
         raise ValueError(f"{count} frames were asked for; ask for at least 1.")
     target.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     try:
-        with av.open(str(path)) as container:
-            if not container.streams.video:
-                raise ValueError("it contains no video")
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            length = _duration(container, stream)
+        with guarded.opened_video(path) as (container, stream):
+            length = _duration(path, container, stream)
+            guarded.check_length(path.name, length)
             best: tuple[float, av.VideoFrame, int] | None = None
             interval = 0
-            for number, frame in enumerate(container.decode(stream)):
+            for number, frame in enumerate(guarded.frames(path.name, container, stream)):
                 if cancelled():
                     raise Cancelled("Reading the video was cancelled.")
                 time = frame.time if frame.time is not None else number / DEFAULT_RATE
@@ -68,9 +66,9 @@ def sharpest_frames(
                 written.append(_save(best, target, path.stem))
     except av.FFmpegError as error:
         if not written:
-            raise ValueError(f"it does not decode as video ({error})") from error
+            raise UnusableVideo(path.name, f"it does not decode as video ({error})") from error
     if not written:
-        raise ValueError("it contains no frame")
+        raise UnusableVideo(path.name, "it contains no frame")
     return written
 
 
@@ -80,14 +78,29 @@ def sharpness(grey: npt.NDArray[np.float32]) -> float:
     return float(laplacian.var()) if laplacian.size else 0.0
 
 
-def _duration(container: av.container.InputContainer, stream: av.VideoStream) -> float:
-    """The video's length in seconds: that of the stream, of the container, or by the number of frames."""
+def _duration(path: Path, container: av.container.InputContainer, stream: av.VideoStream) -> float:
+    """The video's length in seconds: that of the stream, of the container, by the number of frames, or as measured."""
     if stream.duration and stream.time_base:
         return max(float(stream.duration * stream.time_base), 1e-3)
     if container.duration:
         return max(container.duration / av.time_base, 1e-3)
     rate = float(stream.average_rate) if stream.average_rate else DEFAULT_RATE
-    return max(stream.frames / rate, 1e-3)
+    return max(stream.frames / rate or _measured(path, rate), 1e-3)
+
+
+def _measured(path: Path, rate: float) -> float:
+    """The length by the last time stamp, or by the number of packets at `rate`: browsers record without a length."""
+    last = 0.0
+    with guarded.opened_video(path) as (container, stream):
+        for number, packet in enumerate(container.demux(stream)):
+            end = (
+                packet.pts * packet.time_base
+                if packet.pts is not None and packet.time_base
+                else number / rate
+            )
+            last = max(last, float(end))
+            guarded.check_length(path.name, last)
+    return last + 1.0 / rate
 
 
 def _grey(frame: av.VideoFrame) -> npt.NDArray[np.float32]:

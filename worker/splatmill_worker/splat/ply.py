@@ -9,6 +9,7 @@ import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from splatmill.files import replacing
+from splatmill_worker import ply_header
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -101,10 +102,11 @@ def read(path: Path) -> Gaussians:
     out. Raises ModelUnreadable for any other file, and FileNotFoundError where there is none.
     """
     try:
+        ply_header.check(path)
         document = PlyData.read(str(path))
     except FileNotFoundError:
         raise
-    except (PlyParseError, ValueError, UnicodeDecodeError, OSError) as error:
+    except (PlyParseError, ValueError, OSError, IndexError, KeyError) as error:
         raise ModelUnreadable(f"{path.name} could not be read as a .ply file: {error}") from error
     elements = {element.name: element for element in document.elements}
     if "chunk" in elements:

@@ -14,7 +14,7 @@ from PIL import Image
 from splatmill.schema import TrainOptions
 from splatmill_worker import synthetic
 from splatmill_worker.capture import posed_scene
-from splatmill_worker.errors import Cancelled
+from splatmill_worker.errors import Cancelled, UnusablePicture
 from splatmill_worker.images import load_views
 from splatmill_worker.scene import Lens, Scene, View
 from splatmill_worker.sfm import posed, stereo
@@ -156,7 +156,7 @@ def test_a_photo_that_does_not_decode_is_not_reported_as_invalid_poses(tmp_path:
     photo = capture / "images" / "03.png"
     photo.write_bytes(photo.read_bytes()[:2000])  # its size can still be read
     stages: list[str] = []
-    with pytest.raises(OSError, match=r"truncated|broken"):
+    with pytest.raises(UnusablePicture, match=r"03\.png: it does not decode completely"):
         posed_scene(
             capture, tmp_path / "work", TrainOptions(), lambda stage, *_: stages.append(stage), lambda: False
         )

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from splatmill_worker.images.masks import mask_fault
 from splatmill_worker.scene import Scene, Source
 from splatmill_worker.sfm import stereo
 from splatmill_worker.sfm.callbacks import OnProgress
@@ -44,12 +45,14 @@ class PosedInput:
         """The scene with the cameras as they were given.
 
         `left_out` of the scene lists cameras whose photo is missing, and photos without a camera. Raises ValueError,
-        naming the file and the fault, when no usable view is left.
+        naming the file and the fault, when no usable view is left, and UnusablePicture for a mask that is too large.
         """
         files = ImageFiles.under(self.directory)
         if self.model is not None:
-            return colmap_model.load(self.model, files, self.notes)
-        return transforms.load(self.transforms, self.source, files, self.directory, self.notes)
+            scene = colmap_model.load(self.model, files, self.notes)
+        else:
+            scene = transforms.load(self.transforms, self.source, files, self.directory, self.notes)
+        return _without_unfit_masks(scene)
 
 
 def find(directory: Path) -> PosedInput | None:
@@ -87,6 +90,19 @@ def with_stereo_points(
         return scene
     stored = workdir / "sfm" / f"posed-{_digest(scene)}.npz"
     return stereo.with_stereo_points(scene, stored, on_progress, cancelled)
+
+
+def _without_unfit_masks(scene: Scene) -> Scene:
+    """The scene without masks that are unreadable or of another shape than their photo, each named in a note."""
+    views, notes = [], []
+    for view in scene.views:
+        if view.mask is not None:
+            fault = mask_fault(view.mask, (view.camera.width, view.camera.height), upright=view.upright)
+            if fault is not None:
+                notes.append(f"The mask of {view.name} is not used: {fault}.")
+                view = replace(view, mask=None)
+        views.append(view)
+    return replace(scene, views=tuple(views), notes=(*scene.notes, *notes))
 
 
 def _digest(scene: Scene) -> str:

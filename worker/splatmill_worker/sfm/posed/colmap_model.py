@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.errors import UnusablePicture
+from splatmill_worker.images import guarded
 from splatmill_worker.images.decode import upright_size
 from splatmill_worker.images.lens import lens_of, pinhole, without_distortion
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
+from splatmill_worker.sfm.posed import model_files
 from splatmill_worker.sfm.posed.files import ImageFiles
 
 MAX_ASPECT_ERROR = 0.02
@@ -25,15 +27,10 @@ def load(folder: Path, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
     Cameras are scaled to the size of the files. Raises ValueError when the model cannot be read, and when none of its
     photos is among the files.
     """
-    try:
-        model = pycolmap.Reconstruction(folder)
-    except (RuntimeError, ValueError, OSError, IndexError) as error:
-        raise ValueError(
-            f"The COLMAP model in {folder.name}/ could not be read: {_last_line(error)}. "
-            "Give the files cameras, images and points3D, all as .bin or all as .txt."
-        ) from error
+    model = model_files.read(folder)
     views: dict[int, View] = {}
     missing: list[tuple[str, str]] = []
+    unusable: dict[Path, tuple[str, str]] = {}
     for image_id in sorted(model.reg_image_ids(), key=lambda image_id: model.images[image_id].name):
         image = model.images[image_id]
         found = files.photo(image.name)
@@ -43,7 +40,15 @@ def load(folder: Path, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
             )
             continue
         name, path = found
-        views[image_id] = posed_view(model, image_id, name, path, files.mask(name))
+        try:
+            views[image_id] = posed_view(model, image_id, name, path, files.mask(name))
+        except UnusablePicture as error:
+            unusable[path] = (name, error.reason)
+    if not views and unusable:
+        name, reason = next(iter(unusable.values()))
+        raise ValueError(
+            f"None of the {len(unusable)} photos with a camera can be used, such as {name!r}: {reason}."
+        )
     if not views:
         raise ValueError(
             f"The COLMAP model names {len(missing)} photos (such as {missing[0][0]!r}), and the capture has none of "
@@ -55,9 +60,10 @@ def load(folder: Path, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
     without = [
         (name, "the COLMAP model has no camera for it")
         for name, path in files.photos.items()
-        if path not in used
+        if path not in used and path not in unusable
     ]
-    return scene_of(model, views, source="colmap", left_out=(*missing, *without), notes=notes)
+    left_out = (*missing, *unusable.values(), *without)
+    return scene_of(model, views, source="colmap", left_out=left_out, notes=notes)
 
 
 def posed_view(
@@ -86,7 +92,7 @@ def fit_to_file(posed: tuple[Camera, Lens | None], name: str, path: Path, mask: 
     as those of most tools do.
     """
     camera, lens = posed
-    with Image.open(path) as image:
+    with guarded.opened(path, name) as image:
         stored, upright = image.size, upright_size(image)
     aspect = camera.width / camera.height
     stored_fits = abs(stored[0] / stored[1] / aspect - 1.0) < MAX_ASPECT_ERROR
@@ -131,7 +137,3 @@ def scene_of(
         left_out=left_out,
         notes=notes,
     )
-
-
-def _last_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[-1][:200]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 from splatmill.schema.photos import MASK_FOLDERS, PHOTO_SUFFIXES
@@ -68,10 +70,20 @@ class ImageFiles:
 
     def _by_last_part(self, last: str) -> list[str]:
         """Names of the photos whose file name is `last`; when there are none, of those with the same stem."""
-        names = [name for name in self.photos if PurePosixPath(name).name == last]
-        if not names:
-            stem = (
-                last if PurePosixPath(last).suffix.lower() not in PHOTO_SUFFIXES else PurePosixPath(last).stem
-            )
-            names = [name for name in self.photos if PurePosixPath(name).stem == stem]
-        return names
+        path = PurePosixPath(last)
+        stem = path.stem if path.suffix.lower() in PHOTO_SUFFIXES else last
+        return self._by_name.get(last) or self._by_stem.get(stem, [])
+
+    @cached_property
+    def _by_name(self) -> dict[str, list[str]]:
+        return self._indexed(lambda path: path.name)
+
+    @cached_property
+    def _by_stem(self) -> dict[str, list[str]]:
+        return self._indexed(lambda path: path.stem)
+
+    def _indexed(self, key: Callable[[PurePosixPath], str]) -> dict[str, list[str]]:
+        index: dict[str, list[str]] = {}
+        for name in self.photos:
+            index.setdefault(key(PurePosixPath(name)), []).append(name)
+        return index

@@ -13,13 +13,16 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 from plyfile import PlyData, PlyParseError
 
+from splatmill_worker import ply_header
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.errors import UnusablePicture
+from splatmill_worker.images import guarded
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
 from splatmill_worker.sfm.posed.files import ImageFiles
+from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_SIDE
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns the axes of a camera-to-world matrix from OpenGL's to OpenCV's."""
@@ -29,6 +32,10 @@ MAX_SHEAR = 1e-2
 
 MIN_DETERMINANT = 1e-12
 """Determinant of the rotation part up to which a matrix counts as singular or mirrored."""
+
+
+MAX_FILE_BYTES = 64 * 2**20
+"""Bytes of a transforms file: 100,000 frames and more."""
 
 
 def load(
@@ -41,6 +48,7 @@ def load(
     """
     views: dict[str, View] = {}
     left_out: list[tuple[str, str]] = []
+    unusable: dict[str, str] = {}
     messages = list(notes)
     points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     for path in paths:
@@ -49,9 +57,13 @@ def load(
         if split == "val":
             messages.append(f"{path.name} is not used: it is a validation set.")
             continue
-        tests = set(document.get("test_filenames", ()))
+        tests = _test_names(path, document)
         for index, frame in enumerate(document["frames"]):
-            name, view = _view(path, index, document, frame, files, capture)
+            try:
+                name, view = _view(path, index, document, frame, files, capture)
+            except UnusablePicture as error:
+                unusable[error.facts["file"]] = error.reason
+                continue
             if view is None:
                 left_out.append((name, f"{path.name} has a camera for it, but the capture has no such photo"))
                 continue
@@ -60,6 +72,11 @@ def load(
         if document.get("ply_file_path"):
             points, note = _sparse_points(path.parent / str(document["ply_file_path"]), capture)
             messages += [note] if note else []
+    if not views and unusable:
+        name, reason = next(iter(unusable.items()))
+        raise ValueError(
+            f"None of the {len(unusable)} photos with a camera can be used, such as {name!r}: {reason}."
+        )
     if not views:
         first = f" (such as {left_out[0][0]!r})" if left_out else ""
         raise ValueError(
@@ -67,8 +84,11 @@ def load(
             "of their photos. Give the photos the names in file_path."
         )
     used = {view.image for view in views.values()}
+    left_out += unusable.items()
     left_out += [
-        (name, "no camera is given for it") for name, path in files.photos.items() if path not in used
+        (name, "no camera is given for it")
+        for name, path in files.photos.items()
+        if path not in used and name not in unusable
     ]
     return Scene(
         views=tuple(sorted(views.values(), key=lambda view: view.name)),
@@ -81,15 +101,27 @@ def load(
 
 
 def _read(path: Path) -> dict[str, Any]:
+    size = path.stat().st_size
+    if size > MAX_FILE_BYTES:
+        raise ValueError(f"{path.name} has {size} bytes; at most {MAX_FILE_BYTES} are read.")
     try:
         document = json.loads(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except RecursionError as error:
+        raise ValueError(f"{path.name} is not readable JSON: it is nested too deeply.") from error
+    except (OSError, ValueError) as error:
         raise ValueError(f"{path.name} is not readable JSON: {error}.") from error
     if not isinstance(document, dict) or not isinstance(document.get("frames"), list):
         raise ValueError(
             f"{path.name} has no list `frames`. Give a transforms file with one entry in `frames` per photo."
         )
     return document
+
+
+def _test_names(path: Path, document: dict[str, Any]) -> set[str]:
+    names = document.get("test_filenames", [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"test_filenames in {path.name} is no list of names.")
+    return set(names)
 
 
 def _split_of(path: Path) -> Literal["train", "test", "val"] | None:
@@ -116,8 +148,8 @@ def _view(
     values = {**document, **frame}
     try:
         viewmat = world_to_camera(np.array(frame["transform_matrix"], np.float64))
-        camera = _colmap_camera(values, photo)
-    except (KeyError, TypeError, ValueError) as error:
+        camera = _colmap_camera(values, relative, photo)
+    except (KeyError, TypeError, ValueError, ArithmeticError) as error:
         fault = f"{error.args[0]} is missing." if isinstance(error, KeyError) else str(error)
         raise ValueError(f"Frame {index} of {path.name} ({name}): {fault}") from error
     mask = files.mask(relative)
@@ -137,6 +169,8 @@ def world_to_camera(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         raise ValueError(f"transform_matrix has the shape {matrix.shape}; it must be 4 x 4 or 3 x 4.")
     if not np.isfinite(matrix).all():
         raise ValueError("transform_matrix has values that are not finite.")
+    if not np.abs(matrix).max() <= MAX_DISTANCE:
+        raise ValueError(f"transform_matrix has values above {MAX_DISTANCE:.0e}.")
     rotation = matrix[:3, :3]
     determinant = float(np.linalg.det(rotation))
     if not determinant > MIN_DETERMINANT:
@@ -157,15 +191,15 @@ def world_to_camera(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return viewmat_of(camera_to_world[:3, :3].T, camera_to_world[:3, 3])
 
 
-def _colmap_camera(values: dict[str, Any], photo: Path) -> pycolmap.Camera:
+def _colmap_camera(values: dict[str, Any], name: str, photo: Path) -> pycolmap.Camera:
     """The camera of a frame; its size is that of the file when w and h are missing."""
     if "w" in values and "h" in values:
         width, height = int(values["w"]), int(values["h"])
     else:
-        with Image.open(photo) as image:
+        with guarded.opened(photo, name) as image:
             width, height = image.size
-    if width < 1 or height < 1:
-        raise ValueError(f"w and h are {width} and {height} pixels; they must be at least 1.")
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise ValueError(f"w and h are {width} and {height} pixels; they must be 1 to {MAX_SIDE}.")
     if "fl_x" in values or "fl_y" in values:
         fx = float(values.get("fl_x", values.get("fl_y", 0.0)))
         fy = float(values.get("fl_y", fx))
@@ -195,7 +229,10 @@ def _colmap_camera(values: dict[str, Any], photo: Path) -> pycolmap.Camera:
 
 def _within(path: Path, capture: Path) -> bool:
     """Whether a path lies in the capture's folder once symbolic links are resolved."""
-    return path.resolve().is_relative_to(capture.resolve())
+    try:
+        return path.resolve().is_relative_to(capture.resolve())
+    except (OSError, ValueError):  # a name that no file can have
+        return False
 
 
 def _sparse_points(
@@ -206,6 +243,7 @@ def _sparse_points(
     if not _within(path, capture):
         return nothing, f"The points in {path.name} are not used: ply_file_path lies outside the capture."
     try:
+        ply_header.check(path)
         vertex = PlyData.read(path)["vertex"]
         points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
         names = {name.name for name in vertex.properties}
@@ -214,7 +252,7 @@ def _sparse_points(
             colors = np.stack([np.asarray(vertex[channel], np.uint8) for channel in channels], 1)
         else:
             colors = np.full(points.shape, 128, np.uint8)
-    except (OSError, PlyParseError, KeyError, ValueError) as error:
+    except (OSError, PlyParseError, KeyError, ValueError, IndexError) as error:
         return nothing, f"The points in {path.name} are not used: {error}."
     finite = np.isfinite(points).all(axis=1)
     return (points[finite], colors[finite]), None

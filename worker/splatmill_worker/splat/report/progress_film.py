@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from splatmill.files import replacing
 from splatmill.schema import format_duration
 from splatmill_worker.film import Film, with_even_sides
+from splatmill_worker.images.guarded import own_picture
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.renderer import render_view
@@ -79,11 +80,11 @@ class ProgressFilm:
         frames = sorted(self._folder.glob("*.jpg"))
         if not frames:
             return False
-        with Image.open(frames[0]) as first:
+        with own_picture(frames[0]) as first:
             width, height = first.size
         with replacing(path) as part, Film(part, width, height, FPS) as film:
             for frame in frames:
-                with Image.open(frame) as picture:
+                with own_picture(frame) as picture:
                     pixels = np.asarray(picture.convert("RGB"))
                 film.add(pixels)
             for _ in range(HELD):

@@ -1,0 +1,1 @@
+"""Files and requests as an attacker, or bad luck, makes them."""

@@ -1,0 +1,70 @@
+"""Zips that lead elsewhere, unpack to too much, or contradict themselves."""
+
+from __future__ import annotations
+
+import io
+import struct
+import warnings
+import zipfile
+import zlib
+
+from tests.support.hostile.pictures import photo
+
+
+def packed(files: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
+    """A zip of these files."""
+    data = io.BytesIO()
+    with warnings.catch_warnings(), zipfile.ZipFile(data, "w", method) as archive:
+        warnings.simplefilter("ignore")  # of names that occur twice
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return data.getvalue()
+
+
+def with_link() -> bytes:
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        entry = zipfile.ZipInfo("link.png")
+        entry.external_attr = 0o120777 << 16
+        archive.writestr(entry, "/etc/passwd")
+    return data.getvalue()
+
+
+def encrypted() -> bytes:
+    """A zip whose entry says that it is encrypted."""
+    data = bytearray(packed({"a.jpg": photo()}))
+    data[6] |= 1  # of the local header
+    data[data.rindex(b"PK\x01\x02") + 8] |= 1
+    return bytes(data)
+
+
+def wrong_checksum() -> bytes:
+    content = photo()
+    return packed({"a.jpg": content}).replace(struct.pack("<I", zlib.crc32(content)), b"\1\2\3\4")
+
+
+def overlapping(entries: int = 200) -> bytes:
+    """A zip whose entries all name the same packed bytes: each is small, together they are a bomb."""
+    data = packed({"0000.jpg": bytes(range(256)) * 400})
+    start = data.index(b"PK\x01\x02")
+    end = data.index(b"PK\x05\x06")
+    entry = data[start:end]
+    directory = b"".join(entry.replace(b"0000.jpg", b"%04d.jpg" % number) for number in range(entries))
+    tail = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, entries, entries, len(directory), start, 0)
+    return data[:start] + directory + tail
+
+
+def with_entries(count: int) -> bytes:
+    """A zip of `count` empty files, made without zipfile, which would take long."""
+    local = struct.pack("<4s5H3I2H", b"PK\3\4", 20, 0, 0, 0, 0, 0, 0, 0, 9, 0)
+    central = struct.pack("<4s6H3I5H2I", b"PK\1\2", 20, 20, 0, 0, 0, 0, 0, 0, 0, 9, 0, 0, 0, 0, 0, 0)
+    names = [b"%05d.jpg" % number for number in range(count)]
+    body = b"".join(local + name for name in names)
+    directory = b"".join(
+        central[:42] + struct.pack("<I", number * (len(local) + 9)) + name
+        for number, name in enumerate(names)
+    )
+    wide = struct.pack("<4sQ2H2I4Q", b"PK\6\6", 44, 45, 45, 0, 0, count, count, len(directory), len(body))
+    locator = struct.pack("<4sIQI", b"PK\6\7", 0, len(body) + len(directory), 1)
+    tail = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 0xFFFF, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFF, 0)
+    return body + directory + wide + locator + tail

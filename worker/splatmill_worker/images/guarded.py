@@ -1,0 +1,252 @@
+"""The one place where pictures and videos of strangers are opened, and the limits that hold for all of them.
+
+A picture is opened by its header alone: the format must be one of FORMATS, the file and the picture within the limits.
+Nothing is decoded before that. A video is opened by FFmpeg with few of its demuxers, so that no playlist, script or
+image list can name other files or addresses.
+
+`tests/test_architecture.py` forbids other calls of `Image.open` and `av.open`.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import threading
+import time
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import av
+import pillow_heif
+from PIL import Image, UnidentifiedImageError
+
+from splatmill.schema.photos import MAX_PHOTO_PIXELS
+from splatmill_worker.errors import UnusablePicture, UnusableVideo
+
+pillow_heif.register_heif_opener()
+
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF")
+"""Pillow's names of the formats that are read. Its other readers, some of which start programs, are never called."""
+
+MAX_PICTURE_BYTES = 2 * 2**30
+"""Bytes of a picture's file: some readers take the whole file into memory."""
+
+CONTAINERS = "mov,matroska,avi"
+"""FFmpeg's names of the video containers that are read: MP4, MOV and M4V; MKV and WebM; AVI."""
+
+MAX_FRAME_PIXELS = 8192 * 4320
+"""Pixels of a video's frame: 8K as cinemas have it."""
+
+MAX_VIDEO_SECONDS = 4 * 3600.0
+"""Length of a video."""
+
+MAX_VIDEO_FRAMES = 1_000_000
+"""Frames of a video: more than four hours at 60 frames per second."""
+
+MAX_READING_SECONDS = 3600.0
+"""Wall time that reading one video may take."""
+
+_BYTES_PER_PIXEL = 4
+DECODE_ERRORS = (
+    *(
+        OSError,
+        ValueError,
+        SyntaxError,
+        EOFError,
+        IndexError,
+        KeyError,
+        TypeError,
+        OverflowError,
+        RuntimeError,
+    ),
+    *(struct.error, zlib.error),
+)
+"""What Pillow and its readers raise for damaged files."""
+
+# The limit of pixels is checked below. Pillow's own allows twice as many, and only warns before that.
+Image.MAX_IMAGE_PIXELS = None
+
+
+@contextmanager
+def opened(path: Path, name: str | None = None) -> Iterator[Image.Image]:
+    """Open a picture by its header; `decode.whole` decodes it. Errors call it `name`, or else by its file name.
+
+    Raises UnusablePicture when it is empty, of another format, too large, or has a damaged header, and OSError when the
+    operating system cannot open the file.
+    """
+    name = name or path.name
+    with damage(name, "its header cannot be read"):
+        image = _opened(path, name)
+    with image:
+        if image.width * image.height > MAX_PHOTO_PIXELS:
+            raise UnusablePicture(
+                "image_too_large",
+                name,
+                f"it has {image.width} x {image.height} pixels; at most {MAX_PHOTO_PIXELS // 10**6} million are "
+                "decoded",
+            )
+        yield image
+
+
+@contextmanager
+def damage(name: str, what: str = "it does not decode completely") -> Iterator[None]:
+    """Turn what Pillow raises for damaged files within the block into UnusablePicture, about the file `name`."""
+    try:
+        yield
+    except DECODE_ERRORS as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # of the operating system, not of Pillow
+        raise UnusablePicture("image_truncated", name, f"{what}: {_said(error)}") from error
+
+
+@contextmanager
+def room(image: Image.Image) -> Iterator[None]:
+    """Wait until the memory that decoding takes is free: all pictures decoded at a time share a part of the machine's.
+
+    A picture larger than that part is decoded alone. Not to be nested: the inner one could wait for the outer one.
+    """
+    with _room.taken(image.width * image.height):
+        yield
+
+
+def several(image: Image.Image) -> bool:
+    """Whether the file holds more than one picture, such as an animation or the pages of a TIFF."""
+    if image.format != "TIFF":
+        # A JPEG's further pictures are previews and gain maps, which its format, MPO, tells apart from its photo.
+        return image.format != "MPO" and int(getattr(image, "n_frames", 1)) > 1
+    # Counting the pages would read each of them, and a file can chain millions.
+    try:
+        image.seek(1)
+    except DECODE_ERRORS:
+        return False
+    finally:
+        image.seek(0)
+    return True
+
+
+def own_picture(path: Path) -> Image.Image:
+    """Open a picture that this program wrote itself, such as a frame of the progress film."""
+    return Image.open(path)
+
+
+@contextmanager
+def opened_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+    """Open a video of one of CONTAINERS, and its first video stream.
+
+    Raises UnusableVideo when it cannot be opened, has no video, or declares larger frames or more of them than the
+    limits allow.
+    """
+    try:
+        container = av.open(
+            str(path),
+            options={
+                "protocol_whitelist": "file",
+                "format_whitelist": CONTAINERS,
+                "max_pixels": str(MAX_FRAME_PIXELS),
+            },
+            metadata_errors="replace",
+            timeout=60.0,
+        )
+    except (av.FFmpegError, ValueError) as error:
+        raise UnusableVideo(
+            path.name, f"it does not decode as an MP4, MOV, MKV, WebM or AVI video ({_said(error)})"
+        ) from error
+    with container:
+        if not container.streams.video:
+            raise UnusableVideo(path.name, "it contains no video")
+        stream = container.streams.video[0]
+        _check_frame(path.name, stream.width, stream.height)
+        if stream.width * stream.height == 0:  # as FFmpeg leaves it for frames over max_pixels
+            raise UnusableVideo(
+                path.name,
+                f"its frames have no size, or more than {MAX_FRAME_PIXELS / 1e6:.0f} million pixels",
+            )
+        if stream.frames > MAX_VIDEO_FRAMES:
+            raise UnusableVideo(
+                path.name, f"it has {stream.frames} frames; at most {MAX_VIDEO_FRAMES} are read"
+            )
+        stream.thread_type = "AUTO"
+        stream.codec_context.options = {"max_pixels": str(MAX_FRAME_PIXELS)}
+        yield container, stream
+
+
+def check_length(name: str, seconds: float) -> None:
+    """Raise UnusableVideo for a video that is longer than MAX_VIDEO_SECONDS."""
+    if not seconds <= MAX_VIDEO_SECONDS:
+        raise UnusableVideo(
+            name,
+            f"it is {seconds:.0f} seconds long; at most {MAX_VIDEO_SECONDS:.0f} are read. Cut it into parts",
+        )
+
+
+def frames(
+    name: str, container: av.container.InputContainer, stream: av.VideoStream
+) -> Iterator[av.VideoFrame]:
+    """Decode the frames in order. Raises UnusableVideo at the first limit that is reached, and av.FFmpegError."""
+    began = time.monotonic()
+    for number, frame in enumerate(container.decode(stream)):
+        _check_frame(name, frame.width, frame.height)
+        if number >= MAX_VIDEO_FRAMES:
+            raise UnusableVideo(name, f"it has more than {MAX_VIDEO_FRAMES} frames")
+        if time.monotonic() - began > MAX_READING_SECONDS:
+            raise UnusableVideo(
+                name, f"reading it took longer than {MAX_READING_SECONDS:.0f} seconds, up to frame {number}"
+            )
+        yield frame
+
+
+def _opened(path: Path, name: str) -> Image.Image:
+    size = path.stat().st_size
+    if size == 0:
+        raise UnusablePicture("file_empty", name, "the file is empty")
+    if size > MAX_PICTURE_BYTES:
+        raise UnusablePicture(
+            "image_too_large", name, f"the file has {size} bytes; at most {MAX_PICTURE_BYTES} are read"
+        )
+    try:
+        return Image.open(path, formats=FORMATS)
+    except UnidentifiedImageError as error:
+        raise UnusablePicture(
+            "not_an_image",
+            name,
+            "it is not an image, or its format is not supported",
+        ) from error
+
+
+def _check_frame(name: str, width: int, height: int) -> None:
+    if width * height > MAX_FRAME_PIXELS:
+        raise UnusableVideo(
+            name,
+            f"its frames have {width} x {height} pixels; at most {MAX_FRAME_PIXELS / 1e6:.0f} million are decoded",
+        )
+
+
+def _said(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+
+
+class _Room:
+    """Pixels that may be in decoding at a time, shared by all threads."""
+
+    def __init__(self, pixels: int) -> None:
+        self._all = self._free = pixels
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def taken(self, pixels: int) -> Iterator[None]:
+        pixels = min(pixels, self._all)
+        with self._changed:
+            self._changed.wait_for(lambda: self._free >= pixels)
+            self._free -= pixels
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._free += pixels
+                self._changed.notify_all()
+
+
+# A quarter of the machine's memory: what is decoded is copied once or twice before it is reduced.
+_room = _Room(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4 // _BYTES_PER_PIXEL)
