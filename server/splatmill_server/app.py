@@ -15,7 +15,7 @@ from splatmill.backplane.storage import StorageError
 from splatmill.schema import CreateJob, EventRecord, Problem
 from splatmill_server import problems
 from splatmill_server.middleware import RequestMiddleware
-from splatmill_server.routes import captures, job_outputs, jobs, models, status, uploads
+from splatmill_server.routes import captures, imports, job_outputs, jobs, models, status, uploads
 from splatmill_server.service import Service
 from splatmill_server.settings import Settings
 
@@ -39,15 +39,15 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        reaper = asyncio.create_task(service.reaper.run())
+        tasks = [asyncio.create_task(loop()) for loop in (service.reaper.run, service.imports.run)]
         clean_up = asyncio.create_task(run_in_threadpool(_clean_up, service))
         try:
             yield
         finally:
             service.closing.set()
-            reaper.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await reaper
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
             await clean_up
             await service.close()
 
@@ -62,7 +62,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.service = service
     problems.install(app)
-    for module in (captures, uploads, jobs, job_outputs, models, status):
+    for module in (captures, uploads, imports, jobs, job_outputs, models, status):
         app.include_router(module.router)
     _describe(app, with_key=settings.api_key is not None)
     return app

@@ -15,9 +15,11 @@ from splatmill.backplane import rendering
 from splatmill.backplane.connection import connect, connect_async
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill_server.captures import Captures
+from splatmill_server.imports import Imports
 from splatmill_server.jobs import Jobs
 from splatmill_server.metrics import Metrics
 from splatmill_server.models import Models
+from splatmill_server.outgoing import Outgoing
 from splatmill_server.partial_uploads import PartialUploads
 from splatmill_server.reaper import Reaper
 from splatmill_server.settings import Settings
@@ -61,6 +63,7 @@ class Service:
     metrics: Metrics
     captures: Captures
     partial_uploads: PartialUploads
+    imports: Imports
     jobs: Jobs
     models: Models
     reaper: Reaper
@@ -85,6 +88,7 @@ class Service:
             metrics=metrics,
             captures=captures,
             partial_uploads=PartialUploads(storage, captures),
+            imports=Imports(connection, storage, captures, Outgoing(settings.outgoing_allow), settings),
             jobs=jobs,
             models=Models(storage, jobs),
             reaper=Reaper(connection, jobs, metrics, settings),

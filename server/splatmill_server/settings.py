@@ -10,6 +10,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from splatmill.backplane import rendering
 from splatmill.backplane.connection import DEFAULT_URL
 from splatmill.schema import DEFAULT_PORT
+from splatmill_server.outgoing import allowed_hosts
 
 
 class Settings(BaseSettings):
@@ -60,6 +61,14 @@ class Settings(BaseSettings):
         default=256 << 20, ge=0, description="Bytes that uploads leave free on a local disk."
     )
 
+    outgoing_allow: str = Field(
+        default="",
+        description="Private hosts that imports and webhooks may reach: name or name:port, separated by commas.",
+    )
+    import_seconds: float = Field(
+        default=6 * 3600, gt=0, description="Seconds that the import of a file may take."
+    )
+
     redis_timeout: float = Field(default=5.0, gt=0, description="Seconds to wait for a reply of Redis.")
     render_timeout: float = Field(
         default=120.0, gt=0, description="Seconds to wait for an image of the renderer."
@@ -83,6 +92,7 @@ class Settings(BaseSettings):
     def _complete(self) -> Self:
         if not self.storage:
             self.storage = (self.data.expanduser().absolute() / "storage").as_uri()
+        allowed_hosts(self.outgoing_allow)
         if self.renderer_url is not None:
             rendering.address(self.renderer_url)
         if self.api_key is not None and not self.api_key.get_secret_value():

@@ -20,6 +20,8 @@ from tests.support.served_app import ServedApp
 
 pytestmark = pytest.mark.slow
 
+schemathesis.serializer.alias("application/partial-upload", "application/octet-stream")
+
 CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
 
 

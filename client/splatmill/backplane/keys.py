@@ -1,6 +1,6 @@
 """The names of all keys of Splatmill in Redis. RQ keeps its own under `rq:`.
 
-The keys of a job are deleted with the job; only those of `idempotency` expire.
+The keys of a job are deleted with the job; only those of `idempotency` and `lease` expire.
 """
 
 PREFIX = "splatmill:"
@@ -48,3 +48,8 @@ def idempotency(key_digest: str) -> str:
 def of_job(job_id: str) -> tuple[str, ...]:
     """Return all keys of a job, for deletion."""
     return job(job_id), states(job_id), progress(job_id), attempts(job_id), lock(job_id)
+
+
+def lease(kind: str, name: str) -> str:
+    """Return the key of a lease, which expires: the API process that holds it works on an import or a delivery."""
+    return f"{PREFIX}lease:{kind}:{name}"

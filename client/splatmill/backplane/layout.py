@@ -7,7 +7,9 @@ captures/{id}/incoming/{token}              upload in progress; renamed into fil
 captures/{id}/uploads/{upload}/record.json  upload that arrives in several requests: what it will be
 captures/{id}/uploads/{upload}/part         its bytes so far, in a local folder
 captures/{id}/uploads/{upload}/blocks/...   its bytes so far, in a bucket: objects named by their offset
+captures/{id}/imports/{import}.json         record of a file that the server fetches from an address
 captures/{id}/sfm/...                       reconstruction, shared by the jobs of the capture
+imports/{capture}.{import}                  mark of an import that has not ended
 jobs/{id}/work/...                          checkpoints and other files from which another machine can resume
 models/{id}/{file}                          model.ply, report.json, report.png, report.html, cameras.json, ...
 models/{id}/job.json                        record of the ended job; written last: a model exists once it does
@@ -87,6 +89,24 @@ def upload_part(capture_id: str, upload_id: str) -> str:
 
 def upload_blocks(capture_id: str, upload_id: str) -> str:
     return f"captures/{capture_id}/uploads/{upload_id}/blocks"
+
+
+def capture_imports(capture_id: str) -> str:
+    """Return the folder of the records of a capture's imports."""
+    return f"captures/{capture_id}/imports"
+
+
+def import_record(capture_id: str, import_id: str) -> str:
+    return f"captures/{capture_id}/imports/{import_id}.json"
+
+
+def unfinished_imports() -> str:
+    """Return the folder of the marks of all imports that have not ended."""
+    return "imports"
+
+
+def unfinished_import(capture_id: str, import_id: str) -> str:
+    return f"imports/{capture_id}.{import_id}"
 
 
 def capture_sfm(capture_id: str) -> str:

@@ -53,6 +53,12 @@ from splatmill.schema.events import (
     StateEvent,
 )
 from splatmill.schema.fit_image import FitImageOptions
+from splatmill.schema.imports import (
+    CreateImport,
+    Import,
+    ImportList,
+    ImportState,
+)
 from splatmill.schema.info import (
     DEFAULT_PORT,
     Health,
@@ -150,6 +156,7 @@ __all__ = [
     "Color",
     "Convention",
     "CreateCapture",
+    "CreateImport",
     "CreateJob",
     "CurveRow",
     "Duration",
@@ -160,6 +167,9 @@ __all__ = [
     "FitImageOptions",
     "Format",
     "Health",
+    "Import",
+    "ImportList",
+    "ImportState",
     "Info",
     "Job",
     "JobPage",

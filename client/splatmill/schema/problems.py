@@ -37,6 +37,7 @@ PROBLEMS: dict[str, Kind] = {
     "camera_invalid": Kind(422, "The camera is not valid"),
     "size_out_of_range": Kind(422, "The image size is outside its range"),
     "name_invalid": Kind(422, "The file name is not accepted"),
+    "url_refused": Kind(422, "The server sends no requests to this address"),
     "cursor_invalid": Kind(422, "The page cursor is not valid"),
     "upload_length_differs": Kind(400, "The upload has another length than was announced"),
     "idempotency_conflict": Kind(409, "This Idempotency-Key was used for another request"),
@@ -49,6 +50,7 @@ PROBLEMS: dict[str, Kind] = {
     "upload_not_found": Kind(404, "There is no such upload"),
     "upload_offset_differs": Kind(409, "The upload does not stand at this offset"),
     "upload_completed": Kind(409, "The upload is already complete"),
+    "import_not_found": Kind(404, "There is no such import"),
     "preview_not_ready": Kind(404, "There is no preview yet"),
     "report_not_ready": Kind(404, "There is no report yet"),
     "model_not_ready": Kind(409, "The model is not finished yet"),
@@ -59,6 +61,7 @@ PROBLEMS: dict[str, Kind] = {
     # The uploaded files.
     "digest_mismatch": Kind(422, "The bytes do not have the announced digest"),
     "file_empty": Kind(422, "The file is empty"),
+    "import_failed": Kind(502, "The other server did not deliver the file"),
     "not_an_image": Kind(422, "The file is not an image that can be read"),
     "image_truncated": Kind(422, "The image file is incomplete"),
     "image_too_small": Kind(422, "The image is too small"),

@@ -1,0 +1,49 @@
+"""Leases in Redis: of all API processes, one at a time works on a thing. A lease that is not renewed expires."""
+
+import asyncio
+import secrets
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+
+import redis
+from starlette.concurrency import run_in_threadpool
+
+from splatmill.backplane import keys
+
+SECONDS = 30
+"""Seconds until the lease of a process that was killed expires."""
+
+_RELEASE = "if redis.call('get', KEYS[1]) == ARGV[1] then return redis.call('del', KEYS[1]) end return 0"
+_RENEW = (
+    "if redis.call('get', KEYS[1]) == ARGV[1] then return redis.call('expire', KEYS[1], ARGV[2]) end return 0"
+)
+
+
+@asynccontextmanager
+async def lease(connection: redis.Redis, kind: str, name: str) -> AsyncIterator[bool]:
+    """Hold the lease on a thing while the context is open; yield False if another process holds it.
+
+    Raises redis.RedisError if the lease cannot be taken. If Redis is lost while it is held, the work goes on: what a
+    lease protects must be safe, though wasteful, to do twice.
+    """
+    key, token = keys.lease(kind, name), secrets.token_hex(8)
+    if not await run_in_threadpool(lambda: connection.set(key, token, nx=True, ex=SECONDS)):
+        yield False
+        return
+    renewal = asyncio.create_task(_renew(connection, key, token))
+    try:
+        yield True
+    finally:
+        renewal.cancel()
+        with suppress(asyncio.CancelledError):
+            await renewal
+        with suppress(redis.RedisError):
+            # Not in a thread: this also runs while the server stops.
+            connection.eval(_RELEASE, 1, key, token)
+
+
+async def _renew(connection: redis.Redis, key: str, token: str) -> None:
+    while True:
+        await asyncio.sleep(SECONDS / 3)
+        with suppress(redis.RedisError):
+            await run_in_threadpool(connection.eval, _RENEW, 1, key, token, str(SECONDS))

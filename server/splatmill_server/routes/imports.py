@@ -1,0 +1,56 @@
+"""The endpoints of imports: files of a capture that the server fetches from an address."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Body, Path
+from starlette.responses import Response
+
+from splatmill.schema import CreateImport, Import, ImportList
+from splatmill_server.ownership import CaptureId
+from splatmill_server.routes.openapi import problems
+from splatmill_server.routes.requests import JSON_ONLY
+from splatmill_server.service import Shared
+
+router = APIRouter(prefix="/v1/captures", tags=["captures"])
+
+
+@router.post(
+    "/{capture_id}/import",
+    status_code=202,
+    responses=problems(
+        "capture_not_found",
+        "url_refused",
+        "name_invalid",
+        "too_many_requests",
+        "body_too_large",
+        "unsupported_media_type",
+        "malformed_body",
+        "storage_full",
+    ),
+    dependencies=[JSON_ONLY],
+)
+async def import_file(
+    service: Shared,
+    response: Response,
+    capture_id: CaptureId,
+    request: Annotated[CreateImport, Body(examples=[{"url": "https://example.org/kitchen.zip"}])],
+) -> Import:
+    """Fetch a file of the capture from an address. It is fetched in the background; `Location` tells how far it is."""
+    made = await service.imports.create(capture_id, request)
+    response.headers["Location"] = f"/v1/captures/{capture_id}/imports/{made.id}"
+    return made
+
+
+@router.get("/{capture_id}/imports", responses=problems("capture_not_found"))
+def list_imports(service: Shared, capture_id: CaptureId) -> ImportList:
+    """List the imports of a capture, newest first."""
+    return ImportList(imports=service.imports.of_capture(capture_id))
+
+
+@router.get("/{capture_id}/imports/{import_id}", responses=problems("capture_not_found", "import_not_found"))
+def get_import(
+    service: Shared, capture_id: CaptureId, import_id: Annotated[str, Path(description="Id of the import.")]
+) -> Import:
+    """Get an import: its state, the bytes received, and the file or the problem at its end."""
+    service.captures.record(capture_id)
+    return service.imports.get(capture_id, import_id)
