@@ -26,6 +26,7 @@ from splatmill.schema import (
     OptionHelp,
     OptionList,
     Ready,
+    StorageUse,
     TrainOptions,
 )
 from splatmill.uploads import OnProgress, Uploaded, upload
@@ -191,6 +192,15 @@ class AsyncClient:
         """Return the version, the workers and the limits of the server."""
         response = await self.connection.request("GET", "/v1/info")
         return read_answer(Info, response)
+
+    async def storage(self, *, owner: str | None = None, largest: int = 20) -> StorageUse:
+        """Return what is in storage: the use of each owner that the key may see, and the `largest` records.
+
+        `owner` restricts it to one owner, for admins.
+        """
+        params = {"largest": largest} | ({"owner": owner} if owner is not None else {})
+        response = await self.connection.request("GET", "/v1/storage", params=params)
+        return read_answer(StorageUse, response)
 
     async def ready(self) -> Ready:
         """Return whether the service can run jobs, with a check for each part."""

@@ -26,6 +26,7 @@ from splatmill.schema import (
     Problem,
     Ready,
     Report,
+    StorageUse,
     TrainOptions,
 )
 from splatmill.uploads import OnProgress, Uploaded
@@ -159,6 +160,10 @@ class Client:
     def info(self) -> Info:
         """Return the version, the workers and the limits of the server."""
         return self._loop.run(self._async.info())
+
+    def storage(self, *, owner: str | None = None, largest: int = 20) -> StorageUse:
+        """Return what is in storage: the use of each owner that the key may see, and the `largest` records."""
+        return self._loop.run(self._async.storage(owner=owner, largest=largest))
 
     def ready(self) -> Ready:
         """Return whether the service can run jobs, with a check for each part."""

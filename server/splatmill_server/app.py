@@ -15,7 +15,7 @@ from splatmill.backplane.storage import StorageError
 from splatmill.schema import CreateJob, EventRecord, Problem
 from splatmill_server import problems
 from splatmill_server.middleware import RequestMiddleware
-from splatmill_server.routes import captures, imports, job_outputs, jobs, models, status, uploads
+from splatmill_server.routes import captures, imports, job_outputs, jobs, models, status, storage, uploads
 from splatmill_server.service import Service
 from splatmill_server.settings import Settings
 
@@ -62,7 +62,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.service = service
     problems.install(app)
-    for module in (captures, uploads, imports, jobs, job_outputs, models, status):
+    for module in (captures, uploads, imports, jobs, job_outputs, models, status, storage):
         app.include_router(module.router)
     _describe(app, with_key=settings.api_key is not None)
     return app

@@ -23,6 +23,8 @@ from splatmill_server.outgoing import Outgoing
 from splatmill_server.partial_uploads import PartialUploads
 from splatmill_server.reaper import Reaper
 from splatmill_server.settings import Settings
+from splatmill_server.space.ledger import Ledger
+from splatmill_server.space.usage import Usage
 
 CHECK_SECONDS = 5.0
 """Seconds for which a check of storage holds: everybody may request `/readyz`, and each check writes a file."""
@@ -67,6 +69,7 @@ class Service:
     jobs: Jobs
     models: Models
     reaper: Reaper
+    usage: Usage
     closing: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server is stopped, so that event streams end and do not delay it."""
 
@@ -92,6 +95,7 @@ class Service:
             jobs=jobs,
             models=Models(storage, jobs),
             reaper=Reaper(connection, jobs, metrics, settings),
+            usage=Usage(storage, Ledger(connection)),
         )
 
     async def close(self) -> None:

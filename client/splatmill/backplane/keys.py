@@ -45,6 +45,26 @@ def idempotency(key_digest: str) -> str:
     return f"{PREFIX}idempotency:{key_digest}"
 
 
+STORED_OWNERS = PREFIX + "stored"
+"""Set of the owners that have keys of `stored` or `uploads`. Only the server writes it."""
+
+SCAN = PREFIX + "stored:scan"
+"""Hash with the beginning and the end of the last scan of storage."""
+
+SCAN_LOCK = PREFIX + "stored:lock"
+"""Lock of the API process that scans storage."""
+
+
+def stored(owner: str) -> str:
+    """Return the key of a hash with what an owner has in storage, by kind and id. Only the server writes it."""
+    return f"{PREFIX}stored:of:{owner}"
+
+
+def uploads(owner: str) -> str:
+    """Return the key of a hash with an owner's uploads that no scan has counted. Only the server writes it."""
+    return f"{PREFIX}stored:uploads:{owner}"
+
+
 def of_job(job_id: str) -> tuple[str, ...]:
     """Return all keys of a job, for deletion."""
     return job(job_id), states(job_id), progress(job_id), attempts(job_id), lock(job_id)

@@ -38,6 +38,19 @@ def is_id(text: str) -> bool:
     return ID.fullmatch(text) is not None
 
 
+def folder_of(path: str) -> tuple[str, str, str] | None:
+    """Return the kind of the folder that holds a path ("captures", "jobs" or "models"), the id in its name and the
+    rest of the path, or None for a path of another kind."""
+    kind, _, rest = path.partition("/")
+    found, _, inside = rest.partition("/")
+    return (kind, found, inside) if kind in ("captures", "jobs", "models") and is_id(found) else None
+
+
+def is_sfm(inside: str) -> bool:
+    """Return whether a path inside of the folder of a capture belongs to its reconstruction."""
+    return inside.startswith("sfm/")
+
+
 def captures() -> str:
     return "captures"
 

@@ -147,6 +147,17 @@ class Storage:
             found = [_entry(meta) for page in obstore.list(self.store, prefix) for meta in page]
         yield from sorted(found, key=lambda entry: entry.path)
 
+    def walk(self, prefix: str) -> Iterator[Entry]:
+        """Yield all files under the folder `prefix` in any order, page by page, without holding all in memory."""
+        pages = iter(obstore.list(self.store, prefix or None))
+        while True:
+            with storage_errors("list", prefix):
+                page = next(pages, None)
+            if page is None:
+                return
+            for meta in page:
+                yield _entry(meta)
+
     def children(self, prefix: str) -> list[str]:
         """Return the names of the folders directly under `prefix`, sorted."""
         with storage_errors("list", prefix):

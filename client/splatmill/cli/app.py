@@ -19,6 +19,7 @@ COMMANDS = {
     "download": ("splatmill.cli.models", "download"),
     "render": ("splatmill.cli.models", "render"),
     "orbit": ("splatmill.cli.models", "orbit"),
+    "storage": ("splatmill.cli.storage", "storage"),
     "fit-image": ("splatmill.cli.fit_image", "fit_image"),
     "options": ("splatmill.cli.jobs", "options"),
     "doctor": ("splatmill.cli.service", "doctor"),

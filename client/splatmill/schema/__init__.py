@@ -122,6 +122,14 @@ from splatmill.schema.quantities import (
     parse_bytes,
     parse_duration,
 )
+from splatmill.schema.storage import (
+    OwnerUse,
+    PlannedDeletion,
+    StorageUse,
+    StoredBytes,
+    StoredKind,
+    StoredRecord,
+)
 
 __all__ = [
     "ARCHIVE_SUFFIXES",
@@ -197,7 +205,9 @@ __all__ = [
     "OrbitRequest",
     "Output",
     "Owner",
+    "OwnerUse",
     "PlanEvent",
+    "PlannedDeletion",
     "Preset",
     "PreviewEvent",
     "Problem",
@@ -213,6 +223,10 @@ __all__ = [
     "Side",
     "StageSeconds",
     "StateEvent",
+    "StorageUse",
+    "StoredBytes",
+    "StoredKind",
+    "StoredRecord",
     "Switch",
     "Time",
     "TrainOptions",

@@ -1,0 +1,39 @@
+"""The endpoint of `/v1/storage`: who has how much in storage."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query
+
+from splatmill.schema import StorageUse
+from splatmill_server.caller import Who
+from splatmill_server.ownership import ListedOwner
+from splatmill_server.routes.openapi import problems
+from splatmill_server.service import Shared
+from splatmill_server.space.usage import largest
+
+router = APIRouter(tags=["service"])
+
+OLDEST = 10.0
+"""Seconds: a request for figures that are older scans storage."""
+
+
+@router.get("/v1/storage", responses=problems("storage_unavailable"))
+def get_storage(
+    service: Shared,
+    who: Who,
+    owner: ListedOwner,
+    count: Annotated[
+        int, Query(alias="largest", ge=0, le=1000, description="Number of the largest records to list.")
+    ] = 20,
+) -> StorageUse:
+    """Get what the caller's records occupy in storage; for an admin, those of every owner."""
+    usage = service.usage
+    usage.refresh(OLDEST)
+    owners = usage.ledger.owners() if owner is None else [owner]
+    return StorageUse(
+        scanned_at=usage.scanned_at(),
+        owners=sorted(
+            (usage.owner_use(found, None) for found in owners), key=lambda use: (-use.bytes, use.owner or "")
+        ),
+        largest=largest(usage.snapshot(), owner, count),
+    )

@@ -1,0 +1,155 @@
+"""What lies in storage, folder by folder, found by listing all of it once."""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+from splatmill.backplane import layout
+from splatmill.backplane.storage import Entry, Storage
+from splatmill.schema import DEFAULT_OWNER, StoredKind
+
+KINDS = {"captures": StoredKind.capture, "jobs": StoredKind.job, "models": StoredKind.model}
+"""The kind of record by the name of the folder in storage that holds all records of the kind."""
+
+_RECORDS = {StoredKind.capture: "capture.json", StoredKind.model: "job.json"}
+
+
+class Holding(BaseModel):
+    """One folder of storage: a capture, the files of a job, or a model.
+
+    bytes: size of all files but `sfm`.
+    sfm: size of a capture's reconstruction.
+    files: number of files.
+    modified: time of the last write of any file, in seconds since 1970.
+    whole: whether the record is there, which is written first for a capture and last for a model.
+    owner: None if nothing says whose it is.
+    capture: for a model, the capture that it was made of.
+    """
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    kind: StoredKind
+    id: str
+    bytes: int = 0
+    sfm: int = 0
+    files: int = 0
+    modified: float = 0.0
+    whole: bool = False
+    owner: str | None = None
+    name: str | None = None
+    capture: str | None = None
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files."""
+        return self.bytes + self.sfm
+
+    @property
+    def key(self) -> str:
+        """Kind and id, as one text."""
+        return f"{self.kind.value}/{self.id}"
+
+    @property
+    def folder(self) -> str:
+        """The path of the folder."""
+        return folder(self.kind, self.id)
+
+
+@dataclass
+class _Sums:
+    bytes: int = 0
+    sfm: int = 0
+    files: int = 0
+    modified: float = 0.0
+    whole: bool = False
+
+    def add(self, entry: Entry, kind: StoredKind, inside: str) -> None:
+        if kind is StoredKind.capture and layout.is_sfm(inside):
+            self.sfm += entry.size
+        else:
+            self.bytes += entry.size
+        self.files += 1
+        self.modified = max(self.modified, entry.modified.timestamp())
+        self.whole = self.whole or inside == _RECORDS.get(kind)
+
+
+def folder(kind: StoredKind, record_id: str) -> str:
+    """Return the path of the folder of a record."""
+    match kind:
+        case StoredKind.capture:
+            return layout.capture(record_id)
+        case StoredKind.job:
+            return layout.job(record_id)
+        case StoredKind.model:
+            return layout.model(record_id)
+
+
+def sums(entries: Iterable[Entry]) -> dict[tuple[StoredKind, str], Holding]:
+    """Return the folders that hold these files, by kind and id, without owners."""
+    found: dict[tuple[StoredKind, str], _Sums] = {}
+    for entry in entries:
+        if (place := layout.folder_of(entry.path)) is not None:
+            kind = KINDS[place[0]]
+            found.setdefault((kind, place[1]), _Sums()).add(entry, kind, place[2])
+    return {
+        (kind, record_id): Holding(
+            kind=kind,
+            id=record_id,
+            bytes=held.bytes,
+            sfm=held.sfm,
+            files=held.files,
+            modified=held.modified,
+            whole=held.whole,
+        )
+        for (kind, record_id), held in found.items()
+    }
+
+
+def scan(storage: Storage, known: Mapping[str, Holding], job_owners: Mapping[str, str]) -> list[Holding]:
+    """List storage and return all folders with their owners.
+
+    known: the folders of an earlier scan by their keys. The owner of a record never changes, so that records are read
+    once.
+    job_owners: the owners of the jobs that have rows, for folders of jobs and of models that are not finished.
+    """
+    found = sums(storage.walk(""))
+    described: dict[tuple[StoredKind, str], Holding] = {}
+    for place, held in found.items():
+        if held.whole:
+            described[place] = _described(storage, held, known.get(held.key))
+    for (kind, record_id), held in found.items():
+        if (kind, record_id) not in described:
+            owner = job_owners.get(record_id) if kind is not StoredKind.capture else None
+            model = described.get((StoredKind.model, record_id))
+            described[kind, record_id] = held.model_copy(
+                update={"owner": owner if owner is not None or model is None else model.owner}
+            )
+    return list(described.values())
+
+
+def _described(storage: Storage, held: Holding, before: Holding | None) -> Holding:
+    """Return a folder with what its record says: owner, name, and the capture of a model."""
+    if before is None or before.owner is None:
+        record = _record(storage, f"{held.folder}/{_RECORDS[held.kind]}")
+        before = _with_facts(held, record)
+    return held.model_copy(update={"owner": before.owner, "name": before.name, "capture": before.capture})
+
+
+def _with_facts(held: Holding, record: Mapping[str, Any] | None) -> Holding:
+    """Return a folder with owner, name and capture of its record; None is a record that cannot be read."""
+    if record is None:
+        return held
+    texts = {name: value for name in ("name", "capture") if isinstance(value := record.get(name), str)}
+    owner = record.get("owner", DEFAULT_OWNER)
+    return held.model_copy(update={"owner": owner if isinstance(owner, str) else None, **texts})
+
+
+def _record(storage: Storage, path: str) -> dict[str, Any] | None:
+    try:
+        record = json.loads(storage.get(path))
+    except (FileNotFoundError, ValueError):  # deleted meanwhile, or broken
+        return None
+    return record if isinstance(record, dict) else None

@@ -1,0 +1,189 @@
+"""Who has how much in storage, and which records are the largest."""
+
+import threading
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+
+import redis
+import structlog
+from redis.exceptions import LockError
+from redis.lock import Lock
+
+from splatmill.backplane import keys
+from splatmill.backplane.storage import Storage
+from splatmill.schema import OwnerUse, StoredBytes, StoredKind, StoredRecord
+from splatmill_server.space.holdings import Holding, scan
+from splatmill_server.space.job_uses import JobUse, all_jobs
+from splatmill_server.space.ledger import NOBODY, Account, Ledger
+
+log = structlog.get_logger()
+
+SCAN_SHARE = 0.05
+"""Largest share of the time that scans of storage take, however often somebody asks for new figures."""
+
+_LOCK_SECONDS = 3600
+"""Seconds after which the lock of a scan whose process died is free again."""
+
+_FIRST_SCAN_SECONDS = 60
+"""Seconds to wait for another process that makes the first scan."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All records in storage and how jobs use them.
+
+    holdings: by key.
+    jobs: what jobs use, by the id of the job.
+    needed: the id of an unfinished job by the key of each record that it needs.
+    last_used: seconds since 1970 by the key of the record.
+    """
+
+    holdings: Mapping[str, Holding]
+    jobs: Mapping[str, JobUse]
+    needed: Mapping[str, str] = field(default_factory=dict)
+    last_used: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, holdings: Iterable[Holding], jobs: Mapping[str, JobUse]) -> "Snapshot":
+        """Return the snapshot of these records and jobs."""
+        held = {found.key: found for found in holdings}
+        needed: dict[str, str] = {}
+        last_used = {key: found.modified for key, found in held.items()}
+        for use in jobs.values():
+            for key in use.records:
+                last_used[key] = max(last_used.get(key, 0.0), use.last_heard)
+                if use.unfinished:
+                    needed[key] = use.id
+        for found in held.values():
+            if found.kind is StoredKind.model and found.capture is not None:
+                key = Holding(kind=StoredKind.capture, id=found.capture).key
+                last_used[key] = max(last_used.get(key, 0.0), found.modified)
+        return cls(held, jobs, needed, last_used)
+
+
+class Usage:
+    """Keeps the ledger in step with storage, and reports from it."""
+
+    def __init__(self, storage: Storage, ledger: Ledger) -> None:
+        self.storage = storage
+        self.ledger = ledger
+        self._here = threading.Lock()
+
+    @property
+    def connection(self) -> redis.Redis:
+        """The connection to Redis."""
+        return self.ledger.connection
+
+    def refresh(self, oldest: float) -> None:
+        """Scan storage if the last scan is older than `oldest` seconds, unless another process does so already.
+
+        Scans take at most SCAN_SHARE of the time, so that a storage that is slow to list is scanned less often.
+        Returns without figures only if the first scan of another process takes very long.
+        """
+        if not self._is_due(oldest):
+            return
+        with self._here:
+            if not self._is_due(oldest):
+                return
+            first = self.ledger.last_scan() is None
+            lock = Lock(
+                self.connection, keys.SCAN_LOCK, timeout=_LOCK_SECONDS, thread_local=False, sleep=0.05
+            )
+            if lock.acquire(blocking=first, blocking_timeout=_FIRST_SCAN_SECONDS if first else None):
+                try:
+                    if self._is_due(oldest):
+                        self.scan()
+                finally:
+                    _release(lock)
+
+    def _is_due(self, oldest: float) -> bool:
+        last = self.ledger.last_scan()
+        if last is None:
+            return True
+        age = self.ledger.clock() - last.ended
+        return not age < max(oldest, (last.ended - last.began) / SCAN_SHARE)
+
+    def scan(self) -> None:
+        """List storage, and replace the figures in the ledger."""
+        began = self.ledger.clock()
+        known = {held.key: held for owner in self.ledger.owners() for held in self.account(owner).holdings}
+        jobs = all_jobs(self.connection)
+        found = scan(self.storage, known, {job.id: job.owner for job in jobs.values()})
+        self.ledger.publish(began, found)
+        log.debug("storage scanned", folders=len(found), bytes=sum(held.size for held in found))
+
+    def account(self, owner: str) -> Account:
+        """Return what an owner has in storage."""
+        return self.ledger.account(owner)
+
+    def owner_use(self, owner: str, limit: int | None) -> OwnerUse:
+        """Return the bytes of an owner by kind. NOBODY stands for what belongs to nobody."""
+        account = self.account(owner)
+        by_kind = _by_kind(account)
+        return OwnerUse(
+            owner=None if owner == NOBODY else owner,
+            bytes=by_kind.total,
+            limit=limit,
+            by_kind=by_kind,
+            captures=_count(account, StoredKind.capture),
+            models=_count(account, StoredKind.model),
+        )
+
+    def snapshot(self) -> Snapshot:
+        """Return all records in storage as of the last scan, and how jobs use them now."""
+        held = [found for owner in self.ledger.owners() for found in self.account(owner).holdings]
+        return Snapshot.of(held, all_jobs(self.connection))
+
+    def scanned_at(self) -> datetime:
+        """Return when the last scan began. Without one, now: then nothing is known to be in storage."""
+        last = self.ledger.last_scan()
+        return moment(last.began if last is not None else self.ledger.clock())
+
+
+def largest(snapshot: Snapshot, owner: str | None, count: int) -> list[StoredRecord]:
+    """Return the largest records, largest first; with `owner`, only theirs."""
+    wanted = [held for held in snapshot.holdings.values() if owner is None or held.owner == owner]
+    wanted.sort(key=lambda held: (-held.size, held.key))
+    return [
+        StoredRecord(
+            kind=held.kind,
+            id=held.id,
+            owner=held.owner,
+            name=held.name,
+            bytes=held.size,
+            files=held.files,
+            last_used=moment(snapshot.last_used[held.key]),
+            needed_by=snapshot.needed.get(held.key),
+        )
+        for held in wanted[:count]
+    ]
+
+
+def moment(seconds: float) -> datetime:
+    """Return seconds since 1970 as a point in time."""
+    return datetime.fromtimestamp(seconds, UTC)
+
+
+def _by_kind(account: Account) -> StoredBytes:
+    sizes = dict.fromkeys(StoredKind, 0)
+    for held in account.holdings:
+        sizes[held.kind] += held.bytes
+    return StoredBytes(
+        captures=sizes[StoredKind.capture],
+        sfm=sum(held.sfm for held in account.holdings),
+        jobs=sizes[StoredKind.job],
+        models=sizes[StoredKind.model],
+        uploads=sum(found.bytes for found in account.uploads.values()),
+    )
+
+
+def _count(account: Account, kind: StoredKind) -> int:
+    return sum(1 for held in account.holdings if held.kind is kind and held.whole)
+
+
+def _release(lock: Lock) -> None:
+    try:
+        lock.release()
+    except LockError:
+        log.warning("a scan of storage took longer than its lock was valid", seconds=_LOCK_SECONDS)

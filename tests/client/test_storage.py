@@ -1,0 +1,67 @@
+"""`storage` of the SDK and of the command line against the real server.
+
+Not proved here: the figures themselves (tests/server/space).
+"""
+
+import asyncio
+import json
+
+from typer.testing import CliRunner
+
+from splatmill.aio import AsyncClient
+from splatmill.cli.app import app
+from splatmill.client import Client
+from tests.client.conftest import Service
+
+WIDE = {"COLUMNS": "250", "TERM": "dumb", "NO_COLOR": "1"}
+
+
+def _upload(service: Service, tmp_path) -> str:
+    photos = tmp_path / "garden"
+    photos.mkdir()
+    for index in range(2):
+        (photos / f"{index}.jpg").write_bytes(b"\xff\xd8\xff" + bytes([index]) * 5000)
+    with Client(service.url) as client:
+        capture, _ = client.upload(photos)
+    return capture.id
+
+
+def test_the_sdk_returns_the_use_of_storage(service: Service, tmp_path) -> None:
+    capture = _upload(service, tmp_path)
+    with Client(service.url) as client:
+        use = client.storage(largest=1)
+    assert [found.owner for found in use.owners] == ["default"]
+    assert use.owners[0].bytes == use.owners[0].by_kind.total > 10_000
+    assert [(found.kind.value, found.id, found.name) for found in use.largest] == [
+        ("capture", capture, "garden")
+    ]
+
+    async def both() -> None:
+        async with AsyncClient(service.url) as client:
+            assert (await client.storage(owner="default")).owners == use.owners
+            assert (await client.storage(owner="nobody")).owners[0].bytes == 0
+
+    asyncio.run(both())
+
+
+def test_the_command_prints_owners_and_the_largest_records(service: Service, tmp_path) -> None:
+    capture = _upload(service, tmp_path)
+    shown = CliRunner().invoke(app, ["storage", "--server", service.url], env=WIDE)
+    assert shown.exit_code == 0, shown.output
+    lines = [line.split() for line in shown.output.splitlines()]
+    assert lines[0] == ["owner", "total", "captures", "cameras", "jobs", "models", "uploads", "limit"]
+    assert lines[1][:3] == ["default", "10.3", "kB"]
+    found = next(line for line in lines if capture in line)
+    assert found[:4] == ["capture", capture, "garden", "default"]
+    assert found[-2:] == ["on", "request"]
+    assert "The next sweep deletes nothing." in shown.output
+    as_json = CliRunner().invoke(app, ["storage", "--server", service.url, "--json"], env=WIDE)
+    assert json.loads(as_json.output)["largest"][0]["id"] == capture
+
+
+def test_a_capture_in_use_names_its_job(service: Service, tmp_path) -> None:
+    capture = _upload(service, tmp_path)
+    with Client(service.url) as client:
+        job = client.submit(capture).id
+    shown = CliRunner().invoke(app, ["storage", "--server", service.url], env=WIDE)
+    assert f"not before job {job} ends" in shown.output
