@@ -15,6 +15,7 @@ from splatmill.model import AsyncModelHandle
 from splatmill.schema import (
     CameraSpec,
     Capture,
+    CurveRow,
     EventRecord,
     Info,
     Job,
@@ -239,6 +240,10 @@ class JobHandle:
     def logs(self) -> list[LogLine]:
         """Return the log of the job, oldest line first."""
         return self._loop.run(self._async.logs())
+
+    def curve(self) -> list[CurveRow]:
+        """Return the error against run time that was measured so far, from the first measurement on."""
+        return self._loop.run(self._async.curve())
 
     def preview(self) -> bytes:
         """Return the newest preview image (JPEG)."""

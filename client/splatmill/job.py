@@ -8,6 +8,8 @@ from splatmill.connection import Connection, backoff, read_answer
 from splatmill.errors import Conflict, ConnectionFailed, JobCancelled, JobFailed, Unavailable, WaitTimeout
 from splatmill.model import AsyncModelHandle, find_model
 from splatmill.schema import (
+    Curve,
+    CurveRow,
     EventRecord,
     Job,
     JobState,
@@ -21,6 +23,9 @@ from splatmill.schema import (
 )
 from splatmill.sse import GIVE_UP_SECONDS, follow_events
 from splatmill.uploads import OnProgress
+
+MOST_LINES = 10_000
+"""Number of log lines that the server returns at most."""
 
 
 class AsyncJobHandle:
@@ -133,8 +138,13 @@ class AsyncJobHandle:
 
     async def logs(self) -> list[LogLine]:
         """Return the log of the job, oldest line first."""
-        response = await self.connection.request("GET", f"/v1/jobs/{self.id}/logs")
+        response = await self.connection.request("GET", f"/v1/jobs/{self.id}/logs?limit={MOST_LINES}")
         return read_answer(LogPage, response).lines
+
+    async def curve(self) -> list[CurveRow]:
+        """Return the error against run time that was measured so far, from the first measurement on."""
+        response = await self.connection.request("GET", f"/v1/jobs/{self.id}/curve")
+        return read_answer(Curve, response).rows
 
     async def preview(self) -> bytes:
         """Return the newest preview image (JPEG)."""

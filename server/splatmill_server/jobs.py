@@ -11,19 +11,23 @@ from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import redis
+import structlog
 
 from splatmill.backplane import events, keys, layout, queue, row
 from splatmill.backplane.events import StoredEvent
 from splatmill.backplane.fold import fold
 from splatmill.backplane.records import UnreadableRecord, check_format, reason, warn
 from splatmill.backplane.row import JobRow, Verdict
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import DEFAULT_OWNER, CreateJob, Job, JobPage, JobState, Problem
 from splatmill.schema.tolerant import keep_readable
+from splatmill_server import job_log
 from splatmill_server.filters import JobFilter
 from splatmill_server.metrics import Metrics
 from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError
+
+log = structlog.get_logger()
 
 IDEMPOTENCY_DAYS = 7
 SCANNED = 2000
@@ -130,7 +134,7 @@ class Jobs:
         ]
 
     def get(self, job_id: str) -> Job:
-        """Return the job as clients see it. A finished job is read from storage if Redis has lost it."""
+        """Return the job as clients see it. A job that has ended is read from storage if Redis has lost it."""
         try:
             return self._job(self.row(job_id))
         except ProblemError:
@@ -139,16 +143,17 @@ class Jobs:
             raise
 
     def stored(self, job_id: str) -> Job | None:
-        """Return the job in the `job.json` of its model, or None."""
+        """Return an ended job from storage: from the `job.json` of its model or the file of its log, or None."""
         if not layout.is_id(job_id):
             return None
         try:
             return with_links(read_record(self.storage, job_id))
         except FileNotFoundError:
-            return None
+            pass
         except UnreadableRecord as error:
             warn(layout.job_record(job_id), str(error))
-            return None
+        ended = job_log.stored_job(self.storage, job_id)
+        return with_links(ended) if ended is not None else None
 
     def page(self, cursor: str | None, limit: int, wanted: JobFilter | None = None) -> JobPage:
         """Return a page of the jobs that `wanted` admits, newest first.
@@ -220,7 +225,16 @@ class Jobs:
         return found
 
     def _retire(self, job_id: str) -> None:
-        """Remove a job that has ended from the set of active ones, unless it was restarted meanwhile."""
+        """Store the log of a job that has ended, and remove it from the set of active ones.
+
+        It stays there if its log cannot be stored, so that this is tried again, and if it was restarted meanwhile.
+        """
+        try:
+            if (known := row.read(self.connection, job_id)) is not None:
+                job_log.store(self.connection, self.storage, self._job(known))
+        except StorageError as error:
+            log.warning("the log of a job cannot be stored", job=job_id, error=str(error))
+            return
 
         def remove(pipe: Any) -> None:
             known = row.read(self.connection, job_id)

@@ -1,14 +1,15 @@
-"""The events of a job as server-sent events: two streams and the row, merged into one sequence.
+"""The events of a job as server-sent events: its streams and the row, merged into one sequence.
 
-The id of an event is `<states position>_<progress position>_<row events>`, from which a client can resume after a lost
-connection. The events that follow from the row (queued, and the server's verdict) are state events of attempt 0; there
-are up to two of them in each generation of a job.
+The id of an event names a position in each stream, from which a client can resume after a lost connection. The events
+that follow from the row (queued, and the server's verdict) are state events of attempt 0; there are up to two of them
+in each generation of a job.
 """
 
 import asyncio
+import heapq
 import re
 from collections.abc import AsyncIterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import redis
@@ -22,7 +23,8 @@ from splatmill.backplane.row import JobRow
 from splatmill.schema import EventRecord, Job, JobState, StateEvent, Time
 from splatmill_server.service import Service
 
-_POSITION = re.compile(r"(\d{1,19}-\d{1,19})_(\d{1,19}-\d{1,19})_(\d{1,9})")
+_ENTRY = r"\d{1,19}-\d{1,19}"
+_POSITION = re.compile(rf"({_ENTRY})_({_ENTRY})_(\d{{1,9}})((?:_{_ENTRY}){{3}})?")
 _LINE_ENDS = {0x85: "\\u0085", 0x2028: "\\u2028", 0x2029: "\\u2029"}
 _BLOCK_MS = 500
 """Milliseconds that a read waits for new entries, after which the row is read again."""
@@ -32,23 +34,33 @@ _BLOCK_MS = 500
 class Position:
     """A position in the events of a job.
 
-    states: id of the last entry read from the states stream.
-    progress: id of the last entry read from the progress stream.
+    entries: id of the last entry read from each stream of a job, in the order of `events.BOUNDS`.
     row_events: number of the last event that follows from the row.
+
+    As text, it is `<states>_<progress>_<row events>_<log>_<warnings>_<curve>`. Earlier versions had no streams but the
+    first two, and their text ends after the row events: nothing in the other streams has been read then.
     """
 
-    states: str = START
-    progress: str = START
+    entries: list[str] = field(default_factory=lambda: [START] * len(events.BOUNDS))
     row_events: int = 0
 
     @classmethod
     def parse(cls, text: str) -> "Position | None":
         """Return the position in a `Last-Event-ID`, or None for any other text."""
         match = _POSITION.fullmatch(text)
-        return cls(match[1], match[2], int(match[3])) if match else None
+        if match is None:
+            return None
+        states, progress, row_events, others = match.groups()
+        return cls([states, progress, *((others or f"_{START}" * 3)[1:].split("_"))], int(row_events))
+
+    @property
+    def states(self) -> str:
+        """Id of the last entry read from the states stream."""
+        return self.entries[0]
 
     def __str__(self) -> str:
-        return f"{self.states}_{self.progress}_{self.row_events}"
+        states, progress, *others = self.entries
+        return "_".join([states, progress, str(self.row_events), *others])
 
 
 class Follower:
@@ -86,14 +98,11 @@ class Follower:
             if self.position.row_events < 2 * row.generation:
                 yield self._row_event(2 * row.generation, row.queued_at, StateEvent(state=JobState.queued))
             found, end = await self._read()
-            for stored, is_state in found:
-                if is_state:
-                    self.position.states = stored.id
-                else:
-                    self.position.progress = stored.id
+            for stored, stream in found:
+                self.position.entries[stream] = stored.id
                 if self.fold.apply(stored):
                     yield stored.record(str(self.position))
-            self.position.states, self.position.progress = end  # also after entries that are not readable
+            self.position.entries = end  # also after entries that are not readable
             if self.fold.final:
                 return
             verdict = row.verdict
@@ -106,37 +115,25 @@ class Follower:
         self.position.row_events = number
         return EventRecord(id=str(self.position), attempt=0, at=at, event=event)
 
-    async def _read(self) -> tuple[list[tuple[StoredEvent, bool]], tuple[str, str]]:
-        """Return new events of both streams, sorted by time, and the ids of the last entries read from each.
+    async def _read(self) -> tuple[list[tuple[StoredEvent, int]], list[str]]:
+        """Return new events, each with the number of its stream, sorted by time, and the last entry of each stream.
 
         Waits briefly if there are none.
         """
-        states, progress = keys.states(self.job_id), keys.progress(self.job_id)
-        positions: Any = {states: self.position.states, progress: self.position.progress}
+        streams = [stream(self.job_id) for stream in events.BOUNDS]
+        positions: Any = dict(zip(streams, self.position.entries, strict=True))
         reply = await self._reply(self.redis.xread(positions, block=_BLOCK_MS))
         entries = {name.decode(): found for name, found in reply or []}
-        end = {name: found[-1][0].decode() for name, found in entries.items()}
-        read = {name: events.decode(found, name) for name, found in entries.items()}
-        merged = _merge(read.get(states, []), read.get(progress, []))
-        return merged, (end.get(states, self.position.states), end.get(progress, self.position.progress))
+        end = [entries[name][-1][0].decode() if name in entries else positions[name] for name in streams]
+        read = [
+            [(stored, number) for stored in events.decode(entries.get(name, []), name)]
+            for number, name in enumerate(streams)
+        ]
+        # The order within each stream is kept.
+        return list(heapq.merge(*read, key=lambda found: events.time_order(found[0]))), end
 
     async def _reply(self, pending: Any) -> Any:
         return await pending
-
-
-def _merge(states: list[StoredEvent], progress: list[StoredEvent]) -> list[tuple[StoredEvent, bool]]:
-    """Merge the entries of two streams by time, keeping the order within each; True marks states.
-
-    Within a millisecond, a state comes before progress, but a final state after it.
-    """
-    merged: list[tuple[StoredEvent, bool]] = []
-    waiting = progress[::-1]
-    for stored in states:
-        final = isinstance(stored.event, StateEvent) and stored.event.state.final
-        while waiting and (waiting[-1].at <= stored.at if final else waiting[-1].at < stored.at):
-            merged.append((waiting.pop(), False))
-        merged.append((stored, True))
-    return merged + [(stored, False) for stored in reversed(waiting)]
 
 
 async def event_stream(follower: Follower, heartbeat: float, open_streams: Gauge) -> AsyncIterator[bytes]:
@@ -175,4 +172,4 @@ async def stored_stream(job: Job) -> AsyncIterator[bytes]:
     """Yield the end of a job that Redis has lost, which is all that storage knows of its events."""
     event = StateEvent(state=job.state, problem=job.problem)
     at = job.finished_at or job.created_at
-    yield encode(EventRecord(id=f"{START}_{START}_0", attempt=job.attempt, at=at, event=event))
+    yield encode(EventRecord(id=str(Position()), attempt=job.attempt, at=at, event=event))

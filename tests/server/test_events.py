@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import events
-from splatmill.schema import JobState, LogEvent, PlanEvent, ProgressEvent, StateEvent
+from splatmill.backplane import events, keys
+from splatmill.schema import JobState, LogEvent, MetricEvent, PlanEvent, Problem, ProgressEvent, StateEvent
 from tests.support.served_app import Serve, ServedApp, problem
 from tests.support.server_events import brief, follow, messages
 
@@ -135,14 +135,122 @@ def test_an_open_stream_does_not_hold_up_the_end_of_the_server(serve: Serve) -> 
 def test_the_progress_stream_is_trimmed_and_the_states_are_not(app: ServedApp) -> None:
     job_id = app.job()
     app.begin(job_id)
-    for n in range(events.PROGRESS_LENGTH + 500):
+    length = events.BOUNDS[keys.progress]
+    assert length is not None
+    for n in range(length + 500):
         app.say(job_id, ProgressEvent(stage="training", done=n), StateEvent(state=JobState.training))
     left = events.read_progress(app.redis, job_id)
-    assert events.PROGRESS_LENGTH <= len(left) < events.PROGRESS_LENGTH + 200
-    assert len(events.read_states(app.redis, job_id)) == events.PROGRESS_LENGTH + 501
+    assert length <= len(left) < length + 200
+    assert len(events.read_states(app.redis, job_id)) == length + 501
     latest = events.last_progress(app.redis, job_id)
     assert latest is not None
     assert latest.id == left[-1].id
+
+
+def metric(step: int) -> MetricEvent:
+    return MetricEvent(seconds=step, step=step, psnr=20.0, gaussians=10)
+
+
+@pytest.mark.slow
+def test_neither_progress_nor_a_talkative_log_pushes_out_warnings_and_the_curve(app: ServedApp) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.say(job_id, LogEvent(level="warning", message="7.jpg is left out"), metric(1))
+    for n in range(2 * max(bound for bound in events.BOUNDS.values() if bound)):
+        app.say(job_id, LogEvent(message=f"line {n}"), ProgressEvent(stage="training", done=n))
+    lines = app.http.get(f"/v1/jobs/{job_id}/logs?limit=10000").json()["lines"]
+    assert lines[0]["message"] == "7.jpg is left out"
+    assert lines[-1]["message"].startswith("line ")
+    assert [row["step"] for row in app.http.get(f"/v1/jobs/{job_id}/curve").json()["rows"]] == [1]
+    app.say(job_id, StateEvent(state=JobState.succeeded))
+    found = brief(follow(app, job_id))
+    assert found.count("metric") == 1
+
+
+def test_events_of_an_earlier_worker_are_read_with_those_of_this_one(app: ServedApp) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    for event in (
+        LogEvent(level="warning", message="old warning"),
+        metric(1),
+        ProgressEvent(stage="x", done=1),
+    ):
+        entry: Any = {"g": 1, "a": 1, "e": event.model_dump_json()}
+        app.redis.xadd(keys.progress(job_id), entry)
+    app.say(job_id, LogEvent(level="warning", message="new warning"), metric(2))
+    lines = app.http.get(f"/v1/jobs/{job_id}/logs").json()["lines"]
+    assert [line["message"] for line in lines] == ["old warning", "new warning"]
+    assert [row["step"] for row in app.http.get(f"/v1/jobs/{job_id}/curve").json()["rows"]] == [1, 2]
+    app.say(job_id, StateEvent(state=JobState.succeeded))
+    found = follow(app, job_id)
+    told = ["queued", "preparing", "log", "metric", 1, "log", "metric", "succeeded"]
+    assert sorted(map(str, brief(found))) == sorted(map(str, told))
+    for index, record in enumerate(found):
+        assert follow(app, job_id, record["id"]) == found[index + 1 :]
+
+
+def test_an_id_of_an_earlier_server_goes_on_after_its_event(app: ServedApp) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.say(job_id, ProgressEvent(stage="x", done=1))
+    (state,) = events.read_states(app.redis, job_id)
+    (progress,) = events.read_progress(app.redis, job_id)
+    app.say(job_id, LogEvent(message="new"), metric(2), StateEvent(state=JobState.succeeded))
+    found = follow(app, job_id, f"{state.id}_{progress.id}_2")
+    assert sorted(brief(found)[:-1]) == ["log", "metric"]
+    assert brief(found)[-1] == "succeeded"
+
+
+def test_the_curve_is_that_of_the_training_that_went_on(app: ServedApp) -> None:
+    job_id = app.job()
+    assert app.http.get(f"/v1/jobs/{job_id}/curve").json() == {"rows": []}
+    app.begin(job_id)
+    app.say(job_id, *map(metric, (10, 20, 30)))
+    app.begin(job_id)  # resumes from a checkpoint at step 15
+    app.say(job_id, *map(metric, (20, 40)))
+    rows = app.http.get(f"/v1/jobs/{job_id}/curve").json()["rows"]
+    assert [row["step"] for row in rows] == [10, 20, 40]
+    assert rows[0]["psnr"] == 20.0
+    problem(app.http.get("/v1/jobs/0123456789abcdef/curve"), 404, "job_not_found")
+
+
+@pytest.mark.parametrize("end", ["failed", "cancelled", "succeeded"])
+def test_the_log_of_an_ended_job_outlives_redis(app: ServedApp, end: str) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.say(job_id, LogEvent(level="warning", message="7.jpg is left out: a\nb"), metric(1))
+    if end == "cancelled":
+        app.http.post(f"/v1/jobs/{job_id}/cancel")
+    else:
+        failure = Problem.of("diverged", "It diverged.") if end == "failed" else None
+        app.say(job_id, StateEvent(state=JobState(end), problem=failure))
+    app.service.reaper.tick()
+    before = {name: app.http.get(f"/v1/jobs/{job_id}{name}").json() for name in ("", "/logs")}
+    text = app.http.get(f"/v1/jobs/{job_id}/logs?format=text")
+    app.redis.flushall()
+    assert {name: app.http.get(f"/v1/jobs/{job_id}{name}").json() for name in ("", "/logs")} == before
+    assert before["/logs"]["lines"][0]["message"] == "7.jpg is left out: a\nb"
+    assert before[""]["state"] == end
+    again = app.http.get(f"/v1/jobs/{job_id}/logs?format=text")
+    assert again.text == text.text
+    assert "Z  attempt 1  warning  7.jpg is left out: a\nb\n" in again.text
+    assert again.headers["content-type"].startswith("text/plain")
+    assert app.http.delete(f"/v1/jobs/{job_id}").status_code == 204
+    problem(app.http.get(f"/v1/jobs/{job_id}/logs"), 404, "job_not_found")
+
+
+def test_a_log_that_cannot_be_stored_is_stored_later(app: ServedApp) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.say(job_id, LogEvent(message="said"), StateEvent(state=JobState.failed))
+    assert app.service.storage.root is not None
+    jobs = app.service.storage.root / "jobs"
+    jobs.write_text("in the way")
+    app.service.reaper.tick()
+    jobs.unlink()
+    app.service.reaper.tick()
+    app.redis.flushall()
+    assert [line["message"] for line in app.http.get(f"/v1/jobs/{job_id}/logs").json()["lines"]] == ["said"]
 
 
 def test_logs_are_lines_of_all_attempts(app: ServedApp) -> None:

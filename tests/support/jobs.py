@@ -36,5 +36,5 @@ def read_job(connection: redis.Redis, job_id: str) -> Job:
 
 def messages(connection: redis.Redis, job_id: str) -> list[str]:
     """Return the job's log lines."""
-    logged = [stored.event for stored in events.read_progress(connection, job_id)]
+    logged = [stored.event for stored in events.read_log(connection, job_id)]
     return [event.message for event in logged if event.type == "log"]

@@ -1,11 +1,15 @@
-"""The two event streams of a job: `states`, which is never trimmed, and `progress`, which is. Only workers append.
+"""The event streams of a job. Only workers append.
+
+`states` is never trimmed, and each other stream has a bound of its own: frequent progress does not push out log lines,
+a talkative log does not push out warnings, and neither pushes out the curve.
 
 Each entry carries its generation and attempt. Its time is taken from the entry's id, which Redis assigns, so all
 machines share one clock.
 """
 
+import heapq
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, cast
@@ -14,11 +18,29 @@ import redis
 
 from splatmill.backplane import keys
 from splatmill.backplane.records import FORMAT, check_format, reason, warn
-from splatmill.schema import EVENT, Event, EventRecord, PlanEvent, ProgressEvent, StateEvent
+from splatmill.schema import (
+    EVENT,
+    CurveRow,
+    Event,
+    EventRecord,
+    LogEvent,
+    MetricEvent,
+    PlanEvent,
+    PreviewEvent,
+    ProgressEvent,
+    StateEvent,
+)
 from splatmill.schema.tolerant import keep_readable
 
-PROGRESS_LENGTH = 4000
-"""Number of entries to which the progress stream is trimmed: about one megabyte per job."""
+BOUNDS: dict[Callable[[str], str], int | None] = {
+    keys.states: None,
+    keys.progress: 4000,
+    keys.log: 5000,
+    keys.warnings: 5000,
+    keys.curve: 5000,
+}
+"""The streams of a job, as functions from its id to the key, each with the number of newest entries that are kept. In
+order of the time that their entries are reported with, where that is the same millisecond."""
 
 START = "0-0"
 """The position before the first entry of a stream."""
@@ -52,7 +74,7 @@ class StoredEvent:
         return stream_order(self.id)
 
     def record(self, cursor: str) -> EventRecord:
-        """Return the event as it is sent to clients, with `cursor`, a position in both streams, as its id."""
+        """Return the event as it is sent to clients, with `cursor`, a position in all streams, as its id."""
         return EventRecord(id=cursor, attempt=self.attempt, at=self.at, event=self.event)
 
 
@@ -62,9 +84,17 @@ def stream_order(entry_id: str) -> tuple[int, int]:
     return int(milliseconds), int(number or 0)
 
 
-def stream_of(job_id: str, event: Event) -> str:
-    """Return the key of the stream for an event: `fold` needs every state and plan, so these are never trimmed."""
-    return keys.states(job_id) if isinstance(event, StateEvent | PlanEvent) else keys.progress(job_id)
+def stream_of(event: Event) -> Callable[[str], str]:
+    """Return the stream for an event, one of BOUNDS."""
+    match event:
+        case StateEvent() | PlanEvent():
+            return keys.states
+        case LogEvent():
+            return keys.warnings if event.level in ("warning", "error") else keys.log
+        case MetricEvent():
+            return keys.curve
+        case ProgressEvent() | PreviewEvent():
+            return keys.progress
 
 
 def begin_attempt(connection: redis.Redis, job_id: str) -> int:
@@ -74,10 +104,9 @@ def begin_attempt(connection: redis.Redis, job_id: str) -> int:
 
 def append(connection: redis.Redis, job_id: str, generation: int, attempt: int, event: Event) -> str:
     """Append an event to its stream and return the id of the entry. For workers."""
-    key = stream_of(job_id, event)
+    stream = stream_of(event)
     fields = {"g": generation, "a": attempt, "e": event.model_dump_json(exclude_none=True), "format": FORMAT}
-    maxlen = PROGRESS_LENGTH if key == keys.progress(job_id) else None
-    return cast(bytes, connection.xadd(key, cast(Any, fields), maxlen=maxlen)).decode()
+    return cast(bytes, connection.xadd(stream(job_id), cast(Any, fields), maxlen=BOUNDS[stream])).decode()
 
 
 Entries = Iterable[tuple[bytes, Mapping[bytes, bytes]]]
@@ -121,8 +150,46 @@ def read_progress(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
     return decode(cast(Any, connection.xrange(key)), key)
 
 
+def read_log(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
+    """Return the log lines of all attempts at a job that were not trimmed, oldest first."""
+    found = _read(connection, job_id, keys.progress, keys.log, keys.warnings)
+    return [stored for stored in found if isinstance(stored.event, LogEvent)]
+
+
+def read_curve(connection: redis.Redis, job_id: str) -> list[CurveRow]:
+    """Return the curve of a job, by step. An attempt that resumed replaces the rows that came after its checkpoint."""
+    rows: list[CurveRow] = []
+    for stored in _read(connection, job_id, keys.progress, keys.curve):
+        if isinstance(stored.event, MetricEvent):
+            row = CurveRow.model_validate(stored.event.model_dump(exclude={"type"}))
+            while rows and rows[-1].step >= row.step:
+                rows.pop()
+            rows.append(row)
+    return rows
+
+
+def time_order(stored: StoredEvent) -> tuple[datetime, int]:
+    """Return a key that sorts entries of different streams of a job by time.
+
+    Within a millisecond, a state comes before other events, but a final state after them.
+    """
+    event = stored.event
+    if isinstance(event, StateEvent) and event.state.final:
+        return stored.at, 2
+    return stored.at, 0 if isinstance(event, StateEvent | PlanEvent) else 1
+
+
+def _read(connection: redis.Redis, job_id: str, *streams: Callable[[str], str]) -> list[StoredEvent]:
+    with connection.pipeline(transaction=False) as pipe:
+        for stream in streams:
+            pipe.xrange(stream(job_id))
+        replies = pipe.execute()
+    found = [decode(reply, stream(job_id)) for stream, reply in zip(streams, replies, strict=True)]
+    return list(heapq.merge(*found, key=time_order))  # keeps the order within each
+
+
 def last_progress(connection: redis.Redis, job_id: str) -> StoredEvent | None:
-    """Return the newest `ProgressEvent` among the last 1000 entries, which include log lines and metrics, or None."""
+    """Return the newest `ProgressEvent` among the last 1000 entries of the progress stream, or None."""
     key, end = keys.progress(job_id), "+"
     for _ in range(_PAGES):
         page = cast(Any, connection.xrevrange(key, max=end, count=_PAGE))

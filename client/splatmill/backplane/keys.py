@@ -23,8 +23,26 @@ def states(job_id: str) -> str:
 
 
 def progress(job_id: str) -> str:
-    """Return the key of the stream of progress, metrics, logs and previews, which is trimmed. Only workers append."""
+    """Return the key of the stream of progress and previews, which is trimmed. Only workers append.
+
+    Workers of earlier versions append metrics and log lines to it, too.
+    """
     return f"{PREFIX}job:{job_id}:progress"
+
+
+def log(job_id: str) -> str:
+    """Return the key of the stream of log lines below warnings, which is trimmed. Only workers append."""
+    return f"{PREFIX}job:{job_id}:log"
+
+
+def warnings(job_id: str) -> str:
+    """Return the key of the stream of warnings and errors, which is trimmed. Only workers append."""
+    return f"{PREFIX}job:{job_id}:warnings"
+
+
+def curve(job_id: str) -> str:
+    """Return the key of the stream of metrics, which is trimmed. Only workers append."""
+    return f"{PREFIX}job:{job_id}:curve"
 
 
 def attempts(job_id: str) -> str:
@@ -67,7 +85,8 @@ def uploads(owner: str) -> str:
 
 def of_job(job_id: str) -> tuple[str, ...]:
     """Return all keys of a job, for deletion."""
-    return job(job_id), states(job_id), progress(job_id), attempts(job_id), lock(job_id)
+    streams = states(job_id), progress(job_id), log(job_id), warnings(job_id), curve(job_id)
+    return job(job_id), *streams, attempts(job_id), lock(job_id)
 
 
 def lease(kind: str, name: str) -> str:

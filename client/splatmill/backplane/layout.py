@@ -11,6 +11,7 @@ captures/{id}/imports/{import}.json         record of a file that the server fet
 captures/{id}/sfm/...                       reconstruction, shared by the jobs of the capture
 imports/{capture}.{import}                  mark of an import that has not ended
 jobs/{id}/work/...                          checkpoints and other files from which another machine can resume
+jobs/{id}/log.jsonl                         the job as it ended, then the lines of its log
 models/{id}/{file}                          model.ply, report.json, report.png, report.html, cameras.json, ...
 models/{id}/job.json                        record of the ended job; written last: a model exists once it does
 
@@ -132,6 +133,11 @@ def job(job_id: str) -> str:
 
 def job_work(job_id: str) -> str:
     return f"jobs/{job_id}/work"
+
+
+def job_log(job_id: str) -> str:
+    """Return the path of the log of a job that has ended. Only the server writes it."""
+    return f"jobs/{job_id}/log.jsonl"
 
 
 def models() -> str:

@@ -40,6 +40,7 @@ from splatmill.schema.captures import (
 from splatmill.schema.events import (
     EVENT,
     FINAL_STATES,
+    Curve,
     CurveRow,
     Event,
     EventRecord,
@@ -166,6 +167,7 @@ __all__ = [
     "CreateCapture",
     "CreateImport",
     "CreateJob",
+    "Curve",
     "CurveRow",
     "Duration",
     "Effort",

@@ -67,6 +67,12 @@ class CurveRow(Response):
     train_ssim: Measured = Field(default=None, description="Mean over some of the training photos.")
 
 
+class Curve(Response):
+    """The response of `/v1/jobs/{id}/curve`, by step."""
+
+    rows: list[CurveRow]
+
+
 class StateEvent(Response):
     """The job entered a state. `problem` is the reason for the state failed."""
 

@@ -1,14 +1,15 @@
 """The endpoints for the outputs of a job: events, log, preview and report."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Header, Query
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import Response, StreamingResponse
+from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 
 from splatmill.backplane import events, layout
-from splatmill.schema import LogEvent, LogLine, LogPage, PreviewEvent, Report
+from splatmill.schema import Curve, LogPage, PreviewEvent, Report
+from splatmill_server import job_log
 from splatmill_server.files import file_response
 from splatmill_server.ownership import JobId
 from splatmill_server.problems import ProblemError
@@ -63,22 +64,42 @@ async def follow_events(
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
 
-@router.get("/logs", responses=problems("job_not_found"))
+@router.get(
+    "/logs",
+    response_model=LogPage,
+    responses=answer(200, "Lines of the log", content={"text/plain": {"schema": {"type": "string"}}})
+    | problems("job_not_found"),
+)
 def get_logs(
     service: Shared,
     job_id: JobId,
     limit: Annotated[
         int, Query(ge=1, le=10_000, description="Largest number of lines; the last ones are returned.")
     ] = 1000,
-) -> LogPage:
-    """Get the log lines of all attempts at a job, oldest first."""
+    form: Annotated[
+        Literal["json", "text"],
+        Query(
+            alias="format", description="json, or text for all lines as a text file; limit is ignored then."
+        ),
+    ] = "json",
+) -> Response:
+    """Get the log lines of all attempts at a job, oldest first. They are kept when the job has ended."""
     service.jobs.get(job_id)
-    lines = [
-        LogLine(attempt=stored.attempt, at=stored.at, level=stored.event.level, message=stored.event.message)
-        for stored in events.read_progress(service.redis, job_id)
-        if isinstance(stored.event, LogEvent)
-    ]
-    return LogPage(lines=lines[-limit:])
+    lines = job_log.read(service.redis, service.storage, job_id)
+    if form == "text":
+        headers = {"Content-Disposition": f'attachment; filename="{job_id}.log"'}
+        return PlainTextResponse(job_log.text(lines), headers=headers)
+    return JSONResponse(LogPage(lines=lines[-limit:]).model_dump(mode="json"))
+
+
+@router.get("/curve", responses=problems("job_not_found", "model_corrupt"))
+def get_curve(service: Shared, job_id: JobId) -> Curve:
+    """Get the error against run time that was measured so far, from the first measurement on."""
+    service.jobs.get(job_id)
+    if rows := events.read_curve(service.redis, job_id):
+        return Curve(rows=rows)
+    report = _report(service, job_id)
+    return Curve(rows=report.curve if report is not None else [])
 
 
 @router.get(
@@ -104,15 +125,23 @@ async def get_preview(service: Shared, job_id: JobId, request: Request) -> Respo
 def get_report(service: Shared, job_id: JobId) -> Report:
     """Get the report of a job: error against run time, the plan with its reasons, and where it ran."""
     job = service.jobs.get(job_id)
-    try:
-        return Report.model_validate_json(service.storage.get(layout.model_file(job_id, "report.json")))
-    except FileNotFoundError as error:
+    report = _report(service, job_id)
+    if report is None:
         raise ProblemError(
             "report_not_ready",
             f"The job {job_id} has no report; its state is {job.state.value}.",
             advice="The report is written with the model; try again when the job has succeeded.",
             facts={"state": job.state.value},
-        ) from error
+        )
+    return report
+
+
+def _report(service: Service, job_id: str) -> Report | None:
+    """Return the stored report of a job, or None. Raises a problem for one that cannot be read."""
+    try:
+        return Report.model_validate_json(service.storage.get(layout.model_file(job_id, "report.json")))
+    except FileNotFoundError:
+        return None
     except ValueError as error:
         raise ProblemError(
             "model_corrupt", f"The report of the job {job_id} cannot be read: {error}."
