@@ -12,6 +12,7 @@ from splatmill.connection import RETRIES, TIMEOUT, Connection, read_answer
 from splatmill.downloads import AnyPath
 from splatmill.errors import invalid_request
 from splatmill.job import AsyncJobHandle
+from splatmill.keys import AsyncKeys
 from splatmill.local_capture import find_files, start_model
 from splatmill.model import AsyncModelHandle, find_model
 from splatmill.schema import (
@@ -21,6 +22,7 @@ from splatmill.schema import (
     Info,
     Job,
     JobPage,
+    Me,
     Model,
     ModelPage,
     OptionHelp,
@@ -60,6 +62,7 @@ class AsyncClient:
         self.connection = Connection(
             server, api_key=api_key, timeout=timeout, transport=transport, retries=retries
         )
+        self.keys = AsyncKeys(self.connection)
 
     async def __aenter__(self) -> Self:
         return self
@@ -187,6 +190,10 @@ class AsyncClient:
         """Return the training options of the server, with type, default, range and help."""
         response = await self.connection.request("GET", "/v1/options")
         return read_answer(OptionList, response).options
+
+    async def me(self) -> Me:
+        """Return who the server takes the caller for: owner, scopes, limits and their use."""
+        return read_answer(Me, await self.connection.request("GET", "/v1/me"))
 
     async def info(self) -> Info:
         """Return the version, the workers and the limits of the server."""

@@ -10,6 +10,7 @@ from splatmill.aio import AsyncClient
 from splatmill.connection import RETRIES, TIMEOUT
 from splatmill.downloads import AnyPath, OnBytes
 from splatmill.job import AsyncJobHandle
+from splatmill.keys import Keys
 from splatmill.loop import BackgroundLoop
 from splatmill.model import AsyncModelHandle
 from splatmill.schema import (
@@ -21,6 +22,7 @@ from splatmill.schema import (
     Job,
     JobState,
     LogLine,
+    Me,
     Model,
     ModelCamera,
     OptionHelp,
@@ -56,6 +58,7 @@ class Client:
             server, api_key=api_key, timeout=timeout, transport=transport, retries=retries
         )
         self._loop = BackgroundLoop()
+        self.keys = Keys(self._loop, self._async.keys)
 
     def __enter__(self) -> Self:
         return self
@@ -157,6 +160,10 @@ class Client:
     def options(self) -> list[OptionHelp]:
         """Return the training options of the server, with type, default, range and help."""
         return self._loop.run(self._async.options())
+
+    def me(self) -> Me:
+        """Return who the server takes the caller for: owner, scopes, limits and their use."""
+        return self._loop.run(self._async.me())
 
     def info(self) -> Info:
         """Return the version, the workers and the limits of the server."""

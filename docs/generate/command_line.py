@@ -34,7 +34,7 @@ MEANINGS = {
     Exit.job_failed: "The job failed; the message has the problem's sentence, facts and advice.",
     Exit.unreachable: "No server answers, or a part of it is down or full; a later try may succeed.",
     Exit.refused: "The photos or the request cannot be used as they are.",
-    Exit.unauthorized: "The API key is missing or wrong.",
+    Exit.unauthorized: "The API key is missing or wrong, or does not permit the request.",
     Exit.not_found: "There is no such job, model or file, or it is in a state that does not allow the request.",
     Exit.no_service: "The service on this machine could not be started.",
     Exit.cancelled: "The command was stopped by Ctrl-C or SIGTERM, or the job was cancelled by another client.",
@@ -46,7 +46,10 @@ def page() -> str:
     group = get_command(app)
     parts = [INTRODUCTION]
     for name in COMMANDS:
-        parts.append(_command(name, group.get_command(None, name)))  # type: ignore[attr-defined]  # a group, as app is
+        command = group.get_command(None, name)  # type: ignore[attr-defined]  # a group, as app is
+        members = getattr(command, "commands", None)  # a group of commands, such as `keys`
+        parts += [_command(f"{name} {sub}", member) for sub, member in members.items()] if members else []
+        parts += [] if members else [_command(name, command)]
     rows = [[str(int(status)), MEANINGS[status]] for status in Exit]
     return "\n".join([*parts, EXIT_STATUS, table(["status", "meaning"], rows)])
 

@@ -18,6 +18,7 @@ from splatmill.backplane.connection import InvalidRedisUrl
 from splatmill.backplane.redact import redacted
 from splatmill.backplane.storage import StorageError
 from splatmill_server.app import create_app
+from splatmill_server.exposure import NeedsKey
 from splatmill_server.settings import Settings
 
 log = structlog.get_logger()
@@ -52,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for found in error.errors():
             print(f"splatmill_server: {_sentence(found)}", file=sys.stderr)
         return 2
-    except (StorageError, OSError, InvalidRedisUrl) as error:
+    except (StorageError, OSError, InvalidRedisUrl, NeedsKey) as error:
         print(f"splatmill_server: {error}", file=sys.stderr)
         return 2
     config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=GRACE_SECONDS)

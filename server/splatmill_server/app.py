@@ -14,12 +14,16 @@ import splatmill
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import CreateJob, EventRecord, Problem
 from splatmill_server import problems
+from splatmill_server.exposure import check_exposure
 from splatmill_server.middleware import RequestMiddleware
+from splatmill_server.permission import PERMITTED
 from splatmill_server.routes import captures, imports, job_outputs, jobs, models, status, storage, uploads
+from splatmill_server.routes import keys as key_routes
 from splatmill_server.service import Service
 from splatmill_server.settings import Settings
 
 log = structlog.get_logger()
+
 
 _DESCRIPTION = """Photos in, Gaussian splats out.
 
@@ -32,10 +36,12 @@ Cameras are 4x4 row-major camera-to-world matrices with OpenCV axes (x right, y 
 def create_app(settings: Settings | None = None) -> FastAPI:
     """Return the app for `settings`; by default, for the settings in the environment.
 
-    Redis need not run yet. Raises StorageError if storage cannot be opened.
+    Redis need not run yet. Raises StorageError if storage cannot be opened, and NeedsKey for a server without keys that
+    other machines could reach.
     """
     settings = settings or Settings()
     service = Service.of(settings)
+    check_exposure(settings, service.keys)
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -58,12 +64,15 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         lifespan=lifespan,
         docs_url=None,  # FastAPI's pages load scripts from other hosts
         redoc_url=None,
-        middleware=[Middleware(RequestMiddleware, settings=settings, metrics=service.metrics)],
+        middleware=[
+            Middleware(RequestMiddleware, settings=settings, keys=service.keys, metrics=service.metrics)
+        ],
     )
     app.state.service = service
     problems.install(app)
-    for module in (captures, uploads, imports, jobs, job_outputs, models, status, storage):
-        app.include_router(module.router)
+    modules = (captures, uploads, imports, jobs, job_outputs, models, key_routes, status, storage)
+    for module in modules:
+        app.include_router(module.router, dependencies=[PERMITTED])
     _describe(app, with_key=settings.api_key is not None)
     return app
 

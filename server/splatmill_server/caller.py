@@ -52,6 +52,9 @@ class Caller:
 KEYLESS = Caller(DEFAULT_OWNER, key_name="no key")
 """The caller of a server that has no keys."""
 
+NOBODY = Caller("", key_name="", scopes=frozenset())
+"""The caller of the paths that ask for no key."""
+
 BOOTSTRAP = Caller(DEFAULT_OWNER, key_name="SPLATMILL_API_KEY")
 """The caller that sends the key of the setting SPLATMILL_API_KEY."""
 

@@ -245,6 +245,10 @@ class Jobs:
 
         self.connection.transaction(remove, keys.job(job_id))
 
+    def unfinished_of(self, owner: str) -> int:
+        """Return the number of unfinished jobs of an owner."""
+        return sum(1 for found in self.active() if found.owner == owner)
+
     def unfinished_on(self, capture_id: str) -> str | None:
         """Return the id of an unfinished job on a capture, or None."""
         return next((found.id for found in self.active() if found.capture == capture_id), None)

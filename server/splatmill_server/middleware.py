@@ -3,7 +3,6 @@
 It is plain ASGI, because Starlette's BaseHTTPMiddleware buffers streams.
 """
 
-import hmac
 import logging
 import time
 import uuid
@@ -14,24 +13,25 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from splatmill.backplane.storage import StorageError
 from splatmill.schema import Problem, format_bytes
-from splatmill_server.caller import BOOTSTRAP, KEYLESS
+from splatmill_server.authentication import Authentication
+from splatmill_server.caller import NOBODY
+from splatmill_server.keys import Keys
 from splatmill_server.metrics import Metrics
-from splatmill_server.problems import ProblemError, ProblemResponse
+from splatmill_server.permission import OPEN_PATHS
+from splatmill_server.problems import ProblemError, ProblemResponse, problem_of_storage
 from splatmill_server.settings import Settings
 
 log = structlog.get_logger()
-
-OPEN_PATHS = frozenset({"/healthz", "/readyz", "/openapi.json", "/docs"})
-"""Paths that need no API key, for probes and browsers. They contain no data of users."""
 
 
 class RequestMiddleware:
     """Wraps the app."""
 
-    def __init__(self, app: ASGIApp, settings: Settings, metrics: Metrics) -> None:
+    def __init__(self, app: ASGIApp, settings: Settings, keys: Keys, metrics: Metrics) -> None:
         self.app = app
-        self.key = settings.api_key.get_secret_value().encode() if settings.api_key else None
+        self.authentication = Authentication(settings, keys)
         self.max_body = settings.max_json_bytes
         self.metrics = metrics
 
@@ -54,16 +54,13 @@ class RequestMiddleware:
                 marked["X-Content-Type-Options"] = "nosniff"
             await send(message)
 
-        scope.setdefault("state", {})["caller"] = BOOTSTRAP if self.key is not None else KEYLESS
+        scope.setdefault("state", {})["caller"] = NOBODY
         try:
             with structlog.contextvars.bound_contextvars(request=request_id):
-                refused = self._refusal(scope, headers)
-                if refused is not None:
-                    response = ProblemResponse(
-                        refused,
-                        scope["path"],
-                        {"WWW-Authenticate": "Bearer"} if refused.status == 401 else None,
-                    )
+                try:
+                    await self._admit(scope, headers)
+                except ProblemError as refused:
+                    response = ProblemResponse(refused.problem, scope["path"], refused.headers)
                     await response(scope, receive, send_marked)
                 else:
                     await self._answer(scope, self._bounded(scope, headers, receive), send_marked)
@@ -109,19 +106,18 @@ class RequestMiddleware:
             )
             await ProblemResponse(problem, scope["path"])(scope, receive, send)
 
-    def _refusal(self, scope: Scope, headers: Headers) -> Problem | None:
-        if self.key is not None and scope["path"] not in OPEN_PATHS:
-            scheme, _, given = headers.get("authorization", "").partition(" ")
-            if scheme.lower() != "bearer" or not hmac.compare_digest(given.strip().encode(), self.key):
-                return Problem.of(
-                    "unauthorized",
-                    "The request has no API key, or a wrong one.",
-                    advice="Send the header 'Authorization: Bearer KEY'. A key in the address is ignored.",
-                )
+    async def _admit(self, scope: Scope, headers: Headers) -> None:
+        """Find the caller. Raises ProblemError for a request that is refused before its body is read."""
+        if scope["path"] not in OPEN_PATHS:
+            try:
+                scope["state"]["caller"] = await self.authentication.caller(headers)
+            except StorageError as error:
+                log.warning("keys cannot be read", error=str(error))
+                found = problem_of_storage(error)
+                raise ProblemError(found.code, found.detail, advice=found.advice) from error
         length = headers.get("content-length", "0")
         if not _streams(scope, headers) and length.isdigit() and int(length) > self.max_body:
-            return self._too_large(int(length))
-        return None
+            raise self._too_large(int(length))
 
     def _bounded(self, scope: Scope, headers: Headers, receive: Receive) -> Callable[[], Awaitable[Message]]:
         """Return a `receive` that raises a 413 problem once a body without Content-Length grows too large."""
@@ -134,14 +130,13 @@ class RequestMiddleware:
             message = await receive()
             seen += len(message.get("body", b""))
             if seen > self.max_body:
-                problem = self._too_large(seen)
-                raise ProblemError(problem.code, problem.detail, advice=problem.advice, facts=problem.facts)
+                raise self._too_large(seen)
             return message
 
         return bounded
 
-    def _too_large(self, size: int) -> Problem:
-        return Problem.of(
+    def _too_large(self, size: int) -> ProblemError:
+        return ProblemError(
             "body_too_large",
             f"The body has {format_bytes(size)} or more; at most {format_bytes(self.max_body)} "
             f"are accepted here.",

@@ -17,6 +17,7 @@ from splatmill.backplane.storage import Storage, StorageError
 from splatmill_server.captures import Captures
 from splatmill_server.imports import Imports
 from splatmill_server.jobs import Jobs
+from splatmill_server.keys import Keys
 from splatmill_server.metrics import Metrics
 from splatmill_server.models import Models
 from splatmill_server.outgoing import Outgoing
@@ -68,6 +69,7 @@ class Service:
     imports: Imports
     jobs: Jobs
     models: Models
+    keys: Keys
     reaper: Reaper
     usage: Usage
     closing: asyncio.Event = field(default_factory=asyncio.Event)
@@ -94,6 +96,7 @@ class Service:
             imports=Imports(connection, storage, captures, Outgoing(settings.outgoing_allow), settings),
             jobs=jobs,
             models=Models(storage, jobs),
+            keys=Keys(storage, bootstrap=settings.api_key is not None),
             reaper=Reaper(connection, jobs, metrics, settings),
             usage=Usage(storage, Ledger(connection)),
         )

@@ -97,12 +97,12 @@ class Settings(BaseSettings):
             rendering.address(self.renderer_url)
         if self.api_key is not None and not self.api_key.get_secret_value():
             self.api_key = None
-        if self.api_key is None and self.uds is None and not is_loopback(self.host):
-            raise ValueError(
-                f"Listening on {self.host} gives other machines access, which requires an API key: "
-                "set SPLATMILL_API_KEY, or listen on 127.0.0.1."
-            )
         return self
+
+    @property
+    def local(self) -> bool:
+        """Whether the server listens where only this machine reaches it, and so may do without keys."""
+        return self.uds is not None or is_loopback(self.host)
 
 
 def is_loopback(host: str) -> bool:

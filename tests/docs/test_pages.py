@@ -61,6 +61,13 @@ def test_every_command_and_flag_named_exists(page: Path) -> None:
     names = "|".join(COMMANDS)
     for name, rest in re.findall(rf"splatmill ({names})\b([^`\n|]*)", page.read_text()):
         command = group.get_command(None, name)  # type: ignore[attr-defined]  # a group, as app is
+        if hasattr(command, "commands"):  # a group of commands
+            rest = rest.removeprefix(" ")
+            sub, _, rest = rest.partition(" ")
+            if sub not in command.commands:
+                assert not rest.strip(), f"splatmill {name} {sub}"
+                continue
+            command, rest = command.commands[sub], f" {rest}"
         if command.context_settings.get("ignore_unknown_options"):
             continue
         known = {flag for option in command.params for flag in [*option.opts, *option.secondary_opts]}

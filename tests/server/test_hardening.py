@@ -13,6 +13,8 @@ import pytest
 from splatmill.backplane.connection import InvalidRedisUrl, connect, connect_async
 from splatmill.backplane.redact import redacted
 from splatmill_server import service
+from splatmill_server.app import create_app
+from splatmill_server.exposure import NeedsKey
 from splatmill_server.settings import Settings
 from tests.support.served_app import Serve, ServedApp
 
@@ -106,10 +108,10 @@ def test_no_program_prints_the_password_of_redis(url: str, program: str, tmp_pat
     assert "Traceback" not in ran.stderr
 
 
-def test_the_settings_do_not_show_the_password() -> None:
+def test_the_settings_do_not_show_the_password(tmp_path: Path) -> None:
     assert PASSWORD not in repr(Settings(redis_url=f"redis://:{PASSWORD}@h/0"))
-    with pytest.raises(ValueError, match="access") as caught:
-        Settings(redis_url=f"redis://:{PASSWORD}@h/0", host="0.0.0.0")
+    with pytest.raises(NeedsKey, match="access") as caught:
+        create_app(Settings(redis_url=f"redis://:{PASSWORD}@h/0", host="0.0.0.0", data=tmp_path))
     assert PASSWORD not in str(caught.value)
 
 

@@ -14,6 +14,8 @@ jobs/{id}/work/...                          checkpoints and other files from whi
 jobs/{id}/log.jsonl                         the job as it ended, then the lines of its log
 models/{id}/{file}                          model.ply, report.json, report.png, report.html, cameras.json, ...
 models/{id}/job.json                        record of the ended job; written last: a model exists once it does
+keys/{id}.json                              a key of the API: its owner, scopes, limits, and the digests of its secrets
+keys/{id}.revoked                           the key was revoked; it counts more than the record beside it
 
 The id of a model is that of the job that made it.
 """
@@ -155,3 +157,15 @@ def model_file(model_id: str, name: str) -> str:
 def job_record(job_id: str) -> str:
     """Return the path of `job.json`, from which a finished job is read when Redis has lost it."""
     return f"models/{job_id}/job.json"
+
+
+def keys() -> str:
+    return "keys"
+
+
+def key_record(key_id: str) -> str:
+    return f"keys/{key_id}.json"
+
+
+def key_revocation(key_id: str) -> str:
+    return f"keys/{key_id}.revoked"

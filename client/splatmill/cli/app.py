@@ -22,6 +22,7 @@ COMMANDS = {
     "storage": ("splatmill.cli.storage", "storage"),
     "fit-image": ("splatmill.cli.fit_image", "fit_image"),
     "options": ("splatmill.cli.jobs", "options"),
+    "keys": ("splatmill.cli.keys", "keys"),
     "doctor": ("splatmill.cli.service", "doctor"),
     "bench": ("splatmill.cli.service", "bench"),
 }
@@ -40,9 +41,12 @@ class Commands(TyperGroup):
         if cmd_name not in COMMANDS:
             return None
         module, function = COMMANDS[cmd_name]
+        found = getattr(import_module(module), function)
+        if isinstance(found, typer.Typer):  # a group of commands
+            return typer.main.get_command(found)
         single = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
         settings = PASS_ARGUMENTS_ON if cmd_name in ("up", "doctor", "bench") else None
-        single.command(cmd_name, context_settings=settings)(getattr(import_module(module), function))
+        single.command(cmd_name, context_settings=settings)(found)
         return typer.main.get_command(single)
 
     def invoke(self, ctx: Any) -> Any:

@@ -43,6 +43,8 @@ PROBLEMS: dict[str, Kind] = {
     "idempotency_conflict": Kind(409, "This Idempotency-Key was used for another request"),
     "too_many_requests": Kind(429, "Too many requests"),
     # Resources that do not exist, do not exist yet, or are in the wrong state.
+    "key_not_found": Kind(404, "There is no such API key"),
+    "admin_key_needed": Kind(409, "There must be an API key with the scope admin"),
     "capture_not_found": Kind(404, "There is no such capture"),
     "job_not_found": Kind(404, "There is no such job"),
     "model_not_found": Kind(404, "There is no such model"),

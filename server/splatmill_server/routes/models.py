@@ -9,12 +9,13 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from splatmill.backplane import layout, rendering
-from splatmill.schema import Model, ModelCameras, ModelPage, OrbitRequest, RenderRequest
+from splatmill.schema import Model, ModelCameras, ModelPage, OrbitRequest, RenderRequest, Scope
 from splatmill_server.files import file_response
 from splatmill_server.filters import Filter
 from splatmill_server.forward import forward
 from splatmill_server.ownership import ListedOwner, ModelId
 from splatmill_server.paging import DEFAULT_LIMIT
+from splatmill_server.permission import needs
 from splatmill_server.routes.openapi import CAMERA, RENDER_REQUESTS, answer, binary, problems
 from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit, NamePart
 from splatmill_server.service import Shared
@@ -113,6 +114,7 @@ def get_cameras(service: Shared, model_id: ModelId) -> ModelCameras:
     responses=_RENDERED | _RENDER_PROBLEMS | problems("unsupported_media_type", "body_too_large"),
     dependencies=[JSON_ONLY],
 )
+@needs(Scope.read)
 async def render(
     service: Shared,
     model_id: ModelId,
@@ -154,6 +156,7 @@ async def render_cacheable(service: Shared, model_id: ModelId, request: Request)
     | problems("unsupported_media_type", "body_too_large", "size_out_of_range"),
     dependencies=[JSON_ONLY],
 )
+@needs(Scope.read)
 async def orbit(
     service: Shared,
     model_id: ModelId,

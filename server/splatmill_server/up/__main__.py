@@ -19,7 +19,7 @@ def main(argv: list[str] | None = None) -> int:
     chosen = _parser().parse_args(argv)
     key = os.environ.get("SPLATMILL_API_KEY") or None
     try:
-        with _listen(chosen.host, chosen.port, key) as listener:
+        with _listen(chosen.host, chosen.port, chosen.data) as listener:
             folder = DataFolder(chosen.data)
             try:
                 url = _url(chosen.host, listener.getsockname()[1])
@@ -50,7 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address to listen on (default: %(default)s); other machines need SPLATMILL_API_KEY",
+        help="address to listen on (default: %(default)s); other machines need a key",
     )
     parser.add_argument(
         "--port",
@@ -73,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _listen(host: str, port: int, key: str | None) -> socket.socket:
+def _listen(host: str, port: int, data: Path) -> socket.socket:
     """Return the listening socket. Raises UpError for a port in use, and for a public address without a key."""
     if not 0 <= port <= 65535:
         # getaddrinfo takes the port modulo 65536
@@ -85,12 +85,7 @@ def _listen(host: str, port: int, key: str | None) -> socket.socket:
     except OSError as error:
         raise UpError(f"Cannot listen on {host}:{port}: {error}. Choose another --host or --port.") from error
     family, kind, protocol, _, address = found[0]
-    if key is None and not _loopback(str(address[0])):
-        raise UpError(
-            f"Listening on {host} gives other machines access, which requires an API key: set "
-            f"SPLATMILL_API_KEY to a "
-            "secret text, or listen on 127.0.0.1."
-        )
+    _check_exposure(str(address[0]).partition("%")[0], data)
     listener = socket.socket(family, kind, protocol)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -107,8 +102,20 @@ def _listen(host: str, port: int, key: str | None) -> socket.socket:
     return listener
 
 
-def _loopback(address: str) -> bool:
-    return ipaddress.ip_address(address.partition("%")[0]).is_loopback
+def _check_exposure(address: str, data: Path) -> None:
+    """Raise UpError if other machines could reach a server without keys."""
+    if ipaddress.ip_address(address).is_loopback:
+        return
+    from splatmill.backplane.storage import Storage, StorageError
+    from splatmill_server.exposure import check_exposure
+    from splatmill_server.keys import Keys
+    from splatmill_server.settings import Settings
+
+    try:
+        settings = Settings(data=data, host=address)
+        check_exposure(settings, Keys(Storage(settings.storage), bootstrap=settings.api_key is not None))
+    except (ValueError, StorageError) as error:
+        raise UpError(str(error)) from error
 
 
 def _url(host: str, port: int) -> str:

@@ -19,9 +19,12 @@ STOP_SECONDS = 3
 def main(descriptor: int) -> None:
     """Serve on the listening socket with this file descriptor until a signal arrives."""
     configure_logging()
-    app = create_app(Settings())
+    listener = socket.socket(fileno=descriptor)
+    address = listener.getsockname()
+    # The supervisor has opened the socket; whether other machines reach it does not follow from SPLATMILL_HOST.
+    app = create_app(Settings(host=address[0]) if isinstance(address, tuple) else Settings())
     config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=STOP_SECONDS)
-    Server(config, app).run(sockets=[socket.socket(fileno=descriptor)])
+    Server(config, app).run(sockets=[listener])
 
 
 if __name__ == "__main__":

@@ -1,0 +1,106 @@
+"""The keys of a server: `AsyncClient.keys` and `Client.keys`, for callers with the scope admin."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from splatmill.connection import Connection, read_answer
+from splatmill.errors import invalid_request
+from splatmill.loop import BackgroundLoop
+from splatmill.schema import (
+    DEFAULT_OWNER,
+    CreateKey,
+    Key,
+    KeyLimits,
+    KeyList,
+    KeyWithSecret,
+    RotateKey,
+    Scope,
+)
+
+R = TypeVar("R", CreateKey, RotateKey)
+
+
+class AsyncKeys:
+    """Creates, lists, revokes and rotates the keys of a server."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    async def create(
+        self,
+        name: str,
+        *,
+        owner: str = DEFAULT_OWNER,
+        scopes: Iterable[Scope | str] = (Scope.read, Scope.train),
+        limits: KeyLimits | Mapping[str, Any] | None = None,
+    ) -> KeyWithSecret:
+        """Create a key. `secret` of the returned key is what clients send; the server cannot show it again.
+
+        limits: `unfinished_jobs`, `bytes_stored` and `requests_per_minute`; what is left out has no limit.
+
+        Raises Conflict if the first key of a server does not have the scope admin.
+        """
+        given = limits.model_dump() if isinstance(limits, KeyLimits) else dict(limits or {})
+        body = {"name": name, "owner": owner, "scopes": list(scopes), "limits": given}
+        request = _checked(CreateKey, body)
+        # It is sent once: repeated after a lost answer, it would leave a key that nobody knows of.
+        response = await self._connection.request("POST", "/v1/keys", json=request.model_dump(mode="json"))
+        return read_answer(KeyWithSecret, response)
+
+    async def list(self) -> list[Key]:
+        """Return the keys, the oldest first."""
+        return read_answer(KeyList, await self._connection.request("GET", "/v1/keys")).keys
+
+    async def revoke(self, key_id: str) -> None:
+        """Revoke a key. The server refuses it within two seconds.
+
+        Raises NotFound, and Conflict for the last key with the scope admin.
+        """
+        await self._connection.request("DELETE", f"/v1/keys/{key_id}")
+
+    async def rotate(self, key_id: str, *, grace: float | str = 0.0) -> KeyWithSecret:
+        """Give a key a new secret. The former one stays valid for `grace`: seconds, or a text such as `1h`."""
+        request = _checked(RotateKey, {"grace": grace})
+        path = f"/v1/keys/{key_id}/rotate"
+        response = await self._connection.request("POST", path, json=request.model_dump(mode="json"))
+        return read_answer(KeyWithSecret, response)
+
+
+class Keys:
+    """The synchronous twin of `AsyncKeys`; see there."""
+
+    def __init__(self, loop: BackgroundLoop, keys: AsyncKeys) -> None:
+        self._loop = loop
+        self._async = keys
+
+    def create(
+        self,
+        name: str,
+        *,
+        owner: str = DEFAULT_OWNER,
+        scopes: Iterable[Scope | str] = (Scope.read, Scope.train),
+        limits: KeyLimits | Mapping[str, Any] | None = None,
+    ) -> KeyWithSecret:
+        """Create a key. `secret` of the returned key is what clients send; the server cannot show it again."""
+        return self._loop.run(self._async.create(name, owner=owner, scopes=scopes, limits=limits))
+
+    def list(self) -> list[Key]:
+        """Return the keys, the oldest first."""
+        return self._loop.run(self._async.list())
+
+    def revoke(self, key_id: str) -> None:
+        """Revoke a key. The server refuses it within two seconds."""
+        self._loop.run(self._async.revoke(key_id))
+
+    def rotate(self, key_id: str, *, grace: float | str = 0.0) -> KeyWithSecret:
+        """Give a key a new secret. The former one stays valid for `grace`: seconds, or a text such as `1h`."""
+        return self._loop.run(self._async.rotate(key_id, grace=grace))
+
+
+def _checked(kind: type[R], body: Mapping[str, Any]) -> R:
+    try:
+        return kind.model_validate(body)
+    except ValidationError as error:
+        raise invalid_request(error) from error

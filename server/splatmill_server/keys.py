@@ -1,0 +1,239 @@
+"""The keys of the API. They are stored hashed in storage, one file a key; no other code writes there.
+
+A secret is `smk_<id>_<64 hex digits>`: the beginning makes a leaked secret recognisable, the id finds its record
+without a search. The hex digits are 256 random bits, so a plain SHA-256 protects them: the slow hashes that protect
+passwords are needed for texts that can be guessed, and nobody can try 2**256.
+"""
+
+import asyncio
+import hashlib
+import hmac
+import json
+import re
+import secrets
+import threading
+import time
+from datetime import UTC, datetime, timedelta
+
+from pydantic import BaseModel
+from starlette.concurrency import run_in_threadpool
+
+from splatmill.backplane import layout
+from splatmill.backplane.records import FORMAT, check_format, reason, warn
+from splatmill.backplane.storage import Storage
+from splatmill.schema import CreateKey, Key, KeyWithSecret, Scope, Time
+from splatmill_server.problems import ProblemError
+
+CACHE_SECONDS = 2.0
+"""Seconds after which every API process knows of a change to the keys, and so the longest life of a revoked key."""
+
+_SECRET = re.compile(r"smk_([0-9a-f]{16})_[0-9a-f]{64}", re.ASCII)
+
+
+class StoredSecret(BaseModel):
+    """A secret of a key.
+
+    sha256: digest of the whole secret in hex.
+    until: when it stops being valid; None for the present secret.
+    """
+
+    sha256: str
+    until: Time | None = None
+
+
+class StoredKey(Key):
+    """A key with the digests of its secrets."""
+
+    secrets: list[StoredSecret]
+
+    def accepts(self, digest: str) -> bool:
+        """Return whether a secret with this SHA-256 is one of the key's at this moment. Takes constant time."""
+        now = datetime.now(UTC)
+        valid = [held.sha256 for held in self.secrets if held.until is None or now < held.until]
+        # Every digest is compared, so that the time tells nothing about which one matched.
+        return sum(hmac.compare_digest(digest.encode(), one.encode()) for one in valid) > 0
+
+    def public(self) -> Key:
+        """Return what clients see of the key."""
+        fields = self.model_dump(exclude={"secrets"})
+        former = max((held.until for held in self.secrets if held.until is not None), default=None)
+        fields["former_valid_until"] = former if former is not None and former > datetime.now(UTC) else None
+        return Key.model_validate(fields)
+
+
+class Keys:
+    """All operations on keys. The records in storage are the truth, of which every process keeps a copy for a moment.
+
+    bootstrap: whether the server has SPLATMILL_API_KEY, which is an admin's key that is not stored.
+    """
+
+    def __init__(self, storage: Storage, *, bootstrap: bool) -> None:
+        self.storage = storage
+        self.bootstrap = bootstrap
+        self._lock = threading.Lock()
+        self._reading = asyncio.Lock()
+        self._read_at = float("-inf")
+        self._known: dict[str, tuple[str, StoredKey | None]] = {}
+
+    async def current(self) -> None:
+        """Read the keys again if the copy is older than CACHE_SECONDS, and raise StorageError where that fails."""
+        if not self._stale():
+            return
+        async with self._reading:
+            if self._stale():
+                await run_in_threadpool(self.read)
+
+    def _stale(self) -> bool:
+        return time.monotonic() - self._read_at > CACHE_SECONDS
+
+    def read(self) -> None:
+        """Read the keys that were changed since the last time. Raises StorageError."""
+        with self._lock:
+            began = time.monotonic()
+            entries = {entry.path: entry.etag for entry in self.storage.entries(layout.keys())}
+            known: dict[str, tuple[str, StoredKey | None]] = {}
+            for path, etag in entries.items():
+                key_id = path.rsplit("/", 1)[-1].removesuffix(".json")
+                if path != layout.key_record(key_id) or layout.key_revocation(key_id) in entries:
+                    continue
+                before = self._known.get(key_id)
+                known[key_id] = (
+                    before if before is not None and before[0] == etag else (etag, self._load(key_id))
+                )
+            self._known = known
+            self._read_at = began
+
+    def any(self) -> bool:
+        """Return whether there are keys, readable or not, as of the last reading."""
+        return bool(self._known)
+
+    def find(self, secret: str) -> StoredKey | None:
+        """Return the key that a secret belongs to, as of the last reading, or None."""
+        match = _SECRET.fullmatch(secret)
+        return self.with_secret(match[1], digest(secret)) if match else None
+
+    def with_secret(self, key_id: str, sha256: str) -> StoredKey | None:
+        """Return the key with this id if a secret with this digest is valid, as of the last reading, or None."""
+        _, key = self._known.get(key_id, ("", None))
+        return key if key is not None and key.accepts(sha256) else None
+
+    def page(self) -> list[Key]:
+        """Return all keys, the oldest first."""
+        self.read()
+        found = [key for _, key in self._known.values() if key is not None]
+        return [key.public() for key in sorted(found, key=lambda key: (key.created_at, key.id))]
+
+    def get(self, key_id: str) -> StoredKey:
+        """Return a key. Raises a 404 problem."""
+        self.read()
+        _, key = self._known.get(key_id, ("", None))
+        if key is None:
+            raise ProblemError(
+                "key_not_found",
+                f"There is no key {key_id[:80]!r}.",
+                advice="List the keys with GET /v1/keys.",
+            )
+        return key
+
+    def create(self, request: CreateKey) -> KeyWithSecret:
+        """Create a key. Raises a 409 problem if there would be keys, but none of an admin."""
+        self.read()
+        if Scope.admin not in request.scopes and not self._admin_besides(None):
+            raise ProblemError(
+                "admin_key_needed",
+                "The first key must have the scope admin: with it, the server asks for a key, and nobody else could "
+                "make or revoke keys.",
+                advice="Create a key with the scope admin first, or start the server with SPLATMILL_API_KEY.",
+            )
+        key_id = secrets.token_hex(8)
+        secret = _new_secret(key_id)
+        key = StoredKey(
+            id=key_id,
+            name=request.name,
+            owner=request.owner,
+            scopes=[scope for scope in Scope if scope in request.scopes],
+            limits=request.limits,
+            created_at=datetime.now(UTC),
+            secrets=[StoredSecret(sha256=digest(secret))],
+        )
+        self._store(key)
+        return _shown_once(key, secret)
+
+    def rotate(self, key_id: str, grace: float) -> KeyWithSecret:
+        """Give a key a new secret; the present one stays valid for `grace` seconds. Raises a 404 problem.
+
+        Of two rotations at once, the later one counts: the secret of the other is not valid.
+        """
+        key = self.get(key_id)
+        now = datetime.now(UTC)
+        until = now + timedelta(seconds=grace)
+        former = [held.model_copy(update={"until": min(held.until or until, until)}) for held in key.secrets]
+        secret = _new_secret(key_id)
+        valid = [held for held in former if held.until is not None and held.until > now]
+        changed = key.model_copy(
+            update={"rotated_at": now, "secrets": [StoredSecret(sha256=digest(secret)), *valid]}
+        )
+        self._store(changed)
+        return _shown_once(changed, secret)
+
+    def revoke(self, key_id: str) -> None:
+        """Revoke a key for good. Raises a 404 problem, and a 409 problem for the last key of an admin.
+
+        The revocation is a file of its own, which counts more than the record: a rotation at the same moment, which
+        writes the record again, does not bring the key back.
+        """
+        key = self.get(key_id)
+        if Scope.admin in key.scopes and not self._admin_besides(key_id):
+            raise ProblemError(
+                "admin_key_needed",
+                f"{key.name!r} is the last key with the scope admin; without it, nobody could make or revoke keys.",
+                advice="Create another key with the scope admin first, or start the server with SPLATMILL_API_KEY.",
+            )
+        revoked = {
+            "id": key.id,
+            "name": key.name,
+            "owner": key.owner,
+            "revoked_at": datetime.now(UTC).isoformat(),
+        }
+        self.storage.put(layout.key_revocation(key_id), json.dumps(revoked | {"format": FORMAT}).encode())
+        self.storage.delete(layout.key_record(key_id))
+        self.read()
+
+    def _admin_besides(self, key_id: str | None) -> bool:
+        """Return whether an admin's key is left without the key `key_id`."""
+        others = (key for found, (_, key) in self._known.items() if found != key_id)
+        return self.bootstrap or any(key is not None and Scope.admin in key.scopes for key in others)
+
+    def _store(self, key: StoredKey) -> None:
+        record = key.model_dump(mode="json", exclude_none=True) | {"format": FORMAT}
+        self.storage.put(layout.key_record(key.id), json.dumps(record, indent=1).encode())
+        self.read()
+
+    def _load(self, key_id: str) -> StoredKey | None:
+        """Return the key of a record, or None for one that is not readable in every part: no limit may get lost."""
+        try:
+            record = json.loads(self.storage.get(layout.key_record(key_id)))
+            check_format(record)
+            key = StoredKey.model_validate(record)
+        except FileNotFoundError:
+            return None
+        except (ValueError, TypeError, AttributeError) as error:
+            warn(
+                layout.key_record(key_id),
+                f"the key is not accepted, because it cannot be read: {reason(error)}",
+            )
+            return None
+        return key if key.id == key_id else None
+
+
+def digest(secret: str) -> str:
+    """Return the SHA-256 of a secret in hex."""
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
+def _new_secret(key_id: str) -> str:
+    return f"smk_{key_id}_{secrets.token_hex(32)}"
+
+
+def _shown_once(key: StoredKey, secret: str) -> KeyWithSecret:
+    return KeyWithSecret(**key.public().model_dump(), secret=secret)

@@ -1,0 +1,143 @@
+"""Every endpoint of the OpenAPI document, walked: what another owner, a read-only key and nobody get.
+
+An endpoint with a path parameter that this test does not know fails it: say in `world` what fills the parameter. Not
+proved here: what the endpoints do for those who may (the tests of each noun).
+"""
+
+import json
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from splatmill.backplane import layout
+from splatmill.schema import Scope
+from splatmill_server.app import create_app
+from splatmill_server.settings import Settings
+from tests.support.served_app import Serve, ServedApp, problem
+
+OPEN = {"/healthz", "/readyz", "/openapi.json", "/docs"}
+SAFE = {"get", "head", "options"}
+READS = {"/v1/models/{model_id}/render", "/v1/models/{model_id}/orbit"}
+"""Addresses whose POST changes nothing."""
+
+OWN = {"capture_id", "job_id", "model_id"}
+"""Path parameters that name a record of an owner."""
+
+pytestmark = pytest.mark.slow
+
+
+@dataclass
+class World:
+    """A server with records of ann, and keys: `bob` may train, `reader` may read ann's records, `root` is an admin."""
+
+    app: ServedApp
+    ids: dict[str, str]
+    secrets: dict[str, str]
+
+    def ask(self, who: str, method: str, template: str) -> Any:
+        path = template.replace("{name}", "a.jpg").replace("{role}", "images")
+        for name, value in self.ids.items():
+            path = path.replace(f"{{{name}}}", value)
+        assert "{" not in path, f"tell this test what fills the parameter of {template}"
+        secret = self.secrets.get(who)
+        headers = {"Authorization": f"Bearer {secret}" if secret else "none"}
+        with self.app.http.stream(method, path, headers=headers) as answer:
+            if not answer.headers.get("content-type", "").startswith("text/event-stream"):
+                answer.read()  # a stream of events has no end before its job has
+        return answer
+
+
+@pytest.fixture
+def operations() -> list[tuple[str, str, dict[str, Any]]]:
+    with tempfile.TemporaryDirectory() as folder:
+        document = create_app(Settings(data=Path(folder))).openapi()
+    found = [
+        (method, path, operation)
+        for path, methods in document["paths"].items()
+        for method, operation in methods.items()
+    ]
+    assert len(found) > 25
+    return found
+
+
+@pytest.fixture
+def world(serve: Serve) -> World:
+    app = serve(api_key="s3cret")
+
+    def key(owner: str, *scopes: str) -> dict[str, Any]:
+        answer = app.http.post("/v1/keys", json={"name": owner, "owner": owner, "scopes": scopes})
+        return dict(answer.json())
+
+    ann = key("ann", "train")
+    secrets = {
+        "ann": ann["secret"],
+        "bob": key("bob", "train")["secret"],
+        "reader": key("ann", "read")["secret"],
+        "root": "s3cret",
+    }
+    app.http.headers["Authorization"] = f"Bearer {secrets['ann']}"
+    capture = app.capture()
+    done, waiting = app.job(capture), app.job(capture)
+    app.begin(done)
+    app.finish(done)
+    record = json.loads(app.service.storage.get(layout.job_record(done)))
+    app.service.storage.put(layout.job_record(done), json.dumps(record | {"owner": "ann"}).encode())
+    ids = {"capture_id": capture, "job_id": waiting, "model_id": done, "key_id": ann["id"]}
+    return World(app, ids, secrets)
+
+
+def test_nobody_gets_in(world: World, operations: list[tuple[str, str, dict[str, Any]]]) -> None:
+    for method, path, _ in operations:
+        answer = world.ask("nobody", method, path)
+        assert answer.status_code == (200 if path in OPEN else 401), (method, path)
+
+
+def test_another_owner_learns_nothing(
+    world: World, operations: list[tuple[str, str, dict[str, Any]]]
+) -> None:
+    tried = 0
+    for method, path, operation in operations:
+        names = {found["name"] for found in operation.get("parameters", []) if found["in"] == "path"}
+        answer = world.ask("bob", method, path)
+        if names & OWN:
+            found = problem(answer, 404, answer.json()["code"])
+            assert found["code"] in {f"{name.removesuffix('_id')}_not_found" for name in names & OWN}, path
+            tried += 1
+        elif answer.status_code == 403:
+            assert problem(answer, 403, "forbidden")["facts"]["needed"] == "admin", path
+        else:
+            # A list, or something about the service: without ann and without any id of hers.
+            assert not [known for known in world.ids.values() if known in answer.text], path
+            assert '"ann"' not in answer.text, path
+    assert tried > 15
+    assert world.ask("ann", "get", "/v1/jobs/{job_id}").json()["state"] == "queued"
+
+
+def test_a_read_only_key_changes_nothing(
+    world: World, operations: list[tuple[str, str, dict[str, Any]]]
+) -> None:
+    refused = set()
+    for method, path, _ in operations:
+        answer = world.ask("reader", method, path)
+        if method in SAFE or path in READS:
+            admins = answer.status_code == 403 and answer.json()["facts"]["needed"] == "admin"
+            assert admins or answer.status_code not in (401, 403), (method, path)
+        else:
+            found = problem(answer, 403, "forbidden")
+            assert found["facts"]["needed"] in ("train", "admin"), (method, path)
+            assert repr(found["facts"]["needed"]) in found["detail"]
+            refused.add((method, path))
+    assert ("post", "/v1/jobs") in refused
+    assert ("put", "/v1/captures/{capture_id}/{role}/{name}") in refused
+    assert len(world.ask("ann", "get", "/v1/jobs").json()["jobs"]) == 2
+
+
+def test_scopes_include_those_before_them(world: World) -> None:
+    assert list(Scope) == ["read", "train", "admin"]
+    assert world.ask("bob", "get", "/v1/me").json()["scopes"] == ["read", "train"]
+    problem(world.ask("ann", "get", "/v1/keys"), 403, "forbidden")
+    problem(world.ask("ann", "delete", "/v1/keys/{key_id}"), 403, "forbidden")
+    assert world.ask("root", "get", "/v1/jobs/{job_id}").json()["owner"] == "ann"
