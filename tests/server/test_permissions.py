@@ -89,6 +89,7 @@ def world(serve: Serve) -> World:
         f"/v1/captures/{capture}/images/c.jpg", content=b"c", headers={"Upload-Complete": "?0"}
     )
     ids = {"capture_id": capture, "job_id": waiting, "model_id": done, "key_id": ann["id"]}
+    ids["import_id"] = "0" * 16  # guarded by its capture
     ids["upload_id"] = begun.headers["location"].rsplit("/", 1)[-1]
     return World(app, ids, secrets)
 
