@@ -23,7 +23,7 @@ from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow  # a server for each case
 
-ADMIN = {"name": "root", "owner": "root", "scopes": ["admin"]}
+ADMIN: dict[str, Any] = {"name": "root", "owner": "root", "scopes": ["admin"]}
 
 
 def bearer(secret: str) -> dict[str, str]:
