@@ -14,7 +14,16 @@ from starlette.concurrency import run_in_threadpool
 from splatmill.backplane import layout
 from splatmill.backplane.records import FORMAT, UnreadableRecord, check_format, reason, warn
 from splatmill.backplane.storage import Entry, Storage, StorageError
-from splatmill.schema import PHOTO_SUFFIXES, Capture, CaptureFile, CapturePage, Role, format_bytes, safe_name
+from splatmill.schema import (
+    PHOTO_SUFFIXES,
+    Capture,
+    CaptureFile,
+    CapturePage,
+    Role,
+    format_bytes,
+    may_be_empty,
+    safe_name,
+)
 from splatmill.schema.tolerant import keep_readable
 from splatmill_server.filters import Filter
 from splatmill_server.metrics import Metrics
@@ -175,9 +184,9 @@ class Captures:
         """Store a file while it arrives; return its record, and whether it is new.
 
         A file that is already stored with the same bytes is not stored again. Raises UnsafeName, and problems for
-        other bytes under the name (409), a digest that differs (422), an empty file (422), a file that is too large
-        (413), too many files (413) and full storage (507), which all name the file. After an error or a lost
-        connection, storage is unchanged.
+        other bytes under the name (409), a digest that differs (422), an empty file (422) unless it `may_be_empty`, a
+        file that is too large (413), too many files (413) and full storage (507), which all name the file. After an
+        error or a lost connection, storage is unchanged.
         """
         name = safe_name(name)
         try:
@@ -203,15 +212,19 @@ class Captures:
         taken = await run_in_threadpool(self.digest_of, capture_id, role, name)
         body = _Counted(chunks, self.settings.max_file_bytes)
         incoming = layout.capture_incoming(capture_id, secrets.token_hex(8))
-        if not await body.begin():
-            check_whole(body.digest.hexdigest(), body.size, announced_sha256, announced_size)
+        empty_allowed = may_be_empty(role, name)
+        begun = await body.begin()
+        if not begun:
+            check_whole(body.digest.hexdigest(), 0, announced_sha256, announced_size, empty_allowed)
         try:
-            if taken is None:
-                await self.storage.stream_put(incoming, body)
-            else:
+            if taken is not None:
                 async for _ in body:
                     pass
-            check_whole(body.digest.hexdigest(), body.size, announced_sha256, announced_size)
+            elif begun:
+                await self.storage.stream_put(incoming, body)
+            else:
+                await run_in_threadpool(self.storage.put, incoming, b"")
+            check_whole(body.digest.hexdigest(), body.size, announced_sha256, announced_size, empty_allowed)
             file = CaptureFile(role=role, name=name, size=body.size, sha256=body.digest.hexdigest())
             return file, await self.adopt(capture_id, file, incoming, taken)
         finally:
@@ -376,7 +389,13 @@ def too_large(size: int, limit: int) -> ProblemError:
     )
 
 
-def check_whole(digest: str, size: int, announced_sha256: str | None, announced_size: int | None) -> None:
+def check_whole(
+    digest: str,
+    size: int,
+    announced_sha256: str | None,
+    announced_size: int | None,
+    empty_allowed: bool = False,
+) -> None:
     """Raise a problem if received bytes are not those that were announced (422), too few (400), or none (422)."""
     if announced_size is not None and size != announced_size:
         raise ProblemError(
@@ -385,7 +404,7 @@ def check_whole(digest: str, size: int, announced_sha256: str | None, announced_
             advice="Send the file again.",
             facts={"received": size, "announced": announced_size},
         )
-    if size == 0:
+    if size == 0 and not empty_allowed:
         raise ProblemError("file_empty", "The file has no bytes; nothing was stored.")
     if announced_sha256 is not None and digest != announced_sha256.strip().lower():
         raise ProblemError(

@@ -162,6 +162,25 @@ def test_what_does_not_fit_its_digest_is_empty_or_too_large_is_refused(serve: Se
     problem(app.http.put(f"/v1/captures/{capture_id}/images/c.jpg", content=PHOTO), 413, "body_too_large")
 
 
+def test_only_the_points_of_a_colmap_model_may_be_empty(app: ServedApp) -> None:
+    capture_id = app.http.post("/v1/captures", json={}).json()["id"]
+    base = f"/v1/captures/{capture_id}"
+    empty = hashlib.sha256(b"").hexdigest()
+    for name in ("points3D.txt", "sparse/0/points3D.txt", "sparse/0/points3D.bin"):
+        for status in (201, 200):
+            answer = app.http.put(f"{base}/poses/{name}", content=b"")
+            assert answer.status_code == status, answer.text
+            assert answer.json() == {"role": "poses", "name": name, "size": 0, "sha256": empty}
+    assert len(app.http.get(base).json()["files"]) == 3
+    before = stored(app)
+    for name in ("images/points3D.txt", "poses/images.txt", "poses/points3D.txt.bak", "masks/a.png"):
+        refused = problem(app.http.put(f"{base}/{name}", content=b""), 422, "file_empty")
+        assert name in refused["detail"]
+    wrong = {"X-Content-SHA256": "0" * 64}
+    problem(app.http.put(f"{base}/poses/b/points3D.txt", content=b"", headers=wrong), 422, "digest_mismatch")
+    assert stored(app) == before
+
+
 def test_unknown_captures_and_roles_are_named(app: ServedApp) -> None:
     problem(
         app.http.put("/v1/captures/0123456789abcdef/images/a.jpg", content=PHOTO), 404, "capture_not_found"

@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 from splatmill_worker import synthetic
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Camera
 from tests.support.up import Up
 from tests.support.waiting import gone, wait_for
@@ -109,6 +110,41 @@ def test_posed_photos_become_a_model_whose_views_match_them(
     film = up.http.get(f"/v1/models/{later_id}/files/progress.mp4")
     assert film.headers["content-type"] == "video/mp4"
     assert film.content[4:8] == b"ftyp"
+
+
+@pytest.mark.parametrize("points", ["empty", "missing"])
+def test_a_colmap_model_without_points_trains(
+    true_service: Up, photos: tuple[Path, dict[str, Camera]], points: str
+) -> None:
+    """COLMAP's own recipe for known poses: cameras.txt, images.txt, and an empty points3D.txt."""
+    up, (folder, cameras) = true_service, photos
+    capture = upload(up, folder)
+    files = colmap_model(cameras) | ({"points3D.txt": b""} if points == "empty" else {})
+    for name, content in files.items():
+        answer = up.http.put(f"/v1/captures/{capture}/poses/sparse/0/{name}", content=content)
+        assert answer.status_code == 201, answer.text
+    job_id = up.http.post("/v1/jobs", json={"capture": capture, "options": {"steps": 100}}).json()["id"]
+    job = up.ended(job_id, 200)
+    assert job["state"] == "succeeded", job["problem"]
+    report = up.http.get(f"/v1/jobs/{job_id}/report").json()
+    assert report["sfm"]["sparse_points"] == 0
+    assert report["sfm"]["stereo_points"] > 100
+    assert report["curve"][-1]["psnr"] > 14
+
+
+def colmap_model(cameras: dict[str, Camera]) -> dict[str, bytes]:
+    """cameras.txt and images.txt of the given cameras."""
+    one = next(iter(cameras.values()))
+    images = []
+    for number, (name, camera) in enumerate(cameras.items(), 1):
+        x, y, z, w = pycolmap.Rotation3d(camera.viewmat[:3, :3]).quat
+        t = " ".join(map(repr, camera.viewmat[:3, 3].tolist()))
+        images.append(f"{number} {w} {x} {y} {z} {t} 1 {name}\n\n")
+    intrinsics = f"{one.fx} {one.fy} {one.cx} {one.cy}"
+    return {
+        "cameras.txt": f"1 PINHOLE {one.width} {one.height} {intrinsics}\n".encode(),
+        "images.txt": "".join(images).encode(),
+    }
 
 
 def test_cancel_during_reconstruction_takes_under_two_seconds(

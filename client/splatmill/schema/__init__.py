@@ -48,6 +48,7 @@ from splatmill.schema.captures import (
     FileName,
     Role,
     UnsafeName,
+    may_be_empty,
     safe_name,
 )
 from splatmill.schema.events import (
@@ -259,6 +260,7 @@ __all__ = [
     "describe_options",
     "format_bytes",
     "format_duration",
+    "may_be_empty",
     "parse_bytes",
     "parse_duration",
     "safe_name",

@@ -74,6 +74,15 @@ class Role(StrEnum):
     poses = "poses"
 
 
+MAY_BE_EMPTY = ("points3D.txt", "points3D.bin")
+"""File names, among the poses, of a COLMAP model's points: cameras that were measured come without any."""
+
+
+def may_be_empty(role: Role, name: str) -> bool:
+    """Return whether a file with this name is accepted without bytes."""
+    return role is Role.poses and name.rpartition("/")[2] in MAY_BE_EMPTY
+
+
 FileName = Annotated[str, AfterValidator(safe_name)]
 
 
