@@ -31,7 +31,7 @@ from splatmill.schema import (
     StorageUse,
     TrainOptions,
 )
-from splatmill.uploads import OnProgress, Uploaded, upload
+from splatmill.uploads import OnProgress, Uploaded, key_of, upload
 
 PAGE = 100
 """Largest number of entries that are requested at once of a list."""
@@ -87,13 +87,15 @@ class AsyncClient:
         `options` are the fields of `TrainOptions`. `start` may also be the path of a .ply file on this machine, or its
         name in the folder `path`; the file is then uploaded with the poses. The options and the path are checked before
         anything is sent. The job continues when the connection is closed. `refused` of the returned handle lists the
-        photos that the server refused.
+        photos that the server refused. The same files are uploaded once: a second training uses the same capture.
 
         Raises NothingToUpload, ConnectionFailed, or a subclass of `Refused`.
         """
         options, model = with_start_model(options, path)
         checked = train_options(options)
-        capture, uploaded = await self.upload(path, name=name, on_progress=on_progress, model=model)
+        capture, uploaded = await self.upload(
+            path, name=name, on_progress=on_progress, model=model, resume=True
+        )
         handle = await self.submit(capture.id, checked, name=name)
         handle.refused = uploaded.refused
         return handle
@@ -106,16 +108,22 @@ class AsyncClient:
         capture: str | None = None,
         on_progress: OnProgress | None = None,
         model: Path | None = None,
+        resume: bool = False,
     ) -> tuple[Capture, Uploaded]:
         """Upload the capture at `path` into a new capture, or into the one with the id `capture`.
 
-        Files that are already stored are not stored twice. `model` is the path of a .ply file to start from, which is
-        uploaded with the poses. Raises NothingToUpload, ConnectionFailed, or a subclass of `Refused`.
+        With `resume`, the same files go into the same capture as before, and an upload that was interrupted is
+        continued, also by another process. Files that are already stored are not sent again. `model` is the path of a
+        .ply file to start from, which is uploaded with the poses.
+
+        Raises NothingToUpload, ConnectionFailed, or a subclass of `Refused`.
         """
         files = [*find_files(path).files, *([start_model(model)] if model is not None else [])]
         if capture is None:
             body = {"name": name or Path(path).expanduser().resolve().name}
-            response = await self.connection.request("POST", "/v1/captures", json=body)
+            if resume:
+                body["key"] = await key_of(files)
+            response = await self.connection.request("POST", "/v1/captures", json=body, repeatable=resume)
             target = read_answer(Capture, response)
         else:
             target = await self.capture(capture)

@@ -94,14 +94,16 @@ class Client:
         capture: str | None = None,
         on_progress: OnProgress | None = None,
         model: Path | None = None,
+        resume: bool = False,
     ) -> tuple[Capture, Uploaded]:
         """Upload the capture at `path` into a new capture, or into the one with the id `capture`.
 
+        With `resume`, the same files go into the same capture as before, and an interrupted upload is continued.
         `model` is the path of a .ply file to start from, which is uploaded with the poses.
         """
         return self._loop.run_reporting(
             lambda report: self._async.upload(
-                path, name=name, capture=capture, on_progress=report, model=model
+                path, name=name, capture=capture, on_progress=report, model=model, resume=resume
             ),
             on_progress,
         )

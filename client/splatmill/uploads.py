@@ -4,11 +4,13 @@ import asyncio
 import hashlib
 import mimetypes
 import unicodedata
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from time import monotonic
 from urllib.parse import quote
 
+from splatmill.chunked_uploads import PIECE, OnPosition, read_range, send_in_pieces
 from splatmill.connection import Connection, read_answer
 from splatmill.errors import InvalidRequest, NothingToUpload
 from splatmill.local_capture import LocalFile
@@ -16,8 +18,10 @@ from splatmill.schema.captures import SHA256_HEADER, CaptureFile, Role
 from splatmill.schema.events import Progress
 from splatmill.schema.problems import Problem
 
-CHUNK = 256 * 1024  # bytes
 CONCURRENT = 4
+
+REPORT_SECONDS = 0.1
+"""Seconds between two reports of the bytes sent."""
 
 # A photo that is refused with one of these codes is left out and reported; the others are still uploaded.
 BAD_PHOTO_CODES = frozenset(
@@ -57,23 +61,20 @@ async def upload(
     total = sum(file.size for file in files)
     stored: list[CaptureFile] = []
     flawed: list[tuple[str, InvalidRequest]] = []
-    done = 0
+    tally = _Tally(total, on_progress)
     # Poses and masks go first: if one is refused, the upload fails before the photos are sent.
     held = {(file.role, file.name): file for file in stored_files}
     queue = iter(sorted(files, key=lambda file: file.role is Role.images))
 
     async def work() -> None:
-        nonlocal done
         for file in queue:
             try:
-                stored.append(await _send(connection, capture_id, file, held))
+                stored.append(await _send(connection, capture_id, file, held, tally.of(file)))
             except InvalidRequest as error:
                 if file.role is not Role.images or error.code not in BAD_PHOTO_CODES:
                     raise
                 flawed.append((file.name, error))
-            done += file.size
-            if on_progress is not None:
-                on_progress(Progress(stage="uploading", done=done, total=total, note=file.name))
+            tally.end(file)
 
     try:
         async with asyncio.TaskGroup() as group:
@@ -86,8 +87,46 @@ async def upload(
     return Uploaded(tuple(stored), tuple((name, error.problem) for name, error in flawed))
 
 
+@dataclass
+class _Tally:
+    """The bytes sent of all files. What is reported never decreases, though a file may be sent again.
+
+    total: bytes of all files.
+    positions: bytes sent of each file, by role and name; `sent` is their sum.
+    """
+
+    total: int
+    on_progress: OnProgress | None
+    positions: dict[tuple[Role, str], int] = field(default_factory=dict)
+    sent: int = 0
+    reported: int = 0
+    next_report: float = 0.0
+
+    def of(self, file: LocalFile) -> OnPosition:
+        """Return the function that tells how many bytes of a file were sent."""
+
+        return lambda position: self._at(file, position)
+
+    def end(self, file: LocalFile) -> None:
+        """Count a file as done, whether it was sent, was there already, or was refused."""
+        self._at(file, file.size, always=True)
+
+    def _at(self, file: LocalFile, position: int, always: bool = False) -> None:
+        self.sent += position - self.positions.get((file.role, file.name), 0)
+        self.positions[file.role, file.name] = position
+        if self.on_progress is None or (monotonic() < self.next_report and not always):
+            return
+        self.next_report = monotonic() + REPORT_SECONDS
+        self.reported = max(self.reported, self.sent)
+        self.on_progress(Progress(stage="uploading", done=self.reported, total=self.total, note=file.name))
+
+
 async def _send(
-    connection: Connection, capture_id: str, file: LocalFile, held: Mapping[tuple[Role, str], CaptureFile]
+    connection: Connection,
+    capture_id: str,
+    file: LocalFile,
+    held: Mapping[tuple[Role, str], CaptureFile],
+    on_position: OnPosition,
 ) -> CaptureFile:
     digest, size = await asyncio.to_thread(_digest, file.path)
     # The server stores names in this form of Unicode (see `safe_name`).
@@ -97,13 +136,27 @@ async def _send(
     # The media types of .ply and .bin differ between systems, and the server does not need those of poses.
     known = mimetypes.guess_type(file.name)[0] if file.role is not Role.poses else None
     media_type = known or "application/octet-stream"
+    address = f"/v1/captures/{capture_id}/{file.role.value}/{quote(file.name)}"
+    headers = {"Content-Type": media_type, SHA256_HEADER: digest}
+    if size > PIECE:
+        return await send_in_pieces(connection, address, file.path, size, headers, on_position)
     response = await connection.request(
         "PUT",
-        f"/v1/captures/{capture_id}/{file.role.value}/{quote(file.name)}",
-        body=lambda: _chunks(file.path),
-        headers={"Content-Type": media_type, "Content-Length": str(size), SHA256_HEADER: digest},
+        address,
+        body=lambda: read_range(file.path, 0, size, on_position),
+        headers={**headers, "Content-Length": str(size)},
     )
     return read_answer(CaptureFile, response)
+
+
+async def key_of(files: Sequence[LocalFile]) -> str:
+    """Return a key that is the same for the same files: equal roles, names, sizes and contents.
+
+    Raises NothingToUpload for a file that cannot be read.
+    """
+    digests = [(file, *await asyncio.to_thread(_digest, file.path)) for file in files]
+    lines = sorted(f"{file.role.value}/{file.name}\n{size} {digest}" for file, digest, size in digests)
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
 def _digest(path: Path) -> tuple[str, int]:
@@ -113,9 +166,3 @@ def _digest(path: Path) -> tuple[str, int]:
             return digest.hexdigest(), source.tell()
     except OSError as error:
         raise NothingToUpload(f"{path} cannot be read: {error.strerror}.") from error
-
-
-async def _chunks(path: Path) -> AsyncIterator[bytes]:
-    with path.open("rb") as source:
-        while chunk := await asyncio.to_thread(source.read, CHUNK):
-            yield chunk

@@ -52,14 +52,17 @@ class Captures:
         # Number of files per capture, as last seen: listing the folder at each upload would take quadratic time.
         self._counts: dict[str, int] = {}
 
-    def create(self, name: str | None = None, *, owner: str) -> Capture:
-        """Create an empty capture."""
-        capture = Capture(id=secrets.token_hex(8), name=name, owner=owner, created_at=datetime.now(UTC))
-        self.storage.put(
-            layout.capture_record(capture.id),
-            json.dumps(capture.model_dump(mode="json", exclude={"files"}) | {"format": FORMAT}).encode(),
-        )
-        return capture
+    def create(self, name: str | None = None, *, owner: str, key: str | None = None) -> tuple[Capture, bool]:
+        """Create an empty capture; return its record, and whether it is new.
+
+        With a `key` that the owner has used before, the record is that of the same capture. Its id follows from both.
+        """
+        capture_id = secrets.token_hex(8) if key is None else _id_of_key(owner, key)
+        capture = Capture(id=capture_id, name=name, owner=owner, created_at=datetime.now(UTC))
+        record = json.dumps(capture.model_dump(mode="json", exclude={"files"}) | {"format": FORMAT}).encode()
+        if self.storage.put_new(layout.capture_record(capture.id), record):
+            return capture, True
+        return self.record(capture.id), False
 
     def record(self, capture_id: str) -> Capture:
         """Return the record without the files. Raises a 404 problem, and UnreadableRecord."""
@@ -413,6 +416,10 @@ def check_whole(
             advice="Send the file again.",
             facts={"announced": announced_sha256[:100], "received": digest},
         )
+
+
+def _id_of_key(owner: str, key: str) -> str:
+    return hashlib.sha256(f"{owner}\0{key}".encode()).hexdigest()[:32]
 
 
 def fingerprints(files: Sequence[CaptureFile]) -> list[str]:

@@ -25,7 +25,7 @@ async def create_from_form(
     The files are the parts `images`, `masks` and `poses`; the field `options` is JSON, and `name` is text. If any part
     is refused, the capture is deleted.
     """
-    capture = await run_in_threadpool(lambda: service.captures.create(owner=who.owner))
+    capture, _ = await run_in_threadpool(lambda: service.captures.create(owner=who.owner))
     kept = False
     try:
         files, fields = await _receive(service, request, capture.id)

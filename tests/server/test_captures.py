@@ -276,3 +276,34 @@ def test_every_error_of_an_upload_names_its_file(serve: Serve, tmp_path: Path) -
     (tmp_path / "data" / "storage" / "captures" / other / "incoming").write_text("in the way")
     answer = app.http.put(f"/v1/captures/{other}/images/d.jpg", content=PHOTO)
     named(answer, 503, "storage_unavailable", "images/d.jpg")
+
+
+def test_requests_with_the_same_key_get_the_same_capture(app: ServedApp) -> None:
+    body = {"name": "fox", "key": "digest of the photos"}
+    made = app.http.post("/v1/captures", json=body)
+    assert made.status_code == 201
+    address = made.headers["location"]
+    assert app.http.put(f"{address}/images/a.jpg", content=PHOTO).status_code == 201
+    again = app.http.post("/v1/captures", json=body | {"name": "another name"})
+    assert (again.status_code, again.headers["location"]) == (200, address)
+    assert [file["name"] for file in again.json()["files"]] == ["a.jpg"]
+    assert again.json()["name"] == "fox"
+    other = app.http.post("/v1/captures", json={"key": "another digest"})
+    assert other.status_code == 201
+    assert other.json()["id"] != made.json()["id"]
+    # After the capture was deleted, the key begins a new one.
+    assert app.http.delete(address).status_code == 204
+    anew = app.http.post("/v1/captures", json=body)
+    assert (anew.status_code, anew.json()["files"]) == (201, [])
+    problem(app.http.post("/v1/captures", json={"key": ""}), 422, "invalid_request")
+    gate = threading.Barrier(6)
+
+    def create(_: int) -> tuple[int, str]:
+        gate.wait()
+        answer = app.http.post("/v1/captures", json={"key": "at once"})
+        return answer.status_code, answer.json()["id"]
+
+    with ThreadPoolExecutor(6) as pool:
+        answers = list(pool.map(create, range(6)))
+    assert sorted(code for code, _ in answers) == [200] * 5 + [201]
+    assert len({capture_id for _, capture_id in answers}) == 1

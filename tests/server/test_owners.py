@@ -148,6 +148,27 @@ def test_idempotency_keys_of_two_owners_are_apart(app: ServedApp, ann: Person, b
     assert app.redis.exists(keys.idempotency(hashlib.sha256(b"once").hexdigest()))
 
 
+def test_keys_of_captures_of_two_owners_are_apart(app: ServedApp, ann: Person, bob: Person) -> None:
+    ids = [person("POST", "/v1/captures", json={"key": "same"}).json()["id"] for person in (ann, bob, ann)]
+    assert ids[0] == ids[2] != ids[1]
+
+
+def test_an_upload_or_import_of_another_owner_is_absent(app: ServedApp, ann: Person, bob: Person) -> None:
+    capture = ann.capture()
+    headers = {"Upload-Complete": "?0", "Upload-Length": "4"}
+    begun = ann("PUT", f"/v1/captures/{capture}/images/c.mp4", headers=headers)
+    upload = begun.headers["location"]
+    assert ann("HEAD", upload).status_code == 204
+    assert bob("HEAD", upload).status_code == 404
+    problem(bob("DELETE", upload), 404, "capture_not_found")
+    headers = {"Upload-Offset": "0", "Upload-Complete": "?1", "Content-Type": "application/partial-upload"}
+    problem(bob("PATCH", upload, headers=headers, content=b"mine"), 404, "capture_not_found")
+    problem(bob("GET", f"/v1/captures/{capture}/imports"), 404, "capture_not_found")
+    url = {"url": "https://example.org/a.jpg"}
+    problem(bob("POST", f"/v1/captures/{capture}/import", json=url), 404, "capture_not_found")
+    assert ann("PATCH", upload, headers=headers, content=b"mine").status_code == 201
+
+
 def test_records_without_an_owner_belong_to_the_default_owner(
     app: ServedApp, ann: Person, bob: Person
 ) -> None:

@@ -194,7 +194,12 @@ def _upload(
 ) -> Capture:
     with make_display() as display:
         capture, uploaded = client.upload(
-            path, name=name, capture=known.id if known else None, on_progress=display.progress, model=start
+            path,
+            name=name,
+            capture=known.id if known else None,
+            on_progress=display.progress,
+            model=start,
+            resume=True,
         )
     for photo, problem in uploaded.refused:
         typer.echo(f"left out: {photo}: {problem.detail}", err=True)

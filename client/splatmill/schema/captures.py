@@ -90,6 +90,12 @@ class CreateCapture(Request):
     """A request for a new, empty capture. Its files are uploaded one by one afterwards."""
 
     name: str | None = Field(default=None, max_length=200, description="A name to recognise the capture by.")
+    key: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=200,
+        description="Requests of one owner with the same key get the same capture, with the files that it holds.",
+    )
 
 
 class CaptureFile(Response):

@@ -3,6 +3,7 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Header, Path, Request
+from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import SHA256_HEADER, Capture, CaptureFile, CapturePage, CreateCapture, Role
@@ -30,18 +31,25 @@ _ACCEPTED = {
     "",
     status_code=201,
     responses=problems("unsupported_media_type", "malformed_body", "body_too_large", "storage_full")
+    | answer(200, "The capture that an earlier request with the same `key` has made", model=Capture)
     | example(201, CAPTURE_EXAMPLE | {"files": []}, "The new, empty capture"),
     dependencies=[JSON_ONLY],
 )
-def create_capture(
+async def create_capture(
     service: Shared,
     who: Who,
     response: Response,
     request: Annotated[CreateCapture | None, Body(examples=[{"name": "garden"}])] = None,
 ) -> Capture:
     """Create an empty capture. Its files are uploaded one by one afterwards."""
-    capture = service.captures.create(request.name if request is not None else None, owner=who.owner)
+    asked = request or CreateCapture()
+    capture, new = await run_in_threadpool(
+        lambda: service.captures.create(asked.name, owner=who.owner, key=asked.key)
+    )
     response.headers["Location"] = f"/v1/captures/{capture.id}"
+    if not new:
+        response.status_code = 200
+        return await service.captures.read(capture.id)
     return capture
 
 
