@@ -18,7 +18,8 @@ Every address of the server, generated from its OpenAPI document. A running serv
 addresses work together.
 
 Answers marked with a code are [problem documents](errors.md). Besides the codes listed, every address can answer with
-`internal_error`, and `/v1/` addresses with `unauthorized` and `forbidden` when the server asks for an API key.
+`internal_error`, and `/v1/` addresses with `unauthorized`, `forbidden` and `too_many_requests` when the server asks for
+an API key.
 """
 
 HEADINGS = {
@@ -29,7 +30,7 @@ HEADINGS = {
     "service": "The service itself",
 }
 METHODS = ("post", "get", "put", "delete")
-EVERYWHERE = ("unauthorized", "forbidden", "invalid_request", "queue_unavailable")
+EVERYWHERE = ("unauthorized", "forbidden", "invalid_request", "too_many_requests", "queue_unavailable")
 
 Json = Mapping[str, Any]
 

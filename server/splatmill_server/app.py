@@ -64,9 +64,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         lifespan=lifespan,
         docs_url=None,  # FastAPI's pages load scripts from other hosts
         redoc_url=None,
-        middleware=[
-            Middleware(RequestMiddleware, settings=settings, keys=service.keys, metrics=service.metrics)
-        ],
+        middleware=[Middleware(RequestMiddleware, service=service)],
     )
     app.state.service = service
     problems.install(app)

@@ -34,7 +34,9 @@ async def create_from_form(
         await run_in_threadpool(check_start_model, service, who, create)
         described = create.model_dump_json(exclude={"capture"}) + "\n".join(fingerprints(files))
         job, new = await run_in_threadpool(
-            lambda: service.jobs.create(create, owner=who.owner, key=key, body=described)
+            lambda: service.jobs.create(
+                create, owner=who.owner, key=key, body=described, most=who.limits.unfinished_jobs
+            )
         )
         kept = job.capture == capture.id
         return job, new

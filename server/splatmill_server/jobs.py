@@ -52,9 +52,17 @@ class Jobs:
         self.metrics = metrics
 
     def create(
-        self, request: CreateJob, *, owner: str, key: str | None = None, body: str = ""
+        self,
+        request: CreateJob,
+        *,
+        owner: str,
+        key: str | None = None,
+        body: str = "",
+        most: int | None = None,
     ) -> tuple[Job, bool]:
         """Create a job; return it, and whether it is new.
+
+        most: number of unfinished jobs that the owner may have; with as many, raise a 429 problem.
 
         With an `Idempotency-Key` that this owner used before, return the job of that request. `body` identifies the
         request: the same key with another body raises a 409 problem.
@@ -77,14 +85,17 @@ class Jobs:
         def insert(pipe: Any) -> None:
             nonlocal known
             known = row.read(self.connection, job_id)
+            if known is None:
+                self._check_room(owner, most)
             pipe.multi()
             if known is None:
+                pipe.incr(keys.begun_jobs(owner))
                 pipe.hset(keys.job(job_id), mapping=new.fields())
                 pipe.zadd(keys.JOBS, {job_id: int(moment.timestamp() * 1000)})
                 pipe.sadd(keys.ACTIVE, job_id)
 
         # Of two concurrent requests with the same key, only one inserts the job.
-        self.connection.transaction(insert, keys.job(job_id))
+        self.connection.transaction(insert, keys.job(job_id), keys.begun_jobs(owner))
         if known is not None:
             return self._job(known), False
         # A crash here leaves a row that is not in the queue; the reaper enqueues it.
@@ -247,7 +258,27 @@ class Jobs:
 
     def unfinished_of(self, owner: str) -> int:
         """Return the number of unfinished jobs of an owner."""
-        return sum(1 for found in self.active() if found.owner == owner)
+        ids = [entry.decode() for entry in cast(set[bytes], self.connection.smembers(keys.ACTIVE))]
+        own = [job_id for job_id, found in zip(ids, self._owners(ids), strict=True) if found == (True, owner)]
+        return sum(1 for job_id in own if not self._ended(job_id))
+
+    def _ended(self, job_id: str) -> bool:
+        """Return whether a job has ended or was deleted. A job whose row is not readable has not."""
+        try:
+            known = row.read(self.connection, job_id)
+        except UnreadableRecord:
+            return False
+        return known is None or fold(known, events.read_states(self.connection, job_id)).state.final
+
+    def _check_room(self, owner: str, most: int | None) -> None:
+        """Raise a 429 problem if the owner has `most` unfinished jobs. The caller watches `begun_jobs` of the owner."""
+        if most is not None and (count := self.unfinished_of(owner)) >= most:
+            raise ProblemError(
+                "too_many_jobs",
+                f"The owner {owner!r} has {count} unfinished jobs, and its API key permits {most} at once.",
+                advice="Wait until one has ended, or cancel one with POST /v1/jobs/{id}/cancel.",
+                facts={"unfinished_jobs": count, "limit": most},
+            )
 
     def unfinished_on(self, capture_id: str) -> str | None:
         """Return the id of an unfinished job on a capture, or None."""
@@ -270,8 +301,11 @@ class Jobs:
 
         return self._change(job_id, request_cancel)
 
-    def restart(self, job_id: str) -> Job:
-        """Enqueue a job that has ended as a new generation, which resumes from its checkpoint if there is one."""
+    def restart(self, job_id: str, *, most: int | None = None) -> Job:
+        """Enqueue a job that has ended as a new generation, which resumes from its checkpoint if there is one.
+
+        most: number of unfinished jobs that the owner may have; with as many, raise a 429 problem.
+        """
 
         def begin_generation(found: JobRow, job: Job) -> dict[str, str] | None:
             if job.state is JobState.queued and found.cancel_requested_at is None:
@@ -289,6 +323,7 @@ class Jobs:
                     f"The job's capture {found.capture} was deleted.",
                     advice="Upload the photos again and create a new job.",
                 )
+            self._check_room(found.owner, most)
             return {
                 "generation": str(found.generation + 1),
                 "queued_at": row.now().isoformat(),
@@ -298,7 +333,7 @@ class Jobs:
 
         # It is added to the active jobs first: a crash in between leaves an ended job there, which is harmless.
         self.connection.sadd(keys.ACTIVE, job_id)
-        job = self._change(job_id, begin_generation)
+        job = self._change(job_id, begin_generation, begun=keys.begun_jobs(self.row(job_id).owner))
         queue.enqueue(self.connection, job_id, self.row(job_id).generation)
         return job
 
@@ -366,7 +401,13 @@ class Jobs:
         states = events.read_states(self.connection, found.id) if states is None else states
         return with_links(fold(found, states, events.last_progress(self.connection, found.id)))
 
-    def _change(self, job_id: str, decide: Callable[[JobRow, Job], dict[str, str] | None]) -> Job:
+    def _change(
+        self,
+        job_id: str,
+        decide: Callable[[JobRow, Job], dict[str, str] | None],
+        *,
+        begun: str | None = None,
+    ) -> Job:
         """Apply the changes that `decide` returns for the row and the job, and return the job.
 
         `decide` returns new values of fields, where an empty value deletes the field, or None for no change. It is
@@ -381,11 +422,14 @@ class Jobs:
                 return
             kept = {name: value for name, value in changes.items() if value}
             deleted = [name for name, value in changes.items() if not value]
+            if begun is not None:
+                pipe.incr(begun)
             pipe.hset(keys.job(job_id), mapping=kept)
             if deleted:
                 pipe.hdel(keys.job(job_id), *deleted)
 
-        self.connection.transaction(apply, keys.job(job_id), keys.states(job_id))
+        watched = [keys.job(job_id), keys.states(job_id), *([begun] if begun is not None else [])]
+        self.connection.transaction(apply, *watched)
         return self._job(self.row(job_id))
 
     def _ids(self, after: tuple[int, str] | None, count: int) -> list[tuple[int, str]]:

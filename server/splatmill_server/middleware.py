@@ -17,11 +17,10 @@ from splatmill.backplane.storage import StorageError
 from splatmill.schema import Problem, format_bytes
 from splatmill_server.authentication import Authentication
 from splatmill_server.caller import NOBODY
-from splatmill_server.keys import Keys
-from splatmill_server.metrics import Metrics
 from splatmill_server.permission import OPEN_PATHS
 from splatmill_server.problems import ProblemError, ProblemResponse, problem_of_storage
-from splatmill_server.settings import Settings
+from splatmill_server.rate import Rate
+from splatmill_server.service import Service
 
 log = structlog.get_logger()
 
@@ -29,11 +28,12 @@ log = structlog.get_logger()
 class RequestMiddleware:
     """Wraps the app."""
 
-    def __init__(self, app: ASGIApp, settings: Settings, keys: Keys, metrics: Metrics) -> None:
+    def __init__(self, app: ASGIApp, service: Service) -> None:
         self.app = app
-        self.authentication = Authentication(settings, keys)
-        self.max_body = settings.max_json_bytes
-        self.metrics = metrics
+        self.authentication = Authentication(service.settings, service.keys)
+        self.rate = Rate(service.redis_async)
+        self.max_body = service.settings.max_json_bytes
+        self.metrics = service.metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -115,6 +115,7 @@ class RequestMiddleware:
                 log.warning("keys cannot be read", error=str(error))
                 found = problem_of_storage(error)
                 raise ProblemError(found.code, found.detail, advice=found.advice) from error
+            await self.rate.admit(scope["state"]["caller"])
         length = headers.get("content-length", "0")
         if not _streams(scope, headers) and length.isdigit() and int(length) > self.max_body:
             raise self._too_large(int(length))

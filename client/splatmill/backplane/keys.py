@@ -83,6 +83,19 @@ def uploads(owner: str) -> str:
     return f"{PREFIX}stored:uploads:{owner}"
 
 
+def rate(key_id: str) -> str:
+    """Return the key of a string with the time in milliseconds at which an API key may make all its requests again."""
+    return f"{PREFIX}rate:{key_id}"
+
+
+def begun_jobs(owner: str) -> str:
+    """Return the key of the number of jobs of an owner that were created or restarted.
+
+    It is watched while the unfinished jobs of the owner are counted, so that no other begins at the same moment.
+    """
+    return f"{PREFIX}begun:{owner}"
+
+
 def of_job(job_id: str) -> tuple[str, ...]:
     """Return all keys of a job, for deletion."""
     streams = states(job_id), progress(job_id), log(job_id), warnings(job_id), curve(job_id)

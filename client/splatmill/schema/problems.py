@@ -42,6 +42,7 @@ PROBLEMS: dict[str, Kind] = {
     "upload_length_differs": Kind(400, "The upload has another length than was announced"),
     "idempotency_conflict": Kind(409, "This Idempotency-Key was used for another request"),
     "too_many_requests": Kind(429, "Too many requests"),
+    "too_many_jobs": Kind(429, "Too many unfinished jobs"),
     # Resources that do not exist, do not exist yet, or are in the wrong state.
     "key_not_found": Kind(404, "There is no such API key"),
     "admin_key_needed": Kind(409, "There must be an API key with the scope admin"),

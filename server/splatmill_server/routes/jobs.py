@@ -52,6 +52,7 @@ _FORM = {
         "unknown_option",
         "option_out_of_range",
         "idempotency_conflict",
+        "too_many_jobs",
         "body_too_large",
         "unsupported_media_type",
         "storage_full",
@@ -109,11 +110,18 @@ async def _create_from_json(service: Service, who: Caller, body: bytes, key: str
 
     def make() -> tuple[Job, bool]:
         # A repeated request returns its job even if the capture was deleted meanwhile.
-        if key is None or service.jobs.id_of_key(who.owner, key) is None:
+        known = service.jobs.id_of_key(who.owner, key) if key is not None else None
+        if known is None or service.jobs.owner(known) is None:
             check_capture(service, who, create.capture)
             service.captures.check_trainable(create.capture)
             check_start_model(service, who, create)
-        return service.jobs.create(create, owner=who.owner, key=key, body=create.model_dump_json())
+        return service.jobs.create(
+            create,
+            owner=who.owner,
+            key=key,
+            body=create.model_dump_json(),
+            most=who.limits.unfinished_jobs,
+        )
 
     return await run_in_threadpool(make)
 
@@ -171,8 +179,8 @@ async def cancel_job(service: Shared, job_id: JobId) -> Job:
 @router.post(
     "/{job_id}/restart",
     status_code=202,
-    responses=problems("job_not_found", "job_running", "capture_not_found"),
+    responses=problems("job_not_found", "job_running", "capture_not_found", "too_many_jobs"),
 )
-def restart_job(service: Shared, job_id: JobId) -> Job:
+def restart_job(service: Shared, who: Who, job_id: JobId) -> Job:
     """Run a job that has ended again, with the same options, from its last checkpoint if there is one."""
-    return service.jobs.restart(job_id)
+    return service.jobs.restart(job_id, most=who.limits.unfinished_jobs)

@@ -40,7 +40,14 @@ RENDER_REQUESTS = {
 def problems(*codes: str) -> Responses:
     """Return the responses for problems with these codes; codes with the same status share an entry."""
     by_status: dict[int, list[str]] = {}
-    for code in ("unauthorized", "forbidden", "invalid_request", "queue_unavailable", *codes):
+    for code in (
+        "unauthorized",
+        "forbidden",
+        "invalid_request",
+        "too_many_requests",
+        "queue_unavailable",
+        *codes,
+    ):
         by_status.setdefault(PROBLEMS[code].status, []).append(code)
     return {
         status: {
