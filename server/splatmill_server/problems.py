@@ -91,12 +91,7 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(redis.RedisError)
     def on_redis(request: Request, error: redis.RedisError) -> Response:
         log.warning("queue unavailable", error=str(error), path=request.url.path)
-        problem = Problem.of(
-            "queue_unavailable",
-            "The job queue (Redis) cannot be reached; stored files are not affected.",
-            advice="Try again in a few seconds. If the problem persists, check that Redis runs, and "
-            "check REDIS_URL.",
-        )
+        problem = problem_of_redis(error)
         return ProblemResponse(problem, request.url.path, {"Retry-After": "5"})
 
     @app.exception_handler(StorageError)
@@ -108,6 +103,22 @@ def install(app: FastAPI) -> None:
     def on_disconnect(request: Request, _: ClientDisconnect) -> Response:
         # The client is gone, but a proxy in between may read this response.
         return ProblemResponse(body_cut_off(), request.url.path)
+
+
+def problem_of_redis(error: redis.RedisError) -> Problem:
+    """Return the problem for an error of Redis: it cannot be reached, or refuses the command."""
+    cause = " ".join(str(error).split())[:300].removesuffix(".") or type(error).__name__
+    if isinstance(error, redis.ResponseError):
+        return Problem.of(
+            "queue_unavailable",
+            f"The job queue (Redis) refuses the request: {cause}. Stored files are not affected.",
+            advice="Try again when the cause is removed, such as a full disk or memory of Redis.",
+        )
+    return Problem.of(
+        "queue_unavailable",
+        f"The job queue (Redis) cannot be reached: {cause}. Stored files are not affected.",
+        advice="Try again in a few seconds. If the problem persists, check that Redis runs, and check REDIS_URL.",
+    )
 
 
 def problem_of_storage(error: StorageError) -> Problem:

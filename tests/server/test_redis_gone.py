@@ -59,3 +59,15 @@ def check_after_return(app: ServedApp, capture_id: str) -> None:
     assert app.state(app.job(capture_id)) == "queued"
     assert app.http.delete(f"/v1/jobs/{MODEL}").status_code == 204
     assert not app.service.storage.exists(layout.model_file(MODEL, "model.ply"))
+
+
+def test_a_request_that_redis_refuses_is_answered_with_the_cause(app: ServedApp) -> None:
+    job_id = app.job()
+    app.redis.config_set("min-replicas-to-write", 1)
+    try:
+        answer = problem(app.http.post(f"/v1/jobs/{job_id}/cancel"), 503, "queue_unavailable")
+        assert "NOREPLICAS" in answer["detail"]
+        assert app.http.get(f"/v1/jobs/{job_id}").json()["state"] == "queued"
+    finally:
+        app.redis.config_set("min-replicas-to-write", 0)
+    assert app.http.post(f"/v1/jobs/{job_id}/cancel").json()["state"] == "cancelled"

@@ -9,6 +9,7 @@ from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
 from splatmill.backplane.redact import redacted
+from splatmill.backplane.refusal import RefusalAwareRedis
 
 DEFAULT_URL = "redis://127.0.0.1:6379/0"
 
@@ -26,6 +27,8 @@ class InvalidRedisUrl(ValueError):
 def connect(url: str = DEFAULT_URL, *, timeout: float | None = None, retries: int = 3) -> redis.Redis:
     """Return a synchronous client, which connects on first use. Its replies are bytes, as RQ expects.
 
+    It raises redis.ConnectionError also if Redis answers and refuses (see `refusal`).
+
     url: `redis://host:port/db` or `unix:///path/to/redis.sock`.
     timeout: seconds to wait for a reply; None waits for ever.
     retries: how often a command is retried after a lost connection. The API, which must answer, uses few.
@@ -33,7 +36,7 @@ def connect(url: str = DEFAULT_URL, *, timeout: float | None = None, retries: in
     Raises InvalidRedisUrl.
     """
     try:
-        return redis.Redis.from_url(
+        return RefusalAwareRedis.from_url(
             url,
             socket_timeout=timeout,
             health_check_interval=15,

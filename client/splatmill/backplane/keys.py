@@ -11,6 +11,9 @@ JOBS = PREFIX + "jobs"
 ACTIVE = PREFIX + "active"
 """Set of the ids of unfinished jobs, which the reaper checks. It may still hold jobs that have ended."""
 
+WRITABLE = PREFIX + "writable"
+"""String that is written to find out whether Redis takes writes; it expires."""
+
 
 def job(job_id: str) -> str:
     """Return the key of the job row, a hash. Only the server writes it."""

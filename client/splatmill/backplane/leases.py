@@ -13,6 +13,7 @@ from typing import Any, Literal, cast
 import redis
 from rq.registry import StartedJobRegistry
 
+from splatmill.backplane import keys
 from splatmill.backplane.queue import HEARTBEAT_SLACK, KEEP_FINISHED, MONITORING_INTERVAL, TRAIN, open_queue
 
 LEASE = MONITORING_INTERVAL + HEARTBEAT_SLACK
@@ -131,8 +132,8 @@ class Reclaim:
     """Requeues the entries whose leases have expired, as one process that watches them does.
 
     Nothing is requeued for LEASE seconds after Redis was away, as far as this process can tell: it started anew, did
-    not answer, answered late, was replaced, or its clock jumped (a suspended machine). The workers could not prolong
-    their leases then, and get the time for it.
+    not answer, answered late, refused writes, was replaced, or its clock jumped (a suspended machine). The workers
+    could not prolong their leases then, and get the time for it.
     """
 
     def __init__(self, connection: redis.Redis) -> None:
@@ -158,6 +159,8 @@ class Reclaim:
         """Return whether Redis has been there for so long that every living worker has prolonged its lease."""
         asked = time.monotonic()
         try:
+            # A Redis that refuses writes also refuses heartbeats.
+            self._connection.set(keys.WRITABLE, 1, ex=LEASE)
             info = self._connection.info("server")
             seconds, micros = self._connection.time()
         except redis.RedisError:

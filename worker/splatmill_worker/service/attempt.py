@@ -12,6 +12,7 @@ from splatmill.backplane.queue import split_rq_id
 from splatmill.schema import Event, JobState, LogEvent, Problem, StateEvent
 from splatmill_worker.service import hand_back
 from splatmill_worker.service.lock import JobLock
+from splatmill_worker.service.redis_patience import patiently
 
 _LOCK_POLL_SECONDS = 0.2
 
@@ -60,15 +61,16 @@ def start_attempt(connection: redis.Redis, entry_id: str, token: str) -> Attempt
     Waits while another process holds the lock. This happens when a machine was suspended and the queue gave its job to
     another worker; the process on the suspended machine is killed at its next heartbeat.
 
-    Raises HandedBack when the worker is stopped meanwhile.
+    Raises HandedBack when the worker is stopped meanwhile, and redis.RedisError when Redis fails for longer than
+    PATIENCE.
     """
     job_id, generation = split_rq_id(entry_id)
     lock = JobLock(connection, job_id, token)
     process = ProcessIdentity.of(os.getpid())
-    while not lock.take(process, 0):
+    while not patiently(lambda: lock.take(process, 0)):
         if hand_back.requested():
             raise hand_back.HandedBack
         time.sleep(_LOCK_POLL_SECONDS)
-    number = events.begin_attempt(connection, job_id)
-    lock.take(process, number)
+    number = patiently(lambda: events.begin_attempt(connection, job_id))
+    patiently(lambda: lock.take(process, number))
     return Attempt(connection, job_id, generation, number, lock)

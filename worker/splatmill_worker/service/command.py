@@ -5,6 +5,7 @@ import time
 
 import redis
 
+from splatmill.backplane import keys
 from splatmill.backplane.connection import InvalidRedisUrl, connect
 from splatmill.backplane.redact import redacted
 from splatmill_worker import settings
@@ -28,13 +29,19 @@ def serve(stop_grace: float | None) -> int:
     deadline = time.monotonic() + REDIS_WAIT
     while True:
         try:
-            connection.ping()
+            connection.set(keys.WRITABLE, 1, ex=int(REDIS_WAIT))
             break
-        except redis.exceptions.ConnectionError as error:
+        except redis.RedisError as error:
             if time.monotonic() > deadline:
+                refuses = isinstance(error, redis.ResponseError)
                 print(
-                    f"Redis could not be reached at {redacted(url)} within {REDIS_WAIT:g} s: {error}. "
-                    "Start it there, or set REDIS_URL to the address of a running one.",
+                    f"Redis at {redacted(url)} {'refuses writes' if refuses else 'could not be reached'} for "
+                    f"{REDIS_WAIT:g} s: {error}. "
+                    + (
+                        "Free its disk or memory, or change its settings."
+                        if refuses
+                        else "Start it there, or set REDIS_URL to the address of a running one."
+                    ),
                     file=sys.stderr,
                 )
                 return 1

@@ -1,18 +1,20 @@
 """A buffer for the events of an attempt, and the thread that sends them to Redis in order.
 
-Training never waits for Redis, and the events of an outage are sent after it. Progress events come faster than clients
+Training never waits for Redis, and the events of an outage are sent after it: of one that cannot be reached, and of one
+that refuses writes, because its disk or its memory is full. Progress events come faster than clients
 can show them: only the newest one is kept, and it is sent every PROGRESS_SECONDS.
 """
 
 import threading
 import time
+import traceback
 from collections import deque
 
-from redis.exceptions import ConnectionError as RedisConnectionError
-from redis.exceptions import TimeoutError as RedisTimeoutError
+import redis
 
 from splatmill.schema import Event, PlanEvent, ProgressEvent, StateEvent
 from splatmill_worker.service.attempt import Attempt
+from splatmill_worker.service.redis_patience import PATIENCE
 
 PROGRESS_SECONDS = 0.25
 """Seconds between two progress events."""
@@ -26,9 +28,13 @@ nor a plan is dropped."""
 
 
 class Outbox:
-    """Sends events as those of `attempt`, in the order in which they were put. It must be closed."""
+    """Sends events as those of `attempt`, in the order in which they were put. It must be closed.
+
+    trouble: why Redis did not take the last event that was tried; None once it took one.
+    """
 
     def __init__(self, attempt: Attempt) -> None:
+        self.trouble: str | None = None
         self._attempt = attempt
         self._changed = threading.Condition()
         self._events: deque[Event] = deque()
@@ -53,20 +59,21 @@ class Outbox:
                 self._trim()
             self._changed.notify_all()
 
-    def flush(self, seconds: float | None = None) -> bool:
-        """Wait until all events are sent, for at most `seconds` if given. Return whether they are."""
+    def flush(self, seconds: float = PATIENCE) -> bool:
+        """Wait until all events are sent, for at most `seconds`. Return whether they are."""
         with self._changed:
             self._progress_at = 0.0
             self._changed.notify_all()
             return self._changed.wait_for(self._empty, seconds)
 
-    def close(self, seconds: float | None = None) -> None:
-        """Send the remaining events, for at most `seconds` if given, and end the thread."""
-        self.flush(seconds)
+    def close(self, seconds: float = PATIENCE) -> bool:
+        """Send the remaining events, for at most `seconds`, and end the thread. Return whether all were sent."""
+        sent = self.flush(seconds)
         with self._changed:
             self._closed = True
             self._changed.notify_all()
         self._thread.join(seconds)
+        return sent
 
     def _empty(self) -> bool:
         return not self._events and self._progress is None and not self._sending
@@ -106,8 +113,13 @@ class Outbox:
             return None
 
     def _sent(self, event: Event) -> bool:
+        """Send an event; return False if Redis did not take it. One that cannot be written at all is given up."""
         try:
             self._attempt.report(event)
-        except (RedisConnectionError, RedisTimeoutError):
+        except redis.RedisError as error:
+            self.trouble = f"{type(error).__name__}: {error}"
             return False
+        except Exception:
+            traceback.print_exc()  # the events after it must still be sent
+        self.trouble = None
         return True

@@ -3,8 +3,7 @@
 import errno
 import traceback
 
-from redis.exceptions import ConnectionError as RedisConnectionError
-from redis.exceptions import TimeoutError as RedisTimeoutError
+from redis.exceptions import RedisError
 
 from splatmill.backplane.storage import StorageError, StorageFullError
 from splatmill.schema import Problem
@@ -26,7 +25,7 @@ def is_transient(error: BaseException) -> bool:
     """Return whether the same attempt may succeed a little later: the cause lies outside of the job."""
     if isinstance(error, StorageError):
         return not isinstance(error, StorageFullError)
-    return isinstance(error, RedisConnectionError | RedisTimeoutError | FolderInUse)
+    return isinstance(error, RedisError | FolderInUse)
 
 
 def problem_of(error: BaseException) -> Problem:
@@ -44,11 +43,11 @@ def problem_of(error: BaseException) -> Problem:
                 str(error),
                 advice="Check that the storage can be reached, then restart the job.",
             )
-        case RedisConnectionError() | RedisTimeoutError():
+        case RedisError():
             return Problem.of(
                 "queue_unavailable",
-                f"Redis could not be reached: {error}.",
-                advice="Check that Redis is running, then restart the job.",
+                f"Redis could not be reached or refused a command: {error}.",
+                advice="Check that Redis is running and takes writes, then restart the job.",
             )
         case OSError() if error.errno in _DISK_FULL:
             return Problem.of(

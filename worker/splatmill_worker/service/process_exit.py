@@ -11,6 +11,9 @@ from splatmill.schema import Problem, format_bytes
 HANDED_BACK_STATUS = 75
 """Exit status (EX_TEMPFAIL) of an attempt that saved its state because the worker is stopping."""
 
+UNREPORTED_STATUS = 76
+"""Exit status of an attempt that gave up waiting for Redis. Its files are kept, so that the next attempt goes on."""
+
 WITHDRAWN_STATUS = 77
 """Exit status of an attempt that ended before it began, because its job was cancelled meanwhile."""
 
@@ -42,6 +45,11 @@ class ProcessExit:
     def handed_back(self) -> bool:
         """Whether the attempt saved its state and ended on request."""
         return self._exit_status == HANDED_BACK_STATUS
+
+    @property
+    def unreported(self) -> bool:
+        """Whether the attempt gave up waiting for Redis."""
+        return self._exit_status == UNREPORTED_STATUS
 
     @property
     def withdrawn(self) -> bool:

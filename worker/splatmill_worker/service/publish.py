@@ -11,6 +11,7 @@ from splatmill.backplane.row import JobRow, now
 from splatmill.backplane.storage import Storage
 from splatmill.schema import JobState
 from splatmill_worker.service.attempt import Attempt
+from splatmill_worker.service.redis_patience import patiently
 
 _RECORD, _PREVIEW = "job.json", "preview.jpg"
 
@@ -28,7 +29,8 @@ def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path) -> None:
     """Store the files of the pipeline's `out` folder as the job's model.
 
     The record of an earlier generation is deleted first, so that no client sees a model and a report of two runs.
-    Raises StorageError, and FileNotFoundError when there is no model.ply.
+    Raises StorageError, redis.RedisError when Redis fails for longer than PATIENCE, and FileNotFoundError when there is
+    no model.ply.
     """
     if not (out / "model.ply").is_file():
         raise FileNotFoundError(f"The pipeline ended without writing {out / 'model.ply'}.")
@@ -42,10 +44,12 @@ def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path) -> None:
                 continue  # a restarted job replaces it before the other files
             with path.open("rb") as file:
                 digests[name] = hashlib.file_digest(file, "sha256").hexdigest()
-    job = fold(
-        row,
-        events.read_states(attempt.connection, attempt.job_id),
-        events.last_progress(attempt.connection, attempt.job_id),
+    job = patiently(
+        lambda: fold(
+            row,
+            events.read_states(attempt.connection, attempt.job_id),
+            events.last_progress(attempt.connection, attempt.job_id),
+        )
     )
     ended = job.model_copy(
         update={

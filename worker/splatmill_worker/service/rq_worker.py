@@ -13,12 +13,10 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 from uuid import uuid4
 
 import redis
-from redis.exceptions import ConnectionError as RedisConnectionError
-from redis.exceptions import TimeoutError as RedisTimeoutError
 from rq import Queue, Worker
 from rq.command import parse_payload
 from rq.executions import Execution
@@ -31,12 +29,18 @@ from splatmill.backplane import leases
 from splatmill.backplane import queue as backplane
 from splatmill.backplane.leases import Lease, Reclaim
 from splatmill.backplane.process import die_with_parent
+from splatmill.backplane.refusal import RedisRefuses
 from splatmill_worker.service import hand_back, recovery
 from splatmill_worker.service.abandoned_folders import remove_abandoned
 from splatmill_worker.service.attempt import Attempt, start_attempt
 from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.lock import JobLock, LockState
-from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, ProcessExit, oom_kill_count
+from splatmill_worker.service.process_exit import (
+    HANDED_BACK_STATUS,
+    UNREPORTED_STATUS,
+    ProcessExit,
+    oom_kill_count,
+)
 from splatmill_worker.service.run_attempt import run_attempt
 from splatmill_worker.service.saved_progress import SavedProgress
 
@@ -44,8 +48,10 @@ STOP_GRACE = 15.0
 """Seconds that an attempt has to save its state when the worker is told to stop. Then it is killed, and the next
 attempt resumes from the last checkpoint that was stored."""
 
-_REDIS_UNREACHABLE = (RedisConnectionError, RedisTimeoutError)
+T = TypeVar("T")
+
 _RETRY_SECONDS = 0.5
+_LOG_SECONDS = 30.0  # between two log lines about a Redis that does not work
 _REMOVAL_INTERVAL = 3600.0
 
 
@@ -96,7 +102,35 @@ class AttemptWorker(Worker):
         self._superseded = False
         self._remove_at = 0.0
 
-    # Start, maintenance and heartbeat
+    # Start, maintenance and heartbeat. RQ ends a worker on most errors of Redis; here it waits.
+
+    def check_for_suspension(self, burst: bool) -> None:
+        self._until_redis_works(lambda: super(AttemptWorker, self).check_for_suspension(burst))
+
+    def dequeue_job_and_maintain_ttl(
+        self, timeout: int | None, max_idle_time: int | None = None
+    ) -> tuple[Job, Queue] | None:
+        dequeue = super().dequeue_job_and_maintain_ttl
+        return self._until_redis_works(lambda: dequeue(timeout, max_idle_time))
+
+    def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:
+        try:
+            super().heartbeat(timeout, pipeline)
+        except redis.RedisError as error:
+            self.log.warning("Worker %s: Redis took no heartbeat: %s", self.name, error)
+
+    def set_shutdown_requested_date(self) -> None:
+        try:
+            super().set_shutdown_requested_date()  # type: ignore[no-untyped-call]  # RQ leaves it untyped
+        except redis.RedisError as error:
+            self.log.warning("Worker %s: stops, which Redis does not know: %s", self.name, error)
+
+    def teardown(self) -> None:
+        try:
+            super().teardown()  # type: ignore[no-untyped-call]  # RQ leaves it untyped
+        except redis.RedisError as error:
+            # The record expires by itself.
+            self.log.warning("Worker %s: its record stays in Redis: %s", self.name, error)
 
     def register_birth(self) -> None:
         super().register_birth()  # type: ignore[no-untyped-call]  # rq lacks types here and below
@@ -104,11 +138,14 @@ class AttemptWorker(Worker):
         recovery.requeue_orphans(self)
 
     def run_maintenance_tasks(self) -> None:
-        super().run_maintenance_tasks()  # type: ignore[no-untyped-call]  # RQ leaves it untyped
-        if time.monotonic() >= self._remove_at:
-            self._remove_at = time.monotonic() + _REMOVAL_INTERVAL
-            for job_id in remove_abandoned(self.connection):
-                self.log.info("Worker %s: removed the folder of the deleted job %s", self.name, job_id)
+        try:
+            super().run_maintenance_tasks()  # type: ignore[no-untyped-call]  # RQ leaves it untyped
+            if time.monotonic() >= self._remove_at:
+                self._remove_at = time.monotonic() + _REMOVAL_INTERVAL
+                for job_id in remove_abandoned(self.connection):
+                    self.log.info("Worker %s: removed the folder of the deleted job %s", self.name, job_id)
+        except redis.RedisError as error:
+            self.log.warning("Worker %s: maintenance is put off: %s", self.name, error)
 
     def clean_registries(self) -> None:
         """Requeue what lost workers held, and clean RQ's lists of finished entries and of workers."""
@@ -135,11 +172,9 @@ class AttemptWorker(Worker):
             lock = self._lock.refresh() if self._lock else LockState.held
             if self._saved is not None and self._saved.advanced():
                 leases.advanced(self.connection, job.id)
-        except _REDIS_UNREACHABLE as error:
+        except redis.RedisError as error:
             # The attempt can compute without Redis, and its outbox keeps the events.
-            self.log.warning(
-                "Worker %s: Redis cannot be reached, so no heartbeat was sent: %s", self.name, error
-            )
+            self.log.warning("Worker %s: Redis took no heartbeat: %s", self.name, error)
             return
         if lock is LockState.lost or not holds:
             self.log.warning(
@@ -192,6 +227,16 @@ class AttemptWorker(Worker):
         except ValueError:
             recovery.drop_foreign(self, job.id)
             return
+        self._until_redis_works(lambda: self._begin(job, queue), RedisRefuses)
+        self._entry_id, self._superseded = job.id, False
+        try:
+            self.fork_work_horse(job, queue)
+            self.monitor_work_horse(job, queue)
+        finally:
+            self._entry_id = None
+        self._until_redis_works(lambda: self.set_state("idle"))
+
+    def _begin(self, job: Job, queue: Queue) -> None:
         with self.connection.pipeline() as pipeline:
             # From here on the lease holds the job. With the worker's name in it, a stop request finds the worker.
             self.execution = Execution.create(job, leases.LEASE, pipeline, worker_name=self.name)
@@ -200,13 +245,6 @@ class AttemptWorker(Worker):
             job.prepare_for_execution(self.name, pipeline=pipeline)
             pipeline.lrem(queue.intermediate_queue_key, 1, job.id)
             pipeline.execute()
-        self._entry_id, self._superseded = job.id, False
-        try:
-            self.fork_work_horse(job, queue)
-            self.monitor_work_horse(job, queue)
-        finally:
-            self._entry_id = None
-        self._until_redis_answers(lambda: self.set_state("idle"))
 
     def fork_work_horse(self, job: Job, queue: Queue) -> None:
         job_id, _ = backplane.split_rq_id(job.id)
@@ -243,6 +281,9 @@ class AttemptWorker(Worker):
             self.main_work_horse(job, queue)
         except HandedBack:
             os._exit(HANDED_BACK_STATUS)
+        except redis.RedisError as error:
+            self.log.error("Worker %s: job %s does not begin: Redis: %s", self.name, job.id, error)
+            os._exit(UNREPORTED_STATUS)
 
     def setup_work_horse_signals(self) -> None:
         """Do nothing: the handlers are set up before the attempt begins."""
@@ -257,7 +298,7 @@ class AttemptWorker(Worker):
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(horse, signal.SIGKILL)
         self._horse_pid = 0
-        self._until_redis_answers(lambda: self._settle(job, queue, process_exit))
+        self._until_redis_works(lambda: self._settle(job, queue, process_exit))
 
     def _wait(self, job: Job) -> tuple[int, Any]:
         """Wait for the attempt's process, sending heartbeats, and kill it at the end of the grace period of a stop.
@@ -300,8 +341,9 @@ class AttemptWorker(Worker):
             self.handle_job_failure(job, queue, exc_string="Stopped on request.")
         elif job.get_status() is not JobStatus.STARTED:
             return  # the process died after it had updated its entry
-        elif process_exit.handed_back or self._stop_requested:
-            ended.report_requeued("The worker is stopping. The job was put back at the head of the queue.")
+        elif process_exit.handed_back or process_exit.unreported or self._stop_requested:
+            why = "Redis took no events." if process_exit.unreported else "The worker is stopping."
+            ended.report_requeued(f"{why} The job was put back at the head of the queue.")
             recovery.requeue_first(self, job, queue)
         elif job.should_retry:
             left = f"{job.retries_left} {'retry is' if job.retries_left == 1 else 'retries are'} left"
@@ -311,12 +353,19 @@ class AttemptWorker(Worker):
             ended.report_failed(process_exit.problem(attempts=backplane.MAX_RETRIES + 1))
             self.handle_job_failure(job, queue, exc_string=f"The process {process_exit.cause}.")
 
-    def _until_redis_answers(self, action: Callable[[], None]) -> None:
-        """Repeat `action` until Redis can be reached."""
+    def _until_redis_works(
+        self, action: Callable[[], T], refusal: type[redis.RedisError] = redis.RedisError
+    ) -> T:
+        """Return the result of `action`, which is repeated while it raises `refusal`.
+
+        There is no limit: nothing is computed meanwhile, and the log says what the worker waits for.
+        """
+        log_at = 0.0
         while True:
             try:
-                action()
-                return
-            except _REDIS_UNREACHABLE as error:
-                self.log.warning("Worker %s: waiting for Redis: %s", self.name, error)
+                return action()
+            except refusal as error:
+                if time.monotonic() >= log_at:
+                    log_at = time.monotonic() + _LOG_SECONDS
+                    self.log.warning("Worker %s: waiting for Redis: %s", self.name, error)
                 time.sleep(_RETRY_SECONDS)

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, Protocol, cast
 
+import redis
+
 from splatmill.backplane import events, layout
 from splatmill.backplane import row as rows
 from splatmill.backplane.fold import fold
@@ -28,7 +30,8 @@ from splatmill_worker.service.lock import LockState
 from splatmill_worker.service.mirror import Mirror
 from splatmill_worker.service.outbox import Outbox
 from splatmill_worker.service.problems import is_transient, problem_of
-from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, WITHDRAWN_STATUS
+from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, UNREPORTED_STATUS, WITHDRAWN_STATUS
+from splatmill_worker.service.redis_patience import PATIENCE, patiently
 from splatmill_worker.settings import storage_url
 
 PIPELINE = os.environ.get("SPLATMILL_PIPELINE", "splatmill_worker.pipeline")
@@ -60,10 +63,13 @@ def run_attempt(attempt: Attempt, can_retry: bool) -> None:
 
     can_retry: whether the queue tries again when this raises.
 
-    Reports the job's final state, or exits the process with HANDED_BACK_STATUS or WITHDRAWN_STATUS. Raises a transient
-    failure while the queue can retry.
+    Reports the job's final state, or exits the process with HANDED_BACK_STATUS, WITHDRAWN_STATUS, or, if Redis fails
+    for longer than PATIENCE, UNREPORTED_STATUS. Raises a transient failure while the queue can retry.
     """
-    row = _row_to_run(attempt)
+    try:
+        row = patiently(lambda: _row_to_run(attempt))
+    except redis.RedisError as error:
+        _exit_unreported(str(error))
     if row is not None:
         outbox = Outbox(attempt)
         try:
@@ -72,8 +78,9 @@ def run_attempt(attempt: Attempt, can_retry: bool) -> None:
             outbox.flush(FLUSH_SECONDS)
             os._exit(HANDED_BACK_STATUS)
         finally:
-            outbox.close()
-    attempt.lock.release()
+            if not outbox.close():
+                _exit_unreported(outbox.trouble)
+    patiently(attempt.lock.release)
 
 
 def _row_to_run(attempt: Attempt) -> JobRow | None:
@@ -136,7 +143,7 @@ def _train_and_publish(attempt: Attempt, row: JobRow, storage: Storage, outbox: 
     mirror.close(copy=handed_back)
     if handed_back:
         raise HandedBack
-    if attempt.lock.refresh() is LockState.lost:
+    if patiently(attempt.lock.refresh) is LockState.lost:
         _exit_superseded()
     publish.publish(storage, attempt, row, folder.run / "out")
     folder.remove()
@@ -174,7 +181,8 @@ def _report_failure(error: Exception, outbox: Outbox, can_retry: bool) -> None:
     print(trace, flush=True)
     problem = problem_of(error)
     if is_transient(error):
-        outbox.flush()  # waits until Redis is back, if its absence was the failure
+        if not outbox.flush():  # waits until Redis is back, if its absence was the failure
+            _exit_unreported(outbox.trouble)
         if can_retry:
             outbox.put(LogEvent(level="warning", message=f"{problem.detail} The job is tried again."))
             outbox.put(StateEvent(state=JobState.queued))
@@ -194,6 +202,12 @@ def _wait(seconds: float) -> None:
         if hand_back.requested():
             raise HandedBack
         time.sleep(0.1)
+
+
+def _exit_unreported(trouble: str | None) -> NoReturn:
+    """End without a report, because Redis took none. The parent puts the job back into the queue once Redis works."""
+    print(f"Redis took no events for {PATIENCE:g} s ({trouble}); this attempt ends.", flush=True)
+    os._exit(UNREPORTED_STATUS)
 
 
 def _exit_superseded() -> NoReturn:
