@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from splatmill_worker.images import Photo
+from splatmill_worker.images.load import Photo
 from splatmill_worker.scene import Camera, Normalization, Scene, View
 from splatmill_worker.splat.views import TrainingView
 from splatmill_worker.synthetic import orbit, photograph, still_life

@@ -23,7 +23,7 @@ from _rows import Row, write
 from torch import Tensor
 
 from splatmill.schema import TrainOptions
-from splatmill_worker.images import load_views
+from splatmill_worker.images.load import load_views
 from splatmill_worker.kernels.gpu import device
 from splatmill_worker.pipeline import EXTENT
 from splatmill_worker.scene import Camera, Normalization, split

@@ -40,7 +40,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline, sfm, synthetic
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.images import prepare
+from splatmill_worker.images.prepare import prepare
 from splatmill_worker.scene import Camera, Scene
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.matching import pairs

@@ -47,7 +47,7 @@ class Finding:
 def run_checks() -> list[Finding]:
     """Run all checks in order and return their findings. An error inside a check becomes a finding."""
     findings: list[Finding] = []
-    for check in (_python, _parts, _kernels, _threads, _memory, _disk, _redis, _storage, _gpu):
+    for check in (_python, _parts, _kernels, _threads, _memory, _disk, _redis, _storage, _decoders, _gpu):
         try:
             findings.extend(check())
         except Exception as error:  # the other checks still have to run
@@ -172,6 +172,25 @@ def _disk() -> Iterator[Finding]:
     low = free < LOW_DISK
     advice = "Free disk space: a job stores its photos, their cameras and a checkpoint." if low else ""
     yield Finding("disk", "warning" if low else "ok", f"{format_bytes(free)} free for {folder}", advice)
+
+
+def _decoders() -> Iterator[Finding]:
+    from splatmill_worker.images.decoders import confined
+
+    with confined([], []) as decoders:
+        held = set(decoders.ready())
+    lacking = sorted({"files", "network"} - held)
+    if lacking:
+        seen = f"Photos are decoded in processes without secrets, but not kept from {' and '.join(lacking)}"
+        advice = (
+            "Landlock and seccomp of Linux do that. Where photos come from strangers, run workers in "
+            "containers, or as a user with no other rights."
+        )
+        yield Finding("decoders", "warning", seen, advice)
+    else:
+        yield Finding(
+            "decoders", "ok", "Photos are decoded in processes without secrets, network or other files"
+        )
 
 
 def _redis() -> Iterator[Finding]:

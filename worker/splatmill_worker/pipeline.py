@@ -14,7 +14,7 @@ from splatmill.schema import Backend, JobState, LogEvent, PlanEvent, StateEvent,
 from splatmill_worker.capture import choose_kernels, posed_scene, split_views, start_model_path
 from splatmill_worker.errors import Cancelled, Refusal
 from splatmill_worker.events import Emit, TrainingEvents, progress_events
-from splatmill_worker.images import load_views
+from splatmill_worker.images.load import load_views
 from splatmill_worker.kernels.gpu.device import absence, describe
 from splatmill_worker.scene import Normalization, Scene, View
 from splatmill_worker.splat.engine.open import open_engine

@@ -14,9 +14,9 @@ import av
 import pytest
 from PIL import Image
 
-from splatmill_worker import images
 from splatmill_worker.errors import Refusal, UnusablePicture, UnusableVideo
 from splatmill_worker.images import archive, decode, guarded, video
+from splatmill_worker.images.prepare import prepare
 from splatmill_worker.service.problems import problem_of
 from tests.support.hostile import archives, pictures, videos
 from tests.support.hostile.pictures import write
@@ -58,12 +58,12 @@ def test_a_file_larger_than_the_limit_is_not_read(tmp_path: Path) -> None:
 BOMB_UNDER_LIMIT = """
 import resource, sys
 from pathlib import Path
-from splatmill_worker import images
+from splatmill_worker.images.prepare import prepare
 from splatmill_worker.errors import Refusal
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 folder = Path(sys.argv[1])
 try:
-    images.prepare(folder / "images", folder / "masks", folder / "work")
+    prepare(folder / "images", folder / "masks", folder / "work")
 except Refusal as refusal:
     print(refusal.code, refusal.message)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
@@ -94,13 +94,13 @@ def test_a_mask_much_larger_than_its_photo_is_refused(
     write(tmp_path / "images/a.jpg", pictures.photo())
     write(tmp_path / "masks/a.png", pictures.encoded(Image.new("1", (640, 480)), "PNG"))
     with pytest.raises(UnusablePicture, match=r"masks/a.png: it has 640 x 480 pixels, more than 8 times"):
-        images.prepare(tmp_path / "images", tmp_path / "masks", tmp_path / "work")
+        prepare(tmp_path / "images", tmp_path / "masks", tmp_path / "work")
 
 
 @pytest.mark.filterwarnings("ignore")  # Pillow says that the tags are damaged
 def test_damaged_exif_leaves_the_photo_usable(tmp_path: Path) -> None:
     write(tmp_path / "a.jpg", pictures.with_exif(pictures.turned_with_rubbish()))
-    found = images.prepare(tmp_path, None, tmp_path.with_name("work"))
+    found = prepare(tmp_path, None, tmp_path.with_name("work"))
     assert [(photo.width, photo.height) for photo in found.photos] == [(48, 64)]
     assert decode.decode(tmp_path / "a.jpg").size == (48, 64)
 
@@ -110,7 +110,7 @@ def test_of_several_pictures_in_a_file_the_first_is_used_and_a_note_says_so(tmp_
     for name, form in (("a.webp", "WEBP"), ("b.tif", "TIFF"), ("c.png", "PNG")):
         data = pictures.encoded(first, form, save_all=True, append_images=[second])
         write(tmp_path / name, data)
-    found = images.prepare(tmp_path, None, tmp_path.with_name("work"))
+    found = prepare(tmp_path, None, tmp_path.with_name("work"))
     assert len(found.photos) == 3
     assert found.notes == tuple(
         f"{n} holds several pictures; the first one is used." for n in ("a.webp", "b.tif", "c.png")
@@ -202,6 +202,6 @@ def test_all_archives_of_a_capture_share_one_allowance(
     monkeypatch.setattr(archive.Allowance.__init__, "__defaults__", (4, 2**20))
     for attempt in ("first", "again, with what the first has unpacked"):
         with pytest.raises(Refusal, match=r"With b\.zip") as caught:
-            images.prepare(tmp_path / "images", None, tmp_path / "work")
+            prepare(tmp_path / "images", None, tmp_path / "work")
         assert caught.value.code == "archive_bomb", attempt
     assert len(list((tmp_path / "work").rglob("*.jpg"))) == 3

@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatmill_worker import images
 from splatmill_worker.errors import CaptureIncomplete
 from splatmill_worker.images import archive, decode, lens
+from splatmill_worker.images.load import load_view
+from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.scene import Camera, Lens, View
 
 
@@ -29,8 +30,8 @@ def picture(width: int = 64, height: int = 48, seed: int = 0) -> Image.Image:
     return small.resize((width, height), Image.Resampling.BICUBIC)
 
 
-def prepared(folder: Path, tmp_path: Path, masks: Path | None = None) -> images.Prepared:
-    return images.prepare(folder, masks, tmp_path / "work")
+def prepared(folder: Path, tmp_path: Path, masks: Path | None = None) -> Prepared:
+    return prepare(folder, masks, tmp_path / "work")
 
 
 @pytest.fixture
@@ -40,7 +41,7 @@ def photos(tmp_path: Path) -> Path:
     return folder
 
 
-def reasons(result: images.Prepared) -> dict[str, str]:
+def reasons(result: Prepared) -> dict[str, str]:
     return dict(result.skipped)
 
 
@@ -135,7 +136,7 @@ def test_masks_are_found_in_their_folder_and_beside_the_photo(photos: Path, tmp_
     assert [photo.name for photo in result.photos] == ["a.jpg", "b.jpg", "c.jpg"]
     for photo in result.photos:
         camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
-        loaded = images.load_view(View(photo.name, camera, photo.path, photo.mask), 32)
+        loaded = load_view(View(photo.name, camera, photo.path, photo.mask), 32)
         assert loaded.mask is not None
         np.testing.assert_array_equal(loaded.mask, half[::2, ::2] > 0)
 
@@ -152,7 +153,7 @@ def test_a_video_gives_its_sharpest_frames(photos: Path, tmp_path: Path) -> None
             )
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    result = images.prepare(photos, None, tmp_path / "work", frames=4)
+    result = prepare(photos, None, tmp_path / "work", frames=4)
     assert [photo.name for photo in result.photos] == [f"walk_{number:06d}.jpg" for number in (4, 14, 24, 34)]
     assert all(photo.sequence == "walk.mp4" for photo in result.photos)
 
@@ -208,7 +209,7 @@ def test_reduction_is_the_exact_mean_over_each_pixels_area(tmp_path: Path) -> No
     pixels = random.integers(0, 256, (30, 45, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "a.png")
     camera = Camera(45, 30, 40.0, 40.0, 22.5, 15.0, np.eye(4))
-    photo = images.load_view(View("a", camera, tmp_path / "a.png"), 20)
+    photo = load_view(View("a", camera, tmp_path / "a.png"), 20)
     assert photo.rgb.shape == (13, 20, 3)
     # Each pixel repeated until both grids divide: 45 * 4 = 9 * 20 columns, 30 * 13 = 30 * 13 rows.
     fine = pixels.repeat(13, axis=0).repeat(4, axis=1).astype(np.float64)
@@ -223,11 +224,11 @@ def test_alpha_is_kept_and_colour_is_not_taken_from_what_it_hides(tmp_path: Path
     rgba[:, 15:] = (0, 200, 0, 255)
     Image.fromarray(rgba).save(tmp_path / "a.png")
     view = View("a", Camera(32, 32, 30.0, 30.0, 16.0, 16.0, np.eye(4)), tmp_path / "a.png")
-    photo = images.load_view(view, 16)
+    photo = load_view(view, 16)
     assert photo.alpha is not None
     np.testing.assert_array_equal(photo.alpha[0, 6:9], [0, 128, 255])
     np.testing.assert_array_equal(photo.rgb[0, 7], [0, 200, 0])
-    white = images.load_view(view, 16, background=(1.0, 1.0, 1.0))
+    white = load_view(view, 16, background=(1.0, 1.0, 1.0))
     np.testing.assert_array_equal(white.rgb[0, 6], [255, 255, 255])
     # The cover of 0.5 is an exact mean of the file, before alpha was rounded to 128.
     np.testing.assert_array_equal(white.rgb[0, 7], [128, 228, 128])
@@ -246,7 +247,7 @@ def test_undistortion_makes_straight_lines_straight(tmp_path: Path) -> None:
     rays = np.asarray(colmap.cam_from_img(np.stack([u.ravel(), v.ravel()], 1)))
     distorted = pattern(rays[:, 0], rays[:, 1]).reshape(240, 320)
     Image.fromarray(np.repeat(distorted.round().astype(np.uint8)[:, :, None], 3, 2)).save(tmp_path / "a.png")
-    photo = images.load_view(View("a", camera, tmp_path / "a.png", lens=glass), 160)
+    photo = load_view(View("a", camera, tmp_path / "a.png", lens=glass), 160)
     at = photo.camera
     x = (np.arange(160) + 0.5 - at.cx) / at.fx
     y = (np.arange(120) + 0.5 - at.cy) / at.fy
@@ -261,4 +262,4 @@ def test_a_photo_of_another_shape_than_its_camera_is_refused(tmp_path: Path) -> 
     picture(64, 48).save(tmp_path / "a.png")
     view = View("a", Camera(64, 64, 60.0, 60.0, 32.0, 32.0, np.eye(4)), tmp_path / "a.png")
     with pytest.raises(ValueError, match="different shape"):
-        images.load_view(view, 32)
+        load_view(view, 32)

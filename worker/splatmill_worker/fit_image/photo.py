@@ -10,8 +10,9 @@ import numpy as np
 from splatmill.schema.photos import MIN_PHOTO_SIDE
 from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.fit_image.plane import camera_before
-from splatmill_worker.images import guarded, load_view
+from splatmill_worker.images import guarded
 from splatmill_worker.images.decode import upright_size
+from splatmill_worker.images.load import load_view
 from splatmill_worker.scene import Normalization, View
 from splatmill_worker.splat.views import TrainingView
 

@@ -39,6 +39,15 @@ def upright_size(image: Image.Image) -> tuple[int, int]:
     return (height, width) if orientation(image) in TURNED else (width, height)
 
 
+def sizes(path: Path, name: str) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Width and height of a picture in pixels, as stored and upright; nothing is decoded.
+
+    Raises UnusablePicture, about the file `name`, and OSError.
+    """
+    with guarded.opened(path, name) as image:
+        return image.size, upright_size(image)
+
+
 def orientation(image: Image.Image) -> int:
     """The EXIF orientation, 1 to 8; 1 (as stored) when there is none or it is invalid."""
     value = tags(image).get(ORIENTATION, 1)

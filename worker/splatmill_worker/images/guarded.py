@@ -9,6 +9,7 @@ image list can name other files or addresses.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import struct
 import threading
@@ -228,25 +229,41 @@ def _said(error: Exception) -> str:
 
 
 class _Room:
-    """Pixels that may be in decoding at a time, shared by all threads."""
+    """Pixels that may be in decoding at a time, shared by all threads.
 
-    def __init__(self, pixels: int) -> None:
+    lock: descriptor of a file that processes lock to decode a picture larger than their share, one at a time.
+    """
+
+    def __init__(self, pixels: int, lock: int | None = None) -> None:
         self._all = self._free = pixels
         self._changed = threading.Condition()
+        self._lock = lock
 
     @contextmanager
     def taken(self, pixels: int) -> Iterator[None]:
+        alone = self._lock if pixels > self._all else None
         pixels = min(pixels, self._all)
         with self._changed:
             self._changed.wait_for(lambda: self._free >= pixels)
             self._free -= pixels
+        if alone is not None:
+            fcntl.lockf(alone, fcntl.LOCK_EX)
         try:
             yield
         finally:
+            if alone is not None:
+                fcntl.lockf(alone, fcntl.LOCK_UN)
             with self._changed:
                 self._free += pixels
                 self._changed.notify_all()
 
 
 # A quarter of the machine's memory: what is decoded is copied once or twice before it is reduced.
-_room = _Room(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4 // _BYTES_PER_PIXEL)
+_ALL_PIXELS = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4 // _BYTES_PER_PIXEL
+_room = _Room(_ALL_PIXELS)
+
+
+def share_room(processes: int, lock: int) -> None:
+    """Take one of `processes` equal shares of the memory for decoding; larger pictures take turns by `lock`."""
+    global _room
+    _room = _Room(_ALL_PIXELS // processes, lock)

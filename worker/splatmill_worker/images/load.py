@@ -15,7 +15,8 @@ import torch
 from PIL import Image
 
 from splatmill_worker.images import lens as lenses
-from splatmill_worker.images.decode import Pixels, decode
+from splatmill_worker.images.decode import Pixels
+from splatmill_worker.images.decoders import decode
 from splatmill_worker.scene import Camera, Lens, View
 
 MAX_SAMPLES = 4

@@ -6,17 +6,15 @@ import errno
 import hashlib
 import os
 import shutil
-import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from splatmill.schema.photos import ARCHIVE_SUFFIXES, MIN_PHOTO_SIDE, VIDEO_SUFFIXES
-from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
-from splatmill_worker.images import archive, exif, guarded, video
-from splatmill_worker.images.decode import upright_size, whole
-from splatmill_worker.images.masks import mask_fault, mask_of, masks_under
+from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES
+from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusableVideo
+from splatmill_worker.images import archive, decoders, exif
+from splatmill_worker.images.masks import mask_of, masks_under
 
 IGNORED_PREFIXES = (".", "__MACOSX")
 """Beginnings of the names of files and folders that are left out without mention."""
@@ -26,8 +24,6 @@ IGNORED_NAMES = ("thumbs.db", "desktop.ini")
 
 MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 """Errors of the operating system that say nothing about the file: they end the attempt."""
-
-GIVE = "; give JPEG, PNG, WebP, TIFF or HEIC photos, videos or zips"
 
 DEFAULT_FRAMES = 100
 """Frames taken from a video."""
@@ -203,7 +199,7 @@ def _expand(
         elif suffix in VIDEO_SUFFIXES:
             folder = _filled_once(
                 workdir / "frames" / f"{_sha256(path)[:24]}_{frames}",
-                lambda place: video.sharpest_frames(path, place, frames, cancelled=cancelled),
+                lambda place: decoders.sharpest_frames(path, place, frames, cancelled=cancelled),
             )
             pictures = _files(folder)
             prefix = Path(name).with_suffix("").as_posix()
@@ -242,36 +238,26 @@ def _filled_once(folder: Path, make: Callable[[Path], object]) -> Path:
 
 def _inspect(name: str, path: Path, sequence: str | None) -> UsablePhoto | str:
     """The photo, or the reason why the file is left out."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow warns of broken EXIF, with which a photo is usable
-            with guarded.opened(path) as image:
-                width, height = image.size
-                if min(width, height) < MIN_PHOTO_SIDE:
-                    return (
-                        f"it has {width} x {height} pixels, which is too small: each side needs at least "
-                        f"{MIN_PHOTO_SIDE}"
-                    )
-                width, height = upright_size(image)
-                tags = exif.read(image)
-                several = guarded.several(image)
-                if image.format == "JPEG":
-                    # This decodes at the smallest DCT scale, and still reads the whole file.
-                    image.draft(None, (1, 1))
-                with guarded.room(image):
-                    whole(image, name)
-    except UnusablePicture as error:
-        return error.reason + (GIVE if error.code == "not_an_image" else "")
-    except OSError as error:
-        return f"it cannot be read: {error}"
-    return UsablePhoto(name, path, _sha256(path), width, height, tags, sequence=sequence, several=several)
+    found = decoders.examine(path, name)
+    if isinstance(found, str):
+        return found
+    return UsablePhoto(
+        name,
+        path,
+        _sha256(path),
+        found.width,
+        found.height,
+        found.exif,
+        sequence=sequence,
+        several=found.several,
+    )
 
 
 def _with_mask(photo: UsablePhoto, mask: Path | None, found: _Found) -> UsablePhoto:
     """The photo with `mask`, or without it and with a note when it is unreadable or has another shape."""
     if mask is None:
         return photo
-    fault = mask_fault(mask, (photo.width, photo.height))
+    fault = decoders.mask_fault(mask, (photo.width, photo.height))
     if fault is not None:
         found.notes.append(f"The mask of {photo.name} is not used: {fault}.")
         return photo

@@ -126,14 +126,19 @@ def _train_and_publish(attempt: Attempt, row: JobRow, storage: Storage, outbox: 
         folder.stage_start(row.options.start_model)
     mirror = Mirror(folder, log.warning)
     try:
-        run = cast(Pipeline, importlib.import_module(PIPELINE).run)
-        result = run(
-            folder.capture,
-            folder.run,
-            row.options,
-            lambda event: _forward(event, folder, outbox),
-            hand_back.requested,
-        )
+        # Not imported by the worker that forks this process: numpy and the decoders start threads.
+        from splatmill_worker.images import decoders
+
+        folder.run.mkdir(parents=True, exist_ok=True)
+        with decoders.confined(read=[folder.path], write=[folder.run]):
+            run = cast(Pipeline, importlib.import_module(PIPELINE).run)
+            result = run(
+                folder.capture,
+                folder.run,
+                row.options,
+                lambda event: _forward(event, folder, outbox),
+                hand_back.requested,
+            )
     except BaseException as error:
         mirror.close(copy=hand_back.requested())
         if isinstance(error, Exception) and not hand_back.requested() and not is_transient(error):

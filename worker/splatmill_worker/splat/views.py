@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from splatmill_worker.images import Photo
+from splatmill_worker.images.load import Photo
 from splatmill_worker.scene import Camera, Normalization
 
 

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.images import load_views
+from splatmill_worker.images.load import load_views
 from splatmill_worker.scene import split
 from splatmill_worker.sfm import posed
 from tests.support.paths import DATA

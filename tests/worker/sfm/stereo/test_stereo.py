@@ -15,7 +15,7 @@ from splatmill.schema import TrainOptions
 from splatmill_worker import synthetic
 from splatmill_worker.capture import posed_scene
 from splatmill_worker.errors import Cancelled, UnusablePicture
-from splatmill_worker.images import load_views
+from splatmill_worker.images.load import load_views
 from splatmill_worker.scene import Lens, Scene, View
 from splatmill_worker.sfm import posed, stereo
 from splatmill_worker.sfm.stereo.plane_sweep import GreyView, sweep

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from splatmill_worker.errors import FailureName, TrainingFailed
-from splatmill_worker.images import Photo
+from splatmill_worker.images.load import Photo
 from splatmill_worker.scene import Normalization
 from splatmill_worker.splat.engine.open import gaussians_of, open_engine
 from splatmill_worker.splat.gaussians import Gaussians

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatmill_worker.images.masks import mask_fault
+from splatmill_worker.images.decoders import mask_fault
 from splatmill_worker.scene import Scene, Source
 from splatmill_worker.sfm import stereo
 from splatmill_worker.sfm.callbacks import OnProgress

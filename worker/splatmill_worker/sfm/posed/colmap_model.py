@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import UnusablePicture
-from splatmill_worker.images import guarded
-from splatmill_worker.images.decode import upright_size
+from splatmill_worker.images import decoders
 from splatmill_worker.images.lens import lens_of, pinhole, without_distortion
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
 from splatmill_worker.sfm.posed import model_files
@@ -92,8 +91,7 @@ def fit_to_file(posed: tuple[Camera, Lens | None], name: str, path: Path, mask: 
     as those of most tools do.
     """
     camera, lens = posed
-    with guarded.opened(path, name) as image:
-        stored, upright = image.size, upright_size(image)
+    stored, upright = decoders.sizes(path, name)
     aspect = camera.width / camera.height
     stored_fits = abs(stored[0] / stored[1] / aspect - 1.0) < MAX_ASPECT_ERROR
     turned = not stored_fits and stored != upright

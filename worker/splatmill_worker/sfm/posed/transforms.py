@@ -18,7 +18,7 @@ from plyfile import PlyData, PlyParseError
 from splatmill_worker import ply_header
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import UnusablePicture
-from splatmill_worker.images import guarded
+from splatmill_worker.images import decoders
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
 from splatmill_worker.sfm.posed.files import ImageFiles
@@ -196,8 +196,7 @@ def _colmap_camera(values: dict[str, Any], name: str, photo: Path) -> pycolmap.C
     if "w" in values and "h" in values:
         width, height = int(values["w"]), int(values["h"])
     else:
-        with guarded.opened(photo, name) as image:
-            width, height = image.size
+        (width, height), _ = decoders.sizes(photo, name)
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise ValueError(f"w and h are {width} and {height} pixels; they must be 1 to {MAX_SIDE}.")
     if "fl_x" in values or "fl_y" in values:

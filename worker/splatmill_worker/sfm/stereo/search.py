@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from splatmill_worker.images import load_view
+from splatmill_worker.images.load import load_view
 from splatmill_worker.scene import Scene, View, looked_at
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if
 from splatmill_worker.sfm.stereo.plane_sweep import MIN_AGREEING, GreyView, SweepResult, sweep
