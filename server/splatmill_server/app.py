@@ -17,9 +17,20 @@ from splatmill_server import problems
 from splatmill_server.exposure import check_exposure
 from splatmill_server.middleware import RequestMiddleware
 from splatmill_server.permission import PERMITTED
-from splatmill_server.routes import captures, imports, job_outputs, jobs, models, status, storage, uploads
+from splatmill_server.routes import (
+    captures,
+    imports,
+    job_outputs,
+    jobs,
+    models,
+    session,
+    status,
+    storage,
+    uploads,
+)
 from splatmill_server.routes import keys as key_routes
 from splatmill_server.service import Service
+from splatmill_server.sessions import COOKIE
 from splatmill_server.settings import Settings
 
 log = structlog.get_logger()
@@ -68,10 +79,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.service = service
     problems.install(app)
-    modules = (captures, uploads, imports, jobs, job_outputs, models, key_routes, status, storage)
+    modules = (captures, uploads, imports, jobs, job_outputs, models, key_routes, session, status, storage)
     for module in modules:
         app.include_router(module.router, dependencies=[PERMITTED])
-    _describe(app, with_key=settings.api_key is not None)
+    _describe(app, keyless=settings.local and settings.api_key is None)
     return app
 
 
@@ -83,8 +94,11 @@ def _clean_up(service: Service) -> None:
         log.warning("could not look for abandoned uploads", error=str(error))
 
 
-def _describe(app: FastAPI, *, with_key: bool) -> None:
-    """Add what FastAPI cannot infer to the OpenAPI document: models that only `$ref`s name, and the API key."""
+def _describe(app: FastAPI, *, keyless: bool) -> None:
+    """Add what FastAPI cannot infer to the OpenAPI document: models that only `$ref`s name, and how callers are known.
+
+    keyless: whether the server may have no keys.
+    """
 
     def openapi() -> dict[str, object]:
         if app.openapi_schema is None:
@@ -99,9 +113,11 @@ def _describe(app: FastAPI, *, with_key: bool) -> None:
                 schemas[model.__name__] = schema
             for unused in ("HTTPValidationError", "ValidationError"):
                 schemas.pop(unused, None)
-            if with_key:
-                document["components"]["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer"}}
-                document["security"] = [{"key": []}]
+            document["components"]["securitySchemes"] = {
+                "key": {"type": "http", "scheme": "bearer"},
+                "session": {"type": "apiKey", "in": "cookie", "name": COOKIE},
+            }
+            document["security"] = [{"key": []}, {"session": []}, *([{}] if keyless else [])]
             app.openapi_schema = document
         return app.openapi_schema
 

@@ -6,6 +6,7 @@ from typing import Annotated, cast
 from fastapi import Depends, Request
 
 from splatmill.schema import DEFAULT_OWNER, KeyLimits, Scope
+from splatmill_server.keys import StoredKey
 
 ALL_SCOPES = frozenset(Scope)
 
@@ -19,6 +20,7 @@ class Caller:
     key_name: name of that key for people, or what was used in place of a stored key.
     scopes: what the caller may do.
     limits: how much the caller may do.
+    by_session: whether a browser's session stands for the key.
     """
 
     owner: str
@@ -26,6 +28,17 @@ class Caller:
     key_name: str = ""
     scopes: frozenset[Scope] = ALL_SCOPES
     limits: KeyLimits = field(default_factory=KeyLimits)
+    by_session: bool = False
+
+    @classmethod
+    def of(cls, key: StoredKey) -> "Caller":
+        """Return the caller that sends a stored key."""
+        return cls(key.owner, key.id, key.name, frozenset(key.scopes), key.limits)
+
+    @property
+    def with_key(self) -> bool:
+        """Whether the caller has shown a key, stored or that of the setting."""
+        return self.key_id is not None or self == BOOTSTRAP
 
     def has(self, scope: Scope) -> bool:
         """Return whether the caller may do what `scope` permits."""

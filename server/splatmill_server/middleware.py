@@ -8,6 +8,7 @@ import time
 import uuid
 from collections.abc import Awaitable, Callable
 
+import redis
 import structlog
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
@@ -16,13 +17,16 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import Problem, format_bytes
 from splatmill_server.authentication import Authentication
-from splatmill_server.caller import NOBODY
+from splatmill_server.caller import NOBODY, Caller
 from splatmill_server.permission import OPEN_PATHS
-from splatmill_server.problems import ProblemError, ProblemResponse, problem_of_storage
+from splatmill_server.problems import ProblemError, ProblemResponse, problem_of_redis, problem_of_storage
 from splatmill_server.rate import Rate
 from splatmill_server.service import Service
 
 log = structlog.get_logger()
+
+PROBES = frozenset({"/healthz", "/readyz"})
+"""Paths that probes request every few seconds, and that are left out of the access log."""
 
 
 class RequestMiddleware:
@@ -30,23 +34,25 @@ class RequestMiddleware:
 
     def __init__(self, app: ASGIApp, service: Service) -> None:
         self.app = app
-        self.authentication = Authentication(service.settings, service.keys)
+        self.authentication = Authentication(service.settings, service.keys, service.sessions)
         self.rate = Rate(service.redis_async)
         self.max_body = service.settings.max_json_bytes
         self.metrics = service.metrics
+        self.level = logging.INFO if service.settings.access_log else logging.DEBUG
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        begun, status = time.perf_counter(), 500
+        begun, status, sent = time.perf_counter(), 500, 0
         headers = Headers(scope=scope)
         request_id = headers.get("x-request-id", "")
         if not (request_id.isascii() and request_id.isprintable() and 0 < len(request_id) <= 64):
             request_id = uuid.uuid4().hex[:16]
 
         async def send_marked(message: Message) -> None:
-            nonlocal status
+            nonlocal status, sent
+            sent += len(message.get("body", b""))
             if message["type"] == "http.response.start":
                 status = message["status"]
                 marked = MutableHeaders(scope=message)
@@ -70,13 +76,19 @@ class RequestMiddleware:
             route = getattr(scope.get("route"), "path", None) or "other"
             self.metrics.requests.labels(scope["method"], route, str(status)).inc()
             self.metrics.seconds.labels(route).observe(seconds)
+            caller: Caller = scope["state"]["caller"]
+            level = logging.DEBUG if scope["path"] in PROBES else self.level
             log.log(
-                logging.WARNING if status >= 500 else logging.DEBUG,
+                logging.WARNING if status >= 500 else level,
                 "request",
+                request=request_id,
+                owner=caller.owner,
+                key=caller.key_name,
                 method=scope["method"],
                 path=scope["path"],
                 status=status,
                 seconds=round(seconds, 4),
+                bytes=sent,
             )
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -110,11 +122,17 @@ class RequestMiddleware:
         """Find the caller. Raises ProblemError for a request that is refused before its body is read."""
         if scope["path"] not in OPEN_PATHS:
             try:
-                scope["state"]["caller"] = await self.authentication.caller(headers)
+                scope["state"]["caller"] = await self.authentication.caller(scope, headers)
             except StorageError as error:
                 log.warning("keys cannot be read", error=str(error))
                 found = problem_of_storage(error)
                 raise ProblemError(found.code, found.detail, advice=found.advice) from error
+            except redis.RedisError as error:
+                log.warning("sessions cannot be read", error=type(error).__name__)
+                found = problem_of_redis(error)
+                raise ProblemError(
+                    found.code, found.detail, advice=found.advice, headers={"Retry-After": "5"}
+                ) from error
             await self.rate.admit(scope["state"]["caller"])
         length = headers.get("content-length", "0")
         if not _streams(scope, headers) and length.isdigit() and int(length) > self.max_body:

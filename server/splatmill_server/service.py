@@ -23,6 +23,7 @@ from splatmill_server.models import Models
 from splatmill_server.outgoing import Outgoing
 from splatmill_server.partial_uploads import PartialUploads
 from splatmill_server.reaper import Reaper
+from splatmill_server.sessions import Sessions
 from splatmill_server.settings import Settings
 from splatmill_server.space.ledger import Ledger
 from splatmill_server.space.usage import Usage
@@ -70,6 +71,7 @@ class Service:
     jobs: Jobs
     models: Models
     keys: Keys
+    sessions: Sessions
     reaper: Reaper
     usage: Usage
     closing: asyncio.Event = field(default_factory=asyncio.Event)
@@ -79,6 +81,7 @@ class Service:
     def of(cls, settings: Settings) -> "Service":
         """Return the state for these settings. Raises StorageError if storage cannot be opened."""
         storage = Storage(settings.storage)
+        redis_async = connect_async(settings.redis_url)
         connection = connect(settings.redis_url, timeout=settings.redis_timeout, retries=1)
         metrics = Metrics()
         jobs = Jobs(connection, storage, metrics)
@@ -86,7 +89,7 @@ class Service:
         return cls(
             settings=settings,
             redis=connection,
-            redis_async=connect_async(settings.redis_url),
+            redis_async=redis_async,
             storage=storage,
             storage_check=StorageCheck(storage),
             renderer=_renderer(settings),
@@ -97,6 +100,7 @@ class Service:
             jobs=jobs,
             models=Models(storage, jobs),
             keys=Keys(storage, bootstrap=settings.api_key is not None),
+            sessions=Sessions(redis_async, settings.session_seconds, settings.redis_timeout),
             reaper=Reaper(connection, jobs, metrics, settings),
             usage=Usage(storage, Ledger(connection)),
         )

@@ -10,7 +10,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from splatmill.backplane import rendering
 from splatmill.backplane.connection import DEFAULT_URL
 from splatmill.schema import DEFAULT_PORT
-from splatmill_server.outgoing import allowed_hosts
+from splatmill_server import outgoing
 
 
 class Settings(BaseSettings):
@@ -46,6 +46,19 @@ class Settings(BaseSettings):
     )
     uds: Path | None = Field(
         default=None, description="Path of a unix socket to listen on, in place of host and port."
+    )
+
+    allowed_hosts: str = Field(
+        default="",
+        description="Names of proxies before the server, separated by commas; `*.example.org` stands for all names "
+        "that end so. Browsers' pages under these names may use the server. A server without keys is otherwise "
+        "addressed by names of its machine only.",
+    )
+    session_seconds: int = Field(
+        default=12 * 3600, gt=0, description="Seconds after which the session of a browser ends."
+    )
+    access_log: bool = Field(
+        default=True, description="Whether each request is logged: who, what, status, seconds and bytes."
     )
 
     max_file_bytes: int = Field(
@@ -92,12 +105,17 @@ class Settings(BaseSettings):
     def _complete(self) -> Self:
         if not self.storage:
             self.storage = (self.data.expanduser().absolute() / "storage").as_uri()
-        allowed_hosts(self.outgoing_allow)
+        outgoing.allowed_hosts(self.outgoing_allow)
         if self.renderer_url is not None:
             rendering.address(self.renderer_url)
         if self.api_key is not None and not self.api_key.get_secret_value():
             self.api_key = None
         return self
+
+    @property
+    def own_names(self) -> list[str]:
+        """The names of `allowed_hosts`, in lower case."""
+        return [name.strip().lower() for name in self.allowed_hosts.split(",") if name.strip()]
 
     @property
     def local(self) -> bool:

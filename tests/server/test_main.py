@@ -68,7 +68,7 @@ def served(uds: Path, **options: Any) -> Iterator[tuple[subprocess.Popen[str], h
         process = subprocess.Popen(**command(SPLATMILL_UDS=str(uds), **env), **options, stderr=log)
     transport = httpx.HTTPTransport(uds=str(uds))
     try:
-        with httpx.Client(transport=transport, base_url="http://server", timeout=30) as http:
+        with httpx.Client(transport=transport, base_url="http://localhost", timeout=30) as http:
             wait_for(lambda: process.poll() is None and listening(uds), 60)
             yield process, http
     finally:

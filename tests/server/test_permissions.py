@@ -20,8 +20,8 @@ from tests.support.served_app import Serve, ServedApp, problem
 
 OPEN = {"/healthz", "/readyz", "/openapi.json", "/docs"}
 SAFE = {"get", "head", "options"}
-READS = {"/v1/models/{model_id}/render", "/v1/models/{model_id}/orbit"}
-"""Addresses whose POST changes nothing."""
+READS = {"/v1/models/{model_id}/render", "/v1/models/{model_id}/orbit", "/v1/session"}
+"""Addresses whose POST and DELETE change no record."""
 
 OWN = {"capture_id", "job_id", "model_id"}
 """Path parameters that name a record of an owner."""

@@ -143,13 +143,18 @@ def problem(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
 
 
 def raw(
-    app: ServedApp, line: str, body: bytes, *headers: str, length: int | None = None
+    app: ServedApp,
+    line: str,
+    body: bytes,
+    *headers: str,
+    length: int | None = None,
+    host: str = "localhost",
 ) -> tuple[int, bytes]:
     """Send a request as these bytes; status and body of the answer."""
     with socket.create_connection(app.address, 10) as link:
         head = [
             line,
-            "Host: test",
+            f"Host: {host}",
             "Connection: close",
             f"Content-Length: {length or len(body)}",
             *headers,

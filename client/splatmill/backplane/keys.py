@@ -91,6 +91,14 @@ def rate(key_id: str) -> str:
     return f"{PREFIX}rate:{key_id}"
 
 
+def session(cookie_digest: str) -> str:
+    """Return the key of a string with what the cookie of a browser's session stands for; it expires.
+
+    cookie_digest: SHA-256 in hex of the cookie.
+    """
+    return f"{PREFIX}session:{cookie_digest}"
+
+
 def begun_jobs(owner: str) -> str:
     """Return the key of the number of jobs of an owner that were created or restarted.
 
