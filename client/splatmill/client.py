@@ -9,7 +9,7 @@ import httpx
 from splatmill.aio import AsyncClient
 from splatmill.connection import RETRIES, TIMEOUT
 from splatmill.downloads import AnyPath, OnBytes
-from splatmill.job import AsyncJobHandle
+from splatmill.job import MOST_LINES, AsyncJobHandle
 from splatmill.keys import Keys
 from splatmill.loop import BackgroundLoop
 from splatmill.model import AsyncModelHandle
@@ -246,9 +246,12 @@ class JobHandle:
         """Return the report: error against run time, the plan, and where it ran."""
         return self._loop.run(self._async.report())
 
-    def logs(self) -> list[LogLine]:
-        """Return the log of the job, oldest line first."""
-        return self._loop.run(self._async.logs())
+    def logs(self, *, limit: int = MOST_LINES) -> list[LogLine]:
+        """Return the log of the job, oldest line first.
+
+        `limit` is the largest number of lines; the last ones are returned.
+        """
+        return self._loop.run(self._async.logs(limit=limit))
 
     def curve(self) -> list[CurveRow]:
         """Return the error against run time that was measured so far, from the first measurement on."""

@@ -136,9 +136,12 @@ class AsyncJobHandle:
         response = await self.connection.request("GET", f"/v1/jobs/{self.id}/report")
         return read_answer(Report, response)
 
-    async def logs(self) -> list[LogLine]:
-        """Return the log of the job, oldest line first."""
-        response = await self.connection.request("GET", f"/v1/jobs/{self.id}/logs?limit={MOST_LINES}")
+    async def logs(self, *, limit: int = MOST_LINES) -> list[LogLine]:
+        """Return the log of the job, oldest line first.
+
+        `limit` is the largest number of lines; the last ones are returned.
+        """
+        response = await self.connection.request("GET", f"/v1/jobs/{self.id}/logs", params={"limit": limit})
         return read_answer(LogPage, response).lines
 
     async def curve(self) -> list[CurveRow]:

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args, get_origin
 from docs.generate.markdown import code, table
 from typer.main import get_command
 
-from splatmill.cli.app import COMMANDS, app
+from splatmill.cli.app import COMMANDS, HEADINGS, app, heading_of
 from splatmill.cli.exits import Exit
 
 INTRODUCTION = """# Command line
@@ -45,28 +45,39 @@ def page() -> str:
     """The page of commands."""
     group = get_command(app)
     parts = [INTRODUCTION]
-    for name in COMMANDS:
-        command = group.get_command(None, name)  # type: ignore[attr-defined]  # a group, as app is
-        members = getattr(command, "commands", None)  # a group of commands, such as `keys`
-        parts += [_command(f"{name} {sub}", member) for sub, member in members.items()] if members else []
-        parts += [] if members else [_command(name, command)]
+    commands = {name: group.get_command(None, name) for name in COMMANDS}  # type: ignore[attr-defined]  # a group, as app is
+    for heading in HEADINGS:
+        parts.append(f"## {heading}\n")
+        for name, command in commands.items():
+            if heading_of(name) == heading:
+                members = getattr(command, "commands", None)  # a group of commands, such as `keys`
+                parts += (
+                    [_command(f"{name} {sub}", member) for sub, member in members.items()]
+                    if members
+                    else [_command(name, command)]
+                )
     rows = [[str(int(status)), MEANINGS[status]] for status in Exit]
     return "\n".join([*parts, EXIT_STATUS, table(["status", "meaning"], rows)])
 
 
 def _command(name: str, command: Any) -> str:
     if command.context_settings.get("ignore_unknown_options"):
-        return f"## splatmill {name}\n\n```text\n{_said_by_program(name)}\n```\n"
+        return f"### splatmill {name}\n\n```text\n{_said_by_program(name)}\n```\n"
     arguments = [p for p in command.params if p.param_type_name == "argument"]
     options = [p for p in command.params if p.param_type_name == "option" and "--help" not in p.opts]
-    usage = " ".join([f"splatmill {name}", *(f"{p.metavar}" for p in arguments), "[OPTIONS]"])
-    parts = [f"## splatmill {name}\n", f"{command.help}\n", f"```text\n{usage}\n```\n"]
+    usage = " ".join([f"splatmill {name}", *map(_place, arguments), "[OPTIONS]"])
+    parts = [f"### splatmill {name}\n", f"{command.help}\n", f"```text\n{usage}\n```\n"]
     if arguments:
         parts.append(table(["argument", "meaning"], [[code(p.metavar), p.help] for p in arguments]))
     for panel, members in groupby(options, key=lambda p: p.rich_help_panel):
         parts += [f"{panel}:\n"] if panel else []
         parts.append(table(["option", "meaning"], [[_spelling(p), _meaning(p)] for p in members]))
     return "\n".join(parts)
+
+
+def _place(argument: Any) -> str:
+    name = f"{argument.metavar}..." if argument.nargs == -1 else str(argument.metavar)
+    return name if argument.required else f"[{name}]"
 
 
 def _spelling(option: Any) -> str:

@@ -16,9 +16,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from splatmill.cli.app import COMMANDS, app
+from splatmill.cli.app import COMMANDS
 from splatmill.cli.exits import Exit
 from splatmill.cli.follow import ONE_SIGNAL_SECONDS
 from splatmill.client import Client
@@ -31,6 +30,7 @@ from splatmill.schema import (
     StateEvent,
     describe_options,
 )
+from tests.support.command_line import invoke, spawn
 from tests.support.waiting import wait_for
 
 PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n\0\0\0\0"
@@ -40,22 +40,6 @@ PLAN = {
     "reasons": {"image_size": "The photos resolve no more.", "degree": "The views span 20 degrees."},
     "left_out": {"exposure": "Exposures agree."},
 }
-WIDE = {"COLUMNS": "250", "TERM": "dumb", "NO_COLOR": "1"}
-
-
-def invoke(*arguments: str | Path):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments], env=WIDE)
-
-
-def spawn(*arguments: str | Path, **settings) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "splatmill", *map(str, arguments)]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | settings
-    # A runner in the background of a shell ignores Ctrl-C, and its children would inherit that.
-    return subprocess.Popen(command, env=os.environ | WIDE, preexec_fn=_hear_interrupts, **pipes)
-
-
-def _hear_interrupts() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @pytest.fixture

@@ -12,20 +12,40 @@ from splatmill import __version__
 # The module and function of each command.
 COMMANDS = {
     "train": ("splatmill.cli.train", "train"),
-    "up": ("splatmill.cli.service", "up"),
+    "fit-image": ("splatmill.cli.fit_image", "fit_image"),
+    "options": ("splatmill.cli.jobs", "options"),
     "jobs": ("splatmill.cli.jobs", "jobs"),
     "status": ("splatmill.cli.jobs", "status"),
+    "follow": ("splatmill.cli.attach", "follow"),
+    "logs": ("splatmill.cli.attach", "logs"),
     "cancel": ("splatmill.cli.jobs", "cancel"),
+    "restart": ("splatmill.cli.jobs", "restart"),
+    "delete": ("splatmill.cli.delete", "delete"),
+    "models": ("splatmill.cli.records", "models"),
     "download": ("splatmill.cli.models", "download"),
     "render": ("splatmill.cli.models", "render"),
     "orbit": ("splatmill.cli.models", "orbit"),
+    "captures": ("splatmill.cli.records", "captures"),
+    "up": ("splatmill.cli.service", "up"),
     "storage": ("splatmill.cli.storage", "storage"),
-    "fit-image": ("splatmill.cli.fit_image", "fit_image"),
-    "options": ("splatmill.cli.jobs", "options"),
     "keys": ("splatmill.cli.keys", "keys"),
     "doctor": ("splatmill.cli.service", "doctor"),
     "bench": ("splatmill.cli.service", "bench"),
 }
+
+# The commands under each heading of `splatmill --help`; those without one are under the last heading.
+HEADINGS = {
+    "Make a model": ("train", "fit-image", "options"),
+    "Jobs on a server": ("jobs", "status", "follow", "logs", "cancel", "restart", "delete"),
+    "Models and captures": ("models", "download", "render", "orbit", "captures"),
+    "The service and this machine": ("up", "keys", "storage", "doctor", "bench"),
+}
+
+
+def heading_of(name: str) -> str:
+    """Return the heading of a command in `splatmill --help`."""
+    return next((text for text, names in HEADINGS.items() if name in names), [*HEADINGS][-1])
+
 
 # The arguments of these commands are parsed by the programs that they start.
 PASS_ARGUMENTS_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
@@ -42,12 +62,14 @@ class Commands(TyperGroup):
             return None
         module, function = COMMANDS[cmd_name]
         found = getattr(import_module(module), function)
-        if isinstance(found, typer.Typer):  # a group of commands
-            return typer.main.get_command(found)
-        single = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-        settings = PASS_ARGUMENTS_ON if cmd_name in ("up", "doctor", "bench") else None
-        single.command(cmd_name, context_settings=settings)(found)
-        return typer.main.get_command(single)
+        if not isinstance(found, typer.Typer):  # it is a group of commands otherwise
+            single = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+            settings = PASS_ARGUMENTS_ON if cmd_name in ("up", "doctor", "bench") else None
+            single.command(cmd_name, context_settings=settings)(found)
+            found = single
+        command: Any = typer.main.get_command(found)
+        command.rich_help_panel = heading_of(cmd_name)
+        return command
 
     def invoke(self, ctx: Any) -> Any:
         from splatmill.errors import SplatmillError

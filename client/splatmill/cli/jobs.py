@@ -1,10 +1,20 @@
-"""`splatmill jobs`, `status`, `cancel` and `options`."""
+"""`splatmill jobs`, `status`, `cancel`, `restart` and `options`."""
 
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from splatmill.cli.servers import ServerOption, open_client
+from splatmill.cli.tables import (
+    JsonLines,
+    JsonRecord,
+    local_time,
+    print_facts,
+    print_lines,
+    print_record,
+    print_table,
+)
+from splatmill.schema import JobState
 
 if TYPE_CHECKING:
     from splatmill.schema import Job
@@ -13,57 +23,71 @@ JobId = Annotated[str, typer.Argument(metavar="JOB", help="Id of the job.", show
 
 
 def jobs(
-    server: ServerOption = None,
+    state: Annotated[
+        list[JobState] | None,
+        typer.Option(
+            "--state",
+            metavar="STATE",
+            help=f"List only jobs in this state: {', '.join(JobState)}. May be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    name: Annotated[
+        str | None,
+        typer.Option("--name", help="List only jobs whose name contains this text, in any case of letters."),
+    ] = None,
+    capture: Annotated[
+        str | None, typer.Option("--capture", metavar="ID", help="List only jobs on this capture.")
+    ] = None,
     limit: Annotated[int, typer.Option("-n", "--limit", min=1, help="Largest number of jobs to list.")] = 20,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line and job.")] = False,
+    as_json: JsonLines = False,
+    server: ServerOption = None,
 ) -> None:
     """List the jobs, newest first."""
     with open_client(server) as client:
-        found = list(client.jobs(limit=limit))
+        found = list(client.jobs(limit=limit, state=state, name=name, capture=capture))
     if as_json:
-        for job in found:
-            typer.echo(job.model_dump_json(exclude_none=True))
-        return
-    if not found:
+        print_lines(found)
+    elif found:
+        rows = [
+            (job.id, job.name or "", job.state.value, _brief_progress(job), local_time(job.created_at))
+            for job in found
+        ]
+        print_table(("job", "name", "state", "progress", "created"), rows)
+    elif state or name or capture:
+        typer.echo("No job matches.")
+    else:
         typer.echo("There are no jobs yet. Start one with: splatmill train PHOTOS --server URL")
-        return
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("job", "name", "state", "progress", "created", box=None, pad_edge=False)
-    for job in found:
-        created = job.created_at.astimezone().strftime("%Y-%m-%d %H:%M")
-        table.add_row(job.id, job.name or "", job.state.value, _progress(job), created)
-    Console().print(table)
 
 
 def status(
     job_id: JobId,
+    as_json: JsonRecord = False,
     server: ServerOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the record of the job as JSON.")] = False,
 ) -> None:
     """Show the state, progress, plan and problem of a job."""
     with open_client(server) as client:
         job = client.job(job_id).job
     if as_json:
-        typer.echo(job.model_dump_json(indent=2, exclude_none=True))
+        print_record(job)
         return
     from splatmill.cli.plan import plan_lines
+    from splatmill.schema import format_duration
 
-    typer.echo(f"job       {job.id}" + (f" ({job.name})" if job.name else ""))
-    typer.echo(f"state     {job.state.value}" + (" (cancel requested)" if _cancelling(job) else ""))
-    typer.echo(f"attempt   {job.attempt}")
-    typer.echo(f"created   {job.created_at.astimezone():%Y-%m-%d %H:%M:%S}")
-    if job.started_at and job.finished_at:
-        from splatmill.schema import format_duration
-
-        typer.echo(f"took      {format_duration((job.finished_at - job.started_at).total_seconds())}")
-    if job.progress:
-        typer.echo(f"progress  {_progress(job)}")
-    if job.problem:
-        typer.echo(f"problem   {job.problem.sentence}")
-    for line in plan_lines(job.plan or {}):
-        typer.echo(f"plan      {line}")
+    took = (job.finished_at - job.started_at).total_seconds() if job.started_at and job.finished_at else None
+    facts = [
+        ("job", job.id),
+        ("name", job.name or ""),
+        ("owner", job.owner),
+        ("capture", job.capture),
+        ("state", job.state.value + (" (cancel requested)" if _cancelling(job) else "")),
+        ("attempt", str(job.attempt)),
+        ("created", job.created_at.astimezone().strftime("%Y-%m-%d %H:%M:%S")),
+        ("took", format_duration(took) if took is not None else ""),
+        ("progress", _progress(job)),
+        ("problem", job.problem.sentence if job.problem else ""),
+    ]
+    print_facts([*facts, *(("plan", line) for line in plan_lines(job.plan or {}))])
 
 
 def cancel(job_id: JobId, server: ServerOption = None) -> None:
@@ -77,13 +101,23 @@ def cancel(job_id: JobId, server: ServerOption = None) -> None:
     typer.echo(f"The job {job_id} is {state.value}.")
 
 
-def options() -> None:
+def restart(job_id: JobId, server: ServerOption = None) -> None:
+    """Run a job that has ended again, from its last checkpoint if there is one."""
+    with open_client(server) as client:
+        job = client.job(job_id).restart()
+    typer.echo(f"The job {job.id} is {job.state.value}. See how it gets on: splatmill follow {job.id}")
+
+
+def options(as_json: JsonLines = False) -> None:
     """List the training options with their defaults, ranges and help."""
     from rich.console import Console
     from rich.table import Table
 
     from splatmill.schema import describe_options
 
+    if as_json:
+        print_lines(describe_options())
+        return
     table = Table("option", "default", "range", "help", box=None, pad_edge=False)
     for option in describe_options():
         default = "automatic" if option.default is None else str(option.default)
@@ -93,6 +127,14 @@ def options() -> None:
 
 def _cancelling(job: "Job") -> bool:
     return job.cancel_requested and not job.state.final
+
+
+def _brief_progress(job: "Job") -> str:
+    """Return the stage of an unfinished job, and how much of it is done."""
+    progress = job.progress
+    if progress is None or job.state.final:
+        return ""
+    return f"{progress.stage} {progress.done / progress.total:.0%}" if progress.total else progress.stage
 
 
 def _progress(job: "Job") -> str:

@@ -1,11 +1,14 @@
 """`splatmill download`, `render` and `orbit`: the files of a model, and images and videos of it."""
 
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from splatmill.cli.servers import ServerOption, open_client
+from splatmill.cli.transfers import make_transfer_display
 
 if TYPE_CHECKING:
     from splatmill.client import ModelHandle
@@ -23,13 +26,38 @@ OPTIONAL_FILES = ("preview.jpg", "progress.mp4")
 """Files that are also written if the model has them."""
 
 
-def download_files(model: "ModelHandle", folder: Path) -> list[Path]:
-    """Download the files of the model to `folder`, and return their paths."""
+def complete_file() -> list[str]:
+    """Return the names that complete `--file` in a shell."""
+    return [*FILES, *OPTIONAL_FILES]
+
+
+def download_files(model: "ModelHandle", folder: Path, names: Sequence[str] = ()) -> list[Path]:
+    """Download the files of the model with these names, or all of them, to `folder`, and return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     stored = {entry.name for entry in model.model.files}
     wanted = [name for name in FILES if name in stored or not stored]
     wanted += [name for name in OPTIONAL_FILES if name in stored]
-    return [model.download(folder / name, file=name) for name in wanted]
+    with make_transfer_display() as show:
+        return [
+            model.download(folder / name, file=name, on_bytes=partial(show, name)) for name in names or wanted
+        ]
+
+
+def print_summary(model: "ModelHandle", written: list[Path]) -> None:
+    """Print the size and the quality of a model, and the files written."""
+    from splatmill.schema import format_bytes
+
+    record = model.model
+    quality = f", held-out PSNR {record.psnr:.2f} dB" if record.psnr is not None else ""
+    quality += f", SSIM {record.ssim:.3f}" if record.ssim is not None else ""
+    typer.echo(f"{record.gaussians:,} Gaussians, {format_bytes(record.bytes)}{quality}")
+    for path in written:
+        typer.echo(f"  {path}")
+    if any(path.suffix == ".ply" for path in written):
+        typer.echo(
+            "To view it, drop model.ply on https://superspl.at/editor, or open it in any viewer for "
+            "Gaussian splats."
+        )
 
 
 def write_novel_view(model: "ModelHandle", path: Path) -> Path:
@@ -53,11 +81,21 @@ def download(
     out: Annotated[
         Path, typer.Option("-o", "--out", help="Folder for the files; created if missing.")
     ] = Path("splat"),
+    file: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--file",
+            metavar="NAME",
+            help="Download only this file, such as model.ply or report.html. May be repeated.",
+            show_default=False,
+            autocompletion=complete_file,
+        ),
+    ] = None,
     server: ServerOption = None,
 ) -> None:
-    """Download a finished model with its report."""
+    """Download a finished model with its report. A download that was interrupted continues where it stopped."""
     with open_client(server) as client:
-        for path in download_files(client.model(model_id), out):
+        for path in download_files(client.model(model_id), out, file or ()):
             typer.echo(path)
 
 

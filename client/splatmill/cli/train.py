@@ -15,7 +15,7 @@ from splatmill.cli.embedded import embedded_service
 from splatmill.cli.exits import Exit
 from splatmill.cli.folder_lock import locked
 from splatmill.cli.follow import Interrupted, StoppedWaiting, follow_job
-from splatmill.cli.models import download_files, write_novel_view
+from splatmill.cli.models import download_files, print_summary, write_novel_view
 from splatmill.cli.progress import make_display
 from splatmill.cli.schema_options import with_training_options
 from splatmill.cli.servers import open_client
@@ -110,7 +110,7 @@ def train(
             written.append(write_novel_view(model, out / "novel_view.png"))
         if orbit:
             written.append(model.orbit(out / "orbit.mp4"))
-        _summary(model, written)
+        print_summary(model, written)
 
     with _sigterm_as_interrupt():
         if server is None:
@@ -218,19 +218,6 @@ def _follow(
     except StoppedWaiting:
         typer.echo("The job is being cancelled; this command does not wait for its end.", err=True)
     raise typer.Exit(Exit.cancelled)
-
-
-def _summary(model: ModelHandle, written: list[Path]) -> None:
-    record = model.model
-    quality = f", held-out PSNR {record.psnr:.2f} dB" if record.psnr is not None else ""
-    quality += f", SSIM {record.ssim:.3f}" if record.ssim is not None else ""
-    typer.echo(f"{record.gaussians:,} Gaussians, {format_bytes(record.bytes)}{quality}")
-    for path in written:
-        typer.echo(f"  {path}")
-    typer.echo(
-        "To view it, drop model.ply on https://superspl.at/editor, or open it in any viewer for "
-        "Gaussian splats."
-    )
 
 
 @contextmanager

@@ -1,0 +1,130 @@
+"""`splatmill captures` and `models`: what the server stores, as a list or one record at a time."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from splatmill.cli.servers import ServerOption, open_client
+from splatmill.cli.tables import (
+    JsonLines,
+    local_time,
+    print_facts,
+    print_lines,
+    print_record,
+    print_table,
+)
+
+if TYPE_CHECKING:
+    from splatmill.schema import Capture, Model
+
+Limit = Annotated[int, typer.Option("-n", "--limit", min=1, help="Largest number of records to list.")]
+NamePart = Annotated[
+    str | None,
+    typer.Option("--name", help="List only records whose name contains this text, in any case of letters."),
+]
+
+
+def captures(
+    capture_id: Annotated[
+        str | None, typer.Argument(metavar="CAPTURE", help="Id of a capture to show.", show_default=False)
+    ] = None,
+    name: NamePart = None,
+    limit: Limit = 20,
+    as_json: JsonLines = False,
+    server: ServerOption = None,
+) -> None:
+    """List the captures, newest first, or show the files of one."""
+    with open_client(server) as client:
+        if capture_id is not None:
+            _show_capture(client.capture(capture_id), as_json)
+            return
+        found = list(client.captures(name=name, limit=limit))
+    if as_json:
+        print_lines(found)
+    elif found:
+        rows = [(entry.id, entry.name or "", local_time(entry.created_at)) for entry in found]
+        print_table(("capture", "name", "created"), rows)
+    else:
+        typer.echo("No capture is stored." if name is None else "No capture has such a name.")
+
+
+def models(
+    model_id: Annotated[
+        str | None, typer.Argument(metavar="MODEL", help="Id of a model to show.", show_default=False)
+    ] = None,
+    name: NamePart = None,
+    limit: Limit = 20,
+    as_json: JsonLines = False,
+    server: ServerOption = None,
+) -> None:
+    """List the finished models, newest first, or show one with its files."""
+    from splatmill.schema import format_bytes
+
+    with open_client(server) as client:
+        if model_id is not None:
+            _show_model(client.model(model_id).model, as_json)
+            return
+        found = list(client.models(name=name, limit=limit))
+    if as_json:
+        print_lines(found)
+    elif found:
+        rows = [
+            (
+                entry.id,
+                entry.name or "",
+                f"{entry.gaussians:,}",
+                format_bytes(entry.bytes),
+                f"{entry.psnr:.2f} dB" if entry.psnr is not None else "",
+                local_time(entry.created_at),
+            )
+            for entry in found
+        ]
+        print_table(("model", "name", "Gaussians", "size", "PSNR", "created"), rows)
+    else:
+        typer.echo("No model is finished." if name is None else "No model has such a name.")
+
+
+def _show_capture(capture: "Capture", as_json: bool) -> None:
+    from splatmill.schema import format_bytes
+
+    if as_json:
+        print_record(capture)
+        return
+    facts = [
+        ("capture", capture.id),
+        ("name", capture.name or ""),
+        ("owner", capture.owner),
+        ("created", local_time(capture.created_at)),
+        ("files", f"{len(capture.files)}, {format_bytes(sum(file.size for file in capture.files))}"),
+    ]
+    print_facts(facts)
+    if capture.files:
+        typer.echo()
+        rows = [(file.role.value, file.name, format_bytes(file.size)) for file in capture.files]
+        print_table(("role", "file", "size"), rows)
+
+
+def _show_model(model: "Model", as_json: bool) -> None:
+    from splatmill.schema import format_bytes
+
+    if as_json:
+        print_record(model)
+        return
+    facts = [
+        ("model", model.id),
+        ("name", model.name or ""),
+        ("owner", model.owner),
+        ("created", local_time(model.created_at)),
+        ("Gaussians", f"{model.gaussians:,}, spherical harmonics of degree {model.sh_degree}"),
+        ("held out", _quality(model)),
+    ]
+    print_facts(facts)
+    if model.files:
+        typer.echo()
+        print_table(("size", "file"), [(format_bytes(file.size), file.name) for file in model.files])
+
+
+def _quality(model: "Model") -> str:
+    parts = [f"PSNR {model.psnr:.2f} dB"] if model.psnr is not None else []
+    parts += [f"SSIM {model.ssim:.3f}"] if model.ssim is not None else []
+    return ", ".join(parts)

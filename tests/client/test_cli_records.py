@@ -1,0 +1,231 @@
+"""The commands that list, show, follow and delete what a real server stores, and what they print on a terminal.
+
+A worker's part is played through the backplane. Does not prove what trains, nor the embedded service.
+"""
+
+import json
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+
+from splatmill.backplane import layout
+from splatmill.cli.exits import Exit
+from splatmill.client import Client
+from splatmill.schema import EventRecord, JobState, LogEvent, Problem, ProgressEvent, StateEvent
+from tests.support.command_line import invoke, on_terminal, spawn
+
+PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n\0\0\0\0"
+LONG = "the kitchen of the old house by the lake, second floor, at noon"
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for n in range(3):
+        (folder / f"{n}.jpg").write_bytes(bytes([n]) * 1000)
+    return folder
+
+
+@pytest.fixture
+def at(service) -> tuple[str, str]:
+    return ("--server", service.url)
+
+
+@pytest.fixture
+def jobs(service, photos) -> list[str]:
+    """Three jobs on one capture: succeeded, training, queued."""
+    with Client(service.url) as client:
+        capture, _ = client.upload(photos, name="kitchen photos")
+        made = [client.submit(capture.id, name=name).id for name in (LONG, "garden", "[red]\x1b[2J")]
+    service.begin(made[0])
+    service.finish(made[0], PLY)
+    service.begin(made[1])
+    service.say(
+        made[1],
+        StateEvent(state=JobState.training),
+        LogEvent(level="warning", message="2 photos were left out"),
+        LogEvent(message="step\x1b[2J 1"),
+        ProgressEvent(stage="training", done=450, total=1000, loss=0.25, psnr=21.5, gaussians=12345, eta=65),
+    )
+    return made
+
+
+def capture_of(at, job_id: str) -> str:
+    return str(json.loads(invoke("status", job_id, "--json", *at).stdout)["capture"])
+
+
+def test_lists_are_narrowed_by_options(at, jobs):
+    def listed(*options: str) -> list[str]:
+        printed = invoke("jobs", "--json", *options, *at).stdout
+        return [json.loads(line)["id"] for line in printed.splitlines()]
+
+    assert listed() == jobs[::-1]
+    assert listed("--state", "training") == [jobs[1]]
+    assert listed("--state", "training", "--state", "succeeded") == jobs[1::-1]
+    assert listed("--name", "KITCHEN") == [jobs[0]]
+    assert listed("--capture", capture_of(at, jobs[0])) == jobs[::-1]
+    assert listed("--capture", "0" * 16) == []
+    assert invoke("jobs", "--name", "none such", *at).stdout == "No job matches.\n"
+    assert invoke("jobs", "--state", "sleeping", *at).exit_code == Exit.usage
+
+
+def test_captures_and_models_are_listed_and_shown(at, jobs):
+    capture = capture_of(at, jobs[0])
+    assert json.loads(invoke("captures", "--json", *at).stdout)["id"] == capture
+    shown = invoke("captures", capture, *at).stdout
+    for line in (f"capture   {capture}", "name      kitchen photos", "files     3, 3.0 kB", "images  2.jpg"):
+        assert line in shown
+    assert len(json.loads(invoke("captures", capture, "--json", *at).stdout)["files"]) == 3
+    assert json.loads(invoke("models", "--json", "--name", "lake", *at).stdout)["id"] == jobs[0]
+    shown = invoke("models", jobs[0], *at).stdout
+    for line in (f"model     {jobs[0]}", "Gaussians 1, spherical", "held out  PSNR 25.00 dB", "model.ply"):
+        assert line in shown
+    assert json.loads(invoke("models", jobs[0], "--json", *at).stdout)["gaussians"] == 1
+    assert invoke("models", "--name", "garden", *at).stdout == "No model has such a name.\n"
+    assert invoke("captures", "--name", "garden", *at).stdout == "No capture has such a name.\n"
+    assert invoke("models", jobs[1], *at).exit_code == Exit.not_found
+    assert invoke("captures", "0" * 16, *at).exit_code == Exit.not_found
+
+
+def test_tables_fit_a_terminal_of_80_columns_and_are_whole_elsewhere(at, jobs):
+    _, shown = on_terminal("jobs", *at)
+    lines = shown.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert len(lines) == 4, "one line for each job"
+    for job_id in jobs:
+        assert job_id in shown
+    assert "training 45%" in shown
+    assert "…" in shown
+    assert "[red]\N{REPLACEMENT CHARACTER}[2J" in shown, "names are neither markup nor control sequences"
+    assert LONG in invoke("jobs", *at).stdout
+
+
+def test_the_log(service, at, jobs):
+    printed = invoke("logs", jobs[1], *at).stdout.splitlines()
+    assert [line[21:] for line in printed] == [
+        "warning  2 photos were left out",
+        "info     step\N{REPLACEMENT CHARACTER}[2J 1",
+    ]
+    assert len(invoke("logs", jobs[1], "-n", "1", *at).stdout.splitlines()) == 1
+    lines = [json.loads(line) for line in invoke("logs", jobs[1], "--json", *at).stdout.splitlines()]
+    assert [line["level"] for line in lines] == ["warning", "info"]
+    assert invoke("logs", "0" * 16, *at).exit_code == Exit.not_found
+
+
+def test_the_log_is_followed_to_the_end_of_the_job(service, at, jobs):
+    process = spawn("logs", jobs[1], "--follow", "-n", "1", *at)
+    assert process.stdout is not None
+    assert "step" in process.stdout.readline(), "the lines before the last one are not shown"
+    service.say(jobs[1], LogEvent(message="another line"))
+    assert "another line" in process.stdout.readline()
+    service.finish(jobs[1], PLY)
+    rest, stderr = process.communicate(timeout=30)
+    assert (process.returncode, rest, stderr) == (0, "", "")
+
+
+def test_following_a_job_to_its_model(service, at, jobs, tmp_path: Path):
+    threading.Timer(0.3, service.finish, [jobs[1], PLY]).start()
+    done = invoke("follow", jobs[1], "-o", tmp_path / "out", *at)
+    assert done.exit_code == 0, done.output
+    for line in ("warning: 2 photos were left out", "training  450/1000", "1 Gaussians", "model.ply"):
+        assert line in done.stdout
+    assert (tmp_path / "out" / "model.ply").read_bytes() == PLY
+    printed = invoke("follow", jobs[1], "--json", *at).stdout.splitlines()
+    types = [EventRecord.model_validate_json(line).event.type for line in printed]
+    assert sorted(types) == ["log", "log", "progress", *4 * ["state"]]
+
+
+def test_following_a_job_that_fails_or_is_cancelled(service, at, jobs):
+    service.fail(jobs[1], Problem.of("diverged", "It diverged.", advice="Take fewer steps."))
+    done = invoke("follow", jobs[1], *at)
+    assert done.exit_code == Exit.job_failed
+    assert done.stderr == "Error: It diverged.\nTake fewer steps.\n"
+    assert invoke("cancel", jobs[2], *at).exit_code == 0
+    done = invoke("follow", jobs[2], *at)
+    assert done.exit_code == Exit.cancelled
+    assert "was cancelled." in done.stdout
+
+
+def test_ctrl_c_ends_the_following_and_not_the_job(service, at, jobs):
+    process = spawn("follow", jobs[1], *at)
+    assert process.stdout is not None
+    assert any("training  450/1000" in line for line in iter(process.stdout.readline, ""))
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=30)
+    assert process.returncode == Exit.cancelled
+    assert stderr == f"The job continues. See how it gets on: splatmill follow {jobs[1]}\n"
+    assert json.loads(invoke("status", jobs[1], "--json", *at).stdout)["state"] == "training"
+
+
+def test_restarting(service, at, jobs):
+    done = invoke("restart", jobs[1], *at)
+    assert done.exit_code == Exit.not_found
+    assert "has not ended" in done.stderr
+    service.fail(jobs[1], Problem.of("diverged", "It diverged."))
+    done = invoke("restart", jobs[1], *at)
+    assert done.stdout.startswith(f"The job {jobs[1]} is queued.")
+
+
+def test_deleting(service, at, jobs):
+    capture = capture_of(at, jobs[0])
+    done = invoke("delete", jobs[0], *at)
+    assert done.exit_code == Exit.usage
+    assert "give --yes" in done.output
+    done = invoke("delete", jobs[0], jobs[1], "--yes", *at)
+    assert done.exit_code == Exit.not_found
+    assert f"Cancel it first: splatmill cancel {jobs[1]}" in done.stderr
+    done = invoke("delete", jobs[0], "0" * 16, "--yes", *at)
+    assert done.exit_code == Exit.not_found
+    assert "There is no job, model or capture" in done.stderr
+    assert invoke("status", jobs[0], *at).exit_code == 0, "a wrong id deletes nothing"
+    done = invoke("delete", capture, "--yes", *at)
+    assert done.exit_code == Exit.not_found
+    assert "has not ended" in done.stderr
+
+    done = invoke("delete", jobs[0], "--yes", *at)
+    assert done.stdout == (
+        f"Deleted the job {jobs[0]} ({LONG}, succeeded) and its model of 1 Gaussians, {len(PLY)} B.\n"
+    )
+    assert invoke("models", jobs[0], *at).exit_code == Exit.not_found
+    for job_id in jobs[1:]:
+        invoke("cancel", job_id, *at)
+        service.say(job_id, StateEvent(state=JobState.cancelled))
+    done = invoke("delete", *jobs[1:], capture, "-y", *at)
+    assert done.exit_code == 0, done.output
+    assert f"Deleted the capture {capture} (kitchen photos, 3 files, 3.0 kB)." in done.stdout
+    assert invoke("captures", *at).stdout == "No capture is stored.\n"
+
+
+def test_deleting_asks_on_a_terminal(at, jobs):
+    status, shown = on_terminal("delete", jobs[0], *at, typed="n\n")
+    assert status == 1
+    assert "Delete this for good? [y/N]" in shown
+    assert "Nothing was deleted." in shown
+    status, shown = on_terminal("delete", jobs[0], *at, typed="y\n")
+    assert status == 0
+    assert f"Deleted the job {jobs[0]}" in shown
+    assert invoke("status", jobs[0], *at).exit_code == Exit.not_found
+
+
+def test_a_download_shows_a_bar_and_resumes(service, at, jobs, tmp_path: Path):
+    model = PLY + bytes(3_000_000)
+    service.storage.put(layout.model_file(jobs[0], "model.ply"), model)
+    with Client(service.url) as client:
+        part = tmp_path / "splat" / "model.ply.part"
+        part.parent.mkdir()
+        etag = client._async.connection.http.head  # the ETag that the server gives the file
+        response = client._loop.run(etag(f"/v1/models/{jobs[0]}/files/model.ply"))
+    part.write_bytes(model[:1_000_000])
+    part.with_name("model.ply.part.etag").write_text(response.headers["ETag"])
+    status, shown = on_terminal("download", jobs[0], "-o", tmp_path / "splat", "--file", "model.ply", *at)
+    assert status == 0, shown
+    assert "model.ply" in shown
+    assert "1.0/3.0 MB" in shown or "3.0/3.0 MB" in shown
+    assert (tmp_path / "splat" / "model.ply").read_bytes() == model
+    assert [path.name for path in (tmp_path / "splat").iterdir()] == ["model.ply"]
+    done = invoke("download", jobs[0], "-o", tmp_path, "--file", "none.txt", *at)
+    assert done.exit_code == Exit.not_found
+    assert "The files of a model are" in done.stderr
