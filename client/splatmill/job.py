@@ -2,7 +2,8 @@
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator
+from contextlib import aclosing
 
 from splatmill.connection import Connection, backoff, read_answer
 from splatmill.errors import Conflict, ConnectionFailed, JobCancelled, JobFailed, Unavailable, WaitTimeout
@@ -56,17 +57,24 @@ class AsyncJobHandle:
         self.job = read_answer(Job, response)
         return self.job
 
-    async def events(self, after: str | None = None) -> AsyncIterator[EventRecord]:
+    def events(self, after: str | None = None) -> AsyncIterator[EventRecord]:
         """Yield the events of the job until it ends. A lost connection is restored without losing events.
 
         `after` is the id of the last event already seen; without it, the events begin at the start of the job.
         """
+        return self._events(after)
+
+    async def _events(self, after: str | None = None) -> AsyncGenerator[EventRecord, None]:
         empty = 0  # streams in a row that ended without an event
         while True:
             empty += 1
-            async for record in follow_events(self.connection, f"/v1/jobs/{self.id}/events", after=after):
-                after, empty = record.id, 0
-                yield record
+            # It is closed with this generator; the end of the loop would interrupt the closing of its connection.
+            async with aclosing(
+                follow_events(self.connection, f"/v1/jobs/{self.id}/events", after=after)
+            ) as records:
+                async for record in records:
+                    after, empty = record.id, 0
+                    yield record
             if (await self._refresh_patiently()).state.final:
                 return
             if empty:  # do not poll a server that ends its streams at once
@@ -92,8 +100,8 @@ class AsyncJobHandle:
         long as the job takes. Raises WaitTimeout after the timeout, and the job continues.
         """
         try:
-            async with asyncio.timeout(timeout) as limit:
-                async for record in self.events():
+            async with asyncio.timeout(timeout) as limit, aclosing(self._events()) as records:
+                async for record in records:
                     if isinstance(record.event, StateEvent):
                         self.job = self.job.model_copy(update={"state": record.event.state})
                     if on_progress is not None and isinstance(record.event, ProgressEvent):

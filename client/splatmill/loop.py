@@ -19,6 +19,7 @@ class BackgroundLoop:
 
     def __init__(self) -> None:
         self._loop = asyncio.new_event_loop()
+        self._open: set[Callable[[], Coroutine[Any, Any, None]]] = set()  # that close iterations
         self._thread = threading.Thread(target=self._serve, name="splatmill", daemon=True)
         self._thread.start()
 
@@ -73,11 +74,18 @@ class BackgroundLoop:
             if close is not None:
                 await close()
 
+        self._open.add(close_items)
         try:
             while (item := self.run(advance())) is not _DONE:
                 yield item  # type: ignore[misc]  # the default of anext widens the type; _DONE is excluded here
         finally:
-            self.run(close_items())
+            self._close_items(close_items)
+
+    def _close_items(self, close: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        # After `close`, which has closed the items, an abandoned iteration may still be collected.
+        if close in self._open:
+            self._open.discard(close)
+            self.run(close())
 
     @property
     def closed(self) -> bool:
@@ -85,7 +93,10 @@ class BackgroundLoop:
         return self._loop.is_closed()
 
     def close(self) -> None:
-        """Cancel the running coroutines and end the thread."""
+        """Close the iterations, cancel the running coroutines, and end the thread."""
+        # The loop itself would close all generators at once, and report that one which closes another runs already.
+        for close in list(self._open):
+            self._close_items(close)
         self.run(_cancel_others())
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()

@@ -5,7 +5,7 @@ Lines are split as bytes: JSON may contain U+2028 or U+0085, at which str.splitl
 
 import asyncio
 import time
-from collections.abc import AsyncIterable, AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator
 from dataclasses import dataclass
 
 import httpx
@@ -64,7 +64,7 @@ async def _lines(chunks: AsyncIterable[bytes]) -> AsyncIterator[bytes]:
 
 async def follow_events(
     connection: Connection, path: str, *, after: str | None = None, give_up: float = GIVE_UP_SECONDS
-) -> AsyncIterator[EventRecord]:
+) -> AsyncGenerator[EventRecord, None]:
     """Yield the events at `path` until the server ends the stream; after a lost connection, resume after the last one.
 
     `after` is the id of the last event already seen. Events of a type that this version does not know are skipped. The

@@ -68,7 +68,7 @@ def _command(name: str, command: Any) -> str:
     usage = " ".join([f"splatmill {name}", *map(_place, arguments), "[OPTIONS]"])
     parts = [f"### splatmill {name}\n", f"{command.help}\n", f"```text\n{usage}\n```\n"]
     if arguments:
-        parts.append(table(["argument", "meaning"], [[code(p.metavar), p.help] for p in arguments]))
+        parts.append(table(["argument", "meaning"], [[code(_name(p)), p.help] for p in arguments]))
     for panel, members in groupby(options, key=lambda p: p.rich_help_panel):
         parts += [f"{panel}:\n"] if panel else []
         parts.append(table(["option", "meaning"], [[_spelling(p), _meaning(p)] for p in members]))
@@ -76,8 +76,12 @@ def _command(name: str, command: Any) -> str:
 
 
 def _place(argument: Any) -> str:
-    name = f"{argument.metavar}..." if argument.nargs == -1 else str(argument.metavar)
+    name = _name(argument) + ("..." if argument.nargs == -1 else "")
     return name if argument.required else f"[{name}]"
+
+
+def _name(argument: Any) -> str:
+    return str(argument.metavar or argument.name.upper())
 
 
 def _spelling(option: Any) -> str:

@@ -47,7 +47,7 @@ def jobs(service, photos) -> list[str]:
         made[1],
         StateEvent(state=JobState.training),
         LogEvent(level="warning", message="2 photos were left out"),
-        LogEvent(message="step\x1b[2J 1"),
+        LogEvent(level="warning", message="step\x1b[2J 1"),
         ProgressEvent(stage="training", done=450, total=1000, loss=0.25, psnr=21.5, gaussians=12345, eta=65),
     )
     return made
@@ -107,11 +107,11 @@ def test_the_log(service, at, jobs):
     printed = invoke("logs", jobs[1], *at).stdout.splitlines()
     assert [line[21:] for line in printed] == [
         "warning  2 photos were left out",
-        "info     step\N{REPLACEMENT CHARACTER}[2J 1",
+        "warning  step\N{REPLACEMENT CHARACTER}[2J 1",
     ]
     assert len(invoke("logs", jobs[1], "-n", "1", *at).stdout.splitlines()) == 1
     lines = [json.loads(line) for line in invoke("logs", jobs[1], "--json", *at).stdout.splitlines()]
-    assert [line["level"] for line in lines] == ["warning", "info"]
+    assert [line["message"] for line in lines] == ["2 photos were left out", "step\x1b[2J 1"]
     assert invoke("logs", "0" * 16, *at).exit_code == Exit.not_found
 
 

@@ -173,6 +173,16 @@ def test_a_job_that_is_deleted_while_it_is_followed(service, photos):
         assert gone.value.code == "job_not_found"
 
 
+def test_a_client_closes_while_events_are_read(service, photos, caplog):
+    with Client(service.url) as client:
+        job = client.train(photos)
+        service.begin(job.id)
+        events = job.events()
+        assert next(events).event.type == "state"
+    assert caplog.messages == []
+    del events  # what an abandoned iteration leaves open would be reported when it is collected
+
+
 def test_lists_can_be_narrowed(service, photos):
     with Client(service.url) as client:
         kitchen, _ = client.upload(photos, name="Kitchen, 2nd floor")

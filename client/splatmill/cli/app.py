@@ -68,7 +68,7 @@ class Commands(TyperGroup):
             single.command(cmd_name, context_settings=settings)(found)
             found = single
         command: Any = typer.main.get_command(found)
-        command.rich_help_panel = heading_of(cmd_name)
+        command.name, command.rich_help_panel = cmd_name, heading_of(cmd_name)
         return command
 
     def invoke(self, ctx: Any) -> Any:
