@@ -15,7 +15,7 @@ def make_transfer_display() -> Iterator[OnFileBytes]:
         yield lambda name, done, total: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
+    from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColumn, TransferSpeedColumn
 
     columns = (
         TextColumn("{task.description}", markup=False),
@@ -24,7 +24,7 @@ def make_transfer_display() -> Iterator[OnFileBytes]:
         TransferSpeedColumn(),
     )
     with Progress(*columns, console=Console(highlight=False), transient=True) as bar:
-        tasks = {}
+        tasks: dict[str, TaskID] = {}
 
         def show(name: str, done: int, total: int | None) -> None:
             if name not in tasks:
