@@ -14,7 +14,7 @@ from splatmill_server.ownership import check_model
 from splatmill_server.problems import ProblemError
 from splatmill_server.service import Service
 
-_FIELDS = ("name", "options")
+_FIELDS = ("name", "options", "priority")
 
 
 async def create_from_form(
@@ -22,7 +22,8 @@ async def create_from_form(
 ) -> tuple[Job, bool]:
     """Store the files of a form in a new capture and start a job on it; return the job, and whether it is new.
 
-    The files are the parts `images`, `masks` and `poses`; the field `options` is JSON, and `name` is text. If any part
+    The files are the parts `images`, `masks` and `poses`; the field `options` is JSON, `name` is text, and `priority` a
+    number. If any part
     is refused, the capture is deleted.
     """
     capture, _ = await run_in_threadpool(lambda: service.captures.create(owner=who.owner))
@@ -32,7 +33,7 @@ async def create_from_form(
         create = _request(capture.id, fields)
         await run_in_threadpool(service.captures.check_trainable, capture.id)
         await run_in_threadpool(check_start_model, service, who, create)
-        described = create.model_dump_json(exclude={"capture"}) + "\n".join(fingerprints(files))
+        described = create.described(with_capture=False) + "\n".join(fingerprints(files))
         job, new = await run_in_threadpool(
             lambda: service.jobs.create(
                 create, owner=who.owner, key=key, body=described, most=who.limits.unfinished_jobs
@@ -71,7 +72,7 @@ async def _receive(
                 "invalid_request",
                 f"The form contains an unknown {kind}, {part.name[:80]!r}.",
                 advice="Send the files as 'images', 'masks' and 'poses', and the fields 'options' "
-                "(JSON) and 'name'.",
+                "(JSON), 'name' and 'priority'.",
             )
     return files, fields
 
@@ -94,6 +95,7 @@ def _request(capture_id: str, fields: dict[str, str]) -> CreateJob:
             advice='Send a JSON object such as {"steps": 1000}.',
         ) from error
     body = {"capture": capture_id, "options": options, "name": fields.get("name") or None}
+    body |= {"priority": fields["priority"]} if "priority" in fields else {}
     try:
         return CreateJob.model_validate(body)
     except ValidationError as error:

@@ -26,6 +26,7 @@ from splatmill_server.filters import JobFilter
 from splatmill_server.metrics import Metrics
 from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError
+from splatmill_server.queue_places import with_places
 
 log = structlog.get_logger()
 
@@ -77,6 +78,7 @@ class Jobs:
             name=request.name,
             owner=owner,
             options=request.options,
+            priority=request.priority,
             created_at=moment,
             queued_at=moment,
         )
@@ -97,11 +99,11 @@ class Jobs:
         # Of two concurrent requests with the same key, only one inserts the job.
         self.connection.transaction(insert, keys.job(job_id), keys.begun_jobs(owner))
         if known is not None:
-            return self._job(known), False
+            return self._placed(known), False
         # A crash here leaves a row that is not in the queue; the reaper enqueues it.
         queue.enqueue(self.connection, job_id, new.generation)
         self.metrics.created.inc()
-        return self._job(new), True
+        return self._placed(new), True
 
     def id_of_key(self, owner: str, key: str) -> str | None:
         """Return the id of the job that the owner first used an `Idempotency-Key` for, or None."""
@@ -147,7 +149,7 @@ class Jobs:
     def get(self, job_id: str) -> Job:
         """Return the job as clients see it. A job that has ended is read from storage if Redis has lost it."""
         try:
-            return self._job(self.row(job_id))
+            return self._placed(self.row(job_id))
         except ProblemError:
             if (stored := self.stored(job_id)) is not None:
                 return stored
@@ -189,7 +191,8 @@ class Jobs:
             following = write_cursor(page[-1][0], page[-1][1][0].id)
         elif not ended and after is not None:
             following = write_cursor(*after)
-        return JobPage(jobs=[self._job(read, states) for _, (read, states) in page], cursor=following)
+        listed = [(self._job(read, states), read.generation) for _, (read, states) in page]
+        return JobPage(jobs=with_places(self.connection, listed), cursor=following)
 
     def _admitted(self, job_ids: Sequence[str], wanted: JobFilter) -> dict[str, _Read]:
         """Return the rows and states of those jobs that `wanted` admits, by id.
@@ -333,9 +336,10 @@ class Jobs:
 
         # It is added to the active jobs first: a crash in between leaves an ended job there, which is harmless.
         self.connection.sadd(keys.ACTIVE, job_id)
-        job = self._change(job_id, begin_generation, begun=keys.begun_jobs(self.row(job_id).owner))
-        queue.enqueue(self.connection, job_id, self.row(job_id).generation)
-        return job
+        self._change(job_id, begin_generation, begun=keys.begun_jobs(self.row(job_id).owner))
+        begun = self.row(job_id)
+        queue.enqueue(self.connection, job_id, begun.generation)
+        return self._placed(begun)
 
     def delete(self, job_id: str) -> None:
         """Delete a job that has ended, its work files and its model. Raises 404 and 409 problems."""
@@ -401,6 +405,9 @@ class Jobs:
         states = events.read_states(self.connection, found.id) if states is None else states
         return with_links(fold(found, states, events.last_progress(self.connection, found.id)))
 
+    def _placed(self, found: JobRow) -> Job:
+        return with_places(self.connection, [(self._job(found), found.generation)])[0]
+
     def _change(
         self,
         job_id: str,
@@ -430,7 +437,7 @@ class Jobs:
 
         watched = [keys.job(job_id), keys.states(job_id), *([begun] if begun is not None else [])]
         self.connection.transaction(apply, *watched)
-        return self._job(self.row(job_id))
+        return self._placed(self.row(job_id))
 
     def _ids(self, after: tuple[int, str] | None, count: int) -> list[tuple[int, str]]:
         """Return up to `count` pairs (time of creation in milliseconds, id) of jobs after `after`, newest first."""

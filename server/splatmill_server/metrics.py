@@ -42,6 +42,9 @@ class Metrics:
         self.waiting = Gauge(
             "splatmill_queue_length", "Jobs that wait for a worker.", ["queue"], registry=self.registry
         )
+        self.serving = Gauge(
+            "splatmill_queue_workers", "Workers that serve a queue.", ["queue"], registry=self.registry
+        )
         self.workers = Gauge("splatmill_workers", "Registered workers.", ["state"], registry=self.registry)
         self.redis_up = Gauge("splatmill_redis_up", "1 if Redis answers, else 0.", registry=self.registry)
 

@@ -13,7 +13,7 @@ import redis
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import leases, queue
+from splatmill.backplane import entries, leases, lines, queue
 from splatmill.backplane.row import JobRow
 from splatmill.schema import Problem
 from splatmill_server.jobs import Jobs, last_stage
@@ -64,7 +64,8 @@ class Reaper:
 
     def tick(self) -> bool:
         """Check every unfinished job once; return True while one is being cancelled."""
-        self.leases.run()
+        if self.leases.run():
+            lines.sort(self.connection)
         active = self.jobs.active()
         cancelling = [row for row in active if row.cancel_requested_at is not None]
         unfinished = [row for row in cancelling if not _safely(self.cancel, row, True)]
@@ -104,7 +105,7 @@ class Reaper:
     def _give_up(self, row: JobRow, found: queue.QueueStatus) -> None:
         job = self.jobs.get(row.id)
         facts = {"attempts": job.attempt, "stage": last_stage(job), "reason": found.reason}
-        lost = leases.lost(self.connection, queue.rq_id(row.id, row.generation))
+        lost = leases.lost(self.connection, entries.rq_id(row.id, row.generation))
         during = f" during {facts['stage']}" if facts["stage"] else ""
         if found.state == "failed" and lost >= leases.MAX_LOST:
             problem = Problem.of(

@@ -13,9 +13,10 @@ from typing import Any
 import pytest
 import redis
 
-from splatmill.backplane import events, keys, layout, queue
+from splatmill.backplane import entries, events, keys, layout, queue
 from splatmill.schema import EVENT, JobState, LogEvent, ProgressEvent, StateEvent
 from tests.support.formats import job_ids, restore_redis, restore_storage
+from tests.support.queue_entries import waiting
 from tests.support.served_app import Serve, ServedApp, problem
 from tests.support.server_events import brief, follow
 from tests.support.waiting import wait_for
@@ -79,7 +80,7 @@ def has_state(app: ServedApp, path: str, state: str) -> bool:
 def test_the_reaper_finds_the_jobs_of_the_first_version_in_the_queue(stored_copy: ServedApp) -> None:
     stored_copy.service.reaper.tick()
     ids = job_ids()
-    assert queue.waiting(stored_copy.redis) == {"train": 2}
+    assert waiting(stored_copy.redis) == 2
     assert stored_copy.redis.smembers(keys.ACTIVE) == {ids["interrupted"].encode(), ids["queued"].encode()}
     for name in ("interrupted", "queued"):
         path = f"/v1/jobs/{ids[name]}"
@@ -272,7 +273,7 @@ def test_an_error_over_one_job_does_not_keep_the_reaper_from_the_others(app: Ser
     first, second = sorted([app.job(), app.job()])
     for job_id in (first, second):
         queue.forget(app.redis, job_id, 1)
-    app.redis.hset(f"rq:job:{queue.rq_id(first, 1)}", mapping={"status": "unheard of", "created_at": "?"})
+    app.redis.hset(f"rq:job:{entries.rq_id(first, 1)}", mapping={"status": "unheard of", "created_at": "?"})
     app.service.reaper.tick()
     assert queue.status(app.redis, second, 1).state == "waiting"
 

@@ -31,8 +31,8 @@ def test_a_job_is_accepted_queued_and_seen(app: ServedApp) -> None:
         100,
     )
     assert app.http.get(made.headers["location"]).json() == job
-    place = queue.status(app.redis, job["id"], 1)
-    assert (place.state, place.position) == ("waiting", 0)
+    assert queue.status(app.redis, job["id"], 1).state == "waiting"
+    assert (job["queue_position"], job["waiting_for"], job["priority"]) == (0, "any", 0)
 
 
 def test_what_a_worker_says_is_what_a_client_sees(app: ServedApp) -> None:

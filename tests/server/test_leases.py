@@ -12,14 +12,13 @@ from pathlib import Path
 import pytest
 import redis
 
-from splatmill.backplane import leases, queue
+from splatmill.backplane import leases, lines, queue
 from splatmill.backplane.connection import connect
 from splatmill.backplane.leases import Lease, Reclaim
 from tests.support.jobs import write_row
+from tests.support.queue_entries import take, waiting
 from tests.support.redis_server import RedisServer
 from tests.support.waiting import wait_for
-
-LEASE = Lease("job00001-1", "x")
 
 SHIFTED = """
 import sys, time, datetime, rq.utils, rq.registry, rq.executions, rq.job
@@ -28,7 +27,7 @@ shifted = lambda: real_now() + datetime.timedelta(seconds=ahead)
 time.time = lambda: real_time() + ahead
 for module in (rq.utils, rq.registry, rq.executions, rq.job):
     module.now = shifted
-from splatmill.backplane import leases, queue
+from splatmill.backplane import leases
 from splatmill.backplane.connection import connect
 connection = connect(sys.argv[1])
 """
@@ -44,17 +43,11 @@ def shifted(url: str, seconds: float, code: str) -> str:
 def taken(connection: redis.Redis, monkeypatch: pytest.MonkeyPatch) -> Lease:
     """An entry that a worker has just taken, on a Redis that has long been there."""
     monkeypatch.setattr(leases, "LEASE", 2)
+    monkeypatch.setattr(lines, "LEASE", 2)
+    wait_for(lambda: connection.info("server")["uptime_in_seconds"] >= 2)
     write_row(connection, "job00001")
     assert queue.enqueue(connection, "job00001", 1)
-    take(connection, LEASE)
-    wait_for(lambda: connection.info("server")["uptime_in_seconds"] >= 2)
-    return LEASE
-
-
-def take(connection: redis.Redis, lease: Lease) -> None:
-    connection.lrem(queue.open_queue(connection).key, 0, lease.entry)
-    connection.hset(f"rq:job:{lease.entry}", "status", "started")
-    leases.hold(connection, lease)
+    return take(connection)
 
 
 def expires(connection: redis.Redis, lease: Lease) -> float:
@@ -88,7 +81,11 @@ def test_a_server_with_another_clock_requeues_no_running_attempt(
 def test_a_worker_with_another_clock_holds_its_entry_for_one_lease(
     taken: Lease, connection: redis.Redis, redis_url: str, ahead: float
 ) -> None:
-    shifted(redis_url, ahead, f"assert leases.prolong(connection, leases.Lease({taken.entry!r}, 'x'))")
+    shifted(
+        redis_url,
+        ahead,
+        f"assert leases.prolong(connection, leases.Lease({taken.entry!r}, {taken.execution!r}))",
+    )
     assert 0 < expires(connection, taken) - connection.time()[0] <= 15
 
 
@@ -97,7 +94,7 @@ def test_a_lease_that_is_not_prolonged_expires(taken: Lease, connection: redis.R
     assert reclaim.run() == []
     assert leases.prolong(connection, taken)
     assert wait_for(reclaim.run, 10) == [(taken, "waiting")]
-    assert queue.waiting(connection) == {"train": 1}
+    assert waiting(connection) == 1
     assert not leases.prolong(connection, taken), "the worker must learn that it was superseded"
 
 
@@ -106,31 +103,31 @@ def test_a_heartbeat_at_the_last_moment_keeps_the_entry(taken: Lease, connection
     expire(connection, taken)
     assert leases.requeue(connection, taken, if_expired=True) == "waiting"
     assert leases.requeue(connection, taken, if_expired=True) == "kept"
-    assert queue.waiting(connection) == {"train": 1}
+    assert waiting(connection) == 1
 
 
 def test_an_entry_that_was_deleted_is_not_requeued(taken: Lease, connection: redis.Redis) -> None:
     connection.delete(f"rq:job:{taken.entry}")
     expire(connection, taken)
     assert Reclaim(connection).run() == [(taken, "absent")]
-    assert queue.waiting(connection) == {"train": 0}
+    assert waiting(connection) == 0
 
 
 def test_an_entry_whose_worker_is_lost_again_and_again_fails(taken: Lease, connection: redis.Redis) -> None:
     for attempt in range(1, leases.MAX_LOST):
         assert leases.requeue(connection, taken, if_expired=False) == "waiting", attempt
-        take(connection, taken)
+        taken = take(connection)
     leases.advanced(connection, taken.entry)  # a new checkpoint: all of this counts no more
     for attempt in range(1, leases.MAX_LOST):
         assert leases.requeue(connection, taken, if_expired=False) == "waiting", attempt
-        take(connection, taken)
+        taken = take(connection)
     assert leases.requeue(connection, taken, if_expired=False) == "failed"
     assert queue.status(connection, "job00001", 1).state == "failed"
-    assert queue.waiting(connection) == {"train": 0}
+    assert waiting(connection) == 0
 
 
 def test_a_member_of_another_form_is_removed(taken: Lease, connection: redis.Redis) -> None:
-    connection.zadd(leases.key(), {"nonsense": 1})
+    connection.zadd(leases.key(), {"nonsense": 1, "nonsense:x": 1})
     assert leases.held(connection) == [taken]
     assert connection.zrange(leases.key(), 0, -1) == [taken.member.encode()]
 
@@ -140,13 +137,14 @@ def test_after_redis_was_away_workers_get_the_time_of_a_lease(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(leases, "LEASE", 3)
+    monkeypatch.setattr(lines, "LEASE", 3)
     server = RedisServer(tmp_path)
     server.start()
     try:
         connection = connect(server.url, retries=0)
         write_row(connection, "job00001")
         queue.enqueue(connection, "job00001", 1)
-        take(connection, LEASE)
+        lease = take(connection)
         reclaim = Reclaim(connection)
         wait_for(lambda: reclaim._trusted())
         server.kill()
@@ -157,11 +155,11 @@ def test_after_redis_was_away_workers_get_the_time_of_a_lease(
         server.start()
         connection.ping()
         # The lease has expired, and neither this process nor one that has just started requeues it.
-        assert expires(connection, LEASE) < connection.time()[0]
+        assert expires(connection, lease) < connection.time()[0]
         assert reclaim.run() == Reclaim(connection).run() == []
-        assert leases.prolong(connection, LEASE)
+        assert leases.prolong(connection, lease)
         assert queue.status(connection, "job00001", 1).state == "running"
-        assert wait_for(reclaim.run, 10) == [(LEASE, "waiting")]
+        assert wait_for(reclaim.run, 10) == [(lease, "waiting")]
         connection.close()
     finally:
         server.kill()

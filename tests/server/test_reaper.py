@@ -1,7 +1,7 @@
 """Cancelling real processes, and what the reaper mends: lost attempts, used-up tries, jobs the queue forgot.
 
-The worker is RQ's own, in a process of its own, with an attempt that sleeps. Not proved here: the project's worker
-(tests/service), whose attempts also resume.
+The worker is RQ's own but for the queue, in a process of its own, with an attempt that sleeps. Not proved here: the
+project's worker (tests/service), whose attempts also resume.
 """
 
 import os
@@ -15,10 +15,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from rq.job import Job, JobStatus
 
-from splatmill.backplane import keys, leases, queue, row
+from splatmill.backplane import entries, keys, leases, queue, row
 from splatmill.schema import JobState, ProgressEvent, StateEvent
+from tests.support.queue_entries import take, waiting
 from tests.support.served_app import Serve, ServedApp
 from tests.support.waiting import wait_for
 
@@ -28,9 +28,10 @@ WORKER = textwrap.dedent(
     """
     import os, pathlib, sys, time
     from rq import Worker
-    from splatmill.backplane import queue
+    from rq.executions import Execution
+    from splatmill.backplane import entries, lines
     from splatmill.backplane.connection import connect
-    class Entry(queue.QueueEntry):
+    class Entry(entries.QueueEntry):
         def func(self, job_id):
             pathlib.Path(sys.argv[2]).write_text(str(os.getpid()))
             if sys.argv[3] == "die":
@@ -40,9 +41,23 @@ WORKER = textwrap.dedent(
     class Quick(Worker):
         def get_heartbeat_ttl(self, job):
             return 2
+        def dequeue_job_and_maintain_ttl(self, timeout, max_idle_time=None):
+            while True:
+                self.heartbeat()
+                taken = lines.take(self.connection, self.name, lines.LINES)
+                if taken is not None:
+                    lease, _ = taken
+                    self.execution = Execution(lease.execution, lease.entry, self.connection, self.name)
+                    return Entry.fetch(lease.entry, self.connection, entries.SERIALIZER), self.queues[0]
+                if timeout is None:
+                    return None
+                lines.wait(self.connection, lines.LINES, 1)
+        def prepare_execution(self, job):
+            self.set_state("busy")
+    lines.LEASE = 2
     connection = connect(sys.argv[1])
     worker = Quick(
-        [queue.open_queue(connection)], connection=connection, job_class=Entry, serializer=queue.SERIALIZER
+        [entries.open_queue(connection)], connection=connection, job_class=Entry, serializer=entries.SERIALIZER
     )
     worker.work(burst=sys.argv[3] != "sleep", logging_level="ERROR")
     """
@@ -84,7 +99,7 @@ def test_a_waiting_job_is_cancelled_at_once(app: ServedApp) -> None:
     answer = app.http.post(f"/v1/jobs/{job_id}/cancel")
     assert (answer.status_code, answer.json()["state"]) == (202, "cancelled")
     assert answer.json()["finished_at"]
-    assert queue.waiting(app.redis) == {"train": 0}
+    assert waiting(app.redis) == 0
     assert app.http.post(f"/v1/jobs/{job_id}/cancel").json()["state"] == "cancelled"
 
 
@@ -166,7 +181,7 @@ def test_a_job_the_queue_forgot_is_queued_again_once(app: ServedApp) -> None:
     assert queue.status(app.redis, job_id, 1).state == "absent"
     for _ in range(3):
         app.service.reaper.tick()
-    assert queue.waiting(app.redis) == {"train": 1}
+    assert waiting(app.redis) == 1
     # A cancelled one is not: the wish is fulfilled by its absence.
     other = app.job()
     queue.forget(app.redis, other, 1)
@@ -185,25 +200,21 @@ def test_a_wish_that_outlived_the_server_is_fulfilled_by_the_next_one(serve: Ser
 
 
 def test_two_reapers_at_once_requeue_an_attempt_once(app: ServedApp, quick_leases: None) -> None:
-    job_id = app.job()
-    entry = Job.fetch(queue.rq_id(job_id, 1), connection=app.redis, serializer=queue.SERIALIZER)
-    app.redis.lrem(queue.open_queue(app.redis).key, 0, entry.id)
-    entry.set_status(JobStatus.STARTED)
-    app.redis.zadd(leases.key(), {f"{entry.id}:x": 1})
+    app.job()
+    lease = take(app.redis)
+    app.redis.zadd(leases.key(), {lease.member: 1})
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda _: leases.Reclaim(app.redis).run(), range(8)))
     assert [became for runs in found for _, became in runs] == ["waiting"]
-    assert queue.waiting(app.redis) == {"train": 1}
+    assert waiting(app.redis) == 1
 
 
 def test_a_job_whose_worker_is_lost_again_and_again_fails_by_name(app: ServedApp) -> None:
     job_id = app.job()
     app.begin(job_id)
     app.say(job_id, StateEvent(state=JobState.sfm), ProgressEvent(stage="features", done=3))
-    lease = leases.Lease(queue.rq_id(job_id, 1), "x")
     for _ in range(leases.MAX_LOST):
-        leases.hold(app.redis, lease)
-        leases.requeue(app.redis, lease, if_expired=False)
+        leases.requeue(app.redis, take(app.redis), if_expired=False)
     app.service.reaper.tick()
     problem = app.http.get(f"/v1/jobs/{job_id}").json()["problem"]
     assert problem["code"] == "attempts_exhausted"
@@ -211,7 +222,7 @@ def test_a_job_whose_worker_is_lost_again_and_again_fails_by_name(app: ServedApp
     assert problem["facts"]["lost_workers"] == leases.MAX_LOST
     # A restart is a new generation, which may lose as many.
     assert app.http.post(f"/v1/jobs/{job_id}/restart").json()["state"] == "queued"
-    assert leases.lost(app.redis, queue.rq_id(job_id, 2)) == 0
+    assert leases.lost(app.redis, entries.rq_id(job_id, 2)) == 0
 
 
 def test_the_reaper_looks_at_unfinished_jobs_alone_and_at_all_of_them(app: ServedApp) -> None:

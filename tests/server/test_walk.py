@@ -15,7 +15,7 @@ from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, rule, 
 from rq.job import Job as QueueJob
 from rq.job import JobStatus
 
-from splatmill.backplane import events, keys, layout, queue, row
+from splatmill.backplane import entries, events, keys, layout, lines, queue, row
 from splatmill.schema import CreateJob, Job, JobState, StateEvent
 from splatmill_server.problems import ProblemError
 from splatmill_server.service import Service
@@ -48,8 +48,8 @@ class Walk(RuleBasedStateMachine):
         found = row.read(self.redis, job_id)
         if found is None or queue.status(self.redis, job_id, found.generation).state == "absent":
             return None
-        rq_id = queue.rq_id(job_id, found.generation)
-        return QueueJob.fetch(rq_id, connection=self.redis, serializer=queue.SERIALIZER)
+        rq_id = entries.rq_id(job_id, found.generation)
+        return QueueJob.fetch(rq_id, connection=self.redis, serializer=entries.SERIALIZER)
 
     @rule(target=jobs)
     def create(self) -> str:
@@ -65,7 +65,7 @@ class Walk(RuleBasedStateMachine):
         entry, found = self.entry(job_id), row.read(self.redis, job_id)
         if entry is None or found is None:
             return
-        if self.redis.lrem(queue.open_queue(self.redis).key, 1, entry.id):
+        if lines.withdraw(self.redis, entry.id):
             entry.set_status(JobStatus.STARTED)
             events.begin_attempt(self.redis, job_id)
         number = int(self.redis.get(keys.attempts(job_id)) or 0)
@@ -135,9 +135,9 @@ class Walk(RuleBasedStateMachine):
 
     @invariant()
     def at_most_one_attempt_waits(self) -> None:
-        waiting = queue.open_queue(self.redis).job_ids
-        assert len(waiting) == len(set(waiting))
-        jobs = [queue.split_rq_id(rq_id)[0] for rq_id in waiting]
+        lines.sort(self.redis)
+        waiting = [entry.decode() for entry in cast(list[bytes], self.redis.hkeys(keys.PLACES))]
+        jobs = [entries.split_rq_id(rq_id)[0] for rq_id in waiting]
         assert len(jobs) == len(set(jobs))
 
     @invariant()

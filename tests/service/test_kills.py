@@ -10,7 +10,7 @@ import signal
 import httpx
 import pytest
 
-from splatmill.backplane import leases, queue
+from splatmill.backplane import entries, leases
 from tests.support.up import Up
 from tests.support.waiting import gone, wait_for
 
@@ -52,7 +52,7 @@ def test_a_worker_killed_again_and_again_does_not_use_up_the_tries_of_a_job_that
 
     def nothing_lost() -> bool:
         with service.redis() as connection:
-            return leases.lost(connection, queue.rq_id(job_id, 1)) == 0
+            return leases.lost(connection, entries.rq_id(job_id, 1)) == 0
 
     for _ in range(leases.MAX_LOST + 1):
         service.reached(job_id, service.job(job_id)["progress"]["step"] + 5 if service.diary(job_id) else 5)
@@ -106,9 +106,9 @@ def test_a_stopped_service_saves_its_job_and_spends_no_try(own_service: Up) -> N
     lines = own_service.http.get(f"/v1/jobs/{job_id}/logs").json()["lines"]
     assert any(line["message"].startswith("saved at step") for line in lines)
     with own_service.redis() as connection:
-        entry = queue.open_queue(connection).fetch_job(queue.rq_id(job_id, 1))
+        entry = entries.open_queue(connection).fetch_job(entries.rq_id(job_id, 1))
     assert entry is not None
-    assert entry.retries_left == queue.MAX_RETRIES
+    assert entry.retries_left == entries.MAX_RETRIES
 
 
 def test_a_killed_redis_comes_back_and_the_trainer_never_notices(service: Up) -> None:

@@ -26,6 +26,11 @@ def main(argv: list[str] | None = None) -> int:
     train.add_argument(
         "--stop-grace", type=float, help="seconds that a job has to save its state when the worker is stopped"
     )
+    train.add_argument(
+        "--queues",
+        help="the queues to serve, separated by commas: any, cpu, gpu (default: SPLATMILL_QUEUES, or all that this "
+        "machine can run)",
+    )
     renderer = programs.add_parser("renderer", help="render stored models on request over HTTP")
     renderer.add_argument("--host", default="127.0.0.1")
     renderer.add_argument("--port", type=int, default=8090)
@@ -49,7 +54,7 @@ def main(argv: list[str] | None = None) -> int:
         return_freed_memory()
         from splatmill_worker.service.command import serve
 
-        return serve(chosen.stop_grace)
+        return serve(chosen.stop_grace, chosen.queues)
     if chosen.program == "renderer":
         from splatmill_worker.render_service.command import serve as serve_renders
 

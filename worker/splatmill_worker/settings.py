@@ -21,6 +21,11 @@ def storage_url() -> str:
     return os.environ.get("SPLATMILL_STORAGE") or (data_folder() / "storage").as_uri()
 
 
+def queues() -> str | None:
+    """Return SPLATMILL_QUEUES, or None: the queues that a worker serves, separated by commas."""
+    return os.environ.get("SPLATMILL_QUEUES") or None
+
+
 def work_folder(job_id: str) -> Path:
     """Return the folder that the attempts at a job on this machine share."""
     return data_folder() / "work" / job_id

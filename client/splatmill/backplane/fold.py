@@ -82,6 +82,7 @@ class Fold:
             owner=row.owner,
             state=self.state,
             options=row.options,
+            priority=row.priority,
             created_at=row.created_at,
             started_at=self.started_at,
             finished_at=self.finished_at,

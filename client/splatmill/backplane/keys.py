@@ -14,6 +14,30 @@ ACTIVE = PREFIX + "active"
 WRITABLE = PREFIX + "writable"
 """String that is written to find out whether Redis takes writes; it expires."""
 
+PLACES = PREFIX + "queue:places"
+"""Hash of the waiting entries: entry to `<line>:<owner>`, the sorted set that holds it."""
+
+TURNS = PREFIX + "queue:turns"
+"""Sorted set of owners, scored by the number of the turn in which a worker last took an entry of theirs; 0: never."""
+
+COUNTERS = PREFIX + "queue:counters"
+"""Hash of the last numbers given: `back` and `front` of a line, and `turn`."""
+
+
+def line(name: str, owner: str) -> str:
+    """Return the key of the waiting entries of an owner in a line, a sorted set in the order of their turns."""
+    return f"{PREFIX}queue:line:{name}:{owner}"
+
+
+def bell(name: str) -> str:
+    """Return the key of a list on which idle workers wait: one element for each entry that has come to the line."""
+    return f"{PREFIX}queue:bell:{name}"
+
+
+def durations(name: str) -> str:
+    """Return the key of a list with the seconds that the last attempts of a line took, newest first."""
+    return f"{PREFIX}queue:durations:{name}"
+
 
 def job(job_id: str) -> str:
     """Return the key of the job row, a hash. Only the server writes it."""

@@ -1,8 +1,9 @@
 """Leases: until when a worker holds an entry of the queue that it has taken, by the clock of Redis alone.
 
 The leases are the members of RQ's sorted set of started entries, `<entry>:<execution>`, scored by the time at which
-they expire. RQ itself takes these times from the clock of whichever machine calls it, so that two clocks that differ by
-more than a heartbeat would requeue an attempt that runs. Every time here is that of Redis, read in the same step.
+they expire. A lease begins when `lines.take` takes the entry. RQ itself takes the times from the clock of whichever
+machine calls it, so that two clocks that differ by more than a heartbeat would requeue an attempt that runs. Every time
+here is that of Redis, read in the same step.
 """
 
 import logging
@@ -14,7 +15,13 @@ import redis
 from rq.registry import StartedJobRegistry
 
 from splatmill.backplane import keys
-from splatmill.backplane.queue import HEARTBEAT_SLACK, KEEP_FINISHED, MONITORING_INTERVAL, TRAIN, open_queue
+from splatmill.backplane.entries import (
+    HEARTBEAT_SLACK,
+    KEEP_FINISHED,
+    MONITORING_INTERVAL,
+    TRAIN,
+    split_rq_id,
+)
 
 LEASE = MONITORING_INTERVAL + HEARTBEAT_SLACK
 """Seconds for which a heartbeat holds an entry."""
@@ -27,11 +34,6 @@ Requeued = Literal["waiting", "failed", "absent", "kept"]
 """What became of an entry whose worker was lost. `waiting`: it is in the queue again. `failed`: it has been lost
 MAX_LOST times. `absent`: it was deleted. `kept`: its lease was prolonged or given up meanwhile."""
 
-_HOLD = """
-redis.call('ZADD', KEYS[1], tonumber(redis.call('TIME')[1]) + ARGV[2], ARGV[1])
-return 1
-"""
-
 _PROLONG = """
 if not redis.call('ZSCORE', KEYS[1], ARGV[1]) then return 0 end
 redis.call('ZADD', KEYS[1], tonumber(redis.call('TIME')[1]) + ARGV[2], ARGV[1])
@@ -43,15 +45,13 @@ _EXPIRED = """
 return redis.call('ZRANGEBYSCORE', KEYS[1], '-inf', redis.call('TIME')[1])
 """
 
-# KEYS: leases, RQ's record of the entry, queue. ARGV: member, entry, whether only if expired, limit, seconds to keep,
-# execution.
+# KEYS: leases, RQ's record of the entry, queue. ARGV: member, entry, whether only if expired, limit, seconds to keep.
 _REQUEUE = """
 local expires = redis.call('ZSCORE', KEYS[1], ARGV[1])
 if not expires then return 'kept' end
 if ARGV[3] == '1' and tonumber(expires) > tonumber(redis.call('TIME')[1]) then return 'kept' end
 redis.call('ZREM', KEYS[1], ARGV[1])
 redis.call('DEL', 'rq:execution:' .. ARGV[1])
-redis.call('ZREM', 'rq:executions:' .. ARGV[2], ARGV[6])
 if redis.call('EXISTS', KEYS[2]) == 0 then return 'absent' end
 local lost = redis.call('HINCRBY', KEYS[2], 'splatmill_lost', 1)
 if lost >= tonumber(ARGV[4]) then
@@ -79,14 +79,9 @@ class Lease:
         return f"{self.entry}:{self.execution}"
 
 
-def key(name: str = TRAIN) -> str:
-    """Return the key of the leases: RQ's sorted set of started entries of a queue."""
-    return StartedJobRegistry.key_template.format(name)
-
-
-def hold(connection: redis.Redis, lease: Lease) -> None:
-    """Begin a lease. `connection` may be a pipeline, so that other keys change in the same transaction."""
-    connection.eval(_HOLD, 1, key(), lease.member, LEASE)
+def key() -> str:
+    """Return the key of the leases: RQ's sorted set of started entries."""
+    return StartedJobRegistry.key_template.format(TRAIN)
 
 
 def prolong(connection: redis.Redis, lease: Lease) -> bool:
@@ -105,25 +100,42 @@ def lost(connection: redis.Redis, entry: str) -> int:
     return int(cast(Any, connection.hget(f"rq:job:{entry}", "splatmill_lost")) or 0)
 
 
+def drop(connection: redis.Redis, lease: Lease) -> None:
+    """Delete a lease and RQ's record of its entry, which cannot be read. The reaper enqueues its job anew."""
+    with connection.pipeline() as pipe:
+        pipe.delete(f"rq:job:{lease.entry}")
+        pipe.zrem(key(), lease.member)
+        pipe.execute()
+
+
 def held(connection: redis.Redis) -> list[Lease]:
     """Return all leases, also the expired ones. A member of another form is removed and logged."""
     return _leases(connection, cast(list[bytes], connection.zrange(key(), 0, -1)))
 
 
+def running(connection: redis.Redis) -> dict[str, float]:
+    """Return, by name of worker, for how many seconds the attempts that are leased have run."""
+    with connection.pipeline(transaction=False) as pipe:
+        for lease in held(connection):
+            pipe.hmget(f"rq:execution:{lease.member}", "worker_name", "created_at")
+        replies = cast(list[list[bytes | None]], pipe.execute())
+    now = connection.time()[0]
+    return {worker.decode(): max(0.0, now - float(since)) for worker, since in replies if worker and since}
+
+
 def requeue(connection: redis.Redis, lease: Lease, *, if_expired: bool) -> Requeued:
-    """Put an entry whose worker was lost at the end of its queue, or fail it after MAX_LOST times, in one step."""
+    """Put an entry whose worker was lost behind those that wait, or fail it after MAX_LOST times, in one step."""
     answer = connection.eval(
         _REQUEUE,
         3,
         key(),
         f"rq:job:{lease.entry}",
-        open_queue(connection).key,
+        f"rq:queue:{TRAIN}",
         lease.member,
         lease.entry,
         int(if_expired),
         MAX_LOST,
         KEEP_FINISHED,
-        lease.execution,
     )
     return cast(Requeued, cast(bytes, answer).decode())
 
@@ -179,9 +191,14 @@ class Reclaim:
 def _leases(connection: redis.Redis, members: list[bytes]) -> list[Lease]:
     found = []
     for member in members:
-        entry, separator, execution = member.decode("utf-8", "replace").rpartition(":")
-        if separator and entry:
+        entry, _, execution = member.decode("utf-8", "replace").rpartition(":")
+        try:
+            split_rq_id(entry)
+        except ValueError:
+            if connection.zrem(key(), member):
+                log.warning(
+                    "removed %r from the leases, because it is not '<job>-<generation>:<execution>'", member
+                )
+        else:
             found.append(Lease(entry, execution))
-        elif connection.zrem(key(), member):
-            log.warning("removed %r from the leases, because it is not '<entry>:<execution>'", member)
     return found

@@ -43,6 +43,7 @@ class JobRow(BaseModel):
     name: str | None = None
     owner: Owner = DEFAULT_OWNER
     options: TrainOptions
+    priority: int = 0
     created_at: Time
     queued_at: Time
     generation: int = 1

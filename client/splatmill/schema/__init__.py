@@ -79,6 +79,7 @@ from splatmill.schema.info import (
     Health,
     Info,
     Limits,
+    QueueInfo,
     Ready,
     WorkerInfo,
 )
@@ -235,6 +236,7 @@ __all__ = [
     "Problem",
     "Progress",
     "ProgressEvent",
+    "QueueInfo",
     "Ready",
     "RenderRequest",
     "Report",

@@ -14,10 +14,17 @@ class WorkerInfo(Response):
     """A worker that is registered with the job queue."""
 
     name: str
-    queues: list[str] = Field(default_factory=list)
+    queues: list[str] = Field(default_factory=list, description="The queues that it serves: any, cpu, gpu.")
     state: str = Field(description="idle, busy, suspended, ...")
     job: str | None = Field(default=None, description="Id of the job it works on.")
     last_heartbeat: Time | None = None
+
+
+class QueueInfo(Response):
+    """A queue: the jobs that ask the same of their worker, by their option `backend`."""
+
+    waiting: int = Field(ge=0, description="Number of jobs that wait.")
+    workers: int = Field(ge=0, description="Number of workers that serve it.")
 
 
 class Limits(Response):
@@ -40,6 +47,10 @@ class Info(Response):
     storage: str = Field(description="Kind of storage: file or s3.")
     workers: list[WorkerInfo] = Field(default_factory=list)
     queued: int = Field(default=0, ge=0, description="Number of jobs that wait for a worker.")
+    queues: dict[str, QueueInfo] = Field(
+        default_factory=dict,
+        description="The queues: any (backend auto), cpu (backends cpu and reference) and gpu (backend gpu).",
+    )
     limits: Limits
     details: dict[str, Any] = Field(default_factory=dict)
 

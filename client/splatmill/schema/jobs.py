@@ -21,6 +21,22 @@ class CreateJob(Request):
     capture: str = Field(min_length=1, max_length=64, description="Id of the capture.")
     name: str | None = Field(default=None, max_length=200, description="A name to recognise the job by.")
     options: TrainOptions = Field(default_factory=TrainOptions)
+    priority: int = Field(
+        default=0,
+        ge=-100,
+        le=100,
+        description="Of the jobs of one owner, those with a higher priority are run first. Jobs of other owners "
+        "are not affected.",
+    )
+
+    def described(self, *, with_capture: bool = True) -> str:
+        """Return the request as JSON, by which a repeated request is known to be the same.
+
+        A field that was added after the first version is left out where it has its default, so that a request is known
+        again after an upgrade.
+        """
+        later = {"priority"} if self.priority == 0 else set()
+        return self.model_dump_json(exclude=later if with_capture else later | {"capture"})
 
 
 def _readable_options(value: Any) -> Any:
@@ -38,6 +54,22 @@ class Job(Response):
     owner: Owner = DEFAULT_OWNER
     state: JobState
     options: Annotated[TrainOptions, BeforeValidator(_readable_options)]
+    priority: int = Field(default=0, description="Jobs of the owner with a higher priority are run first.")
+    queue_position: int | None = Field(
+        default=None,
+        ge=0,
+        description="Number of jobs that are run before it, as things stand; null once it was taken by a worker.",
+    )
+    estimated_start: Time | None = Field(
+        default=None,
+        description="When a worker will probably take it, from how long the last jobs of its queue took; null where "
+        "that is not known.",
+    )
+    waiting_for: str | None = Field(
+        default=None,
+        description="The queue that it waits in while no worker serves that queue: any, cpu or gpu. It runs once such "
+        "a worker is started.",
+    )
     created_at: Time
     started_at: Time | None = None
     finished_at: Time | None = None

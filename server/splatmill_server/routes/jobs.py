@@ -31,6 +31,7 @@ _FORM = {
         "poses": {"type": "array", "items": {"type": "string", "format": "binary"}},
         "options": {"type": "string", "description": "`TrainOptions` as JSON."},
         "name": {"type": "string"},
+        "priority": {"type": "integer", "minimum": -100, "maximum": 100},
     },
 }
 
@@ -119,7 +120,7 @@ async def _create_from_json(service: Service, who: Caller, body: bytes, key: str
             create,
             owner=who.owner,
             key=key,
-            body=create.model_dump_json(),
+            body=create.described(),
             most=who.limits.unfinished_jobs,
         )
 

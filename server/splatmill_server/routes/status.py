@@ -1,15 +1,16 @@
 """The endpoints about the service itself: options, info, health and metrics."""
 
-from datetime import UTC, datetime
+from collections.abc import Sequence
 
 import redis
 from fastapi import APIRouter, Request
-from rq import Worker
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
 import splatmill
-from splatmill.backplane import queue, rendering
+from splatmill.backplane import entries, lines, rendering, workers
+from splatmill.backplane.lines import Waiting
+from splatmill.backplane.workers import WorkerRecord
 from splatmill.schema import (
     MAX_PHOTO_PIXELS,
     MAX_RENDER_PIXELS,
@@ -17,6 +18,7 @@ from splatmill.schema import (
     Info,
     Limits,
     OptionList,
+    QueueInfo,
     Ready,
     WorkerInfo,
     describe_options,
@@ -39,11 +41,14 @@ def get_options() -> OptionList:
 @router.get("/v1/info", responses=problems())
 def get_info(service: Shared, who: Who) -> Info:
     """Get the version, the limits, the workers and the number of waiting jobs."""
+    listening, waiting = workers.listening(service.redis), lines.look(service.redis)
+    queues = _queues(waiting, listening)
     return Info(
         version=splatmill.__version__,
         storage="file" if service.storage.root is not None else "s3",
-        workers=[_seen_by(service, who, worker) for worker in _workers(service)],
-        queued=sum(queue.waiting(service.redis).values()),
+        workers=[_seen_by(service, who, _shown(worker)) for worker in listening],
+        queued=sum(queue.waiting for queue in queues.values()),
+        queues=queues,
         limits=Limits(
             max_file_bytes=service.settings.max_file_bytes,
             max_files_per_capture=service.settings.max_files_per_capture,
@@ -88,10 +93,12 @@ def get_metrics(service: Shared) -> Response:
     """Get the metrics in the text format of Prometheus."""
     gauges = service.metrics
     try:
-        for name, count in queue.waiting(service.redis).items():
-            gauges.waiting.labels(name).set(count)
+        listening = workers.listening(service.redis)
+        for name, queue in _queues(lines.look(service.redis), listening).items():
+            gauges.waiting.labels(name).set(queue.waiting)
+            gauges.serving.labels(name).set(queue.workers)
         gauges.workers.clear()
-        for worker in _workers(service):
+        for worker in listening:
             gauges.workers.labels(worker.state).inc()
         gauges.redis_up.set(1)
     except redis.RedisError:
@@ -99,18 +106,21 @@ def get_metrics(service: Shared) -> Response:
     return Response(gauges.text(), media_type=metrics.MEDIA_TYPE)
 
 
-def _workers(service: Service) -> list[WorkerInfo]:
-    found = Worker.all(connection=service.redis, serializer=queue.SERIALIZER)
-    return [
-        WorkerInfo(
-            name=worker.name,
-            queues=worker.queue_names(),
-            state=str(getattr(worker.get_state(), "value", worker.get_state())),
-            job=_job_of(worker.get_current_job_id()),
-            last_heartbeat=_aware(worker.last_heartbeat),
-        )
-        for worker in found
-    ]
+def _queues(waiting: Waiting, listening: Sequence[WorkerRecord]) -> dict[str, QueueInfo]:
+    return {
+        line: QueueInfo(waiting=waiting.count(line), workers=len(workers.serving(listening, line)))
+        for line in lines.LINES
+    }
+
+
+def _shown(worker: WorkerRecord) -> WorkerInfo:
+    return WorkerInfo(
+        name=worker.name,
+        queues=list(worker.lines),
+        state=worker.state,
+        job=_job_of(worker.entry),
+        last_heartbeat=worker.last_heartbeat,
+    )
 
 
 def _seen_by(service: Service, who: Caller, worker: WorkerInfo) -> WorkerInfo:
@@ -122,13 +132,9 @@ def _seen_by(service: Service, who: Caller, worker: WorkerInfo) -> WorkerInfo:
 
 def _job_of(rq_id: str | None) -> str | None:
     try:
-        return queue.split_rq_id(rq_id)[0] if rq_id else None
+        return entries.split_rq_id(rq_id)[0] if rq_id else None
     except ValueError:
         return rq_id
-
-
-def _aware(moment: datetime | None) -> datetime | None:
-    return moment.replace(tzinfo=UTC) if moment is not None and moment.tzinfo is None else moment
 
 
 def _redis_check(service: Service) -> str:

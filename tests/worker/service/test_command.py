@@ -1,4 +1,4 @@
-"""Proves that a worker that is started without Redis ends with a sentence."""
+"""Proves which queues a worker serves, and that one that cannot start ends with a sentence."""
 
 import os
 import subprocess
@@ -7,9 +7,40 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow
+from splatmill_worker.service import command, served_lines
+from splatmill_worker.service.served_lines import UnservedLines
 
 
+@pytest.mark.parametrize(
+    ("named", "absence", "served"),
+    [
+        (None, "", ("any", "cpu", "gpu")),
+        (None, "No driver of a GPU is loaded.", ("any", "cpu")),
+        ("", "no GPU", ("any", "cpu")),
+        ("gpu", "", ("gpu",)),
+        (" gpu, any,", "", ("any", "gpu")),
+        ("cpu", "no GPU", ("cpu",)),
+    ],
+)
+def test_a_worker_serves_what_it_is_told_or_what_it_can(
+    monkeypatch: pytest.MonkeyPatch, named: str | None, absence: str, served: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr(served_lines, "gpu_absence", lambda: absence)
+    assert served_lines.served_lines(named) == served
+
+
+def test_a_queue_that_cannot_be_served_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(served_lines, "gpu_absence", lambda: "The driver is too old.")
+    with pytest.raises(UnservedLines, match=r"no queue rocket.*any, cpu, gpu"):
+        served_lines.served_lines("gpu,rocket")
+    monkeypatch.setenv("SPLATMILL_QUEUES", "gpu")
+    assert command.serve(None) == 1
+    assert "The driver is too old." in capsys.readouterr().err
+
+
+@pytest.mark.slow
 def test_a_worker_started_by_hand_says_that_redis_is_away(tmp_path: Path) -> None:
     environment = dict(os.environ) | {"REDIS_URL": f"unix://{tmp_path}/nothing.sock"}
     code = "import splatmill_worker.service.command as c; c.REDIS_WAIT = 0.1; raise SystemExit(c.serve(None))"

@@ -25,6 +25,7 @@ from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.lock import JobLock
 from splatmill_worker.service.outbox import Outbox
 from tests.support.jobs import CAPTURE, messages, read_job, write_row
+from tests.support.queue_entries import take
 from tests.support.redis_server import RedisServer
 from tests.support.up import STANDIN
 from tests.support.waiting import wait_for
@@ -108,8 +109,7 @@ def test_nothing_is_requeued_while_heartbeats_are_refused_nor_right_after(
     monkeypatch.setattr(leases, "LEASE", 1)
     write_row(connection, JOB)
     queue.enqueue(connection, JOB, 1)
-    lease = leases.Lease(f"{JOB}-1", "execution")
-    leases.hold(connection, lease)
+    lease = take(connection)
     reclaim = leases.Reclaim(connection)
     refuse, allow = REFUSALS["NOREPLICAS"]
     refuse(connection)

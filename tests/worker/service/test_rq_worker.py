@@ -6,6 +6,7 @@ Does not prove what happens to attempts that are killed, stopped or cancelled wh
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,11 +17,12 @@ from typing import Any, cast
 import pytest
 from rq.job import Callback
 
-from splatmill.backplane import layout, leases, queue
+from splatmill.backplane import entries, layout, leases, queue, workers
 from splatmill.backplane.row import now
 from splatmill.backplane.storage import Storage
-from splatmill.schema import Job, Role
+from splatmill.schema import Backend, Job, Role, TrainOptions
 from tests.support.jobs import CAPTURE, read_job, write_row
+from tests.support.queue_entries import waiting
 from tests.support.redis_server import RedisServer
 from tests.support.up import STANDIN
 from tests.support.waiting import wait_for
@@ -41,13 +43,13 @@ real_time, real_now, ahead = time.time, rq.utils.now, float(sys.argv[1])
 time.time = lambda: real_time() + ahead
 rq.utils.now = lambda: real_now() + datetime.timedelta(seconds=ahead)
 from splatmill_worker.__main__ import main
-sys.exit(main(["train"]))
+sys.exit(main(["train", *sys.argv[2:]]))
 """
 
 
 @contextlib.contextmanager
 def worker(
-    server: RedisServer, storage: Storage, folder: Path, clock_ahead: float = 0.0
+    server: RedisServer, storage: Storage, folder: Path, *options: str, clock_ahead: float = 0.0
 ) -> Iterator[subprocess.Popen[bytes]]:
     """A worker whose Python also finds the modules in `folder`, and whose clock is this many seconds ahead."""
     environment = dict(os.environ) | {
@@ -57,7 +59,7 @@ def worker(
         "SPLATMILL_STORAGE": storage.url,
         "SPLATMILL_DATA": str(folder / "data"),
     }
-    process = subprocess.Popen([sys.executable, "-c", SHIFTED, str(clock_ahead)], env=environment)
+    process = subprocess.Popen([sys.executable, "-c", SHIFTED, str(clock_ahead), *options], env=environment)
     try:
         yield process
     finally:
@@ -79,7 +81,7 @@ def test_the_function_and_callbacks_that_an_entry_names_are_never_imported(
         f"from pathlib import Path\nPath({str(trace)!r}).touch()\ndef called(*args): Path({str(trace)!r}).touch()\n"
     )
     functions = {
-        "job00001": queue.ATTEMPT,
+        "job00001": entries.ATTEMPT,
         "job00002": "splatmill_worker.job.run_attempt",  # the name in entries of earlier versions
         "job00003": "splatmill_worker.service.job.run_attempt",
         "job00004": "intruder.called",
@@ -87,11 +89,11 @@ def test_the_function_and_callbacks_that_an_entry_names_are_never_imported(
     }
     for job_id, function in functions.items():
         write_row(redis_server.connection, job_id)
-        queue.open_queue(redis_server.connection).enqueue_call(
+        entries.open_queue(redis_server.connection).enqueue_call(
             function,
             args=[job_id],
-            job_id=queue.rq_id(job_id, 1),
-            timeout=queue.JOB_TIMEOUT,
+            job_id=entries.rq_id(job_id, 1),
+            timeout=entries.JOB_TIMEOUT,
             on_success=Callback("intruder.called"),
             on_failure=Callback("intruder.called"),
         )
@@ -124,14 +126,14 @@ def test_an_entry_that_belongs_to_no_job_is_removed_and_the_next_one_runs(
     connection = redis_server.connection
     foreign = ["nonsense", "job-x", "-1"]
     for entry in foreign:
-        queue.open_queue(connection).enqueue_call(queue.ATTEMPT, args=["?"], job_id=entry)
+        entries.open_queue(connection).enqueue_call(entries.ATTEMPT, args=["?"], job_id=entry)
     connection.zadd(leases.key(), {"nonsense:x": 1, "more nonsense": 1})
     write_row(connection, "job00001")
     assert queue.enqueue(connection, "job00001", 1)
     with worker(redis_server, storage, tmp_path) as process:
         assert wait_for(partial(ended, redis_server, "job00001")).state == "succeeded"
         assert process.poll() is None
-    assert queue.waiting(connection) == {"train": 0}
+    assert waiting(connection) == 0
     assert connection.zcard(leases.key()) == 0
     assert not any(connection.exists(f"rq:job:{entry}") for entry in foreign)
 
@@ -155,3 +157,94 @@ def test_a_worker_whose_clock_is_off_runs_its_job_once(
         assert 0 < expires - connection.time()[0] <= leases.LEASE
         job = wait_for(partial(ended, redis_server, "job00001"))
     assert (job.state, job.attempt) == ("succeeded", 1)
+
+
+KILLED = """
+import os, signal, sys
+from splatmill.backplane import lines
+from splatmill_worker.service import rq_worker
+real = lines.take
+def take_and_die(*arguments):
+    taken = real(*arguments)
+    if taken is not None and sys.argv[1] == "taken":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return taken
+lines.take = take_and_die
+def fork_and_die(self, job, queue):
+    os.kill(os.getpid(), signal.SIGKILL)
+if sys.argv[1] == "before the fork":
+    rq_worker.AttemptWorker.fork_work_horse = fork_and_die
+from splatmill_worker.__main__ import main
+sys.exit(main(["train"]))
+"""
+
+
+@pytest.mark.parametrize("moment", ["taken", "before the fork"])
+def test_a_worker_killed_while_it_takes_a_job_loses_none(
+    redis_server: RedisServer, storage: Storage, tmp_path: Path, moment: str
+) -> None:
+    connection = redis_server.connection
+    for job_id in ("job00001", "job00002"):
+        write_row(connection, job_id)
+        assert queue.enqueue(connection, job_id, 1)
+    environment = (
+        dict(os.environ) | STANDIN | {"REDIS_URL": redis_server.url, "SPLATMILL_DATA": str(tmp_path)}
+    )
+    for _ in range(2):
+        killed = subprocess.run([sys.executable, "-c", KILLED, moment], env=environment, timeout=60)
+        assert killed.returncode == -signal.SIGKILL
+    assert waiting(connection) + len(leases.held(connection)) == 2
+    with worker(redis_server, storage, tmp_path):
+        jobs = [wait_for(partial(ended, redis_server, job_id)) for job_id in ("job00001", "job00002")]
+    assert [job.state for job in jobs] == ["succeeded", "succeeded"]
+    assert (waiting(connection), leases.held(connection)) == (0, [])
+
+
+def test_a_job_for_a_gpu_waits_for_a_worker_that_has_one(
+    redis_server: RedisServer, storage: Storage, tmp_path: Path
+) -> None:
+    connection = redis_server.connection
+    write_row(connection, "job00001", options=TrainOptions(backend=Backend.gpu))
+    write_row(connection, "job00002")
+    for job_id in ("job00001", "job00002"):
+        assert queue.enqueue(connection, job_id, 1)
+    with worker(redis_server, storage, tmp_path, "--queues", "any,cpu"):
+        assert wait_for(partial(ended, redis_server, "job00002")).state == "succeeded"
+        (listening,) = workers.listening(connection)
+        assert listening.lines == ("any", "cpu")
+    assert queue.status(connection, "job00001", 1).state == "waiting"
+    environment = dict(os.environ) | STANDIN
+    environment |= {"SPLATMILL_DATA": str(tmp_path / "data"), "SPLATMILL_STORAGE": storage.url}
+    code = "import sys; from splatmill.backplane.connection import connect; "
+    code += "from splatmill_worker.service.rq_worker import AttemptWorker; "
+    code += "AttemptWorker(connect(sys.argv[1]), ('gpu',)).work(burst=True)"
+    subprocess.run([sys.executable, "-c", code, redis_server.url], env=environment, check=True, timeout=60)
+    assert read_job(connection, "job00001").state == "succeeded"
+
+
+def test_an_entry_whose_record_cannot_be_read_does_not_stop_the_worker(
+    redis_server: RedisServer, storage: Storage, tmp_path: Path
+) -> None:
+    connection = redis_server.connection
+    for job_id in ("job00001", "job00002"):
+        write_row(connection, job_id)
+        assert queue.enqueue(connection, job_id, 1)
+    connection.hset("rq:job:job00001-1", "created_at", "?")
+    with worker(redis_server, storage, tmp_path) as process:
+        assert wait_for(partial(ended, redis_server, "job00002")).state == "succeeded"
+        assert process.poll() is None
+    # The reaper enqueues what the queue does not know.
+    assert queue.status(connection, "job00001", 1).state == "absent"
+    assert leases.held(connection) == []
+
+
+def test_a_worker_whose_record_expired_while_redis_was_away_is_listed_again(
+    redis_server: RedisServer, storage: Storage, tmp_path: Path
+) -> None:
+    connection = redis_server.connection
+    with worker(redis_server, storage, tmp_path):
+        (before,) = wait_for(lambda: workers.listening(connection))
+        connection.delete(f"rq:worker:{before.name}")
+        connection.delete("rq:workers", f"rq:workers:{entries.TRAIN}")
+        (after,) = wait_for(lambda: workers.listening(connection))
+        assert (after.name, after.lines) == (before.name, before.lines)

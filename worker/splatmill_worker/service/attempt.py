@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import redis
 
 from splatmill.backplane import events
+from splatmill.backplane.entries import split_rq_id
 from splatmill.backplane.process import ProcessIdentity
-from splatmill.backplane.queue import split_rq_id
 from splatmill.schema import Event, JobState, LogEvent, Problem, StateEvent
 from splatmill_worker.service import hand_back
 from splatmill_worker.service.lock import JobLock

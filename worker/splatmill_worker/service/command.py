@@ -10,20 +10,23 @@ from splatmill.backplane.connection import InvalidRedisUrl, connect
 from splatmill.backplane.redact import redacted
 from splatmill_worker import settings
 from splatmill_worker.service.rq_worker import STOP_GRACE, AttemptWorker
+from splatmill_worker.service.served_lines import UnservedLines, served_lines
 
 REDIS_WAIT = 60.0
 """Seconds that a starting worker waits for Redis, which may be starting at the same time."""
 
 
-def serve(stop_grace: float | None) -> int:
+def serve(stop_grace: float | None, queues: str | None = None) -> int:
     """Take jobs from the queue until a signal to stop. Return the exit status.
 
     stop_grace: seconds that an attempt has to save its state on such a signal; None means STOP_GRACE.
+    queues: the queues to serve, separated by commas; None means SPLATMILL_QUEUES, or all that this machine can run.
     """
     url = settings.redis_url()
     try:
         connection = connect(url)
-    except InvalidRedisUrl as error:
+        served = served_lines(queues or settings.queues())
+    except (InvalidRedisUrl, UnservedLines) as error:
         print(error, file=sys.stderr)
         return 1
     deadline = time.monotonic() + REDIS_WAIT
@@ -46,5 +49,6 @@ def serve(stop_grace: float | None) -> int:
                 )
                 return 1
             time.sleep(0.05)
-    AttemptWorker(connection, stop_grace=STOP_GRACE if stop_grace is None else stop_grace).work()
+    grace = STOP_GRACE if stop_grace is None else stop_grace
+    AttemptWorker(connection, served, stop_grace=grace).work()
     return 0

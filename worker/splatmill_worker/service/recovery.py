@@ -11,15 +11,14 @@ from contextlib import suppress
 from typing import Any, cast
 
 import redis
-from rq import Queue, Worker
+from rq import Worker
 from rq.executions import Execution
-from rq.job import Job
 from rq.worker_registration import get_keys
 
-from splatmill.backplane import keys, leases
+from splatmill.backplane import keys, leases, lines
+from splatmill.backplane.entries import split_rq_id
 from splatmill.backplane.leases import Lease
 from splatmill.backplane.process import ProcessIdentity, wait_gone
-from splatmill.backplane.queue import QueueEntry, split_rq_id
 from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.lock import Holder, JobLock
 
@@ -32,13 +31,16 @@ def record_process(worker: Worker) -> None:
     worker.connection.hset(worker.key, _PROCESS_FIELD, json.dumps(ProcessIdentity.of(os.getpid()).dump()))
 
 
-def requeue_first(worker: Worker, entry: Job, queue: Queue) -> None:
-    """Put an interrupted entry at the head of its queue, without using up one of its retries."""
-    with worker.connection.pipeline() as pipeline:
-        worker.cleanup_execution(entry, pipeline=pipeline)
-        # The public enqueue_job begins a transaction of its own, apart from this one.
-        queue._enqueue_job(entry, pipeline=pipeline, at_front=True)
-        pipeline.execute()
+def is_recorded(worker: Worker) -> bool:
+    """Return whether the worker's record is still there. It expires while Redis cannot be reached."""
+    return bool(worker.connection.hexists(worker.key, _PROCESS_FIELD))
+
+
+def hand_back(worker: Worker, lease: Lease) -> None:
+    """Put an interrupted entry in front of its owner's line, without using up one of its retries."""
+    lines.hand_back(worker.connection, lease)
+    worker.set_current_job_id(None)
+    worker.execution = None
 
 
 def ended_attempt(connection: redis.Redis, entry_id: str, lock: JobLock, holder: Holder | None) -> Attempt:
@@ -54,47 +56,24 @@ def ended_attempt(connection: redis.Redis, entry_id: str, lock: JobLock, holder:
 
 
 def requeue_orphans(worker: Worker) -> None:
-    """Requeue the entries of dead workers on the worker's queue, and delete the records of these workers."""
+    """Requeue the entries of dead workers, and delete the records of these workers."""
     queue = worker.queues[0]
     others = [key for key in get_keys(queue) if key != worker.key]
     dead = {key for key in others if _worker_is_dead(worker.connection, key)}
     for lease in leases.held(worker.connection):
-        try:
-            split_rq_id(lease.entry)
-        except ValueError:
-            drop_foreign(worker, lease.entry)
-        else:
-            _requeue_if_orphaned(worker, lease)
+        _requeue_if_orphaned(worker, lease)
     if set(others) == dead:
-        # A worker can die between taking an entry and registering it. With no other worker alive, every entry in that
-        # state belonged to a dead one.
+        # Workers of earlier versions keep an entry in this list between taking it and registering it. With no other
+        # worker alive, every entry in it belonged to a dead one.
         for entry_id in queue.intermediate_queue.get_job_ids():
             if worker.connection.lrem(queue.intermediate_queue_key, 1, entry_id):
-                queue.push_job_id(entry_id, at_front=True)
+                queue.push_job_id(entry_id)
     for key in dead:
         with worker.connection.pipeline() as pipeline:
             pipeline.srem(worker.redis_workers_keys, key)
             pipeline.srem(f"rq:workers:{queue.name}", key)
             pipeline.delete(key)
             pipeline.execute()
-
-
-def drop_foreign(worker: Worker, entry_id: str) -> None:
-    """Remove an entry that belongs to no job of this service, and log it."""
-    queue = worker.queues[0]
-    with worker.connection.pipeline() as pipeline:
-        pipeline.lrem(queue.key, 0, entry_id)
-        pipeline.lrem(queue.intermediate_queue_key, 0, entry_id)
-        for lease in leases.held(worker.connection):
-            if lease.entry == entry_id:
-                pipeline.zrem(leases.key(), lease.member)
-        pipeline.delete(QueueEntry.key_for(entry_id))
-        pipeline.execute()
-    worker.log.warning(
-        "Worker %s: removed the entry %r from the queue, because it is not '<job>-<generation>'",
-        worker.name,
-        entry_id[:200],
-    )
 
 
 def _worker_is_dead(connection: redis.Redis, worker_key: str) -> bool:

@@ -10,26 +10,27 @@ import os
 import select
 import signal
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, TypeVar
 from uuid import uuid4
 
 import redis
+from redis.client import Pipeline
 from rq import Queue, Worker
 from rq.command import parse_payload
+from rq.exceptions import NoSuchJobError
 from rq.executions import Execution
 from rq.job import Job, JobStatus
 from rq.utils import now
 from rq.worker.base import WorkerStatus
-from rq.worker_registration import clean_worker_registry
+from rq.worker_registration import clean_worker_registry, register
 
-from splatmill.backplane import leases
-from splatmill.backplane import queue as backplane
+from splatmill.backplane import entries, leases, lines, workers
 from splatmill.backplane.leases import Lease, Reclaim
+from splatmill.backplane.lines import Line
 from splatmill.backplane.process import die_with_parent
-from splatmill.backplane.refusal import RedisRefuses
 from splatmill_worker.service import hand_back, recovery
 from splatmill_worker.service.abandoned_folders import remove_abandoned
 from splatmill_worker.service.attempt import Attempt, start_attempt
@@ -53,9 +54,11 @@ T = TypeVar("T")
 _RETRY_SECONDS = 0.5
 _LOG_SECONDS = 30.0  # between two log lines about a Redis that does not work
 _REMOVAL_INTERVAL = 3600.0
+_IDLE_SECONDS = 5.0
+_SIGNALS = {signal.SIGTERM, signal.SIGINT, hand_back.SIGNAL}
 
 
-class AttemptEntry(backplane.QueueEntry):
+class AttemptEntry(entries.QueueEntry):
     """An entry of the queue that runs `run_attempt`, whatever function name and arguments it carries.
 
     RQ imports and calls the function that an entry names. Here the content of Redis does not decide which function
@@ -73,29 +76,36 @@ class AttemptEntry(backplane.QueueEntry):
 
 
 class AttemptWorker(Worker):
-    """A worker on one queue.
+    """A worker that runs one attempt at a time.
 
+    served: the lines that it takes entries from.
     stop_grace: seconds that an attempt has to save its state when the worker is told to stop.
     """
 
     max_connection_wait_time = 2.0
 
     def __init__(
-        self, connection: redis.Redis, queue: str = backplane.TRAIN, stop_grace: float = STOP_GRACE
+        self,
+        connection: redis.Redis,
+        served: Sequence[Line] = ("any", "cpu"),
+        stop_grace: float = STOP_GRACE,
     ) -> None:
         super().__init__(
-            [backplane.open_queue(connection, queue)],
+            [entries.open_queue(connection)],
             name=f"{os.uname().nodename}-{os.getpid()}-{uuid4().hex[:6]}",
             connection=connection,
             job_class=AttemptEntry,
-            serializer=backplane.SERIALIZER,
-            worker_ttl=backplane.WORKER_TTL,
-            maintenance_interval=backplane.MAINTENANCE_INTERVAL,
-            job_monitoring_interval=backplane.MONITORING_INTERVAL,
+            serializer=entries.SERIALIZER,
+            worker_ttl=entries.WORKER_TTL,
+            maintenance_interval=entries.MAINTENANCE_INTERVAL,
+            job_monitoring_interval=entries.MONITORING_INTERVAL,
         )
+        self._served = tuple(served)
         self._grace = stop_grace
         self._reclaim = Reclaim(connection)
         self._entry_id: str | None = None
+        self._line: Line = "any"
+        self._began = 0.0
         self._lock: JobLock | None = None
         self._saved: SavedProgress | None = None
         self._kill_at: float | None = None
@@ -107,15 +117,15 @@ class AttemptWorker(Worker):
     def check_for_suspension(self, burst: bool) -> None:
         self._until_redis_works(lambda: super(AttemptWorker, self).check_for_suspension(burst))
 
-    def dequeue_job_and_maintain_ttl(
-        self, timeout: int | None, max_idle_time: int | None = None
-    ) -> tuple[Job, Queue] | None:
-        dequeue = super().dequeue_job_and_maintain_ttl
-        return self._until_redis_works(lambda: dequeue(timeout, max_idle_time))
-
-    def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:
+    def heartbeat(self, timeout: int | None = None, pipeline: Pipeline | None = None) -> None:
+        """Keep the worker's record, and write it again if it has expired while Redis was away."""
         try:
-            super().heartbeat(timeout, pipeline)
+            super().heartbeat(timeout or entries.WORKER_TTL, pipeline)
+            if pipeline is None and not recovery.is_recorded(self):
+                self.connection.hset(self.key, mapping=self.serialize())
+                register(self)
+                self.set_state(self.get_state())
+                self._record()
         except redis.RedisError as error:
             self.log.warning("Worker %s: Redis took no heartbeat: %s", self.name, error)
 
@@ -134,8 +144,12 @@ class AttemptWorker(Worker):
 
     def register_birth(self) -> None:
         super().register_birth()  # type: ignore[no-untyped-call]  # rq lacks types here and below
-        recovery.record_process(self)
+        self._record()
         recovery.requeue_orphans(self)
+
+    def _record(self) -> None:
+        recovery.record_process(self)
+        workers.announce(self.connection, self.key, self._served)
 
     def run_maintenance_tasks(self) -> None:
         try:
@@ -167,7 +181,7 @@ class AttemptWorker(Worker):
     def _heartbeat(self, job: Job) -> None:
         """Send the heartbeats of an attempt; kill it if another attempt has taken its queue entry or its lock."""
         try:
-            self.heartbeat(backplane.WORKER_TTL)
+            self.heartbeat()
             holds = leases.prolong(self.connection, self._lease)
             lock = self._lock.refresh() if self._lock else LockState.held
             if self._saved is not None and self._saved.advanced():
@@ -221,14 +235,46 @@ class AttemptWorker(Worker):
 
     # One attempt
 
-    def execute_job(self, job: Job, queue: Queue) -> None:
+    def dequeue_job_and_maintain_ttl(
+        self, timeout: int | None, max_idle_time: int | None = None
+    ) -> tuple[Job, Queue] | None:
+        """Wait for an entry and take it. Without a timeout (RQ's burst mode), return None if none waits."""
+        job = self._until_redis_works(lambda: self._next(wait=timeout is not None))
+        return (job, self.queues[0]) if job is not None else None
+
+    def _next(self, *, wait: bool) -> Job | None:
+        self.set_state(WorkerStatus.IDLE)
+        while True:
+            self.heartbeat()
+            if self.should_run_maintenance_tasks:
+                self.run_maintenance_tasks()
+            job = self._take()
+            if job is not None or not wait:
+                return job
+            lines.wait(self.connection, self._served, _IDLE_SECONDS)
+
+    def _take(self) -> Job | None:
+        with _blocked_signals():
+            # A signal to stop an idle worker raises an exception, which would lose the entry on its way.
+            taken = lines.take(self.connection, self.name, self._served)
+            if taken is None:
+                return None
+            lease, self._line = taken
+            self.execution = Execution(lease.execution, lease.entry, self.connection, self.name)
+            self.set_state(WorkerStatus.BUSY)
         try:
-            backplane.split_rq_id(job.id)
-        except ValueError:
-            recovery.drop_foreign(self, job.id)
-            return
-        self._until_redis_works(lambda: self._begin(job, queue), RedisRefuses)
-        self._entry_id, self._superseded = job.id, False
+            job = AttemptEntry.fetch(lease.entry, connection=self.connection, serializer=entries.SERIALIZER)
+        except (ValueError, NoSuchJobError) as error:
+            self.log.warning("Worker %s: the entry %s cannot be read: %s", self.name, lease.entry, error)
+            leases.drop(self.connection, lease)
+            self.execution = None
+            self.set_state(WorkerStatus.IDLE)
+            return None
+        self.log.info("Worker %s: took %s from the line %s", self.name, lease.entry, self._line)
+        return job
+
+    def execute_job(self, job: Job, queue: Queue) -> None:
+        self._entry_id, self._superseded, self._began = job.id, False, time.monotonic()
         try:
             self.fork_work_horse(job, queue)
             self.monitor_work_horse(job, queue)
@@ -236,39 +282,27 @@ class AttemptWorker(Worker):
             self._entry_id = None
         self._until_redis_works(lambda: self.set_state("idle"))
 
-    def _begin(self, job: Job, queue: Queue) -> None:
-        with self.connection.pipeline() as pipeline:
-            # From here on the lease holds the job. With the worker's name in it, a stop request finds the worker.
-            self.execution = Execution.create(job, leases.LEASE, pipeline, worker_name=self.name)
-            leases.hold(pipeline, self._lease)
-            self.set_state(WorkerStatus.BUSY, pipeline=pipeline)
-            job.prepare_for_execution(self.name, pipeline=pipeline)
-            pipeline.lrem(queue.intermediate_queue_key, 1, job.id)
-            pipeline.execute()
-
     def fork_work_horse(self, job: Job, queue: Queue) -> None:
-        job_id, _ = backplane.split_rq_id(job.id)
+        job_id, _ = entries.split_rq_id(job.id)
         self._lock = JobLock(self.connection, job_id, uuid4().hex)
         self._saved = SavedProgress(job_id)
         parent = os.getpid()
-        signals = {signal.SIGTERM, signal.SIGINT, hand_back.SIGNAL}
         # Until the child has set up its own handlers, a signal would run those of the worker in the child.
-        signal.pthread_sigmask(signal.SIG_BLOCK, signals)
-        child = os.fork()
-        if child == 0:
-            try:
-                os.setpgid(0, 0)
-                die_with_parent(parent)
-                hand_back.install_signal_handlers()
-                signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
-                self._run_child(job, queue)
-            finally:
-                os._exit(1)
-        with suppress(OSError):
-            # Parent and child both set the group, so that a kill never reaches the worker's own group.
-            os.setpgid(child, child)
-        self._horse_pid = child
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
+        with _blocked_signals():
+            child = os.fork()
+            if child == 0:
+                try:
+                    os.setpgid(0, 0)
+                    die_with_parent(parent)
+                    hand_back.install_signal_handlers()
+                    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+                    self._run_child(job, queue)
+                finally:
+                    os._exit(1)
+            with suppress(OSError):
+                # Parent and child both set the group, so that a kill never reaches the worker's own group.
+                os.setpgid(child, child)
+            self._horse_pid = child
         if self._stop_requested:
             self.handle_warm_shutdown_request()
 
@@ -306,14 +340,14 @@ class AttemptWorker(Worker):
         Returns the wait status and the resource usage of the process.
         """
         handle = os.pidfd_open(self.horse_pid) if hasattr(os, "pidfd_open") else None
-        beat_at = time.monotonic() + backplane.MONITORING_INTERVAL
+        beat_at = time.monotonic() + entries.MONITORING_INTERVAL
         try:
             while True:
                 pid, status, usage = os.wait4(self.horse_pid, os.WNOHANG)
                 if pid:
                     return status, usage
                 if time.monotonic() >= beat_at:
-                    beat_at = time.monotonic() + backplane.MONITORING_INTERVAL
+                    beat_at = time.monotonic() + entries.MONITORING_INTERVAL
                     self._heartbeat(job)
                 if self._kill_at is not None and time.monotonic() >= self._kill_at:
                     self.kill_horse()
@@ -332,7 +366,10 @@ class AttemptWorker(Worker):
         ours = holder if holder and holder.token == self._lock.token else None
         ended = recovery.ended_attempt(self.connection, job.id, self._lock, ours)
         self._lock.release()
-        if process_exit.clean or self._superseded or not Job.exists(job.id, self.connection):
+        if process_exit.clean:
+            lines.took(self.connection, self._line, time.monotonic() - self._began)
+            return
+        if self._superseded or not Job.exists(job.id, self.connection):
             return
         if process_exit.withdrawn:
             self._stopped_job_id = job.id
@@ -343,20 +380,18 @@ class AttemptWorker(Worker):
             return  # the process died after it had updated its entry
         elif process_exit.handed_back or process_exit.unreported or self._stop_requested:
             why = "Redis took no events." if process_exit.unreported else "The worker is stopping."
-            ended.report_requeued(f"{why} The job was put back at the head of the queue.")
-            recovery.requeue_first(self, job, queue)
+            ended.report_requeued(f"{why} The job was put back in front of its owner's others.")
+            recovery.hand_back(self, self._lease)
         elif job.should_retry:
             left = f"{job.retries_left} {'retry is' if job.retries_left == 1 else 'retries are'} left"
             ended.report_requeued(f"The job's process {process_exit.cause}. It is tried again: {left}.")
             self.handle_job_failure(job, queue, exc_string=f"The process {process_exit.cause}.")
         else:
-            ended.report_failed(process_exit.problem(attempts=backplane.MAX_RETRIES + 1))
+            ended.report_failed(process_exit.problem(attempts=entries.MAX_RETRIES + 1))
             self.handle_job_failure(job, queue, exc_string=f"The process {process_exit.cause}.")
 
-    def _until_redis_works(
-        self, action: Callable[[], T], refusal: type[redis.RedisError] = redis.RedisError
-    ) -> T:
-        """Return the result of `action`, which is repeated while it raises `refusal`.
+    def _until_redis_works(self, action: Callable[[], T]) -> T:
+        """Return the result of `action`, which is repeated while Redis cannot be reached or refuses.
 
         There is no limit: nothing is computed meanwhile, and the log says what the worker waits for.
         """
@@ -364,8 +399,18 @@ class AttemptWorker(Worker):
         while True:
             try:
                 return action()
-            except refusal as error:
+            except redis.RedisError as error:
                 if time.monotonic() >= log_at:
                     log_at = time.monotonic() + _LOG_SECONDS
                     self.log.warning("Worker %s: waiting for Redis: %s", self.name, error)
                 time.sleep(_RETRY_SECONDS)
+
+
+@contextmanager
+def _blocked_signals() -> Iterator[None]:
+    """Delay the signals that a worker handles until the end of the block."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)

@@ -1,0 +1,75 @@
+"""The entries of the job queue: RQ's records, and all settings that differ from RQ's defaults.
+
+An entry is one generation of a Splatmill job, and each run of it is an attempt. The server does not import the worker:
+which function runs an attempt is decided there.
+"""
+
+import redis
+from rq import Queue
+from rq.job import Job
+from rq.serializers import JSONSerializer
+
+TRAIN = "train"
+"""The one queue that RQ knows. Entries arrive in its list; `lines` hold those that wait, `leases` those that run."""
+
+ATTEMPT = "splatmill_worker.job.run_attempt"
+"""The function name that each entry carries, because RQ requires one, with the job id as its argument. A worker runs
+its own attempt function whatever the name says. The name stays for workers of earlier versions, which import it."""
+
+SERIALIZER = JSONSerializer
+"""JSON in place of pickle, RQ's default, so that write access to Redis does not allow running code in a worker.
+`QueueEntry` serves the same end."""
+
+JOB_TIMEOUT = -1
+"""No time limit (RQ's default is 180 s); the option `time_budget` limits the training."""
+
+MAX_RETRIES = 3
+"""Number of further attempts when the process of a job dies. A failure that the pipeline reports is not retried."""
+
+WORKER_TTL = 30
+"""Seconds after which an idle worker that has disappeared is no longer listed (RQ's default is 420)."""
+
+MAINTENANCE_INTERVAL = 10
+"""Seconds between two looks of an idle worker for expired leases (RQ's default is 600)."""
+
+MONITORING_INTERVAL = 5
+"""Seconds between the heartbeats of a busy worker, each of which prolongs its lease (RQ's default is 30)."""
+
+HEARTBEAT_SLACK = 10
+"""Seconds by which a heartbeat may be late before the attempt counts as lost (RQ's constant is 60). If a machine
+dies, its job is requeued when its lease has expired (see `leases`), after at most one more interval of the reaper."""
+
+KEEP_FINISHED = 24 * 3600
+"""Seconds for which RQ keeps its record of a finished job. Splatmill's own stays until the job is deleted."""
+
+
+class QueueEntry(Job):
+    """RQ's record of one generation of a job, without callbacks, which RQ would import by names found in Redis."""
+
+    success_callback = None
+    failure_callback = None
+    stopped_callback = None
+
+
+def open_queue(connection: redis.Redis) -> Queue:
+    """Return RQ's queue, with JSON as serializer, `QueueEntry` as job class and no time limit."""
+    return Queue(
+        TRAIN,
+        connection=connection,
+        serializer=SERIALIZER,
+        job_class=QueueEntry,
+        default_timeout=JOB_TIMEOUT,
+    )
+
+
+def rq_id(job_id: str, generation: int) -> str:
+    """Return RQ's id of a generation of a job. RQ allows only letters, digits, `_` and `-`."""
+    return f"{job_id}-{generation}"
+
+
+def split_rq_id(text: str) -> tuple[str, int]:
+    """Return the job id and the generation in an id of RQ. Raises ValueError for an id of another form."""
+    job_id, _, generation = text.rpartition("-")
+    if not job_id or not generation.isdigit():
+        raise ValueError(f"{text!r} is not '<job id>-<generation>'.")
+    return job_id, int(generation)

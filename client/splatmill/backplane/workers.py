@@ -1,0 +1,75 @@
+"""The workers that listen, as their records in Redis tell: RQ's, with the lines that each serves."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any, cast
+
+import redis
+from rq.worker_registration import REDIS_WORKER_KEYS
+
+from splatmill.backplane.lines import LINES, Line
+
+_LINES_FIELD = "splatmill_lines"
+
+
+@dataclass(frozen=True)
+class WorkerRecord:
+    """A worker whose last heartbeat is not too old.
+
+    name: its name.
+    lines: the lines that it serves; none for a worker of an earlier version.
+    state: idle, busy, suspended, ...
+    entry: the entry that it runs.
+    last_heartbeat: time of its last heartbeat by its own clock.
+    """
+
+    name: str
+    lines: tuple[Line, ...]
+    state: str
+    entry: str | None
+    last_heartbeat: datetime | None
+
+
+def announce(connection: redis.Redis, worker_key: str, lines: Sequence[Line]) -> None:
+    """Record which lines a worker serves."""
+    connection.hset(worker_key, _LINES_FIELD, ",".join(lines))
+
+
+def listening(connection: redis.Redis) -> list[WorkerRecord]:
+    """Return the workers that listen or work, by name."""
+    known = sorted(cast(set[bytes], connection.smembers(REDIS_WORKER_KEYS)))
+    with connection.pipeline(transaction=False) as pipe:
+        for worker_key in known:
+            pipe.hgetall(worker_key)
+        replies = cast(list[dict[bytes, bytes]], pipe.execute())
+    return [
+        _record(
+            worker_key.decode().rpartition(":")[2], {key.decode(): value for key, value in stored.items()}
+        )
+        for worker_key, stored in zip(known, replies, strict=True)
+        if stored and b"death" not in stored
+    ]
+
+
+def serving(workers: Iterable[WorkerRecord], line: Line) -> list[WorkerRecord]:
+    """Return those of the workers that serve a line."""
+    return [worker for worker in workers if line in worker.lines]
+
+
+def _record(name: str, stored: dict[str, Any]) -> WorkerRecord:
+    served = stored.get(_LINES_FIELD, b"").decode().split(",")
+    return WorkerRecord(
+        name=name,
+        lines=tuple(line for line in LINES if line in served),
+        state=stored.get("state", b"?").decode(),
+        entry=stored.get("current_job", b"").decode() or None,
+        last_heartbeat=_moment(stored.get("last_heartbeat", b"").decode()),
+    )
+
+
+def _moment(text: str) -> datetime | None:
+    try:
+        return datetime.fromisoformat(text).replace(tzinfo=UTC)
+    except ValueError:
+        return None

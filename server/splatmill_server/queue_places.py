@@ -1,0 +1,82 @@
+"""Where waiting jobs stand in the queue: their position, when they will probably start, and what they wait for."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+
+import redis
+
+from splatmill.backplane import leases, lines, workers
+from splatmill.backplane.entries import rq_id
+from splatmill.backplane.lines import Line, Waiting
+from splatmill.backplane.refusal import RedisRefuses
+from splatmill.backplane.workers import WorkerRecord
+from splatmill.schema import Job, JobState
+
+
+def with_places(connection: redis.Redis, jobs: Sequence[tuple[Job, int]]) -> list[Job]:
+    """Return the jobs, those that wait with their place in the queue.
+
+    jobs: each with its generation.
+
+    The queue is read once for all of them.
+    """
+    entries = [rq_id(job.id, generation) if job.state is JobState.queued else "" for job, generation in jobs]
+    if not (asked := [entry for entry in entries if entry]):
+        return [job for job, _ in jobs]
+    try:
+        waiting = lines.look(connection, asked)
+    except RedisRefuses:
+        # What has just arrived cannot be sorted into its line; the jobs can be read all the same.
+        return [job for job, _ in jobs]
+    queue = _Queue(connection, waiting) if waiting.places else None
+    return [
+        job.model_copy(update=queue.place(entry)) if queue and entry in waiting.places else job
+        for (job, _), entry in zip(jobs, entries, strict=True)
+    ]
+
+
+def start_after(position: int, seconds: float, free_after: Sequence[float]) -> float:
+    """Return in how many seconds a job starts.
+
+    position: number of jobs before it.
+    seconds: how long a job takes.
+    free_after: for each worker, the seconds until it has finished its present job, at most `seconds`.
+    """
+    rounds, worker = divmod(position, len(free_after))
+    return sorted(free_after)[worker] + rounds * seconds
+
+
+class _Queue:
+    """The queue at one moment."""
+
+    def __init__(self, connection: redis.Redis, waiting: Waiting) -> None:
+        self._waiting = waiting
+        self._workers = workers.listening(connection)
+        self._running = leases.running(connection)
+        self._durations = lines.mean_durations(connection)
+        seconds, micros = connection.time()
+        self._now = datetime.fromtimestamp(seconds + micros / 1e6, UTC)
+
+    def place(self, entry: str) -> dict[str, object]:
+        """Return the fields of a job for an entry that waits."""
+        line = self._waiting.places[entry].line
+        serving = workers.serving(self._workers, line)
+        served = {other for worker in serving for other in worker.lines}
+        position = self._waiting.position(entry, served)
+        assert position is not None
+        return {
+            "queue_position": position,
+            "estimated_start": self._start(line, position, serving),
+            "waiting_for": None if serving else line,
+        }
+
+    def _start(self, line: Line, position: int, serving: Sequence[WorkerRecord]) -> datetime | None:
+        seconds = self._durations.get(line)
+        if not serving or seconds is None:
+            return None
+        free_after = [
+            max(0.0, seconds - self._running[worker.name]) if worker.name in self._running else 0.0
+            for worker in serving
+        ]
+        start = self._now + timedelta(seconds=start_after(position, seconds, free_after))
+        return start.replace(microsecond=0)
