@@ -1,0 +1,65 @@
+"""The access log: who, what, status, seconds, bytes and request id, one line a request, which a setting turns off."""
+
+import logging
+from typing import Any
+
+import pytest
+import structlog
+from structlog.testing import CapturingLogger
+
+from tests.support.served_app import Serve
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def lines() -> Any:
+    """What is logged at the level info and above, as dictionaries."""
+    before = structlog.get_config()
+    captured = CapturingLogger()
+    structlog.configure(
+        processors=[structlog.stdlib.add_log_level, lambda _, __, found: ((), found)],
+        wrapper_class=structlog.make_filtering_bound_logger(logging.INFO),
+        logger_factory=lambda *_: captured,
+        cache_logger_on_first_use=False,
+    )
+    yield captured
+    structlog.configure(**before)
+
+
+def requests(captured: CapturingLogger) -> list[dict[str, Any]]:
+    return [dict(call.kwargs) for call in captured.calls if call.kwargs.get("event") == "request"]
+
+
+def test_a_request_is_one_line(serve: Serve, lines: CapturingLogger) -> None:
+    app = serve(api_key="s3cret")
+    made = app.http.post("/v1/keys", json={"name": "Ann's laptop", "owner": "ann", "scopes": ["read"]}).json()
+    auth = {"Authorization": f"Bearer {made['secret']}", "X-Request-ID": "abc-1"}
+    answer = app.http.get("/v1/me?page=1", headers=auth)
+    app.http.post("/v1/captures", headers=auth)
+    app.http.get("/v1/jobs", headers={"Authorization": "none"})
+    app.http.get("/healthz")
+    created, me, refused, nobody = requests(lines)
+    seconds = me.pop("seconds")
+    assert me == {
+        "event": "request",
+        "level": "info",
+        "request": "abc-1",
+        "owner": "ann",
+        "key": "Ann's laptop",
+        "method": "GET",
+        "path": "/v1/me",
+        "status": 200,
+        "bytes": len(answer.content),
+    }
+    assert 0 <= seconds < 60
+    assert (created["owner"], created["key"], created["status"]) == ("default", "SPLATMILL_API_KEY", 201)
+    assert (refused["owner"], refused["status"]) == ("ann", 403)
+    assert (nobody["owner"], nobody["key"], nobody["status"]) == ("", "", 401)
+    assert made["secret"] not in str(lines.calls)
+
+
+def test_it_can_be_turned_off(serve: Serve, lines: CapturingLogger) -> None:
+    app = serve(access_log=False)
+    app.http.get("/v1/me")
+    assert requests(lines) == []
