@@ -7,6 +7,7 @@ import secrets
 import shutil
 from collections.abc import AsyncIterator, Sequence
 from datetime import UTC, datetime
+from pathlib import PurePosixPath
 
 import structlog
 from starlette.concurrency import run_in_threadpool
@@ -20,6 +21,7 @@ from splatmill.schema import (
     CaptureFile,
     CapturePage,
     Role,
+    UnsafeName,
     format_bytes,
     may_be_empty,
     safe_name,
@@ -191,12 +193,21 @@ class Captures:
         file that is too large (413), too many files (413) and full storage (507), which all name the file. After an
         error or a lost connection, storage is unchanged.
         """
-        name = safe_name(name)
+        name = sent_name(name)
         try:
             return await self._store(capture_id, role, name, chunks, announced_sha256, announced_size)
         except ProblemError as error:
             raise error.about_file(f"{role.value}/{name}") from error
         except StorageError as error:
+            other = await run_in_threadpool(self._in_the_way, capture_id, role, name)
+            if other is not None:
+                raise ProblemError(
+                    "name_taken",
+                    f"{role.value}/{name}: the capture holds {role.value}/{other}, and a name cannot be that of a file "
+                    "and of a folder.",
+                    advice="Upload this file under another name.",
+                    facts={"file": f"{role.value}/{name}", "stored": f"{role.value}/{other}"},
+                ) from error
             problem = problem_of_storage(error)
             log.warning("storage error", error=str(error), file=f"{role.value}/{name}", capture=capture_id)
             named = ProblemError(problem.code, problem.detail, advice=problem.advice, facts=problem.facts)
@@ -249,6 +260,15 @@ class Captures:
             self.metrics.uploaded.inc(file.size)
             self._counts[capture_id] = self._counts.get(capture_id, 0) + 1
         return new
+
+    def _in_the_way(self, capture_id: str, role: Role, name: str) -> str | None:
+        """Return the name of a stored file that lies above `name` in the folders, or below it."""
+        for folder in PurePosixPath(name).parents[:-1]:
+            if self.storage.exists(layout.capture_file(capture_id, role, folder.as_posix())):
+                return folder.as_posix()
+        root = layout.capture_files(capture_id, role)
+        below = next(iter(self.storage.entries(layout.capture_file(capture_id, role, name))), None)
+        return None if below is None else below.path[len(root) + 1 :]
 
     def _claim(self, capture_id: str, file: CaptureFile, incoming: str) -> bool:
         """Give an upload its name; return False if another upload has the name.
@@ -420,6 +440,15 @@ def check_whole(
 
 def _id_of_key(owner: str, key: str) -> str:
     return hashlib.sha256(f"{owner}\0{key}".encode()).hexdigest()[:32]
+
+
+def sent_name(name: str) -> str:
+    """Return the `safe_name` of a file in a request. Raises UnsafeName, also for a name that was not sent as UTF-8."""
+    if "\ufffd" in name:
+        raise UnsafeName(
+            f"The file name {name[:80]!a} is not UTF-8; rename the file, or encode its name as UTF-8."
+        )
+    return safe_name(name)
 
 
 def fingerprints(files: Sequence[CaptureFile]) -> list[str]:

@@ -64,6 +64,8 @@ async def _receive(
     async for part in read_parts(request):
         if part.filename is not None and part.name in Role.__members__:
             files.append(await _store(service, capture_id, part, part.filename))
+        elif part.filename is None and part.name in fields:
+            raise ProblemError("invalid_request", f"The form contains the field {part.name!r} twice.")
         elif part.filename is None and part.name in _FIELDS:
             fields[part.name] = await part.text()
         else:

@@ -90,19 +90,24 @@ class _Events:
         self._found: list[tuple[PartEvent, bytes]] = []
         self._header, self._value, self._disposition = b"", b"", b""
         self.complete = False
-        self._parser = MultipartParser(
-            boundary,
-            {
-                "on_part_begin": self._on_part_begin,
-                "on_header_field": self._on_header_field,
-                "on_header_value": self._on_header_value,
-                "on_header_end": self._on_header_end,
-                "on_headers_finished": self._on_headers_finished,
-                "on_part_data": self._on_part_data,
-                "on_part_end": self._on_part_end,
-                "on_end": self._on_end,
-            },
-        )
+        try:
+            self._parser = MultipartParser(
+                boundary,
+                {
+                    "on_part_begin": self._on_part_begin,
+                    "on_header_field": self._on_header_field,
+                    "on_header_value": self._on_header_value,
+                    "on_header_end": self._on_header_end,
+                    "on_headers_finished": self._on_headers_finished,
+                    "on_part_data": self._on_part_data,
+                    "on_part_end": self._on_part_end,
+                    "on_end": self._on_end,
+                },
+            )
+        except FormParserError as error:
+            raise ProblemError(
+                "malformed_body", f"The boundary of the multipart body is not accepted: {error}."
+            ) from error
 
     async def next(self) -> tuple[PartEvent, bytes] | None:
         """Return the next event, or None at the end of the body."""

@@ -23,9 +23,16 @@ from splatmill.backplane import layout
 from splatmill.backplane.parts import EndMoved, Part, open_part
 from splatmill.backplane.records import FORMAT
 from splatmill.backplane.storage import Storage, StorageError
-from splatmill.schema import CaptureFile, Response, Role, Time, safe_name
+from splatmill.schema import CaptureFile, Response, Role, Time
 from splatmill.schema.uploads import UPLOAD_COMPLETE, UPLOAD_OFFSET, write_boolean
-from splatmill_server.captures import STALE_SECONDS, Captures, check_whole, name_taken, too_large
+from splatmill_server.captures import (
+    STALE_SECONDS,
+    Captures,
+    check_whole,
+    name_taken,
+    sent_name,
+    too_large,
+)
 from splatmill_server.problems import ProblemError, problem_of_storage
 
 
@@ -76,7 +83,7 @@ class PartialUploads:
         Raises UnsafeName, and problems for a name that other bytes have (409), a file that is too large (413), and
         storage without room for it (507).
         """
-        name = safe_name(name)
+        name = sent_name(name)
         sha256 = sha256.strip().lower() if sha256 is not None else None
         async with _named(f"{role.value}/{name}"):
             return await run_in_threadpool(self._create, capture_id, role, name, length, sha256)

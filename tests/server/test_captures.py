@@ -251,10 +251,10 @@ def test_every_error_of_an_upload_names_its_file(serve: Serve, tmp_path: Path) -
         assert found["facts"]["file"] == name
 
     named(app.http.put(address, content=b"other"), 409, "name_taken", "images/sub/a.jpg")
-    empty = address.replace("images/sub/a.jpg", "poses/points3D.txt")
-    named(app.http.put(empty, content=b""), 422, "file_empty", "poses/points3D.txt")
-    named(app.http.put(empty, content=b"x" * 2000), 413, "body_too_large", "poses/points3D.txt")
-    named(app.http.put(empty, content=b"x", headers=wrong), 422, "digest_mismatch", "poses/points3D.txt")
+    empty = address.replace("images/sub/a.jpg", "poses/images.txt")
+    named(app.http.put(empty, content=b""), 422, "file_empty", "poses/images.txt")
+    named(app.http.put(empty, content=b"x" * 2000), 413, "body_too_large", "poses/images.txt")
+    named(app.http.put(empty, content=b"x", headers=wrong), 422, "digest_mismatch", "poses/images.txt")
     gone = "/v1/captures/0123456789abcdef/images/a.jpg"
     named(app.http.put(gone, content=PHOTO), 404, "capture_not_found", "images/a.jpg")
     refused = app.http.put(address, content=PHOTO, headers={"Content-Type": "text/html"})

@@ -1,10 +1,11 @@
 """The base classes of all messages on the wire, and the number and time types they share."""
 
 import math
+import unicodedata
 from datetime import datetime
 from typing import Annotated, Any
 
-from pydantic import AwareDatetime, BaseModel, BeforeValidator, ConfigDict
+from pydantic import AfterValidator, AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field
 
 
 class Request(BaseModel):
@@ -27,7 +28,17 @@ def _finite_or_none(value: Any) -> Any:
 Measured = Annotated[float | None, BeforeValidator(_finite_or_none)]
 """A measured number, or None where nothing was measured. NaN and infinities become None."""
 
+
+def _without_controls(label: str) -> str:
+    if any(unicodedata.category(char) == "Cc" for char in label):
+        raise ValueError("it contains a control character, which would act on the terminals that show it")
+    return label
+
+
+Label = Annotated[str, Field(max_length=200), AfterValidator(_without_controls)]
+"""A name that a client gives to something, to recognise it by. Records of earlier versions may hold other text."""
+
 Time = AwareDatetime
 """A point in time with its time zone; ISO 8601 on the wire."""
 
-__all__ = ["Measured", "Request", "Response", "Time", "datetime"]
+__all__ = ["Label", "Measured", "Request", "Response", "Time", "datetime"]

@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 
 from splatmill.schema.access import DEFAULT_OWNER, Owner
-from splatmill.schema.base import Request, Response, Time
+from splatmill.schema.base import Label, Request, Response, Time
 
 SHA256_HEADER = "X-Content-SHA256"
 """Request and response header: SHA-256 of a file's bytes in lower-case hex."""
@@ -89,7 +89,7 @@ FileName = Annotated[str, AfterValidator(safe_name)]
 class CreateCapture(Request):
     """A request for a new, empty capture. Its files are uploaded one by one afterwards."""
 
-    name: str | None = Field(default=None, max_length=200, description="A name to recognise the capture by.")
+    name: Label | None = Field(default=None, description="A name to recognise the capture by.")
     key: str | None = Field(
         default=None,
         min_length=1,

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 from splatmill.schema.access import DEFAULT_OWNER, Owner
-from splatmill.schema.base import Request, Response, Time
+from splatmill.schema.base import Label, Request, Response, Time
 from splatmill.schema.events import JobState, LogEvent, Progress
 from splatmill.schema.options import TrainOptions
 from splatmill.schema.problems import Problem
@@ -19,7 +19,7 @@ class CreateJob(Request):
     """A request to train a capture."""
 
     capture: str = Field(min_length=1, max_length=64, description="Id of the capture.")
-    name: str | None = Field(default=None, max_length=200, description="A name to recognise the job by.")
+    name: Label | None = Field(default=None, description="A name to recognise the job by.")
     options: TrainOptions = Field(default_factory=TrainOptions)
     priority: int = Field(
         default=0,

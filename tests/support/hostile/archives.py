@@ -14,8 +14,7 @@ from tests.support.hostile.pictures import photo
 def packed(files: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
     """A zip of these files."""
     data = io.BytesIO()
-    with warnings.catch_warnings(), zipfile.ZipFile(data, "w", method) as archive:
-        warnings.simplefilter("ignore")  # of names that occur twice
+    with zipfile.ZipFile(data, "w", method) as archive:
         for name, content in files.items():
             archive.writestr(name, content)
     return data.getvalue()
@@ -36,6 +35,16 @@ def encrypted() -> bytes:
     data[6] |= 1  # of the local header
     data[data.rindex(b"PK\x01\x02") + 8] |= 1
     return bytes(data)
+
+
+def twice() -> bytes:
+    """A zip with two files of one name."""
+    data = io.BytesIO()
+    with warnings.catch_warnings(), zipfile.ZipFile(data, "w") as archive:
+        warnings.simplefilter("ignore")
+        for seed in range(2):
+            archive.writestr("a.jpg", photo(seed))
+    return data.getvalue()
 
 
 def wrong_checksum() -> bytes:

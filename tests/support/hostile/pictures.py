@@ -48,8 +48,8 @@ def bomb(width: int = 27_000, height: int = 25_000) -> bytes:
 
 
 def text_bomb() -> bytes:
-    """A PNG with a text that unpacks to 256 MB."""
-    text = b"Comment\0\0" + zlib.compress(bytes(256 * 2**20), 9)
+    """A PNG with a text that unpacks to 64 MB."""
+    text = b"Comment\0\0" + zlib.compress(bytes(64 * 2**20))
     rows = zlib.compress(b"\0" * 65 * 48)
     return png(64, 48, rows, before=chunk(b"zTXt", text))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path
 from typing import Any
 
 import av
@@ -33,10 +32,10 @@ def without_length() -> bytes:
     return video("webm", codec="libvpx", live="1")
 
 
-def larger_than_8k(folder: Path) -> bytes:
-    """A video of one frame of 8,208 x 4,336 pixels, that compresses well."""
-    path = folder / "large.avi"
-    with av.open(str(path), "w", format="avi") as container:
+def larger_than_8k() -> bytes:
+    """A video of one frame of 8,208 x 4,336 pixels."""
+    data = io.BytesIO()
+    with av.open(data, "w", format="avi") as container:
         stream: Any = container.add_stream("mjpeg", rate=10)
         stream.width, stream.height, stream.pix_fmt = 8_208, 4_336, "yuvj420p"
         frame = av.VideoFrame(8_208, 4_336, "yuvj420p")
@@ -44,4 +43,4 @@ def larger_than_8k(folder: Path) -> bytes:
             plane.update(bytes(plane.buffer_size))
         container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    return path.read_bytes()
+    return data.getvalue()

@@ -157,7 +157,7 @@ def test_a_video_without_length_is_measured(tmp_path: Path) -> None:
 
 
 def test_frames_larger_than_8k_are_refused_before_one_is_decoded(tmp_path: Path) -> None:
-    path = write(tmp_path / "walk.avi", videos.larger_than_8k(tmp_path))
+    path = write(tmp_path / "walk.avi", videos.larger_than_8k())
     with pytest.raises(UnusableVideo, match="35 million"):
         video.sharpest_frames(path, tmp_path / "out", 4)
 

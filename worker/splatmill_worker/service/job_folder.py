@@ -68,7 +68,8 @@ class JobFolder:
             if _is_whole(target, entry):
                 continue
             source = self.storage.local_path(entry.path)
-            with suppress(FileNotFoundError):  # deleted meanwhile: it is missed below
+            # Deleted meanwhile, or both a file and a folder, which buckets allow: it is missed below.
+            with suppress(FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError):
                 if source is None:
                     self.storage.download(entry.path, target)
                 else:

@@ -1,0 +1,10 @@
+"""The list of hostile inputs, each with the answer that it must get. docs/generate/hostile.py prints it."""
+
+from __future__ import annotations
+
+from tests.support.hostile.entry import Hostile
+from tests.support.hostile.table_files import FILES
+from tests.support.hostile.table_poses import POSES
+from tests.support.hostile.table_requests import REQUESTS
+
+HOSTILE: tuple[Hostile, ...] = (*REQUESTS, *FILES, *POSES)
