@@ -21,9 +21,10 @@ import structlog
 from splatmill.backplane.connection import connect
 from splatmill.schema import TrainOptions
 from splatmill_server.settings import Settings
-from splatmill_worker import images
 from splatmill_worker.capture import posed_scene
 from splatmill_worker.errors import WorkerError
+from splatmill_worker.images import decoders
+from splatmill_worker.images.prepare import prepare
 from splatmill_worker.scene import Normalization
 from splatmill_worker.splat.start.given_model import read_given_model
 from tests.support.hostile.pictures import photo, write
@@ -111,7 +112,7 @@ class Bench:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
-                found = images.prepare(capture / "images", capture / "masks", capture / "work", frames=4)
+                found = prepare(capture / "images", capture / "masks", capture / "work", frames=4)
             except WorkerError as error:
                 return Answer(f"the job fails: `{error.code}`", error.message)
         skipped = [f"{where}: {reason}" for where, reason in found.skipped]
@@ -170,7 +171,11 @@ def bench() -> Iterator[Bench]:
             reaper_interval=3600,
             max_files_per_capture=MAX_FILES,
         )
-        yield Bench(stack.enter_context(served_app(settings, client)), place / "capture")
+        captures = place / "captures"
+        captures.mkdir()
+        # As in an attempt: see service/run_attempt.
+        stack.enter_context(decoders.confined(read=[captures], write=[captures]))
+        yield Bench(stack.enter_context(served_app(settings, client)), captures / "one")
 
 
 def _answer(received: bytes) -> Answer:

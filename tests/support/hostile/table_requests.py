@@ -349,6 +349,26 @@ REQUESTS = (
         "400",
     ),
     Hostile("API", "no Host", lambda b: b.send(b"GET /healthz HTTP/1.1\r\nConnection: close\r\n\r\n"), "400"),
+    Hostile(
+        "API",
+        "a name in Host that is not this machine's",
+        lambda b: b.request("GET /v1/captures", b"", "Host: evil.example"),
+        "403 `forbidden`",
+    ),
+    Hostile(
+        "API",
+        "rubbish in Host",
+        lambda b: b.request("GET /v1/captures", b"", "Host: a b/\\@:::"),
+        "403 `forbidden`",
+    ),
+    Hostile(
+        "API",
+        "a web page of another site that starts a training",
+        lambda b: b.post(
+            "/v1/jobs", {"capture": "x"}, "Content-Type: application/json", "Origin: http://evil.example"
+        ),
+        "403 `forbidden`",
+    ),
     Hostile("API", "a hundred clients that never finish their headers, and one that does", _slow, "200"),
     Hostile(
         "API",
