@@ -353,13 +353,13 @@ REQUESTS = (
         "API",
         "a name in Host that is not this machine's",
         lambda b: b.request("GET /v1/captures", b"", "Host: evil.example"),
-        "403 `forbidden`",
+        "421 `host_not_allowed`",
     ),
     Hostile(
         "API",
         "rubbish in Host",
         lambda b: b.request("GET /v1/captures", b"", "Host: a b/\\@:::"),
-        "403 `forbidden`",
+        "421 `host_not_allowed`",
     ),
     Hostile(
         "API",
@@ -367,7 +367,7 @@ REQUESTS = (
         lambda b: b.post(
             "/v1/jobs", {"capture": "x"}, "Content-Type: application/json", "Origin: http://evil.example"
         ),
-        "403 `forbidden`",
+        "403 `origin_not_allowed`",
     ),
     Hostile("API", "a hundred clients that never finish their headers, and one that does", _slow, "200"),
     Hostile(
