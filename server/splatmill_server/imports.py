@@ -28,6 +28,7 @@ from splatmill_server.leases import lease
 from splatmill_server.outgoing import AddressRefused, Answer, NoAnswer, Outgoing
 from splatmill_server.problems import ProblemError, problem_of_storage
 from splatmill_server.settings import Settings
+from splatmill_server.space.quota import Quota
 
 log = structlog.get_logger()
 
@@ -57,12 +58,14 @@ class Imports:
         connection: redis.Redis,
         storage: Storage,
         captures: Captures,
+        quota: Quota,
         outgoing: Outgoing,
         settings: Settings,
     ) -> None:
         self.connection = connection
         self.storage = storage
         self.captures = captures
+        self.quota = quota
         self.outgoing = outgoing
         self.settings = settings
         self._wake = asyncio.Event()
@@ -202,14 +205,16 @@ class Imports:
             _check(answer)
             found = found.model_copy(update={"size": answer.size})
             chunks = self._recorded(found, answer.chunks)
-            file, _ = await self.captures.store(
-                found.capture,
-                found.role,
-                found.name,
-                chunks,
-                announced_sha256=found.sha256,
-                announced_size=answer.size,
-            )
+            async with self.quota.upload(None, found.capture, answer.size) as arrival:
+                file, new = await self.captures.store(
+                    found.capture,
+                    found.role,
+                    found.name,
+                    arrival.counted(chunks),
+                    announced_sha256=found.sha256,
+                    announced_size=answer.size,
+                )
+                arrival.stored = file.size if new else 0
         return found.model_copy(
             update={"state": ImportState.succeeded, "received": file.size, "file": file, "name": file.name}
         )

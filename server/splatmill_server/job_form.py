@@ -26,10 +26,11 @@ async def create_from_form(
     number. If any part
     is refused, the capture is deleted.
     """
+    await run_in_threadpool(service.quota.check_new, who)
     capture, _ = await run_in_threadpool(lambda: service.captures.create(owner=who.owner))
     kept = False
     try:
-        files, fields = await _receive(service, request, capture.id)
+        files, fields = await _receive(service, who, request, capture.id)
         create = _request(capture.id, fields)
         await run_in_threadpool(service.captures.check_trainable, capture.id)
         await run_in_threadpool(check_start_model, service, who, create)
@@ -43,7 +44,7 @@ async def create_from_form(
         return job, new
     finally:
         if not kept:
-            await run_in_threadpool(service.captures.delete, capture.id)
+            await run_in_threadpool(service.deletion.unused_capture, capture)
 
 
 def check_start_model(service: Service, who: Caller, create: CreateJob) -> None:
@@ -57,13 +58,13 @@ def check_start_model(service: Service, who: Caller, create: CreateJob) -> None:
 
 
 async def _receive(
-    service: Service, request: Request, capture_id: str
+    service: Service, who: Caller, request: Request, capture_id: str
 ) -> tuple[list[CaptureFile], dict[str, str]]:
     files: list[CaptureFile] = []
     fields: dict[str, str] = {}
     async for part in read_parts(request):
         if part.filename is not None and part.name in Role.__members__:
-            files.append(await _store(service, capture_id, part, part.filename))
+            files.append(await _store(service, who, capture_id, part, part.filename))
         elif part.filename is None and part.name in fields:
             raise ProblemError("invalid_request", f"The form contains the field {part.name!r} twice.")
         elif part.filename is None and part.name in _FIELDS:
@@ -79,10 +80,14 @@ async def _receive(
     return files, fields
 
 
-async def _store(service: Service, capture_id: str, part: Part, filename: str) -> CaptureFile:
+async def _store(service: Service, who: Caller, capture_id: str, part: Part, filename: str) -> CaptureFile:
     if not filename:
         raise ProblemError("name_invalid", f"A file among the {part.name} of the form has no file name.")
-    file, _ = await service.captures.store(capture_id, Role(part.name), filename, part.chunks)
+    async with service.quota.upload(who, capture_id, None) as arrival:
+        file, new = await service.captures.store(
+            capture_id, Role(part.name), filename, arrival.counted(part.chunks)
+        )
+        arrival.stored = file.size if new else 0
     return file
 
 

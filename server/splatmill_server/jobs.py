@@ -19,7 +19,7 @@ from splatmill.backplane.fold import fold
 from splatmill.backplane.records import UnreadableRecord, check_format, reason, warn
 from splatmill.backplane.row import JobRow, Verdict
 from splatmill.backplane.storage import Storage, StorageError
-from splatmill.schema import DEFAULT_OWNER, CreateJob, Job, JobPage, JobState, Problem
+from splatmill.schema import DEFAULT_OWNER, CreateJob, Job, JobPage, JobState, Problem, StoredKind
 from splatmill.schema.tolerant import keep_readable
 from splatmill_server import job_log
 from splatmill_server.filters import JobFilter
@@ -27,6 +27,7 @@ from splatmill_server.metrics import Metrics
 from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError
 from splatmill_server.queue_places import with_places
+from splatmill_server.space.marks import DELETING, check_marks, mark_keys, needs_of
 
 log = structlog.get_logger()
 
@@ -83,11 +84,13 @@ class Jobs:
             queued_at=moment,
         )
         known: JobRow | None = None
+        needs = needs_of(request.capture, request.options)
 
         def insert(pipe: Any) -> None:
             nonlocal known
             known = row.read(self.connection, job_id)
             if known is None:
+                check_marks(self.connection, self.storage, needs)
                 self._check_room(owner, most)
             pipe.multi()
             if known is None:
@@ -96,8 +99,9 @@ class Jobs:
                 pipe.zadd(keys.JOBS, {job_id: int(moment.timestamp() * 1000)})
                 pipe.sadd(keys.ACTIVE, job_id)
 
-        # Of two concurrent requests with the same key, only one inserts the job.
-        self.connection.transaction(insert, keys.job(job_id), keys.begun_jobs(owner))
+        # Of two concurrent requests with the same key, only one inserts the job. No job is inserted whose capture is
+        # being deleted.
+        self.connection.transaction(insert, keys.job(job_id), keys.begun_jobs(owner), *mark_keys(needs))
         if known is not None:
             return self._placed(known), False
         # A crash here leaves a row that is not in the queue; the reaper enqueues it.
@@ -283,10 +287,6 @@ class Jobs:
                 facts={"unfinished_jobs": count, "limit": most},
             )
 
-    def unfinished_on(self, capture_id: str) -> str | None:
-        """Return the id of an unfinished job on a capture, or None."""
-        return next((found.id for found in self.active() if found.capture == capture_id), None)
-
     def cancel(self, job_id: str) -> Job:
         """Record the request to cancel a job. The reaper then kills its process and ends the job."""
 
@@ -309,6 +309,8 @@ class Jobs:
 
         most: number of unfinished jobs that the owner may have; with as many, raise a 429 problem.
         """
+        known = self.row(job_id)
+        needs = [*needs_of(known.capture, known.options), (StoredKind.model, job_id)]
 
         def begin_generation(found: JobRow, job: Job) -> dict[str, str] | None:
             if job.state is JobState.queued and found.cancel_requested_at is None:
@@ -326,6 +328,9 @@ class Jobs:
                     f"The job's capture {found.capture} was deleted.",
                     advice="Upload the photos again and create a new job.",
                 )
+            check_marks(self.connection, self.storage, needs[:-1])
+            if self.connection.get(mark_keys(needs)[-1]) == DELETING:
+                raise job_not_found(job_id)
             self._check_room(found.owner, most)
             return {
                 "generation": str(found.generation + 1),
@@ -334,9 +339,7 @@ class Jobs:
                 "verdict": "",
             }
 
-        # It is added to the active jobs first: a crash in between leaves an ended job there, which is harmless.
-        self.connection.sadd(keys.ACTIVE, job_id)
-        self._change(job_id, begin_generation, begun=keys.begun_jobs(self.row(job_id).owner))
+        self._change(job_id, begin_generation, *mark_keys(needs), begun=keys.begun_jobs(known.owner))
         begun = self.row(job_id)
         queue.enqueue(self.connection, job_id, begun.generation)
         return self._placed(begun)
@@ -412,13 +415,13 @@ class Jobs:
         self,
         job_id: str,
         decide: Callable[[JobRow, Job], dict[str, str] | None],
-        *,
+        *watched: str,
         begun: str | None = None,
     ) -> Job:
         """Apply the changes that `decide` returns for the row and the job, and return the job.
 
         `decide` returns new values of fields, where an empty value deletes the field, or None for no change. It is
-        called again if the row or the states changed meanwhile.
+        called again if the row, the states or the keys `watched` changed meanwhile.
         """
 
         def apply(pipe: Any) -> None:
@@ -432,11 +435,13 @@ class Jobs:
             if begun is not None:
                 pipe.incr(begun)
             pipe.hset(keys.job(job_id), mapping=kept)
+            if "generation" in kept:
+                pipe.sadd(keys.ACTIVE, job_id)
             if deleted:
                 pipe.hdel(keys.job(job_id), *deleted)
 
-        watched = [keys.job(job_id), keys.states(job_id), *([begun] if begun is not None else [])]
-        self.connection.transaction(apply, *watched)
+        seen = [keys.job(job_id), keys.states(job_id), *watched, *([begun] if begun is not None else [])]
+        self.connection.transaction(apply, *seen)
         return self._placed(self.row(job_id))
 
     def _ids(self, after: tuple[int, str] | None, count: int) -> list[tuple[int, str]]:

@@ -25,7 +25,9 @@ from splatmill_server.partial_uploads import PartialUploads
 from splatmill_server.reaper import Reaper
 from splatmill_server.sessions import Sessions
 from splatmill_server.settings import Settings
+from splatmill_server.space.deletion import Deletion
 from splatmill_server.space.ledger import Ledger
+from splatmill_server.space.quota import Quota
 from splatmill_server.space.usage import Usage
 
 CHECK_SECONDS = 5.0
@@ -74,6 +76,8 @@ class Service:
     sessions: Sessions
     reaper: Reaper
     usage: Usage
+    quota: Quota
+    deletion: Deletion
     closing: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server is stopped, so that event streams end and do not delay it."""
 
@@ -86,6 +90,8 @@ class Service:
         metrics = Metrics()
         jobs = Jobs(connection, storage, metrics)
         captures = Captures(storage, settings, metrics)
+        usage = Usage(storage, Ledger(connection))
+        quota = Quota(usage, captures, settings.quota)
         return cls(
             settings=settings,
             redis=connection,
@@ -96,13 +102,17 @@ class Service:
             metrics=metrics,
             captures=captures,
             partial_uploads=PartialUploads(storage, captures),
-            imports=Imports(connection, storage, captures, Outgoing(settings.outgoing_allow), settings),
+            imports=Imports(
+                connection, storage, captures, quota, Outgoing(settings.outgoing_allow), settings
+            ),
             jobs=jobs,
             models=Models(storage, jobs),
             keys=Keys(storage, bootstrap=settings.api_key is not None),
             sessions=Sessions(redis_async, settings.session_seconds, settings.redis_timeout),
             reaper=Reaper(connection, jobs, metrics, settings),
-            usage=Usage(storage, Ledger(connection)),
+            usage=usage,
+            quota=quota,
+            deletion=Deletion(connection, storage, captures, jobs, usage.ledger),
         )
 
     async def close(self) -> None:

@@ -9,7 +9,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from splatmill.backplane import rendering
 from splatmill.backplane.connection import DEFAULT_URL
-from splatmill.schema import DEFAULT_PORT
+from splatmill.schema import DEFAULT_PORT, ByteSize
 from splatmill_server import outgoing
 
 
@@ -80,6 +80,13 @@ class Settings(BaseSettings):
     )
     import_seconds: float = Field(
         default=6 * 3600, gt=0, description="Seconds that the import of a file may take."
+    )
+
+    quota: ByteSize | None = Field(
+        default=None,
+        gt=0,
+        description="Bytes that the records of one owner may occupy in storage, such as 50GB, unless a key has a "
+        "limit of its own. Left out, there is no limit.",
     )
 
     redis_timeout: float = Field(default=5.0, gt=0, description="Seconds to wait for a reply of Redis.")

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import layout, queue, row
+from splatmill.backplane import keys, layout, queue, row
 from splatmill.schema import JobState, Problem, ProgressEvent, StateEvent
 from splatmill_server import jobs
 from tests.support.served_app import ServedApp, problem, raw, stored
@@ -221,7 +221,9 @@ def test_deleting_a_job_removes_its_model_and_every_key(app: ServedApp) -> None:
     app.finish(job_id)
     assert app.http.delete(f"/v1/jobs/{job_id}").status_code == 204
     assert stored(app) == before
-    assert not [key for key in app.redis.keys("*") if job_id.encode() in key]
+    mark = keys.deleting(f"model/{job_id}")  # keeps jobs from starting from the model
+    assert [key for key in app.redis.keys("*") if job_id.encode() in key] == [mark.encode()]
+    assert app.redis.ttl(mark) > 0  # it expires
     problem(app.http.get(f"/v1/jobs/{job_id}"), 404, "job_not_found")
     problem(app.http.delete(f"/v1/jobs/{job_id}"), 404, "job_not_found")
 

@@ -90,14 +90,31 @@ def idempotency(key_digest: str) -> str:
     return f"{PREFIX}idempotency:{key_digest}"
 
 
-STORED_OWNERS = PREFIX + "stored"
-"""Set of the owners that have keys of `stored` or `uploads`. Only the server writes it."""
+STORED_TOTALS = PREFIX + "stored"
+"""Hash with the bytes in `stored` by owner, for all owners that have keys of `stored` or `uploads`. Only the server
+writes it."""
+
+STORED_LIMITS = PREFIX + "stored:limits"
+"""Hash with the limit in bytes of the API key that last added to an owner's records, by owner. Only the server writes
+it."""
 
 SCAN = PREFIX + "stored:scan"
-"""Hash with the beginning and the end of the last scan of storage."""
+"""Hash with the beginning and the end of the last scan of storage, and the number of the last listing."""
 
 SCAN_LOCK = PREFIX + "stored:lock"
 """Lock of the API process that scans storage."""
+
+
+DELETIONS = PREFIX + "deletions"
+"""Hash with the deletions of records that have begun and not ended, by kind and id. Only the server writes it."""
+
+
+def deleting(record: str) -> str:
+    """Return the key of a string that says that a record (kind and id) is being deleted, or was. It expires.
+
+    A job is not created if this key says that it could not run. Only the server writes it.
+    """
+    return f"{PREFIX}deleting:{record}"
 
 
 def stored(owner: str) -> str:

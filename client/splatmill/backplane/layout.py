@@ -49,9 +49,9 @@ def folder_of(path: str) -> tuple[str, str, str] | None:
     return (kind, found, inside) if kind in ("captures", "jobs", "models") and is_id(found) else None
 
 
-def is_sfm(inside: str) -> bool:
-    """Return whether a path inside of the folder of a capture belongs to its reconstruction."""
-    return inside.startswith("sfm/")
+def is_derived(kind: str, inside: str) -> bool:
+    """Return whether a path inside of a folder can be made again: a capture's reconstruction, or a job's work files."""
+    return (kind, inside.partition("/")[0]) in (("captures", "sfm"), ("jobs", "work"))
 
 
 def captures() -> str:

@@ -62,6 +62,7 @@ PROBLEMS: dict[str, Kind] = {
     "model_not_ready": Kind(409, "The model is not finished yet"),
     "name_taken": Kind(409, "Another file is stored under this name"),
     "capture_in_use": Kind(409, "A job is using this capture"),
+    "model_in_use": Kind(409, "A job starts from this model"),
     "job_running": Kind(409, "The job is still running"),
     "job_finished": Kind(409, "The job has already ended"),
     # The uploaded files.
@@ -106,6 +107,7 @@ PROBLEMS: dict[str, Kind] = {
     "renderer_unavailable": Kind(503, "The renderer cannot be reached"),
     "render_timeout": Kind(504, "The renderer did not answer in time"),
     "storage_full": Kind(507, "The storage is full"),
+    "quota_exceeded": Kind(507, "The owner has no room left in storage"),
     "storage_unwritable": Kind(507, "The storage cannot be written to"),
 }
 

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Body, Header, Path, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
-from splatmill.schema import SHA256_HEADER, Capture, CaptureFile, CapturePage, CreateCapture, Role
+from splatmill.schema import SHA256_HEADER, Capture, CaptureFile, CapturePage, CreateCapture, Role, safe_name
 from splatmill.schema.uploads import UPLOAD_COMPLETE, UPLOAD_LENGTH, read_boolean
 from splatmill_server.caller import Who
 from splatmill_server.filters import Filter
@@ -30,7 +30,9 @@ _ACCEPTED = {
 @router.post(
     "",
     status_code=201,
-    responses=problems("unsupported_media_type", "malformed_body", "body_too_large", "storage_full")
+    responses=problems(
+        "unsupported_media_type", "malformed_body", "body_too_large", "storage_full", "quota_exceeded"
+    )
     | answer(200, "The capture that an earlier request with the same `key` has made", model=Capture)
     | example(201, CAPTURE_EXAMPLE | {"files": []}, "The new, empty capture"),
     dependencies=[JSON_ONLY],
@@ -46,6 +48,12 @@ async def create_capture(
     capture, new = await run_in_threadpool(
         lambda: service.captures.create(asked.name, owner=who.owner, key=asked.key)
     )
+    if new:
+        try:
+            await run_in_threadpool(service.quota.check_new, who)
+        except Exception:
+            await run_in_threadpool(service.deletion.unused_capture, capture)
+            raise
     response.headers["Location"] = f"/v1/captures/{capture.id}"
     if not new:
         response.status_code = 200
@@ -77,15 +85,7 @@ async def get_capture(service: Shared, capture_id: CaptureId) -> Capture:
 @router.delete("/{capture_id}", status_code=204, responses=problems("capture_not_found", "capture_in_use"))
 def delete_capture(service: Shared, capture_id: CaptureId) -> Response:
     """Delete a capture and its files, unless an unfinished job uses it."""
-    service.captures.record(capture_id)
-    if (job_id := service.jobs.unfinished_on(capture_id)) is not None:
-        raise ProblemError(
-            "capture_in_use",
-            f"The job {job_id} uses this capture and has not ended.",
-            advice=f"Cancel it with POST /v1/jobs/{job_id}/cancel, or wait until it has ended.",
-            facts={"job": job_id},
-        )
-    service.captures.delete(capture_id)
+    service.deletion.capture(capture_id)
     return Response(status_code=204)
 
 
@@ -106,6 +106,7 @@ def delete_capture(service: Shared, capture_id: CaptureId) -> Response:
         "body_too_large",
         "unsupported_media_type",
         "storage_full",
+        "quota_exceeded",
     ),
     openapi_extra={
         "requestBody": {
@@ -120,6 +121,7 @@ def delete_capture(service: Shared, capture_id: CaptureId) -> Response:
 )
 async def put_file(
     service: Shared,
+    who: Who,
     request: Request,
     capture_id: CaptureId,
     role: Role,
@@ -156,16 +158,26 @@ async def put_file(
             facts={"accepted": list(_ACCEPTED[role])},
         )
     if read_boolean(complete) is False:
-        return await uploads.begin(service, request, capture_id, role, name, digest, total)
+        return await uploads.begin(service, who, request, capture_id, role, name, digest, total)
     length = request.headers.get("content-length", "")
-    file, new = await service.captures.store(
+    size = int(length) if length.isdigit() else None
+    name = safe_name(name)
+    async with service.quota.upload(
+        who,
         capture_id,
-        role,
-        name,
-        request.stream(),
-        announced_sha256=digest,
-        announced_size=int(length) if length.isdigit() else None,
-    )
+        size,
+        file=f"{role.value}/{name}",
+        is_stored=lambda: service.captures.digest_of(capture_id, role, name) is not None,
+    ) as arrival:
+        file, new = await service.captures.store(
+            capture_id,
+            role,
+            name,
+            arrival.counted(request.stream()),
+            announced_sha256=digest,
+            announced_size=size,
+        )
+        arrival.stored = file.size if new else 0
     return JSONResponse(
         file.model_dump(mode="json"), 201 if new else 200, headers={SHA256_HEADER: file.sha256}
     )

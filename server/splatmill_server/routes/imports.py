@@ -3,9 +3,11 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Path
+from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from splatmill.schema import CreateImport, Import, ImportList
+from splatmill_server.caller import Who
 from splatmill_server.ownership import CaptureId
 from splatmill_server.routes.openapi import problems
 from splatmill_server.routes.requests import JSON_ONLY
@@ -26,16 +28,19 @@ router = APIRouter(prefix="/v1/captures", tags=["captures"])
         "unsupported_media_type",
         "malformed_body",
         "storage_full",
+        "quota_exceeded",
     ),
     dependencies=[JSON_ONLY],
 )
 async def import_file(
     service: Shared,
+    who: Who,
     response: Response,
     capture_id: CaptureId,
     request: Annotated[CreateImport, Body(examples=[{"url": "https://example.org/kitchen.zip"}])],
 ) -> Import:
     """Fetch a file of the capture from an address. It is fetched in the background; `Location` tells how far it is."""
+    await run_in_threadpool(service.quota.check_new, who, capture_id)
     made = await service.imports.create(capture_id, request)
     response.headers["Location"] = f"/v1/captures/{capture_id}/imports/{made.id}"
     return made

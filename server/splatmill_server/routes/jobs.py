@@ -57,6 +57,7 @@ _FORM = {
         "body_too_large",
         "unsupported_media_type",
         "storage_full",
+        "quota_exceeded",
     ),
     openapi_extra={
         "requestBody": {
@@ -116,6 +117,7 @@ async def _create_from_json(service: Service, who: Caller, body: bytes, key: str
             check_capture(service, who, create.capture)
             service.captures.check_trainable(create.capture)
             check_start_model(service, who, create)
+            service.quota.check_new(who)
         return service.jobs.create(
             create,
             owner=who.owner,
@@ -157,10 +159,12 @@ def get_job(service: Shared, job_id: JobId) -> Job:
     return service.jobs.get(job_id)
 
 
-@router.delete("/{job_id}", status_code=204, responses=problems("job_not_found", "job_running"))
+@router.delete(
+    "/{job_id}", status_code=204, responses=problems("job_not_found", "job_running", "model_in_use")
+)
 def delete_job(service: Shared, job_id: JobId) -> Response:
     """Delete a job that has ended, and its model. Its capture is kept."""
-    service.jobs.delete(job_id)
+    service.deletion.job(job_id)
     return Response(status_code=204)
 
 

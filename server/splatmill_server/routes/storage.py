@@ -5,10 +5,11 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 
 from splatmill.schema import StorageUse
-from splatmill_server.caller import Who
+from splatmill_server.caller import Caller, Who
 from splatmill_server.ownership import ListedOwner
 from splatmill_server.routes.openapi import problems
-from splatmill_server.service import Shared
+from splatmill_server.service import Service, Shared
+from splatmill_server.space.ledger import NOBODY
 from splatmill_server.space.usage import largest
 
 router = APIRouter(tags=["service"])
@@ -30,10 +31,15 @@ def get_storage(
     usage = service.usage
     usage.refresh(OLDEST)
     owners = usage.ledger.owners() if owner is None else [owner]
+    uses = [usage.owner_use(found, _limit(service, who, found)) for found in owners]
     return StorageUse(
         scanned_at=usage.scanned_at(),
-        owners=sorted(
-            (usage.owner_use(found, None) for found in owners), key=lambda use: (-use.bytes, use.owner or "")
-        ),
+        owners=sorted(uses, key=lambda use: (-use.bytes, use.owner or "")),
         largest=largest(usage.snapshot(), owner, count),
     )
+
+
+def _limit(service: Service, who: Caller, owner: str) -> int | None:
+    if owner == NOBODY:
+        return None
+    return service.quota.limit(who, owner) if who.owner == owner else service.quota.known_limit(owner)

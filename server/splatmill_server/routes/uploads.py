@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Path, Request
+from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import SHA256_HEADER, CaptureFile, Role
@@ -21,6 +22,7 @@ from splatmill.schema.uploads import (
     read_integer,
     write_boolean,
 )
+from splatmill_server.caller import Caller, Who
 from splatmill_server.captures import STALE_SECONDS
 from splatmill_server.ownership import CaptureId
 from splatmill_server.partial_uploads import Standing
@@ -54,6 +56,7 @@ CREATED: Responses = answer(
 
 async def begin(
     service: Service,
+    who: Caller,
     request: Request,
     capture_id: str,
     role: Role,
@@ -66,13 +69,26 @@ async def begin(
         found = await service.partial_uploads.create(capture_id, role, name, read_integer(length), digest)
         if isinstance(found, CaptureFile):
             return _stored(found, 200)
+        try:
+            missing = max((found.record.length or 0) - found.offset, 0)
+            await run_in_threadpool(service.quota.check_new, who, capture_id, missing)
+        except ProblemError:
+            if not found.offset:
+                await service.partial_uploads.cancel(capture_id, found.record.id)
+            raise
         address = {"Location": f"/v1/captures/{capture_id}/uploads/{found.record.id}"}
         size = read_integer(request.headers.get("content-length"))
         if size or (size is None and "transfer-encoding" in request.headers):
             try:
-                found, _, _ = await service.partial_uploads.append(
-                    capture_id, found.record.id, request.stream(), offset=0, complete=False, body_size=size
-                )
+                async with service.quota.upload(who, capture_id, size, keeps_parts=True) as arrival:
+                    found, _, _ = await service.partial_uploads.append(
+                        capture_id,
+                        found.record.id,
+                        arrival.counted(request.stream()),
+                        offset=0,
+                        complete=False,
+                        body_size=size,
+                    )
             except ProblemError as error:
                 error.headers = {**(error.headers or {}), **address}
                 raise
@@ -122,6 +138,7 @@ async def get_upload(service: Shared, capture_id: CaptureId, upload_id: UploadId
         "body_cut_off",
         "body_too_large",
         "storage_full",
+        "quota_exceeded",
     ),
     openapi_extra={
         "requestBody": {
@@ -133,6 +150,7 @@ async def get_upload(service: Shared, capture_id: CaptureId, upload_id: UploadId
 )
 async def append_to_upload(
     service: Shared,
+    who: Who,
     request: Request,
     capture_id: CaptureId,
     upload_id: UploadId,
@@ -164,16 +182,18 @@ async def append_to_upload(
             f"The header {missing} is missing or has another form.",
             advice="Send Upload-Offset with a number of bytes, and Upload-Complete with ?0, or ?1 for the last bytes.",
         )
+    size = read_integer(request.headers.get("content-length"))
     with _limits_on_413(service):
-        standing, file, new = await service.partial_uploads.append(
-            capture_id,
-            upload_id,
-            request.stream(),
-            offset=at,
-            complete=last,
-            length=read_integer(length),
-            body_size=read_integer(request.headers.get("content-length")),
-        )
+        async with service.quota.upload(who, capture_id, size, keeps_parts=True) as arrival:
+            standing, file, new = await service.partial_uploads.append(
+                capture_id,
+                upload_id,
+                arrival.counted(request.stream()),
+                offset=at,
+                complete=last,
+                length=read_integer(length),
+                body_size=size,
+            )
     if file is None:
         return Response(status_code=204, headers=_state(service, standing))
     return _stored(file, 201 if new else 200)

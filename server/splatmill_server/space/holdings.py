@@ -14,19 +14,22 @@ from splatmill.schema import DEFAULT_OWNER, StoredKind
 KINDS = {"captures": StoredKind.capture, "jobs": StoredKind.job, "models": StoredKind.model}
 """The kind of record by the name of the folder in storage that holds all records of the kind."""
 
-_RECORDS = {StoredKind.capture: "capture.json", StoredKind.model: "job.json"}
+_FOLDERS = {kind: name for name, kind in KINDS.items()}
+
+_RECORDS = {StoredKind.capture: "capture.json", StoredKind.job: "log.jsonl", StoredKind.model: "job.json"}
 
 
 class Holding(BaseModel):
     """One folder of storage: a capture, the files of a job, or a model.
 
-    bytes: size of all files but `sfm`.
-    sfm: size of a capture's reconstruction.
+    bytes: size of all files but `derived`.
+    derived: size of what can be made again: a capture's reconstruction, or a job's checkpoints.
     files: number of files.
     modified: time of the last write of any file, in seconds since 1970.
-    whole: whether the record is there, which is written first for a capture and last for a model.
+    whole: whether the record is there: `capture.json`, which is written first; `job.json` of a model, which is written
+        last; the log of a job that has ended.
     owner: None if nothing says whose it is.
-    capture: for a model, the capture that it was made of.
+    capture: for a model or a job that has ended, its capture.
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -34,7 +37,7 @@ class Holding(BaseModel):
     kind: StoredKind
     id: str
     bytes: int = 0
-    sfm: int = 0
+    derived: int = 0
     files: int = 0
     modified: float = 0.0
     whole: bool = False
@@ -45,7 +48,7 @@ class Holding(BaseModel):
     @property
     def size(self) -> int:
         """Bytes of all files."""
-        return self.bytes + self.sfm
+        return self.bytes + self.derived
 
     @property
     def key(self) -> str:
@@ -61,19 +64,19 @@ class Holding(BaseModel):
 @dataclass
 class _Sums:
     bytes: int = 0
-    sfm: int = 0
+    derived: int = 0
     files: int = 0
     modified: float = 0.0
     whole: bool = False
 
     def add(self, entry: Entry, kind: StoredKind, inside: str) -> None:
-        if kind is StoredKind.capture and layout.is_sfm(inside):
-            self.sfm += entry.size
+        if layout.is_derived(_FOLDERS[kind], inside):
+            self.derived += entry.size
         else:
             self.bytes += entry.size
         self.files += 1
         self.modified = max(self.modified, entry.modified.timestamp())
-        self.whole = self.whole or inside == _RECORDS.get(kind)
+        self.whole = self.whole or inside == _RECORDS[kind]
 
 
 def folder(kind: StoredKind, record_id: str) -> str:
@@ -99,7 +102,7 @@ def sums(entries: Iterable[Entry]) -> dict[tuple[StoredKind, str], Holding]:
             kind=kind,
             id=record_id,
             bytes=held.bytes,
-            sfm=held.sfm,
+            derived=held.derived,
             files=held.files,
             modified=held.modified,
             whole=held.whole,
@@ -108,14 +111,17 @@ def sums(entries: Iterable[Entry]) -> dict[tuple[StoredKind, str], Holding]:
     }
 
 
-def scan(storage: Storage, known: Mapping[str, Holding], job_owners: Mapping[str, str]) -> list[Holding]:
-    """List storage and return all folders with their owners.
+def scan(
+    storage: Storage, entries: Iterable[Entry], known: Mapping[str, Holding], job_owners: Mapping[str, str]
+) -> list[Holding]:
+    """Return all folders in storage with their owners.
 
+    entries: all files in storage.
     known: the folders of an earlier scan by their keys. The owner of a record never changes, so that records are read
     once.
     job_owners: the owners of the jobs that have rows, for folders of jobs and of models that are not finished.
     """
-    found = sums(storage.walk(""))
+    found = sums(entries)
     described: dict[tuple[StoredKind, str], Holding] = {}
     for place, held in found.items():
         if held.whole:
@@ -149,7 +155,9 @@ def _with_facts(held: Holding, record: Mapping[str, Any] | None) -> Holding:
 
 def _record(storage: Storage, path: str) -> dict[str, Any] | None:
     try:
-        record = json.loads(storage.get(path))
-    except (FileNotFoundError, ValueError):  # deleted meanwhile, or broken
+        text = storage.get(path)
+        record = json.loads(text if path.endswith(".json") else text.partition(b"\n")[0])
+        record = record.get("job", record)
+    except (FileNotFoundError, ValueError, AttributeError):  # deleted meanwhile, or broken
         return None
     return record if isinstance(record, dict) else None

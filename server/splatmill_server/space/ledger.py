@@ -1,12 +1,13 @@
 """What each owner has in storage, as of the last scan, with what was uploaded and deleted since. Kept in Redis.
 
 Each scan replaces the figures of the last one. In between, uploads are entries of their own, and deletions leave a mark
-where a running scan would put the record back. If a process dies between a change of storage and its entry here, the
+where a running scan would put the record back. A file that is stored just while its capture is listed may count twice
+until the next scan. If a process dies between a change of storage and its entry here, the
 figures are wrong until the next scan, which corrects them.
 """
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -23,17 +24,18 @@ NOBODY = ""
 UPLOAD_SECONDS = 3600.0
 """Seconds after its last sign of life at which an upload counts as broken off."""
 
+_ARRIVING, _STORED = "arriving", "stored"
+
 Clock = Callable[[], float]
 """Returns the time in seconds since 1970."""
 
 
 class Upload(BaseModel):
-    """An upload that the last scan has not counted, or only in part.
+    """An upload that arrives.
 
     bytes: its size as announced, or what has arrived if that is more.
     capture: where it goes.
     touched: time of its last sign of life.
-    done: time at which it was stored, or None while it arrives.
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -41,7 +43,6 @@ class Upload(BaseModel):
     bytes: int
     capture: str
     touched: float
-    done: float | None = None
 
 
 @dataclass(frozen=True)
@@ -49,16 +50,16 @@ class Account:
     """What one owner has in storage.
 
     holdings: the folders as of the last scan, without those deleted since.
-    uploads: uploads by token.
+    uploads: bytes of uploads that arrive, and of those that no scan has counted.
     """
 
     holdings: list[Holding]
-    uploads: dict[str, Upload]
+    uploads: int
 
     @property
     def bytes(self) -> int:
         """Bytes in storage, with those of uploads that still arrive."""
-        return sum(held.size for held in self.holdings) + sum(found.bytes for found in self.uploads.values())
+        return sum(held.size for held in self.holdings) + self.uploads
 
 
 @dataclass(frozen=True)
@@ -83,34 +84,73 @@ class Ledger:
 
     def owners(self) -> list[str]:
         """Return the owners that have something in storage, sorted; NOBODY among them."""
-        return sorted(
-            owner.decode() for owner in cast(set[bytes], self.connection.smembers(keys.STORED_OWNERS))
-        )
+        found = cast(list[bytes], self.connection.hkeys(keys.STORED_TOTALS))
+        return sorted(owner.decode() for owner in found)
 
     def account(self, owner: str) -> Account:
         """Return what an owner has in storage."""
         with self.connection.pipeline() as pipe:
-            pipe.hgetall(keys.stored(owner))
+            pipe.hvals(keys.stored(owner))
             pipe.hgetall(keys.uploads(owner))
             stored, uploads = pipe.execute()
-        return _account(stored, uploads)
+        held = (_holding(value) for value in stored)
+        return Account([found for found in held if found is not None], _bytes_of(uploads))
+
+    def bytes_of(self, owner: str) -> int:
+        """Return the bytes that an owner has in storage, with those of uploads that arrive."""
+        with self.connection.pipeline() as pipe:
+            pipe.hget(keys.STORED_TOTALS, owner)
+            pipe.hgetall(keys.uploads(owner))
+            total, uploads = pipe.execute()
+        return int(total or 0) + _bytes_of(uploads)
 
     def last_scan(self) -> ScanTimes | None:
         """Return when the last scan was, or None if Redis knows of none."""
         began, ended = cast(list[bytes | None], self.connection.hmget(keys.SCAN, ["began", "ended"]))
         return ScanTimes(float(began), float(ended)) if began and ended else None
 
-    def publish(self, began: float, holdings: Iterable[Holding]) -> None:
-        """Replace the figures by those of a scan that began at `began`, and forget the uploads that it has counted."""
-        by_owner: dict[str, dict[str, str]] = {owner: {} for owner in self.owners()}
+    def note_limit(self, owner: str, limit: int | None) -> None:
+        """Note the limit of the key that adds to an owner's records, for what is added without a caller."""
+        if limit is None:
+            self.connection.hdel(keys.STORED_LIMITS, owner)
+        else:
+            self.connection.hset(keys.STORED_LIMITS, owner, limit)
+
+    def noted_limit(self, owner: str) -> int | None:
+        """Return the limit that was noted last for an owner, or None."""
+        noted = cast(bytes | None, self.connection.hget(keys.STORED_LIMITS, owner))
+        return int(noted) if noted is not None and noted.isdigit() else None
+
+    def begin_listing(self) -> int:
+        """Enter that storage is listed from here on, and return the number of the listing.
+
+        Uploads that end before the next listing begins are summed under the number of this one.
+        """
+        return self.connection.hincrby(keys.SCAN, "listing", 1)
+
+    def captures_since(self, listing: int) -> set[str]:
+        """Return the captures that files were stored in since a listing began."""
+        found = set()
+        for owner in self.owners():
+            for field in cast(list[bytes], self.connection.hkeys(keys.uploads(owner))):
+                kind, capture, number = [*field.decode().split("/"), ""][:3]
+                if kind == _STORED and number.isdigit() and int(number) >= listing:
+                    found.add(capture)
+        return found
+
+    def publish(self, began: float, listing: int, holdings: Iterable[Holding]) -> None:
+        """Replace the figures by those of a scan that began at `began`.
+
+        listing: uploads that ended before this listing began are among `holdings`, and are forgotten.
+        """
+        by_owner: dict[str, dict[str, Holding]] = {owner: {} for owner in self.owners()}
         for held in holdings:
-            owner = NOBODY if held.owner is None else held.owner
-            by_owner.setdefault(owner, {})[held.key] = held.model_dump_json(exclude_defaults=True)
-        for owner, fields in by_owner.items():
-            self._replace(owner, fields, began)
+            by_owner.setdefault(NOBODY if held.owner is None else held.owner, {})[held.key] = held
+        for owner, found in by_owner.items():
+            self._replace(owner, found, began, listing)
         self.connection.hset(keys.SCAN, mapping={"began": str(began), "ended": str(self.clock())})
 
-    def _replace(self, owner: str, fields: dict[str, str], began: float) -> None:
+    def _replace(self, owner: str, found: Mapping[str, Holding], began: float, listing: int) -> None:
         name, uploads_name = keys.stored(owner), keys.uploads(owner)
 
         def apply(pipe: Any) -> None:
@@ -119,64 +159,86 @@ class Ledger:
                 for key, value in pipe.hgetall(name).items()
                 if (at := _deleted_at(value)) is not None and at >= began
             }
-            uploads = _uploads(pipe.hgetall(uploads_name))
-            over = [token for token, found in uploads.items() if _is_over(found, began)]
-            kept = {**fields, **marks}
+            uploads = pipe.hgetall(uploads_name)
+            over = [
+                field for field, value in uploads.items() if _is_over(field.decode(), value, began, listing)
+            ]
+            kept = {key: held for key, held in found.items() if key not in marks}
+            fields = {key: held.model_dump_json(exclude_defaults=True) for key, held in kept.items()} | marks
             pipe.multi()
             pipe.delete(name)
-            if kept:
-                pipe.hset(name, mapping=kept)
+            if fields:
+                pipe.hset(name, mapping=fields)
             if over:
                 pipe.hdel(uploads_name, *over)
-            if kept or len(over) < len(uploads):
-                pipe.sadd(keys.STORED_OWNERS, owner)
+            if fields or len(over) < len(uploads):
+                pipe.hset(keys.STORED_TOTALS, owner, sum(held.size for held in kept.values()))
             else:
-                pipe.srem(keys.STORED_OWNERS, owner)
+                pipe.hdel(keys.STORED_TOTALS, owner)
 
         self.connection.transaction(apply, name, uploads_name)
 
     def put_upload(self, owner: str, token: str, upload: Upload) -> int:
         """Enter an upload, or its new size. Return the bytes that the owner then has in storage."""
         with self.connection.pipeline(transaction=True) as pipe:
-            pipe.hset(keys.uploads(owner), token, upload.model_dump_json(exclude_none=True))
-            pipe.sadd(keys.STORED_OWNERS, owner)
-            pipe.hgetall(keys.stored(owner))
+            pipe.hset(keys.uploads(owner), f"{_ARRIVING}/{token}", upload.model_dump_json())
+            pipe.hincrby(keys.STORED_TOTALS, owner, 0)
             pipe.hgetall(keys.uploads(owner))
-            *_, stored, uploads = pipe.execute()
-        return _account(stored, uploads).bytes
+            _, total, uploads = pipe.execute()
+        return int(total) + _bytes_of(uploads)
 
-    def drop_upload(self, owner: str, token: str) -> None:
-        """Remove the entry of an upload that stored nothing."""
-        self.connection.hdel(keys.uploads(owner), token)
+    def end_upload(self, owner: str, token: str, capture: str, stored: int) -> None:
+        """Enter that an upload has ended, and left `stored` bytes in storage."""
+        listing = int(cast(bytes | None, self.connection.hget(keys.SCAN, "listing")) or 0)
+        with self.connection.pipeline(transaction=True) as pipe:
+            pipe.hdel(keys.uploads(owner), f"{_ARRIVING}/{token}")
+            if stored:
+                pipe.hincrby(keys.uploads(owner), f"{_STORED}/{capture}/{listing}", stored)
+                pipe.hincrby(keys.STORED_TOTALS, owner, 0)
+            pipe.execute()
+
+    def arriving(self, owner: str, capture: str, now: float) -> bool:
+        """Return whether an upload to a capture arrives, as far as is known."""
+        for field, value in cast(dict[bytes, bytes], self.connection.hgetall(keys.uploads(owner))).items():
+            upload = _upload(value) if field.decode().startswith(_ARRIVING) else None
+            if upload is not None and upload.capture == capture and upload.touched > now - UPLOAD_SECONDS:
+                return True
+        return False
 
     def deleted(self, kind: StoredKind, record_id: str, owner: str | None) -> None:
         """Enter that a record was deleted from storage."""
         name = NOBODY if owner is None else owner
-        key = Holding(kind=kind, id=record_id).key
-        gone = []
-        if kind is StoredKind.capture:
-            uploads = _uploads(cast(dict[bytes, bytes], self.connection.hgetall(keys.uploads(name))))
-            gone = [
-                token
-                for token, found in uploads.items()
-                if found.capture == record_id and found.done is not None
-            ]
-        with self.connection.pipeline(transaction=True) as pipe:
-            pipe.hset(keys.stored(name), key, json.dumps({"deleted_at": self.clock()}))
+        key, stored, uploads = (
+            Holding(kind=kind, id=record_id).key,
+            keys.stored(name),
+            keys.uploads(name),
+        )
+        mark = json.dumps({"deleted_at": self.clock()})
+
+        def apply(pipe: Any) -> None:
+            before = _holding(pipe.hget(stored, key) or b"")
+            gone = []
+            if kind is StoredKind.capture:
+                gone = [
+                    field
+                    for field in pipe.hkeys(uploads)
+                    if field.decode().startswith(f"{_STORED}/{record_id}/")
+                ]
+            pipe.multi()
+            pipe.hset(stored, key, mark)
+            pipe.hincrby(keys.STORED_TOTALS, name, -before.size if before is not None else 0)
             if gone:
-                pipe.hdel(keys.uploads(name), *gone)
-            pipe.execute()
+                pipe.hdel(uploads, *gone)
+
+        self.connection.transaction(apply, stored, uploads)
 
 
-def _account(stored: dict[bytes, bytes], uploads: dict[bytes, bytes]) -> Account:
-    holdings = []
-    for value in stored.values():
-        if _deleted_at(value) is None:
-            try:
-                holdings.append(Holding.model_validate_json(value))
-            except ValidationError:
-                continue  # of another version; the next scan replaces it
-    return Account(holdings, _uploads(uploads))
+def _holding(value: bytes) -> Holding | None:
+    """Return a stored folder, or None for a mark, or for a value of another version, which the next scan replaces."""
+    try:
+        return Holding.model_validate_json(value)
+    except ValidationError:
+        return None
 
 
 def _deleted_at(value: bytes) -> float | None:
@@ -188,18 +250,29 @@ def _deleted_at(value: bytes) -> float | None:
     return float(moment) if isinstance(moment, int | float) else None
 
 
-def _uploads(fields: dict[bytes, bytes]) -> dict[str, Upload]:
-    found = {}
-    for token, value in fields.items():
-        try:
-            found[token.decode()] = Upload.model_validate_json(value)
-        except ValidationError:
-            found[token.decode()] = Upload(bytes=0, capture="", touched=0.0, done=0.0)
-    return found
+def _upload(value: bytes) -> Upload | None:
+    try:
+        return Upload.model_validate_json(value)
+    except ValidationError:
+        return None
 
 
-def _is_over(upload: Upload, began: float) -> bool:
-    """Whether a scan that began at `began` has counted an upload, or the upload was broken off."""
-    if upload.done is not None:
-        return upload.done < began
-    return upload.touched < began - UPLOAD_SECONDS
+def _bytes_of(uploads: Mapping[bytes, bytes]) -> int:
+    total = 0
+    for field, value in uploads.items():
+        if field.decode().startswith(f"{_ARRIVING}/"):
+            upload = _upload(value)
+            total += upload.bytes if upload is not None else 0
+        elif value.isdigit():
+            total += int(value)
+    return total
+
+
+def _is_over(field: str, value: bytes, began: float, listing: int) -> bool:
+    """Whether a scan has counted an upload, or the upload was broken off long before."""
+    kind, _, rest = field.partition("/")
+    if kind == _ARRIVING:
+        upload = _upload(value)
+        return upload is None or upload.touched < began - UPLOAD_SECONDS
+    number = rest.rpartition("/")[2]
+    return not number.isdigit() or int(number) < listing

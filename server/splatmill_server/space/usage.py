@@ -1,7 +1,8 @@
 """Who has how much in storage, and which records are the largest."""
 
-import threading
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
@@ -11,9 +12,9 @@ from redis.exceptions import LockError
 from redis.lock import Lock
 
 from splatmill.backplane import keys
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import Entry, Storage
 from splatmill.schema import OwnerUse, StoredBytes, StoredKind, StoredRecord
-from splatmill_server.space.holdings import Holding, scan
+from splatmill_server.space.holdings import Holding, scan, sums
 from splatmill_server.space.job_uses import JobUse, all_jobs
 from splatmill_server.space.ledger import NOBODY, Account, Ledger
 
@@ -22,8 +23,8 @@ log = structlog.get_logger()
 SCAN_SHARE = 0.05
 """Largest share of the time that scans of storage take, however often somebody asks for new figures."""
 
-_LOCK_SECONDS = 3600
-"""Seconds after which the lock of a scan whose process died is free again."""
+_LOCK_SECONDS = 30.0
+"""Seconds after which the lock of a scan whose process died is free again. A scan renews it."""
 
 _FIRST_SCAN_SECONDS = 60
 """Seconds to wait for another process that makes the first scan."""
@@ -68,7 +69,6 @@ class Usage:
     def __init__(self, storage: Storage, ledger: Ledger) -> None:
         self.storage = storage
         self.ledger = ledger
-        self._here = threading.Lock()
 
     @property
     def connection(self) -> redis.Redis:
@@ -83,19 +83,14 @@ class Usage:
         """
         if not self._is_due(oldest):
             return
-        with self._here:
-            if not self._is_due(oldest):
-                return
-            first = self.ledger.last_scan() is None
-            lock = Lock(
-                self.connection, keys.SCAN_LOCK, timeout=_LOCK_SECONDS, thread_local=False, sleep=0.05
-            )
-            if lock.acquire(blocking=first, blocking_timeout=_FIRST_SCAN_SECONDS if first else None):
-                try:
-                    if self._is_due(oldest):
-                        self.scan()
-                finally:
-                    _release(lock)
+        first = self.ledger.last_scan() is None
+        lock = Lock(self.connection, keys.SCAN_LOCK, timeout=_LOCK_SECONDS, thread_local=False, sleep=0.05)
+        if lock.acquire(blocking=first, blocking_timeout=_FIRST_SCAN_SECONDS if first else None):
+            try:
+                if self._is_due(oldest):
+                    self.scan(lock)
+            finally:
+                _release(lock)
 
     def _is_due(self, oldest: float) -> bool:
         last = self.ledger.last_scan()
@@ -104,14 +99,29 @@ class Usage:
         age = self.ledger.clock() - last.ended
         return not age < max(oldest, (last.ended - last.began) / SCAN_SHARE)
 
-    def scan(self) -> None:
-        """List storage, and replace the figures in the ledger."""
+    def scan(self, lock: Lock | None = None) -> None:
+        """List storage, and replace the figures in the ledger. `lock` is renewed meanwhile."""
         began = self.ledger.clock()
         known = {held.key: held for owner in self.ledger.owners() for held in self.account(owner).holdings}
         jobs = all_jobs(self.connection)
-        found = scan(self.storage, known, {job.id: job.owner for job in jobs.values()})
-        self.ledger.publish(began, found)
+        first = self.ledger.begin_listing()
+        listed = _renewing(lock, self.storage.walk(""))
+        found = scan(self.storage, listed, known, {job.id: job.owner for job in jobs.values()})
+        second = self.ledger.begin_listing()
+        busy = self.ledger.captures_since(first)
+        self.ledger.publish(
+            began, second, [self._listed_again(held) if held.id in busy else held for held in found]
+        )
         log.debug("storage scanned", folders=len(found), bytes=sum(held.size for held in found))
+
+    def _listed_again(self, held: Holding) -> Holding:
+        """Return a folder that was written to while it was listed with the bytes of another listing."""
+        now = sums(self.storage.walk(held.folder)).get((held.kind, held.id))
+        return (
+            held
+            if now is None
+            else now.model_copy(update=held.model_dump(include={"owner", "name", "capture"}))
+        )
 
     def account(self, owner: str) -> Account:
         """Return what an owner has in storage."""
@@ -168,13 +178,13 @@ def moment(seconds: float) -> datetime:
 def _by_kind(account: Account) -> StoredBytes:
     sizes = dict.fromkeys(StoredKind, 0)
     for held in account.holdings:
-        sizes[held.kind] += held.bytes
+        sizes[held.kind] += held.bytes if held.kind is StoredKind.capture else held.size
     return StoredBytes(
         captures=sizes[StoredKind.capture],
-        sfm=sum(held.sfm for held in account.holdings),
+        sfm=sum(held.derived for held in account.holdings if held.kind is StoredKind.capture),
         jobs=sizes[StoredKind.job],
         models=sizes[StoredKind.model],
-        uploads=sum(found.bytes for found in account.uploads.values()),
+        uploads=account.uploads,
     )
 
 
@@ -182,8 +192,17 @@ def _count(account: Account, kind: StoredKind) -> int:
     return sum(1 for held in account.holdings if held.kind is kind and held.whole)
 
 
+def _renewing(lock: Lock | None, entries: Iterable[Entry]) -> Iterator[Entry]:
+    """Pass on what is listed, and renew the lock every few seconds."""
+    renewed = time.monotonic()
+    for entry in entries:
+        yield entry
+        if lock is not None and time.monotonic() - renewed > _LOCK_SECONDS / 5:
+            renewed = time.monotonic()
+            with suppress(LockError):  # lost to another process: two scans are as right as one
+                lock.reacquire()
+
+
 def _release(lock: Lock) -> None:
-    try:
+    with suppress(LockError):
         lock.release()
-    except LockError:
-        log.warning("a scan of storage took longer than its lock was valid", seconds=_LOCK_SECONDS)

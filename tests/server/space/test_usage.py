@@ -124,37 +124,60 @@ def test_what_is_deleted_during_a_scan_stays_deleted(serve_people: ServePeople) 
     app = serve_people()
     ledger = Ledger(app.redis, clock := Clock(1000.0))
     held = [Holding(kind=StoredKind.capture, id=name, bytes=10, owner="ann") for name in ("kept", "gone")]
-    ledger.publish(900.0, held)
+    ledger.publish(900.0, 1, held)
     clock.now = 1010.0
     ledger.deleted(StoredKind.capture, "gone", "ann")
     assert ledger.account("ann").bytes == 10
-    ledger.publish(1005.0, held)  # it listed storage before the deletion
+    ledger.publish(1005.0, 1, held)  # it listed storage before the deletion
     assert ledger.account("ann").bytes == 10
-    ledger.publish(1020.0, held[:1])
+    ledger.publish(1020.0, 1, held[:1])
     assert ledger.account("ann").bytes == 10
     assert app.redis.hkeys(keys.stored("ann")) == [b"capture/kept"]
-    ledger.publish(1030.0, [])
+    ledger.publish(1030.0, 1, [])
     assert ledger.owners() == []
     assert not app.redis.exists(keys.stored("ann"))
 
 
-def test_an_upload_is_counted_until_a_scan_that_began_after_it(serve_people: ServePeople) -> None:
+def test_an_upload_is_counted_until_a_listing_that_began_after_it(serve_people: ServePeople) -> None:
     app = serve_people()
     ledger = Ledger(app.redis, Clock(1000.0))
     arriving = Upload(bytes=70, capture="c", touched=1000.0)
     assert ledger.put_upload("ann", "token", arriving) == 70
-    ledger.publish(1001.0, [])
-    assert ledger.account("ann").bytes == 70
-    ledger.put_upload("ann", "token", arriving.model_copy(update={"done": 1002.0}))
-    held = [Holding(kind=StoredKind.capture, id="c", bytes=70, owner="ann")]
-    ledger.publish(1001.5, [])
-    assert ledger.account("ann").bytes == 70
-    ledger.publish(1003.0, held)
-    assert ledger.account("ann").bytes == 70
-    assert ledger.account("ann").uploads == {}
+    first = ledger.begin_listing()
+    ledger.publish(1001.0, first, [])
+    assert ledger.bytes_of("ann") == ledger.account("ann").bytes == 70
+    ledger.end_upload("ann", "token", "c", 60)
+    assert ledger.captures_since(first) == {"c"}
+    held = [Holding(kind=StoredKind.capture, id="c", bytes=60, owner="ann")]
+    ledger.publish(1002.0, first, [])
+    assert ledger.bytes_of("ann") == ledger.account("ann").bytes == 60
+    ledger.publish(1003.0, ledger.begin_listing(), held)
+    assert ledger.bytes_of("ann") == ledger.account("ann").bytes == 60
+    assert ledger.account("ann").uploads == 0
     ledger.put_upload("ann", "killed", arriving)
-    ledger.publish(1000.0 + UPLOAD_SECONDS + 1, held)
-    assert ledger.account("ann").uploads == {}
+    assert ledger.arriving("ann", "c", 1010.0)
+    ledger.publish(1000.0 + UPLOAD_SECONDS + 1, ledger.begin_listing(), held)
+    assert ledger.bytes_of("ann") == 60
+    assert not ledger.arriving("ann", "c", 1010.0)
+
+
+def test_a_capture_that_is_written_to_while_storage_is_listed_is_counted_once(
+    people: ServedApp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ann, usage = Person(people.http, "ann"), people.service.usage
+    capture = ann.capture(1000)
+    walk = people.service.storage.walk
+
+    def walked(prefix: str) -> list[Entry]:
+        found = list(walk(prefix))
+        if prefix == "":
+            assert ann.put(capture, "meanwhile.jpg", b"x" * 500).status_code == 201
+        return found
+
+    monkeypatch.setattr(people.service.storage, "walk", walked)
+    usage.scan()
+    total = sum(entry.size for entry in walk(""))
+    assert usage.ledger.bytes_of("ann") == total > 1500
 
 
 def test_scans_take_a_small_share_of_the_time_however_often_figures_are_asked_for(
@@ -186,14 +209,14 @@ def test_of_two_processes_that_know_nothing_one_scans_and_the_other_waits(
     scanning, go_on, scans = threading.Event(), threading.Event(), []
     scan = one.scan
 
-    def slow() -> None:
+    def slow(lock: object) -> None:
         scans.append("one")
         scanning.set()
         assert go_on.wait(10)
         scan()
 
     monkeypatch.setattr(one, "scan", slow)
-    monkeypatch.setattr(two, "scan", lambda: scans.append("two"))
+    monkeypatch.setattr(two, "scan", lambda lock: scans.append("two"))
     first = threading.Thread(target=one.refresh, args=(10.0,))
     second = threading.Thread(target=two.refresh, args=(10.0,))
     first.start()

@@ -1,0 +1,170 @@
+"""Deletes captures and jobs, unless an unfinished job needs them. Whoever deletes a record does it through here.
+
+A deletion and the creation of a job that needs the record can meet. The deletion first sets a mark in Redis and then
+looks for unfinished jobs; a job is inserted in a transaction that fails if the mark appears. So one of the two always
+sees the other. A deletion that is cut off stays noted, and the next sweep finishes it.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import cast
+
+import redis
+
+from splatmill.backplane import keys, layout
+from splatmill.backplane.records import UnreadableRecord
+from splatmill.backplane.storage import Storage
+from splatmill.schema import Capture, StoredKind
+from splatmill_server.captures import Captures
+from splatmill_server.jobs import Jobs
+from splatmill_server.problems import ProblemError
+from splatmill_server.space.holdings import Holding
+from splatmill_server.space.job_uses import JobUse, unfinished_jobs
+from splatmill_server.space.ledger import Ledger
+from splatmill_server.space.marks import DELETED, DELETING
+
+_MARK_SECONDS = 600
+"""Seconds for which a mark stays. It must outlast any creation of a job that began before the deletion did."""
+
+
+class Deletion:
+    """Deletes records. Methods raise ProblemError, StorageError, and redis.RedisError if Redis cannot be reached."""
+
+    def __init__(
+        self, connection: redis.Redis, storage: Storage, captures: Captures, jobs: Jobs, ledger: Ledger
+    ) -> None:
+        self.connection = connection
+        self.storage = storage
+        self.captures = captures
+        self.jobs = jobs
+        self.ledger = ledger
+
+    def capture(self, capture_id: str, still: Callable[[], bool] | None = None) -> bool:
+        """Delete a capture and its files. Return False if `still`, called when no job can use it any more, does.
+
+        Raises problems for a capture that does not exist (404) or that an unfinished job uses (409).
+        """
+        owner = self._owner(capture_id)
+        record = Holding(kind=StoredKind.capture, id=capture_id).key
+        with self._marked(record) as mark:
+            if (use := self._user(record)) is not None:
+                raise ProblemError(
+                    "capture_in_use",
+                    f"The job {use.id} uses this capture and has not ended.",
+                    advice=f"Cancel it with POST /v1/jobs/{use.id}/cancel, or wait until it has ended.",
+                    facts={"job": use.id},
+                )
+            if still is not None and not still():
+                return False
+            mark.begin()
+            self.captures.delete(capture_id)
+            self.ledger.deleted(StoredKind.capture, capture_id, owner)
+        return True
+
+    def job(self, job_id: str, still: Callable[[], bool] | None = None) -> bool:
+        """Delete a job that has ended, with its model. Return False if `still` does, as for `capture`.
+
+        Raises problems for a job that does not exist (404), that has not ended (409), or whose model another unfinished
+        job starts from (409).
+        """
+        owner = self.jobs.owner(job_id)
+        model = Holding(kind=StoredKind.model, id=job_id).key
+        with self._marked(model) as mark:
+            use = self._user(model)
+            if use is not None and use.id != job_id:
+                raise ProblemError(
+                    "model_in_use",
+                    f"The job {use.id} starts from the model of this job and has not ended.",
+                    advice=f"Cancel it with POST /v1/jobs/{use.id}/cancel, or wait until it has ended.",
+                    facts={"job": use.id},
+                )
+            if still is not None and not still():
+                return False
+            mark.begin()
+            self.jobs.delete(job_id)
+            for kind in (StoredKind.job, StoredKind.model):
+                self.ledger.deleted(kind, job_id, owner)
+        return True
+
+    def unused_capture(self, capture: Capture) -> None:
+        """Delete a capture that nobody else knows yet, also while Redis cannot be reached."""
+        self.captures.delete(capture.id)
+        with suppress(redis.RedisError):  # the next scan corrects the figures
+            self.ledger.deleted(StoredKind.capture, capture.id, capture.owner)
+
+    def finish(self) -> list[str]:
+        """Finish the deletions that were cut off, and return the keys of their records."""
+        finished = []
+        for field in cast(list[bytes], self.connection.hkeys(keys.DELETIONS)):
+            record = field.decode()
+            if self.connection.get(keys.deleting(record)) == DELETING:
+                continue  # another process may be at it
+            kind, _, record_id = record.partition("/")
+            is_capture = kind == StoredKind.capture.value
+            try:
+                (self.capture if is_capture else self.job)(record_id)
+            except ProblemError as error:
+                if error.problem.status == 404:  # its record was deleted, and files may be left
+                    for path in (
+                        (layout.capture(record_id),)
+                        if is_capture
+                        else (layout.model(record_id), layout.job(record_id))
+                    ):
+                        self.storage.delete_prefix(path)
+                    finished.append(record)
+            else:
+                finished.append(record)
+            self.connection.hdel(keys.DELETIONS, record)
+        return finished
+
+    def _owner(self, capture_id: str) -> str | None:
+        try:
+            return self.captures.record(capture_id).owner
+        except UnreadableRecord:
+            return None
+
+    def _user(self, record: str) -> JobUse | None:
+        return next((use for use in unfinished_jobs(self.connection) if record in use.records), None)
+
+    @contextmanager
+    def _marked(self, record: str) -> Iterator["_Mark"]:
+        mark = _Mark(self.connection, record)
+        mark.set()
+        try:
+            yield mark
+        except ProblemError:
+            mark.remove()
+            raise
+        if mark.begun:
+            mark.end()
+        else:
+            mark.remove()
+
+
+class _Mark:
+    """The mark of one deletion, and the note that it has begun."""
+
+    def __init__(self, connection: redis.Redis, record: str) -> None:
+        self.connection = connection
+        self.record = record
+        self.begun = False
+
+    def set(self) -> None:
+        """Keep new jobs from using the record."""
+        self.connection.set(keys.deleting(self.record), DELETING, ex=_MARK_SECONDS)
+
+    def begin(self) -> None:
+        """Note that files are deleted from here on, so that a sweep finishes it if this process cannot."""
+        self.begun = True
+        self.connection.hset(keys.DELETIONS, self.record, "begun")
+
+    def end(self) -> None:
+        """Note that the record is deleted."""
+        self.connection.set(keys.deleting(self.record), DELETED, ex=_MARK_SECONDS)
+        self.connection.hdel(keys.DELETIONS, self.record)
+
+    def remove(self) -> None:
+        """Let jobs use the record again."""
+        self.connection.delete(keys.deleting(self.record))
+        if self.begun:
+            self.connection.hdel(keys.DELETIONS, self.record)
