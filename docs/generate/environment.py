@@ -18,6 +18,9 @@ WORKER = """
 Workers and the renderer read `REDIS_URL`, `SPLATMILL_DATA` and `SPLATMILL_STORAGE` as above. A storage of the form
 `s3://bucket/prefix` takes its credentials, region and endpoint from the usual `AWS_*` variables.
 `SPLATMILL_QUEUES` names the queues that a worker serves, such as `gpu,any`; without it, all that its machine can run.
+`SPLATMILL_MAX_RUN_TIME`, such as `12h`, limits how long an attempt at a job runs (by default 48 hours), and
+`SPLATMILL_MAX_MEMORY`, such as `24GB`, how much memory it uses (by default 90% of what the machine has or its control
+group allows); 0 is no limit.
 `SPLATMILL_RENDER_CACHE` limits the memory of the models that the renderer keeps, such as `500MB`; without it, an eighth
 of the machine's memory and at most 1 GiB. `SPLATMILL_REDIS_PATIENCE` is the number of seconds for which an attempt at a
 job waits at its start and its end for a Redis that does not work; by default 600.

@@ -12,6 +12,7 @@ The capture's `images/script.json` controls it, or without one the environment v
 
 import fcntl
 import json
+import multiprocessing
 import os
 import signal
 import time
@@ -94,6 +95,14 @@ def _save(checkpoint: Path, step: int) -> None:
     atomic_write(checkpoint, json.dumps({"step": step}))
 
 
+def _allocate() -> None:
+    """Take a gigabyte a second, ten of them at most."""
+    kept = []
+    for _ in range(100):
+        kept.append(np.ones(100_000_000, dtype=np.uint8))
+        time.sleep(0.1)
+
+
 def _act(script: dict[str, object], step: int) -> None:
     """Do what the script says at its step; the step is not stored then, so that a later attempt does it again."""
     if script.get("at") != step:
@@ -108,6 +117,15 @@ def _act(script: dict[str, object], step: int) -> None:
         case "kill worker":
             os.kill(os.getppid(), signal.SIGKILL)
             time.sleep(30)  # the kernel ends this process as well
+        case "sleep":
+            time.sleep(600)
+        case "allocate":
+            _allocate()
+        case "allocate in a child":
+            context = multiprocessing.get_context("fork")
+            child = context.Process(target=_allocate)
+            child.start()
+            child.join()
         case "native":
             # One call that does not return to the interpreter for many seconds, like a mapper's.
             np.linalg.svd(np.random.default_rng(0).normal(size=(6000, 6000)))

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from splatmill.schema import format_bytes
-from splatmill_worker import settings
+from splatmill_worker import memory, settings
 
 LOW_MEMORY = 2 << 30
 """Bytes of available memory below which small photos and few Gaussians are advised."""
@@ -144,21 +144,13 @@ def _memory() -> Iterator[Finding]:
 
     now = psutil.virtual_memory()
     total, free = now.total, now.available
-    limit = _cgroup_limit()
+    limit = memory.group_limit()
     usable = min(free, limit) if limit else free
     seen = f"{format_bytes(free)} free of {format_bytes(total)}"
     seen += f", limited to {format_bytes(limit)} by the container" if limit and limit < total else ""
     low = usable < LOW_MEMORY
     advice = "Close other programs, or set a smaller image_size and max_memory." if low else ""
     yield Finding("memory", "warning" if low else "ok", seen, advice)
-
-
-def _cgroup_limit() -> int | None:
-    try:
-        text = Path("/sys/fs/cgroup/memory.max").read_text().strip()
-    except OSError:
-        return None
-    return int(text) if text.isdigit() else None
 
 
 def _disk() -> Iterator[Finding]:

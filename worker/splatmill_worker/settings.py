@@ -1,9 +1,12 @@
-"""The worker's settings from the environment: the address of Redis, and where files lie."""
+"""The worker's settings from the environment: the address of Redis, where files lie, its queues and limits."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from splatmill.backplane.connection import DEFAULT_URL
+from splatmill.schema.quantities import parse_bytes, parse_duration
 
 
 def redis_url() -> str:
@@ -29,3 +32,24 @@ def queues() -> str | None:
 def work_folder(job_id: str) -> Path:
     """Return the folder that the attempts at a job on this machine share."""
     return data_folder() / "work" / job_id
+
+
+def max_run_time() -> float | None:
+    """Return SPLATMILL_MAX_RUN_TIME in seconds, by default 48 hours; None for 0: no limit. Raises ValueError."""
+    return _read("SPLATMILL_MAX_RUN_TIME", parse_duration, 48 * 3600.0) or None
+
+
+def max_memory() -> int | None:
+    """Return SPLATMILL_MAX_MEMORY in bytes (0: no limit), or None if it is not set. Raises ValueError."""
+    found: int | None = _read("SPLATMILL_MAX_MEMORY", parse_bytes, None)
+    return found
+
+
+def _read(name: str, parse: Callable[[str], Any], default: Any) -> Any:
+    text = os.environ.get(name, "").strip()
+    if not text:
+        return default
+    try:
+        return parse(text)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}.") from None

@@ -94,6 +94,7 @@ PROBLEMS: dict[str, Kind] = {
     "diverged": Kind(500, "The optimisation diverged"),
     "empty_scene": Kind(500, "No Gaussians were left in the scene"),
     "out_of_memory": Kind(500, "The machine ran out of memory"),
+    "run_time_exceeded": Kind(500, "The job ran longer than the worker allows"),
     # The service itself.
     "worker_lost": Kind(500, "The worker ended without reporting a result"),
     "attempts_exhausted": Kind(500, "Every attempt at the job ended early"),

@@ -6,11 +6,12 @@ import time
 import redis
 
 from splatmill.backplane import keys
-from splatmill.backplane.connection import InvalidRedisUrl, connect
+from splatmill.backplane.connection import connect
 from splatmill.backplane.redact import redacted
 from splatmill_worker import settings
+from splatmill_worker.service.attempt_limits import Limits
 from splatmill_worker.service.rq_worker import STOP_GRACE, AttemptWorker
-from splatmill_worker.service.served_lines import UnservedLines, served_lines
+from splatmill_worker.service.served_lines import served_lines
 
 REDIS_WAIT = 60.0
 """Seconds that a starting worker waits for Redis, which may be starting at the same time."""
@@ -26,7 +27,8 @@ def serve(stop_grace: float | None, queues: str | None = None) -> int:
     try:
         connection = connect(url)
         served = served_lines(queues or settings.queues())
-    except (InvalidRedisUrl, UnservedLines) as error:
+        limits = Limits.from_settings()
+    except ValueError as error:
         print(error, file=sys.stderr)
         return 1
     deadline = time.monotonic() + REDIS_WAIT
@@ -50,5 +52,5 @@ def serve(stop_grace: float | None, queues: str | None = None) -> int:
                 return 1
             time.sleep(0.05)
     grace = STOP_GRACE if stop_grace is None else stop_grace
-    AttemptWorker(connection, served, stop_grace=grace).work()
+    AttemptWorker(connection, served, grace, limits).work()
     return 0

@@ -34,6 +34,7 @@ from splatmill.backplane.process import die_with_parent
 from splatmill_worker.service import hand_back, recovery
 from splatmill_worker.service.abandoned_folders import remove_abandoned
 from splatmill_worker.service.attempt import Attempt, start_attempt
+from splatmill_worker.service.attempt_limits import Exceeded, Limits, LimitWatch, RunTimeExceeded, die_first
 from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.lock import JobLock, LockState
 from splatmill_worker.service.process_exit import (
@@ -80,6 +81,7 @@ class AttemptWorker(Worker):
 
     served: the lines that it takes entries from.
     stop_grace: seconds that an attempt has to save its state when the worker is told to stop.
+    limits: how long an attempt may run, and how much memory it may use.
     """
 
     max_connection_wait_time = 2.0
@@ -89,6 +91,7 @@ class AttemptWorker(Worker):
         connection: redis.Redis,
         served: Sequence[Line] = ("any", "cpu"),
         stop_grace: float = STOP_GRACE,
+        limits: Limits | None = None,
     ) -> None:
         super().__init__(
             [entries.open_queue(connection)],
@@ -102,6 +105,8 @@ class AttemptWorker(Worker):
         )
         self._served = tuple(served)
         self._grace = stop_grace
+        self._limits = limits or Limits()
+        self._exceeded: Exceeded | None = None
         self._reclaim = Reclaim(connection)
         self._entry_id: str | None = None
         self._line: Line = "any"
@@ -274,7 +279,8 @@ class AttemptWorker(Worker):
         return job
 
     def execute_job(self, job: Job, queue: Queue) -> None:
-        self._entry_id, self._superseded, self._began = job.id, False, time.monotonic()
+        self._entry_id, self._superseded, self._exceeded = job.id, False, None
+        self._began = time.monotonic()
         try:
             self.fork_work_horse(job, queue)
             self.monitor_work_horse(job, queue)
@@ -294,6 +300,7 @@ class AttemptWorker(Worker):
                 try:
                     os.setpgid(0, 0)
                     die_with_parent(parent)
+                    die_first()
                     hand_back.install_signal_handlers()
                     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
                     self._run_child(job, queue)
@@ -335,12 +342,15 @@ class AttemptWorker(Worker):
         self._until_redis_works(lambda: self._settle(job, queue, process_exit))
 
     def _wait(self, job: Job) -> tuple[int, Any]:
-        """Wait for the attempt's process, sending heartbeats, and kill it at the end of the grace period of a stop.
+        """Wait for the attempt's process, sending heartbeats.
+
+        It is killed when it uses too much memory, and at the end of the grace period of a stop or of the longest run.
 
         Returns the wait status and the resource usage of the process.
         """
         handle = os.pidfd_open(self.horse_pid) if hasattr(os, "pidfd_open") else None
         beat_at = time.monotonic() + entries.MONITORING_INTERVAL
+        watch, stop_at = LimitWatch(self._limits, self.horse_pid), float("inf")
         try:
             while True:
                 pid, status, usage = os.wait4(self.horse_pid, os.WNOHANG)
@@ -349,7 +359,15 @@ class AttemptWorker(Worker):
                 if time.monotonic() >= beat_at:
                     beat_at = time.monotonic() + entries.MONITORING_INTERVAL
                     self._heartbeat(job)
-                if self._kill_at is not None and time.monotonic() >= self._kill_at:
+                if self._exceeded is None and (exceeded := watch.exceeded()) is not None:
+                    self._exceeded = exceeded
+                    self.log.warning("Worker %s: %s", self.name, exceeded.problem().detail)
+                    stop_at = time.monotonic()
+                    if isinstance(exceeded, RunTimeExceeded):
+                        stop_at += self._grace
+                        with suppress(ProcessLookupError):
+                            os.kill(self.horse_pid, hand_back.SIGNAL)
+                if time.monotonic() >= min(stop_at, self._kill_at or stop_at):
                     self.kill_horse()
                 if handle is not None:
                     select.select([handle], [], [], max(0.0, min(0.5, beat_at - time.monotonic())))
@@ -378,6 +396,11 @@ class AttemptWorker(Worker):
             self.handle_job_failure(job, queue, exc_string="Stopped on request.")
         elif job.get_status() is not JobStatus.STARTED:
             return  # the process died after it had updated its entry
+        elif self._exceeded is not None:
+            # Another attempt would come to the same limit.
+            ended.report_failed(self._exceeded.problem())
+            job.retries_left = 0
+            self.handle_job_failure(job, queue, exc_string=self._exceeded.problem().detail)
         elif process_exit.handed_back or process_exit.unreported or self._stop_requested:
             why = "Redis took no events." if process_exit.unreported else "The worker is stopping."
             ended.report_requeued(f"{why} The job was put back in front of its owner's others.")

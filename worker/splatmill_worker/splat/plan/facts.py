@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import psutil
 import torch
 
+from splatmill_worker import memory
 from splatmill_worker.images.lens import distortion
 from splatmill_worker.scene import Scene
 from splatmill_worker.splat.start.cells import cells_of
@@ -83,7 +83,7 @@ class Facts:
     view_angle: median over points of the largest angle between two views of the point, degrees; without stereo points.
     distance_ratio: largest over smallest footprint of a pixel on the same point, 90th percentile over points.
     reprojection: median reprojection error, pixels; without stereo points.
-    memory_available: free memory of the machine, or of the GPU for the gpu kernels, bytes.
+    memory_available: memory that this process can still use, or free memory of the GPU for the gpu kernels, bytes.
     speed: training time of this machine; None where it was not probed.
     start: the model that training starts from; None without one.
     tint_spread: as exposure_spread, of red over green or blue over green, whichever spreads more.
@@ -158,7 +158,7 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
         distance_ratio=None if seen is None else seen.distance_ratio(),
         reprojection=_reprojection(scene, max(width, height)),
         lens_residual=_lens_residual(scene, max(width, height)),
-        memory_available=int(psutil.virtual_memory().available),
+        memory_available=memory.available(),
         speed=speed,
         **_coverage(scene, views),
     )
