@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from splatmill.job import AsyncJobHandle
     from splatmill.model import AsyncModelHandle
     from splatmill.schema import CameraSpec, OrbitRequest, RenderRequest, TrainOptions
+    from splatmill.webhook_signature import InvalidWebhook, verify_webhook
 
 _MODULES = {
     "AsyncClient": "splatmill.aio",
@@ -31,6 +32,8 @@ _MODULES = {
     "RenderRequest": "splatmill.schema",
     "SplatmillError": "splatmill.errors",
     "TrainOptions": "splatmill.schema",
+    "InvalidWebhook": "splatmill.webhook_signature",
+    "verify_webhook": "splatmill.webhook_signature",
     "WaitTimeout": "splatmill.errors",
 }
 
@@ -40,6 +43,7 @@ __all__ = [
     "AsyncModelHandle",
     "CameraSpec",
     "Client",
+    "InvalidWebhook",
     "JobCancelled",
     "JobFailed",
     "JobHandle",
@@ -50,6 +54,7 @@ __all__ = [
     "TrainOptions",
     "WaitTimeout",
     "__version__",
+    "verify_webhook",
 ]
 
 

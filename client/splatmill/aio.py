@@ -32,6 +32,7 @@ from splatmill.schema import (
     TrainOptions,
 )
 from splatmill.uploads import OnProgress, Uploaded, key_of, upload
+from splatmill.webhooks import AsyncWebhooks
 
 PAGE = 100
 """Largest number of entries that are requested at once of a list."""
@@ -63,6 +64,7 @@ class AsyncClient:
             server, api_key=api_key, timeout=timeout, transport=transport, retries=retries
         )
         self.keys = AsyncKeys(self.connection)
+        self.webhooks = AsyncWebhooks(self.connection)
 
     async def __aenter__(self) -> Self:
         return self

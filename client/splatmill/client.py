@@ -33,6 +33,7 @@ from splatmill.schema import (
     TrainOptions,
 )
 from splatmill.uploads import OnProgress, Uploaded
+from splatmill.webhooks import Webhooks
 
 
 class Client:
@@ -59,6 +60,7 @@ class Client:
         )
         self._loop = BackgroundLoop()
         self.keys = Keys(self._loop, self._async.keys)
+        self.webhooks = Webhooks(self._loop, self._async.webhooks)
 
     def __enter__(self) -> Self:
         return self

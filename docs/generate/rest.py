@@ -26,10 +26,11 @@ HEADINGS = {
     "captures": "Captures",
     "jobs": "Jobs",
     "models": "Models",
+    "webhooks": "Webhooks",
     "keys": "Keys",
     "service": "The service itself",
 }
-METHODS = ("post", "get", "put", "delete")
+METHODS = ("post", "get", "head", "put", "patch", "delete")
 EVERYWHERE = ("unauthorized", "forbidden", "invalid_request", "too_many_requests", "queue_unavailable")
 
 Json = Mapping[str, Any]

@@ -27,6 +27,7 @@ from splatmill_server.routes import (
     status,
     storage,
     uploads,
+    webhooks,
 )
 from splatmill_server.routes import keys as key_routes
 from splatmill_server.service import Service
@@ -56,7 +57,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(loop()) for loop in (service.reaper.run, service.imports.run)]
+        loops = (service.reaper.run, service.imports.run, service.deliveries.run)
+        tasks = [asyncio.create_task(loop()) for loop in loops]
         clean_up = asyncio.create_task(run_in_threadpool(_clean_up, service))
         try:
             yield
@@ -79,7 +81,19 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.service = service
     problems.install(app)
-    modules = (captures, uploads, imports, jobs, job_outputs, models, key_routes, session, status, storage)
+    modules = (
+        captures,
+        uploads,
+        imports,
+        jobs,
+        job_outputs,
+        models,
+        webhooks,
+        key_routes,
+        session,
+        status,
+        storage,
+    )
     for module in modules:
         app.include_router(module.router, dependencies=[PERMITTED])
     _describe(app, keyless=settings.local and settings.api_key is None)

@@ -52,6 +52,13 @@ class Jobs:
         self.connection = connection
         self.storage = storage
         self.metrics = metrics
+        self.on_begin: list[Callable[[JobRow], None]] = []
+        """Called with the row of a job that is new or restarted."""
+        self.on_end: list[Callable[[Job, int], None]] = []
+        """Called with a job that has ended, and its generation, before it is forgotten that it was unfinished.
+
+        A function may be called several times for one end, and by several processes.
+        """
 
     def create(
         self,
@@ -106,6 +113,8 @@ class Jobs:
             return self._placed(known), False
         # A crash here leaves a row that is not in the queue; the reaper enqueues it.
         queue.enqueue(self.connection, job_id, new.generation)
+        for begun in self.on_begin:
+            begun(new)
         self.metrics.created.inc()
         return self._placed(new), True
 
@@ -243,15 +252,16 @@ class Jobs:
         return found
 
     def _retire(self, job_id: str) -> None:
-        """Store the log of a job that has ended, and remove it from the set of active ones.
+        """Store the log of a job that has ended, announce its end, and remove it from the set of active ones.
 
-        It stays there if its log cannot be stored, so that this is tried again, and if it was restarted meanwhile.
+        It stays there if either cannot be stored, so that this is tried again, and if it was restarted meanwhile.
         """
         try:
             if (known := row.read(self.connection, job_id)) is not None:
                 job_log.store(self.connection, self.storage, self._job(known))
+                self._announce_end(known)
         except StorageError as error:
-            log.warning("the log of a job cannot be stored", job=job_id, error=str(error))
+            log.warning("the end of a job cannot be stored", job=job_id, error=str(error))
             return
 
         def remove(pipe: Any) -> None:
@@ -262,6 +272,24 @@ class Jobs:
                 pipe.srem(keys.ACTIVE, job_id)
 
         self.connection.transaction(remove, keys.job(job_id))
+
+    def _announce_end(self, found: JobRow) -> None:
+        """Tell that a job has ended, if it has. Raises StorageError if that cannot be stored."""
+        job = self._job(found)
+        if not job.state.final:
+            return
+        for ended in self.on_end:
+            try:
+                ended(job, found.generation)
+            except StorageError:
+                raise
+            except Exception:  # other jobs must still be looked after
+                log.exception("the end of a job could not be announced", job=found.id)
+
+    def _announce_unretired(self, job_id: str) -> None:
+        """Announce the end of a job that has ended so recently that it still counts as active."""
+        if self.connection.sismember(keys.ACTIVE, job_id):
+            self._announce_end(self.row(job_id))
 
     def unfinished_of(self, owner: str) -> int:
         """Return the number of unfinished jobs of an owner."""
@@ -339,9 +367,12 @@ class Jobs:
                 "verdict": "",
             }
 
+        self._announce_unretired(job_id)
         self._change(job_id, begin_generation, *mark_keys(needs), begun=keys.begun_jobs(known.owner))
         begun = self.row(job_id)
         queue.enqueue(self.connection, job_id, begun.generation)
+        for begin in self.on_begin:
+            begin(begun)
         return self._placed(begun)
 
     def delete(self, job_id: str) -> None:
@@ -362,8 +393,10 @@ class Jobs:
                     advice="Cancel it with POST /v1/jobs/{id}/cancel first.",
                     facts={"state": job.state.value},
                 )
+            self._announce_unretired(job_id)
             for generation in range(1, found.generation + 1):
                 queue.forget(self.connection, job_id, generation)
+        self.storage.delete(layout.watched_job(job_id))
         # The record goes first, so that no model with missing files is visible.
         self.storage.delete(layout.job_record(job_id))
         self.storage.delete_prefix(layout.model(job_id))

@@ -15,6 +15,7 @@ from splatmill.backplane import rendering
 from splatmill.backplane.connection import connect, connect_async
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill_server.captures import Captures
+from splatmill_server.deliveries import Deliveries
 from splatmill_server.imports import Imports
 from splatmill_server.jobs import Jobs
 from splatmill_server.keys import Keys
@@ -29,6 +30,7 @@ from splatmill_server.space.deletion import Deletion
 from splatmill_server.space.ledger import Ledger
 from splatmill_server.space.quota import Quota
 from splatmill_server.space.usage import Usage
+from splatmill_server.webhooks import Webhooks
 
 CHECK_SECONDS = 5.0
 """Seconds for which a check of storage holds: everybody may request `/readyz`, and each check writes a file."""
@@ -70,6 +72,9 @@ class Service:
     captures: Captures
     partial_uploads: PartialUploads
     imports: Imports
+    outgoing: Outgoing
+    webhooks: Webhooks
+    deliveries: Deliveries
     jobs: Jobs
     models: Models
     keys: Keys
@@ -92,6 +97,8 @@ class Service:
         captures = Captures(storage, settings, metrics)
         usage = Usage(storage, Ledger(connection))
         quota = Quota(usage, captures, settings.quota)
+        outgoing = Outgoing(settings.outgoing_allow)
+        webhooks = Webhooks(storage, jobs)
         return cls(
             settings=settings,
             redis=connection,
@@ -102,9 +109,10 @@ class Service:
             metrics=metrics,
             captures=captures,
             partial_uploads=PartialUploads(storage, captures),
-            imports=Imports(
-                connection, storage, captures, quota, Outgoing(settings.outgoing_allow), settings
-            ),
+            imports=Imports(connection, storage, captures, quota, outgoing, settings),
+            outgoing=outgoing,
+            webhooks=webhooks,
+            deliveries=Deliveries(connection, webhooks, outgoing),
             jobs=jobs,
             models=Models(storage, jobs),
             keys=Keys(storage, bootstrap=settings.api_key is not None),

@@ -23,7 +23,7 @@ SAFE = {"get", "head", "options"}
 READS = {"/v1/models/{model_id}/render", "/v1/models/{model_id}/orbit", "/v1/session"}
 """Addresses whose POST and DELETE change no record."""
 
-OWN = {"capture_id", "job_id", "model_id"}
+OWN = {"capture_id", "job_id", "model_id", "webhook_id"}
 """Path parameters that name a record of an owner."""
 
 pytestmark = pytest.mark.slow
@@ -90,6 +90,8 @@ def world(serve: Serve) -> World:
     )
     ids = {"capture_id": capture, "job_id": waiting, "model_id": done, "key_id": ann["id"]}
     ids["import_id"] = "0" * 16  # guarded by its capture
+    ids["webhook_id"] = app.http.post("/v1/webhooks", json={"url": "http://8.8.8.8/"}).json()["id"]
+    ids["delivery_id"] = "0" * 16  # guarded by its webhook
     ids["upload_id"] = begun.headers["location"].rsplit("/", 1)[-1]
     return World(app, ids, secrets)
 

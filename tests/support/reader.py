@@ -42,7 +42,7 @@ SMALLER = (
         'OUT="$PWD/demo" PHOTOS="$PWD/demo/photos" ARGS="--novel-view --time-budget 1s --image-size 120"',
     ),
     # The port of the documentation may be in use here; the address is replaced when the service is up.
-    (r"^splatmill up\b", 'splatmill up --port 0 --data "$PWD/data"'),
+    (r"^((?:env \S+ )?)splatmill up\b", r'\1splatmill up --port 0 --data "$PWD/data"'),
 )
 ONCE = (
     "python -m splatmill_worker.synthetic photos\n",

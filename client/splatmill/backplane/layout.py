@@ -10,6 +10,10 @@ captures/{id}/uploads/{upload}/blocks/...   its bytes so far, in a bucket: objec
 captures/{id}/imports/{import}.json         record of a file that the server fetches from an address
 captures/{id}/sfm/...                       reconstruction, shared by the jobs of the capture
 imports/{capture}.{import}                  mark of an import that has not ended
+webhooks/{id}/webhook.json                  record of a webhook, with its secrets
+webhooks/{id}/deliveries/{delivery}.json    one event for this webhook, and the attempts to deliver it
+due/{time}.{webhook}.{delivery}             mark of a delivery that is pending: Unix time of its next attempt
+watched/{job}.json                          row of an unfinished job whose owner has webhooks
 jobs/{id}/work/...                          checkpoints and other files from which another machine can resume
 jobs/{id}/log.jsonl                         the job as it ended, then the lines of its log
 models/{id}/{file}                          model.ply, report.json, report.png, report.html, cameras.json, ...
@@ -169,3 +173,43 @@ def key_record(key_id: str) -> str:
 
 def key_revocation(key_id: str) -> str:
     return f"keys/{key_id}.revoked"
+
+
+def webhooks() -> str:
+    return "webhooks"
+
+
+def webhook(webhook_id: str) -> str:
+    return f"webhooks/{webhook_id}"
+
+
+def webhook_record(webhook_id: str) -> str:
+    return f"webhooks/{webhook_id}/webhook.json"
+
+
+def deliveries(webhook_id: str) -> str:
+    """Return the folder of the deliveries of a webhook."""
+    return f"webhooks/{webhook_id}/deliveries"
+
+
+def delivery_record(webhook_id: str, delivery_id: str) -> str:
+    return f"webhooks/{webhook_id}/deliveries/{delivery_id}.json"
+
+
+def due_deliveries() -> str:
+    """Return the folder of the marks of all pending deliveries."""
+    return "due"
+
+
+def due_delivery(seconds: int, webhook_id: str, delivery_id: str) -> str:
+    """Return the path of the mark of a pending delivery, whose next attempt is due at a Unix time."""
+    return f"due/{seconds:012d}.{webhook_id}.{delivery_id}"
+
+
+def watched_jobs() -> str:
+    """Return the folder of the rows of unfinished jobs whose owners have webhooks."""
+    return "watched"
+
+
+def watched_job(job_id: str) -> str:
+    return f"watched/{job_id}.json"

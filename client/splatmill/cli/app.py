@@ -29,6 +29,7 @@ COMMANDS = {
     "up": ("splatmill.cli.service", "up"),
     "storage": ("splatmill.cli.storage", "storage"),
     "keys": ("splatmill.cli.keys", "keys"),
+    "webhooks": ("splatmill.cli.webhooks", "webhooks"),
     "doctor": ("splatmill.cli.service", "doctor"),
     "bench": ("splatmill.cli.service", "bench"),
 }

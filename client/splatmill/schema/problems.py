@@ -57,6 +57,8 @@ PROBLEMS: dict[str, Kind] = {
     "upload_offset_differs": Kind(409, "The upload does not stand at this offset"),
     "upload_completed": Kind(409, "The upload is already complete"),
     "import_not_found": Kind(404, "There is no such import"),
+    "webhook_not_found": Kind(404, "There is no such webhook"),
+    "delivery_not_found": Kind(404, "There is no such delivery"),
     "preview_not_ready": Kind(404, "There is no preview yet"),
     "report_not_ready": Kind(404, "There is no report yet"),
     "model_not_ready": Kind(409, "The model is not finished yet"),
@@ -97,6 +99,7 @@ PROBLEMS: dict[str, Kind] = {
     "run_time_exceeded": Kind(500, "The job ran longer than the worker allows"),
     # The service itself.
     "worker_lost": Kind(500, "The worker ended without reporting a result"),
+    "job_lost": Kind(500, "The record of the job was lost"),
     "attempts_exhausted": Kind(500, "Every attempt at the job ended early"),
     "render_failed": Kind(500, "The image could not be rendered"),
     "capture_incomplete": Kind(500, "Not all files of the capture reached the training"),
