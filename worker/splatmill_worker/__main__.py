@@ -1,4 +1,4 @@
-"""The worker's programs: `python -m splatmill_worker train | renderer | fit-image | doctor | bench NAME`."""
+"""The worker's programs: `python -m splatmill_worker train | renderer | render-file | orbit-file | fit-image | ...`."""
 
 import argparse
 import ctypes
@@ -38,6 +38,14 @@ def main(argv: list[str] | None = None) -> int:
     renderer.add_argument(
         "--backend", choices=["reference", "cpu", "gpu"], help="kernels to render with (default: cpu)"
     )
+    for name, what in (("render-file", "an image"), ("orbit-file", "a video")):
+        file = programs.add_parser(name, help=f"render {what} of a .ply on this machine")
+        file.add_argument("model", type=Path)
+        file.add_argument("--out", type=Path, required=True)
+        file.add_argument("--request", default="{}", help="the request of the REST API as JSON")
+        file.add_argument("--cameras", type=Path, help="cameras.json of the model")
+        file.add_argument("--width", type=int, help="width in pixels of an image without a camera")
+        file.add_argument("--up", default="z", help="axis that points up, for a model without cameras")
     fit_image = programs.add_parser("fit-image", help="fit one image by Gaussians in a plane")
     fit_image.add_argument("photo", type=Path)
     fit_image.add_argument("--out", type=Path, required=True, help="folder for the results")
@@ -59,6 +67,10 @@ def main(argv: list[str] | None = None) -> int:
         from splatmill_worker.render_service.command import serve as serve_renders
 
         return serve_renders(chosen.host, chosen.port, chosen.uds, chosen.backend)
+    if chosen.program in ("render-file", "orbit-file"):
+        from splatmill_worker.render_service.local import main as local_main
+
+        return local_main(chosen)
     if chosen.program == "fit-image":
         from splatmill_worker.fit_image.command import main as fit_image_main
 

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from typing import NoReturn
 
 import typer
 
@@ -26,7 +27,7 @@ def bench(context: typer.Context) -> None:
     exec_module("splatmill_worker", "bench", *context.args)
 
 
-def exec_module(module: str, *arguments: str) -> None:
+def exec_module(module: str, *arguments: str) -> NoReturn:
     """Replace this process by `python -m module`, so that signals and the exit code are those of that program."""
     sys.stdout.flush()
     sys.stderr.flush()

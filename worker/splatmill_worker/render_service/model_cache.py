@@ -100,8 +100,16 @@ class ModelCache:
     def _antialias(self, model_id: str) -> bool:
         """Return what the plan in the model's report says of antialiasing; False without a report or a plan."""
         try:
-            report: Any = json.loads(self._storage.get(layout.model_file(model_id, "report.json")))
-            decision = report["plan"]["antialias"]
-        except (FileNotFoundError, ValueError, KeyError, TypeError):
+            return antialias_of(self._storage.get(layout.model_file(model_id, "report.json")))
+        except FileNotFoundError:
             return False
-        return bool(decision["value"] if isinstance(decision, dict) else decision)
+
+
+def antialias_of(report: bytes) -> bool:
+    """Return what the plan in a report.json says of antialiasing; False for a report without one."""
+    try:
+        fields: Any = json.loads(report)
+        decision = fields["plan"]["antialias"]
+    except (ValueError, KeyError, TypeError):
+        return False
+    return bool(decision["value"] if isinstance(decision, dict) else decision)

@@ -18,6 +18,9 @@ FULL_CIRCLE = math.radians(220)
 """Radians of azimuth that photos must cover for a full circle. If they cover less, the camera swings back and forth
 within the arc of the photos, because no photo shows the model from outside of it."""
 
+Z: Float = np.array([0.0, 0.0, 1.0])
+"""The axis that points up in a model without cameras, if nothing else is said."""
+
 DEFAULT_FOV = 50.0
 """Vertical field of view in degrees where neither the request nor the photos give one."""
 
@@ -78,15 +81,15 @@ def fit_path(centers: Float, forwards: Float, ups: Float) -> OrbitPath:
     return OrbitPath(target, right, front, up, radius, float(np.median(heights)), middle, half)
 
 
-def path_around(points: Float) -> OrbitPath:
-    """Return a full circle around points [N,3] with z up, for a model without cameras.
+def path_around(points: Float, up: Float = Z) -> OrbitPath:
+    """Return a full circle around points [N,3] with a coordinate axis `up`, [3], for a model without cameras.
 
     Its radius is 2.5 times the distance from the median point within which 80 % of the points lie.
     """
     target = np.median(points, axis=0)
     reach = float(np.quantile(np.linalg.norm(points - target, axis=1), 0.8)) or 1.0
-    x, y, z = np.eye(3)
-    return OrbitPath(target, x, y, z, 2.5 * reach, 0.5 * reach, 0.0, math.pi)
+    right = np.eye(3)[1 if up[0] else 0]
+    return OrbitPath(target, right, np.cross(up, right), up, 2.5 * reach, 0.5 * reach, 0.0, math.pi)
 
 
 def cameras_along(path: OrbitPath, request: OrbitRequest, fov_y_deg: float) -> Iterable[Camera]:
@@ -103,15 +106,18 @@ def cameras_along(path: OrbitPath, request: OrbitRequest, fov_y_deg: float) -> I
         )
 
 
-def orbit_cameras(stored: ModelCameras | None, points: Float, request: OrbitRequest) -> Iterable[Camera]:
+def orbit_cameras(
+    stored: ModelCameras | None, points: Float, request: OrbitRequest, up: Float = Z
+) -> Iterable[Camera]:
     """Return the cameras of an orbit video of a model.
 
     stored: the cameras of its photos; None, or fewer than two, gives a circle around the points.
     points: the means of its Gaussians, [N,3], in world units.
     request: number and size of the frames, and the field of view if given.
+    up: the coordinate axis that points up where there are no cameras, [3].
     """
     if stored is None or len(stored.cameras) < 2:
-        return cameras_along(path_around(points), request, request.fov_y_deg or DEFAULT_FOV)
+        return cameras_along(path_around(points, up), request, request.fov_y_deg or DEFAULT_FOV)
     poses = np.array([camera.camera.opencv_to_world() for camera in stored.cameras])
     path = fit_path(poses[:, :3, 3], poses[:, :3, 2], -poses[:, :3, 1])
     return cameras_along(path, request, request.fov_y_deg or _field_of_view(stored, request))

@@ -1,0 +1,95 @@
+"""Images and videos of a .ply on this machine: the worker part renders them, as a process that replaces this one."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import typer
+
+from splatmill.cli.embedded import require
+from splatmill.cli.service import exec_module
+
+if TYPE_CHECKING:
+    from splatmill.schema import CameraSpec, ModelCamera
+
+
+def is_local(model: str) -> bool:
+    """Return whether a command is given the path of a .ply, and not the id of a model. Ids have no suffix."""
+    return model.lower().endswith(".ply")
+
+
+def local_cameras(model: Path) -> "list[ModelCamera]":
+    """Return the cameras in the cameras.json beside a .ply; none, with a sentence, if it has none that can be read."""
+    from pydantic import ValidationError
+
+    from splatmill.schema import ModelCameras
+
+    if not model.is_file():
+        raise typer.BadParameter(f"There is no file {model}.", param_hint="MODEL")
+    path = _cameras_path(model)
+    if not path.is_file():
+        typer.echo(f"There is no cameras.json beside {model}.", err=True)
+        return []
+    try:
+        return ModelCameras.model_validate_json(path.read_bytes()).cameras
+    except ValidationError:
+        typer.echo(f"{path} is not used: it was not written by Splatmill.", err=True)
+        return []
+
+
+def render_local(
+    model: Path,
+    out: Path,
+    options: Mapping[str, Any],
+    camera: "CameraSpec | None",
+    width: int | None,
+    up: str,
+) -> NoReturn:
+    """Render an image of a .ply and end. Without a camera, it shows the whole scene from the side.
+
+    options: output, format and background of `RenderRequest`.
+    """
+    from pydantic import ValidationError
+
+    from splatmill.errors import invalid_request
+    from splatmill.schema import CameraSpec, RenderRequest
+
+    seen = camera or CameraSpec.looking_at((1, 0, 0), (0, 0, 0), width=16, height=16)
+    try:
+        request = RenderRequest.model_validate({**options, "camera": seen})
+    except ValidationError as error:
+        raise invalid_request(error, "camera_invalid") from error
+    if camera is None:
+        typer.echo(f"The image shows the whole scene from the side, with {up} up.", err=True)
+    body = request.model_dump_json(exclude_none=True, exclude={"camera"} if camera is None else None)
+    size = ("--width", str(width)) if width is not None else ()
+    _run("render-file", model, out, body, up, *size)
+
+
+def orbit_local(
+    model: Path, out: Path, options: Mapping[str, Any], *, with_cameras: bool, up: str
+) -> NoReturn:
+    """Render a video that circles the scene of a .ply and end. `options` are fields of `OrbitRequest`."""
+    from pydantic import ValidationError
+
+    from splatmill.errors import invalid_request
+    from splatmill.schema import OrbitRequest
+
+    try:
+        request = OrbitRequest.model_validate(options)
+    except ValidationError as error:
+        raise invalid_request(error) from error
+    if not with_cameras:
+        typer.echo(f"The camera circles the middle of the Gaussians, with {up} up.", err=True)
+    cameras = ("--cameras", str(_cameras_path(model))) if with_cameras else ()
+    _run("orbit-file", model, out, request.model_dump_json(exclude_none=True), up, *cameras)
+
+
+def _cameras_path(model: Path) -> Path:
+    return model.with_name("cameras.json")
+
+
+def _run(program: str, model: Path, out: Path, request: str, up: str, *more: str) -> NoReturn:
+    require("splatmill_worker", "Rendering a .ply on this machine")
+    options = ("--out", str(out), "--request", request, f"--up={up}", *more)
+    exec_module("splatmill_worker", program, *options, "--", str(model))

@@ -1,0 +1,177 @@
+"""`splatmill render` and `orbit`: images and videos of a model on a server, or of a .ply on this machine."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from splatmill.cli.local_model import is_local, local_cameras, orbit_local, render_local
+from splatmill.cli.servers import ServerOption, open_client
+
+if TYPE_CHECKING:
+    from splatmill.schema import CameraSpec, ModelCamera
+
+ModelOrFile = Annotated[
+    str,
+    typer.Argument(
+        metavar="MODEL",
+        help="Id of a model on the server, or path of a .ply, which is rendered on this machine.",
+        show_default=False,
+    ),
+]
+Up = Annotated[
+    Literal["x", "y", "z", "-x", "-y", "-z"] | None,
+    typer.Option(
+        "--up",
+        help="Axis that points up in a .ply without a cameras.json beside it. Left out, z.",
+        show_default=False,
+    ),
+]
+
+
+def render(
+    model_id: ModelOrFile,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Image to write: .png, .jpg, .webp, or .npy (float32).")
+    ] = Path("view.png"),
+    view: Annotated[
+        str | None,
+        typer.Option(
+            help="Name of the photo from whose camera to render. Left out, the first held-out photo."
+        ),
+    ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NUMBER|FILE",
+            help="In place of --view: the number of a camera of the model, from 0, or a JSON file with a camera as in "
+            "the API (`CameraSpec`).",
+        ),
+    ] = None,
+    width: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=8192,
+            help="Width in pixels; the aspect ratio stays. Left out, the width of the camera.",
+        ),
+    ] = None,
+    output: Annotated[
+        Literal["color", "depth", "alpha"],
+        typer.Option(help="What to render: colour, depth along the viewing axis, or opacity."),
+    ] = "color",
+    background: Annotated[
+        Literal["black", "white", "transparent"], typer.Option(help="Colour behind the model.")
+    ] = "black",
+    up: Up = None,
+    server: ServerOption = None,
+) -> None:
+    """Render an image of a model on a server, or of a .ply on this machine."""
+    from splatmill.files import atomic_write
+    from splatmill.schema import Format
+
+    suffixes = {
+        ".png": Format.png,
+        ".jpg": Format.jpeg,
+        ".jpeg": Format.jpeg,
+        ".webp": Format.webp,
+        ".npy": Format.npy,
+    }
+    if out.suffix.lower() not in suffixes:
+        raise typer.BadParameter(f"{out} must end in one of {', '.join(suffixes)}.", param_hint="--out")
+    if camera is not None and view is not None:
+        raise typer.BadParameter("Give --view or --camera, not both.", param_hint="--view")
+    options: dict[str, Any] = {"output": output, "background": background}
+    options["format"] = suffixes[out.suffix.lower()]
+    if is_local(model_id):
+        path = Path(model_id)
+        cameras = local_cameras(path)
+        whole = not cameras and view is None and camera is None
+        _check_up(up, used=whole)
+        chosen = None if whole else _camera(cameras, view, camera, width)
+        render_local(path, out, options, chosen, width, up or "z")
+    _check_up(up, used=False)
+    with open_client(server) as client:
+        model = client.model(model_id)
+        stored = [] if _is_file(camera) else model.cameras()
+        picture = model.render(_camera(stored, view, camera, width), **options)
+    atomic_write(out, picture)
+    typer.echo(out)
+
+
+def orbit(
+    model_id: ModelOrFile,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Video to write (MP4).")] = Path("orbit.mp4"),
+    seconds: Annotated[float, typer.Option(min=0.5, max=60, help="Length of the video in seconds.")] = 6.0,
+    fps: Annotated[int, typer.Option(min=1, max=60, help="Frames per second.")] = 24,
+    width: Annotated[int, typer.Option(min=16, max=3840, help="Width in pixels; must be even.")] = 640,
+    height: Annotated[int, typer.Option(min=16, max=2160, help="Height in pixels; must be even.")] = 480,
+    up: Up = None,
+    server: ServerOption = None,
+) -> None:
+    """Render a video that circles the scene of a model on a server, or of a .ply on this machine."""
+    options = {"seconds": seconds, "fps": fps, "width": width, "height": height}
+    if is_local(model_id):
+        cameras = local_cameras(Path(model_id))
+        _check_up(up, used=not cameras)
+        orbit_local(Path(model_id), out, options, with_cameras=bool(cameras), up=up or "z")
+    _check_up(up, used=False)
+    with open_client(server) as client:
+        typer.echo(client.model(model_id).orbit(out, **options))
+
+
+def _check_up(up: str | None, *, used: bool) -> None:
+    if up is not None and not used:
+        raise typer.BadParameter(
+            "--up is for a .ply without cameras; the cameras of this model say where up is.",
+            param_hint="--up",
+        )
+
+
+def _is_file(camera: str | None) -> bool:
+    return camera is not None and not camera.isdigit()
+
+
+def _camera(
+    cameras: "list[ModelCamera]", view: str | None, camera: str | None, width: int | None
+) -> "CameraSpec":
+    """Return the camera that the options choose, at the given width."""
+    if camera is not None and _is_file(camera):
+        chosen = _read_camera(Path(camera))
+    elif not cameras:
+        hint = "--view" if camera is None else "--camera"
+        raise typer.BadParameter("The model has no cameras; give a file with --camera.", param_hint=hint)
+    elif camera is not None:
+        if int(camera) >= len(cameras):
+            raise typer.BadParameter(
+                f"The model has {len(cameras)} cameras, 0 to {len(cameras) - 1}.", param_hint="--camera"
+            )
+        chosen = cameras[int(camera)].camera
+    elif view is not None:
+        found = [entry for entry in cameras if entry.name == view]
+        if not found:
+            raise typer.BadParameter(
+                f"The model has no camera named {view!r}; it has "
+                f"{', '.join(c.name for c in cameras[:8])}, ...",
+                param_hint="--view",
+            )
+        chosen = found[0].camera
+    else:
+        chosen = next((entry for entry in cameras if entry.split == "test"), cameras[0]).camera
+    return chosen.scaled_to(width) if width is not None else chosen
+
+
+def _read_camera(path: Path) -> "CameraSpec":
+    from pydantic import ValidationError
+
+    from splatmill.errors import invalid_request
+    from splatmill.schema import CameraSpec
+
+    if not path.is_file():
+        raise typer.BadParameter(
+            f"{path} is neither a file nor the number of a camera.", param_hint="--camera"
+        )
+    try:
+        return CameraSpec.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise invalid_request(error, "camera_invalid") from error

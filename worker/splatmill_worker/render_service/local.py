@@ -1,0 +1,120 @@
+"""Pictures and videos of a `.ply` on this machine, without a server: the programs `render-file` and `orbit-file`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+
+from splatmill.files import atomic_write, replacing
+from splatmill.schema import CameraSpec, ModelCameras, OrbitRequest, RenderRequest
+from splatmill_worker.errors import ModelUnreadable
+from splatmill_worker.film import Film
+from splatmill_worker.render_service.encoding import render_frame, render_image
+from splatmill_worker.render_service.model_cache import LoadedModel, antialias_of
+from splatmill_worker.render_service.orbit import DEFAULT_FOV, Float, orbit_cameras, path_around
+from splatmill_worker.splat import ply
+
+UNWRITABLE, REFUSED, STOPPED = 1, 5, 130
+"""Exit statuses, those of the command line: a file cannot be read or written; the model cannot be used; Ctrl-C."""
+
+AXES = {
+    f"{sign}{name}": (-1.0 if sign else 1.0) * axis
+    for sign in ("", "-")
+    for name, axis in zip("xyz", np.eye(3), strict=True)
+}
+"""Directions that may point up in a model without cameras."""
+
+DEFAULT_WIDTH = 640  # pixels, of a picture of a model without cameras; its sides are as 4 to 3
+
+_SAY_EVERY = 2.0  # seconds between two lines about the progress of a video
+
+
+def main(chosen: argparse.Namespace) -> int:
+    """Run `render-file` or `orbit-file` with its parsed arguments; return the exit status."""
+    model, out, up = chosen.model, chosen.out, chosen.up
+    try:
+        if chosen.program == "render-file":
+            render_file(model, out, json.loads(chosen.request), chosen.width, up)
+        else:
+            request = OrbitRequest.model_validate_json(chosen.request)
+            orbit_file(model, out, request, chosen.cameras, up)
+    except ModelUnreadable as error:
+        print(f"Error: {error.message}", file=sys.stderr)
+        return REFUSED
+    except (OSError, av.FFmpegError) as error:
+        print(f"Error: {error.filename or out}: {error.strerror or error}.", file=sys.stderr)
+        return UNWRITABLE
+    except KeyboardInterrupt:
+        print("Stopped; nothing was written.", file=sys.stderr)
+        return STOPPED
+    print(out)
+    return 0
+
+
+def render_file(model: Path, out: Path, request: dict[str, Any], width: int | None, up: str) -> None:
+    """Render an image of the `.ply` at `model` and write it to `out`.
+
+    request: the fields of RenderRequest. Without a camera, the image shows the whole model from the side.
+    width: width in pixels of an image without a camera.
+    up: the axis that points up in an image without a camera, a key of AXES.
+
+    Raises ModelUnreadable, FileNotFoundError, and OSError where `out` cannot be written.
+    """
+    loaded = load(model)
+    if "camera" not in request:
+        request |= {"camera": overview(loaded, width or DEFAULT_WIDTH, AXES[up])}
+    atomic_write(out, render_image(loaded, RenderRequest.model_validate(request)).data)
+
+
+def orbit_file(model: Path, out: Path, request: OrbitRequest, cameras: Path | None, up: str) -> None:
+    """Render a video that circles the `.ply` at `model` and write it to `out`.
+
+    cameras: the cameras.json of the model, whose positions the path is fitted to; None gives a circle with `up`.
+
+    Raises ModelUnreadable, FileNotFoundError, and OSError or av.FFmpegError where `out` cannot be written.
+    """
+    loaded = load(model)
+    stored = ModelCameras.model_validate_json(cameras.read_bytes()) if cameras is not None else None
+    path = orbit_cameras(stored, _means(loaded), request, AXES[up])
+    said = time.monotonic()
+    with replacing(out) as part, Film(part, request.width, request.height, request.fps) as film:
+        for index, camera in enumerate(path):
+            film.add(render_frame(loaded, camera, request.background))
+            if time.monotonic() - said > _SAY_EVERY:
+                said = time.monotonic()
+                print(f"{index + 1} of {request.frames} frames", flush=True)
+
+
+def load(model: Path) -> LoadedModel:
+    """Return the model in a `.ply`. A report.json beside it says whether it is to be rendered with antialiasing."""
+    gaussians = ply.read(model)
+    if not gaussians.count:
+        raise ModelUnreadable(f"{model.name} has no Gaussians with finite values.")
+    report = model.with_name("report.json")
+    antialias = antialias_of(report.read_bytes()) if report.is_file() else False
+    return LoadedModel(str(model), "", gaussians, antialias, 0)
+
+
+def overview(model: LoadedModel, width: int, up: Float) -> CameraSpec:
+    """Return a camera that shows the whole model from the side, where an orbit around it begins."""
+    path = path_around(_means(model), up)
+    return CameraSpec.looking_at(
+        tuple(path.eye(0.0)),
+        tuple(path.target),
+        width=width,
+        height=max(1, round(width * 3 / 4)),
+        fov_y_deg=DEFAULT_FOV,
+        up=tuple(path.up),
+    )
+
+
+def _means(model: LoadedModel) -> Float:
+    means: Float = model.gaussians.means.double().cpu().numpy()
+    return means
