@@ -12,7 +12,8 @@
     ├── TrainingFailed       training ended with a numerical failure
     ├── ModelNotFound        there is no finished model with the requested id
     ├── ModelUnreadable      a .ply file cannot be read as a 3D Gaussian model
-    └── FolderInUse          another process works in the job's folder
+    ├── FolderInUse          another process works in the job's folder
+    └── DiskReserveReached   the worker's disk is full but for the reserve
 
     Cancelled                the caller requested to stop; not a failure
 
@@ -26,7 +27,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, ClassVar
 
-from splatmill.schema import Problem
+from splatmill.schema import Problem, format_bytes
 
 
 class WorkerError(Exception):
@@ -219,6 +220,27 @@ class FolderInUse(WorkerError):
             f"Another process works in the job's folder {folder}.",
             advice="End the process that was left over on the worker's machine, then restart the job.",
         )
+
+
+class DiskReserveReached(WorkerError):
+    """The worker's disk is full but for the reserve. What the attempt has stored is kept, and a restart goes on.
+
+    folder: the worker's data folder.
+    free, reserve, needed: bytes that are free, that stay free, and that were to be written.
+    """
+
+    def __init__(self, folder: Path, free: int, reserve: int, needed: int) -> None:
+        wanted = f", and {format_bytes(needed)} more are needed" if needed else ""
+        super().__init__(
+            "worker_disk_full",
+            f"The disk of the worker's data folder {folder} has {format_bytes(free)} left{wanted}; "
+            f"{format_bytes(reserve)} stay free.",
+            facts={"free": free, "reserve": reserve, "needed": needed},
+            advice="Free space on that disk, then restart the job: it goes on from its last checkpoint.",
+        )
+        self.folder = folder
+        self.free = free
+        self.reserve = reserve
 
 
 class Cancelled(Exception):

@@ -8,6 +8,9 @@ from typing import Any
 from splatmill.backplane.connection import DEFAULT_URL
 from splatmill.schema.quantities import parse_bytes, parse_duration
 
+DISK_RESERVE = 256 * 2**20
+"""Bytes that stay free on the disk of the data folder. On a shared disk, Redis needs them for its log."""
+
 
 def redis_url() -> str:
     """Return REDIS_URL, or the default address on this machine."""
@@ -17,6 +20,11 @@ def redis_url() -> str:
 def data_folder() -> Path:
     """Return SPLATMILL_DATA, or `splatmill-data` in the current folder."""
     return Path(os.environ.get("SPLATMILL_DATA") or "splatmill-data").expanduser().absolute()
+
+
+def disk_reserve() -> int:
+    """Return SPLATMILL_DISK_RESERVE in bytes, or the default. Raises ValueError for a text that is not a size."""
+    return int(_read("SPLATMILL_DISK_RESERVE", parse_bytes, DISK_RESERVE))
 
 
 def storage_url() -> str:

@@ -110,6 +110,7 @@ PROBLEMS: dict[str, Kind] = {
     "storage_unavailable": Kind(503, "The storage cannot be reached"),
     "renderer_unavailable": Kind(503, "The renderer cannot be reached"),
     "render_timeout": Kind(504, "The renderer did not answer in time"),
+    "worker_disk_full": Kind(507, "The disk of the worker is almost full"),
     "storage_full": Kind(507, "The storage is full"),
     "quota_exceeded": Kind(507, "The owner has no room left in storage"),
     "storage_unwritable": Kind(507, "The storage cannot be written to"),

@@ -25,6 +25,7 @@ def serve(stop_grace: float | None, queues: str | None = None) -> int:
     """
     url = settings.redis_url()
     try:
+        settings.disk_reserve()
         connection = connect(url)
         served = served_lines(queues or settings.queues())
         limits = Limits.from_settings()

@@ -12,12 +12,14 @@ import fcntl
 import os
 import shutil
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Entry, Storage
 from splatmill_worker.errors import CaptureIncomplete, FolderInUse, StartNotStored
+from splatmill_worker.service.disk_reserve import shortage
 from splatmill_worker.service.own_copy import link_or_copy
 from splatmill_worker.settings import work_folder
 
@@ -63,6 +65,7 @@ class JobFolder:
         for path in self.capture.rglob("*") if self.capture.is_dir() else ():
             if not path.is_dir() and path.relative_to(self.capture).as_posix() not in wanted:
                 path.unlink()
+        self._check_space(wanted)
         for name, entry in wanted.items():
             target = self.capture / name
             if _is_whole(target, entry):
@@ -78,6 +81,17 @@ class JobFolder:
         if missing:
             raise CaptureIncomplete(self.capture_id, missing, len(entries))
         return len(entries)
+
+    def _check_space(self, wanted: Mapping[str, Entry]) -> None:
+        """Raise DiskReserveReached if copies of the files that are missing would not fit beside the reserve."""
+        root = self.storage.root
+        if root is not None and root.stat().st_dev == self.path.stat().st_dev:
+            return  # they are linked
+        missing = sum(
+            entry.size for name, entry in wanted.items() if not _is_whole(self.capture / name, entry)
+        )
+        if missing and (short := shortage(missing)) is not None:
+            raise short
 
     def stage_start(self, model_id: str) -> None:
         """Make a stored model available as run/start.ply. Raises StartNotStored when there is no such model."""

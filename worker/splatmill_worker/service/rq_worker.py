@@ -35,6 +35,7 @@ from splatmill_worker.service import hand_back, recovery
 from splatmill_worker.service.abandoned_folders import remove_abandoned
 from splatmill_worker.service.attempt import Attempt, start_attempt
 from splatmill_worker.service.attempt_limits import Exceeded, Limits, LimitWatch, RunTimeExceeded, die_first
+from splatmill_worker.service.disk_reserve import shortage_text
 from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.lock import JobLock, LockState
 from splatmill_worker.service.process_exit import (
@@ -53,6 +54,7 @@ attempt resumes from the last checkpoint that was stored."""
 T = TypeVar("T")
 
 _RETRY_SECONDS = 0.5
+_SPACE_SECONDS = 1.0  # between two looks at a disk that is full
 _LOG_SECONDS = 30.0  # between two log lines about a Redis that does not work
 _REMOVAL_INTERVAL = 3600.0
 _IDLE_SECONDS = 5.0
@@ -133,6 +135,18 @@ class AttemptWorker(Worker):
                 self._record()
         except redis.RedisError as error:
             self.log.warning("Worker %s: Redis took no heartbeat: %s", self.name, error)
+
+    def _wait_for_space(self) -> None:
+        """Take no job while the disk is full but for the reserve."""
+        if (short := shortage_text()) is None:
+            return
+        self.log.error("Worker %s: takes no jobs: %s", self.name, short)
+        self.set_state(WorkerStatus.SUSPENDED)
+        while shortage_text():
+            time.sleep(_SPACE_SECONDS)
+            self.heartbeat()
+        self.set_state(WorkerStatus.IDLE)
+        self.log.info("Worker %s: takes jobs again", self.name)
 
     def set_shutdown_requested_date(self) -> None:
         try:
@@ -253,6 +267,7 @@ class AttemptWorker(Worker):
             self.heartbeat()
             if self.should_run_maintenance_tasks:
                 self.run_maintenance_tasks()
+            self._wait_for_space()
             job = self._take()
             if job is not None or not wait:
                 return job

@@ -24,12 +24,13 @@ from splatmill.schema import Event, JobState, LogEvent, PreviewEvent, StateEvent
 from splatmill_worker.errors import EmptyCapture
 from splatmill_worker.service import hand_back, publish, sfm_cache
 from splatmill_worker.service.attempt import LONGEST_MESSAGE, Attempt
+from splatmill_worker.service.disk_reserve import DiskWatch
 from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.job_folder import JobFolder
 from splatmill_worker.service.lock import LockState
 from splatmill_worker.service.mirror import Mirror
 from splatmill_worker.service.outbox import Outbox
-from splatmill_worker.service.problems import is_transient, problem_of
+from splatmill_worker.service.problems import is_transient, keeps_progress, problem_of
 from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, UNREPORTED_STATUS, WITHDRAWN_STATUS
 from splatmill_worker.service.redis_patience import PATIENCE, patiently
 from splatmill_worker.settings import storage_url
@@ -115,6 +116,27 @@ def _run(attempt: Attempt, row: JobRow, outbox: Outbox, can_retry: bool) -> None
 
 def _train_and_publish(attempt: Attempt, row: JobRow, storage: Storage, outbox: Outbox) -> None:
     folder = JobFolder(storage, attempt.job_id, row.capture)
+    disk = DiskWatch()
+    try:
+        _train(row, folder, disk, outbox)
+    except Exception as error:
+        # Native code reports a full disk in many ways; the watch knows better.
+        if disk.error is not None and not hand_back.requested():
+            raise disk.error from error
+        raise
+    finally:
+        disk.close()
+    if patiently(attempt.lock.refresh) is LockState.lost:
+        _exit_superseded()
+    publish.publish(storage, attempt, row, folder.run / "out")
+    folder.remove()
+
+
+def _train(row: JobRow, folder: JobFolder, disk: DiskWatch, outbox: Outbox) -> None:
+    """Stage the capture and run the pipeline to its end. Raises HandedBack, DiskReserveReached and its errors."""
+    if disk.error is not None:
+        raise disk.error
+    storage = folder.storage
     restored = folder.restore()
     if restored:
         log.info("Resuming from %d files that an attempt on another machine stored.", len(restored))
@@ -137,21 +159,18 @@ def _train_and_publish(attempt: Attempt, row: JobRow, storage: Storage, outbox: 
                 folder.run,
                 row.options,
                 lambda event: _forward(event, folder, outbox),
-                hand_back.requested,
+                lambda: hand_back.requested() or disk.error is not None,
             )
     except BaseException as error:
         mirror.close(copy=hand_back.requested())
-        if isinstance(error, Exception) and not hand_back.requested() and not is_transient(error):
+        stopped = hand_back.requested() or disk.error is not None
+        if isinstance(error, Exception) and not stopped and not keeps_progress(error):
             folder.reset()
         raise
-    handed_back = result.ended == "cancelled"
-    mirror.close(copy=handed_back)
-    if handed_back:
-        raise HandedBack
-    if patiently(attempt.lock.refresh) is LockState.lost:
-        _exit_superseded()
-    publish.publish(storage, attempt, row, folder.run / "out")
-    folder.remove()
+    ended_early = result.ended == "cancelled"
+    mirror.close(copy=ended_early)
+    if ended_early:
+        raise HandedBack if disk.error is None or hand_back.requested() else disk.error
 
 
 def _forward(event: Event, folder: JobFolder, outbox: Outbox) -> None:

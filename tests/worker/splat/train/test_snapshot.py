@@ -6,6 +6,7 @@ Does not prove when snapshots and checkpoints are taken: test_train.py does.
 
 from __future__ import annotations
 
+import resource
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -198,3 +199,19 @@ def test_what_this_version_cannot_read_is_no_checkpoint(tmp_path: Path, spoil: s
         path.write_text("no checkpoint")
     assert checkpoint.load(tmp_path) is None
     assert checkpoint.load(tmp_path / "nowhere") is None
+
+
+def test_a_checkpoint_that_the_disk_does_not_take_is_an_error_of_the_disk_and_keeps_the_last_one(
+    tmp_path: Path,
+) -> None:
+    run = a_run(course())
+    checkpoint.save(tmp_path, run.snapshot())
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            checkpoint.save(tmp_path, run.snapshot())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert checkpoint.load(tmp_path) is not None
+    assert [path.name for path in tmp_path.iterdir()] == [checkpoint.NAME]

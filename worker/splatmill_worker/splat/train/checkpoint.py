@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import torch
 
@@ -21,8 +21,31 @@ FORMAT = 1
 
 def save(directory: Path, snapshot: Snapshot) -> None:
     """Replace the checkpoint in `directory`, atomically and synced. Raises OSError where that fails."""
-    with replacing(directory / NAME, sync=True) as part:
-        torch.save(_encoded(snapshot), part)
+    with replacing(directory / NAME, sync=True) as part, part.open("wb") as file:
+        stream = _Stream(file)
+        try:
+            torch.save(_encoded(snapshot), cast(BinaryIO, stream))  # torch calls write and flush alone
+        except RuntimeError as error:
+            # torch's own text says nothing of the disk
+            raise (stream.error or error) from error
+
+
+class _Stream:
+    """A file for torch to write to, which keeps the error of a write that failed."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.error: OSError | None = None
+
+    def write(self, data: bytes) -> int:
+        try:
+            return self._file.write(data)
+        except OSError as error:
+            self.error = error
+            raise
+
+    def flush(self) -> None:
+        self._file.flush()
 
 
 def load(directory: Path) -> Snapshot | None:
