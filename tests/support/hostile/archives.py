@@ -52,6 +52,13 @@ def wrong_checksum() -> bytes:
     return packed({"a.jpg": content}).replace(struct.pack("<I", zlib.crc32(content)), b"\1\2\3\4")
 
 
+def damaged_bzip2() -> bytes:
+    """A zip with bzip2 data of which a byte is wrong."""
+    data = bytearray(packed({"a.jpg": photo()}, zipfile.ZIP_BZIP2))
+    data[60] ^= 0xFF
+    return bytes(data)
+
+
 def overlapping(entries: int = 200) -> bytes:
     """A zip whose entries all name the same packed bytes: each is small, together they are a bomb."""
     data = packed({"0000.jpg": bytes(range(256)) * 400})

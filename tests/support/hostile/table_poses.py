@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import struct
 
-from tests.support.hostile import models
+from PIL import Image
+
+from tests.support.hostile import models, pictures
 from tests.support.hostile.bench import Answer, Bench
 from tests.support.hostile.entry import Hostile
+from tests.support.hostile.pictures import encoded, photo
 
 INVALID = "the job fails: `poses_invalid`"
 USED = "used: 3 cameras"
@@ -16,6 +19,16 @@ UNUSABLE = "the job fails: `start_unusable`"
 
 def _transforms(what: str, data: bytes, kind: str = INVALID, said: str = "") -> Hostile:
     return Hostile("Poses", what, lambda bench: bench.posed({"poses/transforms.json": data}), kind, said)
+
+
+def _beside(what: str, name: str, data: bytes | None, kind: str, said: str) -> Hostile:
+    """Cameras as they should be, and one other file; None: the bomb."""
+
+    def give(bench: Bench) -> Answer:
+        content = pictures.bomb() if data is None else data
+        return bench.posed({"poses/transforms.json": models.transforms(), name: content})
+
+    return Hostile("Photos and masks with given cameras", what, give, kind, said)
 
 
 def _colmap(what: str, changes: dict[str, bytes | None], kind: str = INVALID, said: str = "") -> Hostile:
@@ -96,6 +109,22 @@ POSES = (
     _transforms("bytes that are not UTF-8", b'{"frames": "\xff"}', said="not readable JSON"),
     _transforms("a list for an object", b"[]", said="frames"),
     _transforms("65 MB", b" " * 65 * 2**20, said="at most"),
+    _transforms("a principal point at 1e300", models.transforms(cx=1e300), said="Frame 0"),
+    _beside("a photo of 675 megapixels", "images/1.jpg", None, "used: 2 cameras", "27000 x 25000 pixels"),
+    _beside(
+        "a photo that is cut off", "images/1.jpg", photo()[:-600], "the job fails: `image_truncated`", "1.jpg"
+    ),
+    _beside("a photo that is an EPS", "images/1.jpg", pictures.EPS, "used: 2 cameras", "not an image"),
+    _beside(
+        "a mask of 675 megapixels", "masks/1.png", None, "the job fails: `image_too_large`", "masks/1.png"
+    ),
+    _beside(
+        "a mask of another shape than its photo",
+        "masks/1.png",
+        encoded(Image.new("L", (64, 64)), "PNG"),
+        USED,
+        "shape differs",
+    ),
     _colmap("no points", {"points3D": None}, USED),
     _colmap("an empty file of points", {"points3D": b""}, USED),
     _colmap("2^50 points in 8 bytes", {"points3D": HUGE}, said="points3D.bin"),

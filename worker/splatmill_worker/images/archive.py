@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import lzma
 import stat
@@ -38,6 +39,9 @@ _LOCAL_HEADER_BYTES = 30
 
 _DAMAGED = (zipfile.BadZipFile, NotImplementedError, EOFError, zlib.error, lzma.LZMAError, struct.error)
 """What zipfile raises for damaged archives and for packing methods that it does not know."""
+
+_DAMAGED_ERRNOS = (None, errno.EINVAL)
+"""Of the OSErrors that bz2 raises for damaged data, and that places outside of the file lead to."""
 
 CHUNK = 2**20
 """Bytes written at a time; size and cancellation are checked in between."""
@@ -109,6 +113,10 @@ def unpack(
     except UnsafeArchive:
         raise
     except (*_DAMAGED, RuntimeError, ValueError) as error:
+        raise UnsafeArchive(f"it is not a complete zip file ({error})") from error
+    except OSError as error:
+        if error.errno not in _DAMAGED_ERRNOS:
+            raise
         raise UnsafeArchive(f"it is not a complete zip file ({error})") from error
 
 

@@ -158,6 +158,8 @@ def opened_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.V
         if not container.streams.video:
             raise UnusableVideo(path.name, "it contains no video")
         stream = container.streams.video[0]
+        if stream.codec_context is None:
+            raise UnusableVideo(path.name, "its video has a format that is not known")
         _check_frame(path.name, stream.width, stream.height)
         if stream.width * stream.height == 0:  # as FFmpeg leaves it for frames over max_pixels
             raise UnusableVideo(

@@ -28,6 +28,9 @@ MAX_NAME_BYTES = 4096
 MAX_SIDE = 1_000_000
 """Pixels of a side of a camera."""
 
+MAX_PARAMETER = 1e7
+"""Largest parameter of a camera: a focal length or a coordinate in pixels, or a coefficient of the lens."""
+
 MAX_DISTANCE = 1e12
 """Distance of a camera from the origin, in units of the model: squares of it are exact enough."""
 
@@ -75,7 +78,7 @@ def _check_values(model: pycolmap.Reconstruction) -> None:
                 f"Camera {number} of the COLMAP model is spherical; photos of such cameras are not used."
             )
         focal = [camera.params[index] for index in camera.focal_length_idxs()]
-        if not (np.isfinite(camera.params).all() and min(focal, default=1.0) > 0.0):
+        if not (np.abs(camera.params).max() <= MAX_PARAMETER and min(focal, default=1.0) > 0.0):
             raise ValueError(f"Camera {number} of the COLMAP model has the parameters {list(camera.params)}.")
         if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
             raise ValueError(

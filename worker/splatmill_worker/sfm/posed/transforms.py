@@ -22,7 +22,7 @@ from splatmill_worker.images import decoders
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
 from splatmill_worker.sfm.posed.files import ImageFiles
-from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_SIDE
+from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_PARAMETER, MAX_SIDE
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns the axes of a camera-to-world matrix from OpenGL's to OpenCV's."""
@@ -213,9 +213,11 @@ def _colmap_camera(values: dict[str, Any], name: str, photo: Path) -> pycolmap.C
         raise ValueError("it has no focal length; give fl_x or camera_angle_x.")
     cx, cy = float(values.get("cx", 0.5 * width)), float(values.get("cy", 0.5 * height))
     k1, k2, k3, k4, p1, p2 = (float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    if not all(map(math.isfinite, (fx, fy, cx, cy, k1, k2, k3, k4, p1, p2))) or fx <= 0 or fy <= 0:
+    largest = float(np.abs([fx, fy, cx, cy, k1, k2, k3, k4, p1, p2]).max())
+    if not (fx > 0 and fy > 0 and largest <= MAX_PARAMETER):
         raise ValueError(
-            f"the focal lengths are {fx} and {fy} pixels; they must be positive, and all intrinsics finite."
+            f"the focal lengths are {fx} and {fy} pixels; they must be positive, and all intrinsics at most "
+            f"{MAX_PARAMETER:.0e}."
         )
     if values.get("camera_model") == "OPENCV_FISHEYE" or values.get("is_fisheye"):
         model, extra = "OPENCV_FISHEYE", [k1, k2, k3, k4]
