@@ -1,15 +1,19 @@
 """Finds the caller of a request: by a key, by the cookie of a session, or as anybody on a server without keys."""
 
 import hmac
+import time
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 
+import redis
 from starlette.datastructures import Headers
-from starlette.requests import cookie_parser
+from starlette.requests import Request, cookie_parser
 from starlette.types import Scope
 
+from splatmill.backplane.storage import StorageError
 from splatmill_server.browsers import check_host, check_origin
 from splatmill_server.caller import BOOTSTRAP, KEYLESS, Caller
-from splatmill_server.keys import Keys, digest
+from splatmill_server.keys import CACHE_SECONDS, Keys, digest
 from splatmill_server.problems import ProblemError
 from splatmill_server.sessions import COOKIE, Session, Sessions
 from splatmill_server.settings import Settings
@@ -50,6 +54,22 @@ class Authentication:
             advice="Send the header 'Authorization: Bearer KEY'. A key in the address is ignored.",
             headers={"WWW-Authenticate": "Bearer"},
         )
+
+    def again(self, request: Request) -> Callable[[], Awaitable[bool]]:
+        """Return a function that tells whether the request would still be let in; it looks every CACHE_SECONDS."""
+        looked, let_in = time.monotonic(), True
+
+        async def permitted() -> bool:
+            nonlocal looked, let_in
+            if time.monotonic() - looked > CACHE_SECONDS:
+                try:
+                    await self.caller(request.scope, request.headers)
+                except (ProblemError, StorageError, redis.RedisError):
+                    let_in = False
+                looked = time.monotonic()
+            return let_in
+
+        return permitted
 
     def _of_bootstrap(self, sha256: str) -> Caller | None:
         known = self._bootstrap

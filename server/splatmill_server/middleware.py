@@ -16,7 +16,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import Problem, format_bytes
-from splatmill_server.authentication import Authentication
 from splatmill_server.caller import NOBODY, Caller
 from splatmill_server.permission import OPEN_PATHS
 from splatmill_server.problems import ProblemError, ProblemResponse, problem_of_redis, problem_of_storage
@@ -34,7 +33,7 @@ class RequestMiddleware:
 
     def __init__(self, app: ASGIApp, service: Service) -> None:
         self.app = app
-        self.authentication = Authentication(service.settings, service.keys, service.sessions)
+        self.authentication = service.authentication
         self.rate = Rate(service.redis_async)
         self.max_body = service.settings.max_json_bytes
         self.metrics = service.metrics

@@ -14,6 +14,7 @@ from redis.asyncio import Redis as AsyncRedis
 from splatmill.backplane import rendering
 from splatmill.backplane.connection import connect, connect_async
 from splatmill.backplane.storage import Storage, StorageError
+from splatmill_server.authentication import Authentication
 from splatmill_server.captures import Captures
 from splatmill_server.deliveries import Deliveries
 from splatmill_server.imports import Imports
@@ -78,6 +79,7 @@ class Service:
     jobs: Jobs
     models: Models
     keys: Keys
+    authentication: Authentication
     sessions: Sessions
     reaper: Reaper
     usage: Usage
@@ -99,6 +101,8 @@ class Service:
         quota = Quota(usage, captures, settings.quota)
         outgoing = Outgoing(settings.outgoing_allow)
         webhooks = Webhooks(storage, jobs)
+        stored_keys = Keys(storage, bootstrap=settings.api_key is not None)
+        sessions = Sessions(redis_async, settings.session_seconds, settings.redis_timeout)
         return cls(
             settings=settings,
             redis=connection,
@@ -115,8 +119,9 @@ class Service:
             deliveries=Deliveries(connection, webhooks, outgoing),
             jobs=jobs,
             models=Models(storage, jobs),
-            keys=Keys(storage, bootstrap=settings.api_key is not None),
-            sessions=Sessions(redis_async, settings.session_seconds, settings.redis_timeout),
+            keys=stored_keys,
+            authentication=Authentication(settings, stored_keys, sessions),
+            sessions=sessions,
             reaper=Reaper(connection, jobs, metrics, settings),
             usage=usage,
             quota=quota,

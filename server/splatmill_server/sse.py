@@ -8,7 +8,7 @@ in each generation of a job.
 import asyncio
 import heapq
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -64,9 +64,15 @@ class Position:
 
 
 class Follower:
-    """Reads the events of a job from a position on. Raises redis.RedisError if Redis cannot be reached."""
+    """Reads the events of a job from a position on. Raises redis.RedisError if Redis cannot be reached.
 
-    def __init__(self, service: Service, job_id: str, position: Position) -> None:
+    permitted: whether the reader may go on; asked again and again, because keys can be revoked.
+    """
+
+    def __init__(
+        self, service: Service, job_id: str, position: Position, permitted: Callable[[], Awaitable[bool]]
+    ) -> None:
+        self.permitted = permitted
         self.redis = service.redis_async
         self.closing = service.closing
         self.job_id = job_id
@@ -83,8 +89,8 @@ class Follower:
         return not self.fold.final
 
     async def records(self) -> AsyncIterator[EventRecord]:
-        """Yield the events that count, until the job ends or the server stops."""
-        while not self.closing.is_set():
+        """Yield the events that count, until the job ends, the server stops or the reader may not go on."""
+        while not self.closing.is_set() and await self.permitted():
             try:
                 row = JobRow.of(await self._reply(self.redis.hgetall(keys.job(self.job_id))))
             except UnreadableRecord as error:

@@ -158,6 +158,20 @@ def test_every_api_process_knows_of_a_change_within_the_stated_time(serve: Serve
     wait_for(lambda: me(other, ann["secret"]).status_code == 401, CACHE_SECONDS + 8)
 
 
+def test_a_stream_of_events_ends_with_its_key(app: ServedApp) -> None:
+    root = make(app, **ADMIN)
+    auth = bearer(root["secret"])
+    ann = make(app, root["secret"], name="ann", owner="ann")
+    app.http.headers.update(bearer(ann["secret"]))
+    job_id = app.job()
+    with app.http.stream("GET", f"/v1/jobs/{job_id}/events") as answer:
+        pieces = answer.iter_text()
+        assert "retry" in next(pieces)
+        assert app.http.delete(f"/v1/keys/{ann['id']}", headers=auth).status_code == 204
+        assert "failed" not in "".join(pieces)  # it ends, while the job goes on
+    assert app.http.get(f"/v1/jobs/{job_id}", headers=auth).json()["state"] == "queued"
+
+
 def test_the_key_of_the_setting_is_an_admin_beside_stored_keys(serve: Serve) -> None:
     app = serve(api_key="s3cret")
     ann = make(app, "s3cret", name="ann", owner="ann")

@@ -33,6 +33,7 @@ router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
 )
 async def follow_events(
     service: Shared,
+    request: Request,
     job_id: JobId,
     last_event_id: Annotated[
         str | None, Header(description="Id of the last event already received; the stream resumes after it.")
@@ -57,7 +58,7 @@ async def follow_events(
         if last_event_id:
             return Response(status_code=204)
         return StreamingResponse(stored_stream(job), media_type="text/event-stream", headers=headers)
-    follower = Follower(service, job_id, position)
+    follower = Follower(service, job_id, position, service.authentication.again(request))
     if not await follower.begin(row):
         return Response(status_code=204)
     stream = event_stream(follower, service.settings.heartbeat, service.metrics.streams)
