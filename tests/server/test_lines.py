@@ -170,8 +170,8 @@ def test_when_a_job_starts() -> None:
 def listen(connection: redis.Redis, name: str, *served: Line) -> None:
     """Register a worker, as RQ and the worker do."""
     connection.sadd("rq:workers", f"rq:worker:{name}")
-    connection.hset(f"rq:worker:{name}", mapping={"state": "idle"})
-    workers.announce(connection, f"rq:worker:{name}", served)
+    record: Any = {"state": "idle"} | workers.served(served)
+    connection.hset(f"rq:worker:{name}", mapping=record)
 
 
 def shown(app: ServedApp, job_id: str) -> tuple[Any, ...]:
@@ -223,3 +223,22 @@ def test_a_priority_is_kept_and_shown(app: ServedApp) -> None:
     photos = [("images", (f"{name}.jpg", b"\xff\xd8\xff " + name.encode())) for name in "ab"]
     made = app.http.post("/v1/jobs", files=[*photos, ("priority", (None, "9"))]).json()
     assert (made["priority"], made["queue_position"]) == (9, 0)
+
+
+def test_jobs_are_listed_while_redis_refuses_writes(app: ServedApp) -> None:
+    job_id = app.job()
+    app.redis.config_set("min-replicas-to-write", "1")
+    try:
+        assert shown(app, job_id)[0] == 0
+        app.redis.config_set("min-replicas-to-write", "0")
+        late = app.job()
+        lines.withdraw(app.redis, f"{late}-1")
+        app.redis.hset(f"rq:job:{late}-1", "status", "queued")
+        app.redis.rpush(entries.open_queue(app.redis).key, f"{late}-1")
+        app.redis.config_set("min-replicas-to-write", "1")
+        # It cannot be sorted into its line now, so that its position is not known.
+        assert shown(app, late) == (None, None, False)
+        assert len(app.http.get("/v1/jobs").json()["jobs"]) == 2
+    finally:
+        app.redis.config_set("min-replicas-to-write", "0")
+    assert shown(app, late)[0] == 1

@@ -17,6 +17,7 @@ _LINES_FIELD = "splatmill_lines"
 class WorkerRecord:
     """A worker whose last heartbeat is not too old.
 
+    key: the key of its record.
     name: its name.
     lines: the lines that it serves; none for a worker of an earlier version.
     state: idle, busy, suspended, ...
@@ -24,6 +25,7 @@ class WorkerRecord:
     last_heartbeat: time of its last heartbeat by its own clock.
     """
 
+    key: str
     name: str
     lines: tuple[Line, ...]
     state: str
@@ -31,9 +33,9 @@ class WorkerRecord:
     last_heartbeat: datetime | None
 
 
-def announce(connection: redis.Redis, worker_key: str, lines: Sequence[Line]) -> None:
-    """Record which lines a worker serves."""
-    connection.hset(worker_key, _LINES_FIELD, ",".join(lines))
+def served(lines: Sequence[Line]) -> dict[str, str]:
+    """Return the fields of a worker's record that tell which lines it serves."""
+    return {_LINES_FIELD: ",".join(lines)}
 
 
 def listening(connection: redis.Redis) -> list[WorkerRecord]:
@@ -44,9 +46,7 @@ def listening(connection: redis.Redis) -> list[WorkerRecord]:
             pipe.hgetall(worker_key)
         replies = cast(list[dict[bytes, bytes]], pipe.execute())
     return [
-        _record(
-            worker_key.decode().rpartition(":")[2], {key.decode(): value for key, value in stored.items()}
-        )
+        _record(worker_key.decode(), {key.decode(): value for key, value in stored.items()})
         for worker_key, stored in zip(known, replies, strict=True)
         if stored and b"death" not in stored
     ]
@@ -57,11 +57,12 @@ def serving(workers: Iterable[WorkerRecord], line: Line) -> list[WorkerRecord]:
     return [worker for worker in workers if line in worker.lines]
 
 
-def _record(name: str, stored: dict[str, Any]) -> WorkerRecord:
-    served = stored.get(_LINES_FIELD, b"").decode().split(",")
+def _record(worker_key: str, stored: dict[str, Any]) -> WorkerRecord:
+    names = stored.get(_LINES_FIELD, b"").decode().split(",")
     return WorkerRecord(
-        name=name,
-        lines=tuple(line for line in LINES if line in served),
+        key=worker_key,
+        name=worker_key.rpartition(":")[2],
+        lines=tuple(line for line in LINES if line in names),
         state=stored.get("state", b"?").decode(),
         entry=stored.get("current_job", b"").decode() or None,
         last_heartbeat=_moment(stored.get("last_heartbeat", b"").decode()),

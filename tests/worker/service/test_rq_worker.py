@@ -17,7 +17,7 @@ from typing import Any, cast
 import pytest
 from rq.job import Callback
 
-from splatmill.backplane import entries, layout, leases, queue, workers
+from splatmill.backplane import entries, layout, leases, lines, queue, workers
 from splatmill.backplane.row import now
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Backend, Job, Role, TrainOptions
@@ -248,3 +248,19 @@ def test_a_worker_whose_record_expired_while_redis_was_away_is_listed_again(
         connection.delete("rq:workers", f"rq:workers:{entries.TRAIN}")
         (after,) = wait_for(lambda: workers.listening(connection))
         assert (after.name, after.lines) == (before.name, before.lines)
+
+
+def test_an_entry_that_a_dead_worker_of_the_first_version_had_taken_runs(
+    redis_server: RedisServer, storage: Storage, tmp_path: Path
+) -> None:
+    connection = redis_server.connection
+    write_row(connection, "job00001")
+    assert queue.enqueue(connection, "job00001", 1)
+    lines.withdraw(connection, "job00001-1")
+    connection.hset("rq:job:job00001-1", "status", "queued")
+    # Between taking an entry and registering it, that version kept it here; its record has expired since.
+    connection.rpush(f"rq:queue:{entries.TRAIN}:intermediate", "job00001-1")
+    connection.sadd("rq:workers", "rq:worker:earlier")
+    connection.sadd(f"rq:workers:{entries.TRAIN}", "rq:worker:earlier")
+    with worker(redis_server, storage, tmp_path):
+        assert wait_for(partial(ended, redis_server, "job00001")).state == "succeeded"

@@ -15,7 +15,7 @@ from rq import Worker
 from rq.executions import Execution
 from rq.worker_registration import get_keys
 
-from splatmill.backplane import keys, leases, lines
+from splatmill.backplane import keys, leases, lines, workers
 from splatmill.backplane.entries import split_rq_id
 from splatmill.backplane.leases import Lease
 from splatmill.backplane.process import ProcessIdentity, wait_gone
@@ -26,9 +26,9 @@ _PROCESS_FIELD = "splatmill_process"
 _KILL_SECONDS = 5.0
 
 
-def record_process(worker: Worker) -> None:
-    """Store the identity of this process in the worker's record."""
-    worker.connection.hset(worker.key, _PROCESS_FIELD, json.dumps(ProcessIdentity.of(os.getpid()).dump()))
+def process_fields() -> dict[str, str]:
+    """Return the fields of a worker's record with the identity of this process."""
+    return {_PROCESS_FIELD: json.dumps(ProcessIdentity.of(os.getpid()).dump())}
 
 
 def is_recorded(worker: Worker) -> bool:
@@ -62,9 +62,10 @@ def requeue_orphans(worker: Worker) -> None:
     dead = {key for key in others if _worker_is_dead(worker.connection, key)}
     for lease in leases.held(worker.connection):
         _requeue_if_orphaned(worker, lease)
-    if set(others) == dead:
-        # Workers of earlier versions keep an entry in this list between taking it and registering it. With no other
-        # worker alive, every entry in it belonged to a dead one.
+    living = [found for found in workers.listening(worker.connection) if found.key not in dead]
+    if all(found.lines for found in living):
+        # Workers of earlier versions, which serve no lines, keep an entry in this list between taking it and
+        # registering it. With none of them alive, every entry in it belonged to a dead one.
         for entry_id in queue.intermediate_queue.get_job_ids():
             if worker.connection.lrem(queue.intermediate_queue_key, 1, entry_id):
                 queue.push_job_id(entry_id)

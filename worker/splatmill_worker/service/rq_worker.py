@@ -129,10 +129,9 @@ class AttemptWorker(Worker):
         try:
             super().heartbeat(timeout or entries.WORKER_TTL, pipeline)
             if pipeline is None and not recovery.is_recorded(self):
-                self.connection.hset(self.key, mapping=self.serialize())
+                record: Any = self.serialize() | {"state": self.get_state()}
+                self.connection.hset(self.key, mapping=record)
                 register(self)
-                self.set_state(self.get_state())
-                self._record()
         except redis.RedisError as error:
             self.log.warning("Worker %s: Redis took no heartbeat: %s", self.name, error)
 
@@ -163,12 +162,11 @@ class AttemptWorker(Worker):
 
     def register_birth(self) -> None:
         super().register_birth()  # type: ignore[no-untyped-call]  # rq lacks types here and below
-        self._record()
         recovery.requeue_orphans(self)
 
-    def _record(self) -> None:
-        recovery.record_process(self)
-        workers.announce(self.connection, self.key, self._served)
+    def serialize(self) -> dict[str, Any]:
+        """Return the worker's record: RQ's, with its process and the lines that it serves."""
+        return super().serialize() | recovery.process_fields() | workers.served(self._served)
 
     def run_maintenance_tasks(self) -> None:
         try:
@@ -400,6 +398,8 @@ class AttemptWorker(Worker):
         ended = recovery.ended_attempt(self.connection, job.id, self._lock, ours)
         self._lock.release()
         if process_exit.clean:
+            if self.connection.hget(job.key, "status") != JobStatus.FINISHED.value.encode():
+                return  # a transient failure, which waits again
             lines.took(self.connection, self._line, time.monotonic() - self._began)
             return
         if self._superseded or not Job.exists(job.id, self.connection):
