@@ -57,7 +57,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        loops = (service.reaper.run, service.imports.run, service.deliveries.run)
+        loops = (service.reaper.run, service.imports.run, service.deliveries.run, service.sweeper.run)
         tasks = [asyncio.create_task(loop()) for loop in loops]
         clean_up = asyncio.create_task(run_in_threadpool(_clean_up, service))
         try:

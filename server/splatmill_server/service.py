@@ -30,6 +30,8 @@ from splatmill_server.settings import Settings
 from splatmill_server.space.deletion import Deletion
 from splatmill_server.space.ledger import Ledger
 from splatmill_server.space.quota import Quota
+from splatmill_server.space.retention import Ages
+from splatmill_server.space.sweeper import Sweeper
 from splatmill_server.space.usage import Usage
 from splatmill_server.webhooks import Webhooks
 
@@ -85,6 +87,7 @@ class Service:
     usage: Usage
     quota: Quota
     deletion: Deletion
+    sweeper: Sweeper
     closing: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server is stopped, so that event streams end and do not delay it."""
 
@@ -99,6 +102,7 @@ class Service:
         captures = Captures(storage, settings, metrics)
         usage = Usage(storage, Ledger(connection))
         quota = Quota(usage, captures, settings.quota)
+        deletion = Deletion(connection, storage, captures, jobs, usage.ledger)
         outgoing = Outgoing(settings.outgoing_allow)
         webhooks = Webhooks(storage, jobs)
         stored_keys = Keys(storage, bootstrap=settings.api_key is not None)
@@ -125,7 +129,8 @@ class Service:
             reaper=Reaper(connection, jobs, metrics, settings),
             usage=usage,
             quota=quota,
-            deletion=Deletion(connection, storage, captures, jobs, usage.ledger),
+            deletion=deletion,
+            sweeper=Sweeper(usage, deletion, captures, _ages(settings), settings.sweep_interval),
         )
 
     async def close(self) -> None:
@@ -134,6 +139,16 @@ class Service:
         self.redis.close()
         if self.renderer is not None:
             await self.renderer.aclose()
+
+
+def _ages(settings: Settings) -> Ages:
+    return Ages(
+        captures=settings.keep_captures,
+        failed_jobs=settings.keep_failed_jobs,
+        work=settings.keep_work,
+        models=settings.keep_models,
+        orphans=settings.keep_orphans,
+    )
 
 
 def _renderer(settings: Settings) -> httpx.AsyncClient | None:

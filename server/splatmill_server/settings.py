@@ -9,7 +9,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from splatmill.backplane import rendering
 from splatmill.backplane.connection import DEFAULT_URL
-from splatmill.schema import DEFAULT_PORT, ByteSize
+from splatmill.schema import DEFAULT_PORT, ByteSize, Duration
 from splatmill_server import outgoing
 
 
@@ -87,6 +87,33 @@ class Settings(BaseSettings):
         gt=0,
         description="Bytes that the records of one owner may occupy in storage, such as 50GB, unless a key has a "
         "limit of its own. Left out, there is no limit.",
+    )
+
+    keep_captures: Duration | None = Field(
+        default=None,
+        gt=0,
+        description="Age at which captures are deleted, such as 30d, since a file was stored or a job on it ended.",
+    )
+    keep_failed_jobs: Duration | None = Field(
+        default=None, gt=0, description="Age at which jobs without a model are deleted, since their end."
+    )
+    keep_work: Duration | None = Field(
+        default=None,
+        gt=0,
+        description="Age at which the files from which a job resumes are deleted, since its end. Workers read it too.",
+    )
+    keep_models: Duration | None = Field(
+        default=None,
+        gt=0,
+        description="Age at which models and their jobs are deleted, since the end of the job.",
+    )
+    keep_orphans: Duration = Field(
+        default=86400.0,
+        gt=0,
+        description="Age at which files are deleted whose record is missing, since their last write.",
+    )
+    sweep_interval: Duration = Field(
+        default=600.0, gt=0, description="Seconds between two searches for what has reached its age."
     )
 
     redis_timeout: float = Field(default=5.0, gt=0, description="Seconds to wait for a reply of Redis.")

@@ -37,6 +37,15 @@ def queues() -> str | None:
     return os.environ.get("SPLATMILL_QUEUES") or None
 
 
+def keep_work() -> float | None:
+    """Return SPLATMILL_KEEP_WORK in seconds, the age at which folders of ended jobs are removed, or None: never.
+
+    Raises ValueError.
+    """
+    found: float | None = _read("SPLATMILL_KEEP_WORK", parse_duration, None)
+    return found
+
+
 def work_folder(job_id: str) -> Path:
     """Return the folder that the attempts at a job on this machine share."""
     return data_folder() / "work" / job_id

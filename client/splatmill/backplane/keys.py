@@ -109,6 +109,16 @@ DELETIONS = PREFIX + "deletions"
 """Hash with the deletions of records that have begun and not ended, by kind and id. Only the server writes it."""
 
 
+SWEPT = PREFIX + "swept"
+"""A string that exists while no API process needs to sweep storage, since one has. It expires."""
+
+
+def job_of(name: str) -> str | None:
+    """Return the id in the name of a key of a job, or None for another key."""
+    head = PREFIX + "job:"
+    return name.removeprefix(head).partition(":")[0] if name.startswith(head) else None
+
+
 def deleting(record: str) -> str:
     """Return the key of a string that says that a record (kind and id) is being deleted, or was. It expires.
 

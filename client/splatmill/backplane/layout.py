@@ -58,6 +58,16 @@ def is_derived(kind: str, inside: str) -> bool:
     return (kind, inside.partition("/")[0]) in (("captures", "sfm"), ("jobs", "work"))
 
 
+def digest_of(path: str) -> tuple[str, str] | None:
+    """Return role and name of the file whose digest lies at a path, or None for a path of another kind."""
+    parts = path.split("/", 4)
+    return (
+        (parts[3], parts[4])
+        if len(parts) == 5 and parts[2] == "sha256" and parts[3] in Role.__members__
+        else None
+    )
+
+
 def captures() -> str:
     return "captures"
 

@@ -6,6 +6,7 @@ let the API pass files through without holding them in memory.
 """
 
 import os
+import re
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -31,6 +32,9 @@ _S3_RETRY: "RetryConfig" = {"max_retries": 4, "retry_timeout": timedelta(seconds
 """By default, obstore retries for three minutes, which is longer than a client of the API waits."""
 
 _FULL = ("os error 28", "os error 122", "os error 27", "No space left", "QuotaExceeded", "StorageFull")
+
+
+_STAGED = re.compile(r"#\d+\Z", re.ASCII)
 
 
 class StorageError(Exception):
@@ -201,6 +205,19 @@ class Storage:
         for entry in entries:
             self.delete(entry.path)
         return len(entries)
+
+    def delete_staged(self, seconds: float) -> int:
+        """Delete the files of all writes that a killed process left unfinished longer ago, and return their number.
+
+        Only a local folder has such files: those in which a write is staged, `name#1`, which are not listed.
+        """
+        before, deleted = datetime.now(UTC).timestamp() - seconds, 0
+        for path in self.root.rglob("*#*") if self.root is not None else ():
+            with suppress(FileNotFoundError):
+                if _STAGED.search(path.name) and path.is_file() and path.stat().st_mtime < before:
+                    path.unlink()
+                    deleted += 1
+        return deleted
 
     def download(self, path: str, target: Path) -> None:
         """Copy a stored file to a local path, atomically. Raises FileNotFoundError."""

@@ -70,7 +70,10 @@ class StoredRecord(Response):
 class PlannedDeletion(Response):
     """What the next sweep deletes, and why."""
 
-    kind: str
+    kind: str = Field(
+        description="capture; job, with its model; work, the files from which a job resumes; or orphan, a folder "
+        "without a record."
+    )
     id: str
     owner: str | None = None
     bytes: int = Field(ge=0)

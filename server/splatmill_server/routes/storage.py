@@ -4,12 +4,14 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query
 
-from splatmill.schema import StorageUse
+from splatmill.schema import PlannedDeletion, StorageUse
 from splatmill_server.caller import Caller, Who
 from splatmill_server.ownership import ListedOwner
 from splatmill_server.routes.openapi import problems
 from splatmill_server.service import Service, Shared
 from splatmill_server.space.ledger import NOBODY
+from splatmill_server.space.retention import expiry, plan
+from splatmill_server.space.sweeper import MOST
 from splatmill_server.space.usage import largest
 
 router = APIRouter(tags=["service"])
@@ -32,10 +34,23 @@ def get_storage(
     usage.refresh(OLDEST)
     owners = usage.ledger.owners() if owner is None else [owner]
     uses = [usage.owner_use(found, _limit(service, who, found)) for found in owners]
+    snapshot, ages = usage.snapshot(), service.sweeper.ages
+    deletions = [
+        PlannedDeletion(
+            kind=found.action,
+            id=found.held.id,
+            owner=found.held.owner,
+            bytes=found.bytes,
+            reason=found.reason,
+        )
+        for found in plan(snapshot, ages, usage.ledger.clock())
+        if owner is None or found.held.owner == owner
+    ]
     return StorageUse(
         scanned_at=usage.scanned_at(),
         owners=sorted(uses, key=lambda use: (-use.bytes, use.owner or "")),
-        largest=largest(usage.snapshot(), owner, count),
+        largest=largest(snapshot, expiry(snapshot, ages), owner, count),
+        deletions=deletions[:MOST],
     )
 
 

@@ -86,6 +86,25 @@ class Deletion:
                 self.ledger.deleted(kind, job_id, owner)
         return True
 
+    def work(self, job_id: str, still: Callable[[], bool]) -> bool:
+        """Delete the files from which a job that has ended would resume. Return False if `still` does."""
+        model = Holding(kind=StoredKind.model, id=job_id).key
+        with self._marked(model):
+            if any(use.id == job_id for use in unfinished_jobs(self.connection)) or not still():
+                return False
+            self.storage.delete_prefix(layout.job_work(job_id))
+        return True
+
+    def orphan(self, held: Holding, still: Callable[[], bool]) -> bool:
+        """Delete a folder whose record is missing. Return False if `still` does, or if a job needs it."""
+        with self._marked(held.key) as mark:
+            if self._user(held.key) is not None or not still():
+                return False
+            mark.begin()
+            self.storage.delete_prefix(held.folder)
+            self.ledger.deleted(held.kind, held.id, held.owner)
+        return True
+
     def unused_capture(self, capture: Capture) -> None:
         """Delete a capture that nobody else knows yet, also while Redis cannot be reached."""
         self.captures.delete(capture.id)
@@ -148,10 +167,14 @@ class _Mark:
         self.connection = connection
         self.record = record
         self.begun = False
+        self._mine = False
 
     def set(self) -> None:
         """Keep new jobs from using the record."""
-        self.connection.set(keys.deleting(self.record), DELETING, ex=_MARK_SECONDS)
+        name = keys.deleting(self.record)
+        self._mine = bool(self.connection.set(name, DELETING, ex=_MARK_SECONDS, nx=True))
+        if not self._mine and self.connection.get(name) != DELETING:
+            self._mine = bool(self.connection.set(name, DELETING, ex=_MARK_SECONDS))
 
     def begin(self) -> None:
         """Note that files are deleted from here on, so that a sweep finishes it if this process cannot."""
@@ -164,7 +187,8 @@ class _Mark:
         self.connection.hdel(keys.DELETIONS, self.record)
 
     def remove(self) -> None:
-        """Let jobs use the record again."""
-        self.connection.delete(keys.deleting(self.record))
+        """Let jobs use the record again, unless another process deletes it."""
+        if self._mine:
+            self.connection.delete(keys.deleting(self.record))
         if self.begun:
             self.connection.hdel(keys.DELETIONS, self.record)

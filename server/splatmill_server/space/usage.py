@@ -3,7 +3,6 @@
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 import redis
@@ -15,8 +14,9 @@ from splatmill.backplane import keys
 from splatmill.backplane.storage import Entry, Storage
 from splatmill.schema import OwnerUse, StoredBytes, StoredKind, StoredRecord
 from splatmill_server.space.holdings import Holding, scan, sums
-from splatmill_server.space.job_uses import JobUse, all_jobs
+from splatmill_server.space.job_uses import all_jobs
 from splatmill_server.space.ledger import NOBODY, Account, Ledger
+from splatmill_server.space.snapshot import Snapshot
 
 log = structlog.get_logger()
 
@@ -28,39 +28,6 @@ _LOCK_SECONDS = 30.0
 
 _FIRST_SCAN_SECONDS = 60
 """Seconds to wait for another process that makes the first scan."""
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """All records in storage and how jobs use them.
-
-    holdings: by key.
-    jobs: what jobs use, by the id of the job.
-    needed: the id of an unfinished job by the key of each record that it needs.
-    last_used: seconds since 1970 by the key of the record.
-    """
-
-    holdings: Mapping[str, Holding]
-    jobs: Mapping[str, JobUse]
-    needed: Mapping[str, str] = field(default_factory=dict)
-    last_used: Mapping[str, float] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, holdings: Iterable[Holding], jobs: Mapping[str, JobUse]) -> "Snapshot":
-        """Return the snapshot of these records and jobs."""
-        held = {found.key: found for found in holdings}
-        needed: dict[str, str] = {}
-        last_used = {key: found.modified for key, found in held.items()}
-        for use in jobs.values():
-            for key in use.records:
-                last_used[key] = max(last_used.get(key, 0.0), use.last_heard)
-                if use.unfinished:
-                    needed[key] = use.id
-        for found in held.values():
-            if found.kind is StoredKind.model and found.capture is not None:
-                key = Holding(kind=StoredKind.capture, id=found.capture).key
-                last_used[key] = max(last_used.get(key, 0.0), found.modified)
-        return cls(held, jobs, needed, last_used)
 
 
 class Usage:
@@ -151,8 +118,13 @@ class Usage:
         return moment(last.began if last is not None else self.ledger.clock())
 
 
-def largest(snapshot: Snapshot, owner: str | None, count: int) -> list[StoredRecord]:
-    """Return the largest records, largest first; with `owner`, only theirs."""
+def largest(
+    snapshot: Snapshot, expires: Mapping[str, float], owner: str | None, count: int
+) -> list[StoredRecord]:
+    """Return the largest records, largest first; with `owner`, only theirs.
+
+    expires: when records reach their age, in seconds since 1970, by key.
+    """
     wanted = [held for held in snapshot.holdings.values() if owner is None or held.owner == owner]
     wanted.sort(key=lambda held: (-held.size, held.key))
     return [
@@ -165,6 +137,7 @@ def largest(snapshot: Snapshot, owner: str | None, count: int) -> list[StoredRec
             files=held.files,
             last_used=moment(snapshot.last_used[held.key]),
             needed_by=snapshot.needed.get(held.key),
+            expires_at=moment(expires[held.key]) if held.key in expires else None,
         )
         for held in wanted[:count]
     ]

@@ -3,6 +3,9 @@
 Does not prove that S3 works: tests/server/test_storage does where there is a bucket.
 """
 
+import os
+import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -12,10 +15,11 @@ from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import Role
 from splatmill_worker.errors import CaptureIncomplete, FolderInUse, StartNotStored
 from splatmill_worker.service import job_folder
-from splatmill_worker.service.job_folder import JobFolder, in_use
+from splatmill_worker.service.job_folder import JobFolder, hold
 from splatmill_worker.service.mirror import Mirror
 from splatmill_worker.service.problems import is_transient, problem_of
 from tests.support.jobs import CAPTURE
+from tests.support.waiting import wait_for
 
 JOB = "job00001"
 
@@ -125,12 +129,30 @@ def test_starting_over_keeps_the_cameras(local: Storage) -> None:
 
 def test_two_processes_never_share_a_folder(local: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = JobFolder(local, JOB, CAPTURE)
-    assert in_use(folder.path)
+    with hold(folder.path) as held:
+        assert not held
     monkeypatch.setattr(job_folder, "LOCK_SECONDS", 0.1)
     with pytest.raises(FolderInUse) as caught:
         JobFolder(local, JOB, CAPTURE)
     assert is_transient(caught.value)
     assert problem_of(caught.value).code == "worker_lost"
+
+
+def test_a_folder_that_is_removed_while_an_attempt_waits_for_it_is_made_anew(local: Storage) -> None:
+    before = JobFolder(local, JOB, CAPTURE)
+    (before.path / "old").touch()
+    before.close()
+    os.utime(before.path / "lock", (began := 1000.0, began))
+    with hold(before.path) as held:
+        assert held
+        waiting = ThreadPoolExecutor(1).submit(JobFolder, local, JOB, CAPTURE)
+        wait_for(lambda: (before.path / "lock").stat().st_mtime > began)
+        shutil.rmtree(before.path)
+    after = waiting.result(10)
+    assert (after.path / "lock").is_file()
+    assert not (after.path / "old").exists()
+    with hold(after.path) as held:
+        assert not held
 
 
 @pytest.mark.parametrize("where", ["local", "remote"])

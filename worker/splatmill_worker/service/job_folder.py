@@ -12,8 +12,8 @@ import fcntl
 import os
 import shutil
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from splatmill.backplane import layout
@@ -48,10 +48,9 @@ class JobFolder:
         self.job_id = job_id
         self.capture_id = capture_id
         self.path = work_folder(job_id)
-        self.path.mkdir(parents=True, exist_ok=True)
         self.capture = self.path / "capture"
         self.run = self.path / "run"
-        self._lock = _locked(self.path / "lock")
+        self._lock = _locked_folder(self.path)
 
     def stage_capture(self) -> int:
         """Make the capture folder equal to the stored capture; return the number of its files.
@@ -146,21 +145,42 @@ class JobFolder:
             self.storage.delete_prefix(layout.job_work(self.job_id))
 
 
-def in_use(folder: Path) -> bool:
-    """Return whether a process holds the lock of a job's folder."""
+@contextmanager
+def hold(folder: Path) -> Iterator[bool]:
+    """Hold the lock of a job's folder while the context is open; yield False if it is held, or if there is none."""
     try:
-        with (folder / "lock").open("a") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
+        descriptor = os.open(folder / "lock", os.O_WRONLY)
     except FileNotFoundError:
-        return False
-    return False
+        yield False
+        return
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+        else:
+            yield True
+    finally:
+        os.close(descriptor)
 
 
 def _is_whole(path: Path, entry: Entry) -> bool:
     """Whether `path` is a file of its own, not a symbolic link, with the size of the stored one."""
     return path.is_file() and not path.is_symlink() and path.stat().st_size == entry.size
+
+
+def _locked_folder(folder: Path) -> int:
+    """Make a folder if there is none, lock it, and return the descriptor of its lock.
+
+    A folder that is being removed is waited for, and made anew.
+    """
+    while True:
+        folder.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):
+            descriptor = _locked(folder / "lock")
+            if os.fstat(descriptor).st_nlink:
+                return descriptor
+            os.close(descriptor)
 
 
 def _locked(path: Path) -> int:

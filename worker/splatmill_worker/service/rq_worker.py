@@ -174,7 +174,11 @@ class AttemptWorker(Worker):
             if time.monotonic() >= self._remove_at:
                 self._remove_at = time.monotonic() + _REMOVAL_INTERVAL
                 for job_id in remove_abandoned(self.connection):
-                    self.log.info("Worker %s: removed the folder of the deleted job %s", self.name, job_id)
+                    self.log.info(
+                        "Worker %s: removed the folder of the job %s, which needs it no longer",
+                        self.name,
+                        job_id,
+                    )
         except redis.RedisError as error:
             self.log.warning("Worker %s: maintenance is put off: %s", self.name, error)
 

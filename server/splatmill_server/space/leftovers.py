@@ -1,0 +1,118 @@
+"""Deletes what no record names: digests without files in storage, and keys of jobs without a row in Redis."""
+
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import Any, cast
+
+import redis
+
+from splatmill.backplane import keys, layout
+from splatmill.backplane.storage import Storage
+from splatmill.schema import Role
+
+_PAGE = 1000
+
+
+def delete_digests(storage: Storage, seconds: float) -> int:
+    """Delete digests older than `seconds` whose files never came, and return their number.
+
+    An upload that takes up such a digest at the same moment keeps it: it is put back if the file is there afterwards.
+    """
+    before, deleted = time.time() - seconds, 0
+    for capture_id in storage.children(layout.captures()):
+        held = {entry.path: entry for entry in storage.walk(layout.capture(capture_id))}
+        for path, entry in held.items():
+            place = layout.digest_of(path)
+            if place is None or entry.modified.timestamp() >= before:
+                continue
+            file = layout.capture_file(capture_id, Role(place[0]), place[1])
+            if file in held or storage.exists(file):
+                continue
+            try:
+                digest = storage.get(path)
+            except FileNotFoundError:
+                continue
+            storage.delete(path)
+            deleted += 1
+            if storage.exists(file):
+                storage.put_new(path, digest)
+                deleted -= 1
+    return deleted
+
+
+def tidy_redis(connection: redis.Redis, seconds: float) -> dict[str, int]:
+    """Repair the list of jobs, and delete keys of jobs without a row that were not used for `seconds`.
+
+    Return the numbers of what was done: rows listed again, ids of the list without a row, and keys deleted.
+    """
+    relisted = unlisted = deleted = 0
+    for page in _pages(connection, f"{keys.job('*')}"):
+        for name in page:
+            job_id = keys.job_of(name)
+            if job_id is None or not layout.is_id(job_id):
+                continue
+            if name == keys.job(job_id):
+                relisted += _list_again(connection, job_id)
+            elif not connection.exists(keys.job(job_id)) and _idle(connection, name) >= seconds:
+                deleted += connection.delete(name)
+    for member in cast(list[bytes], connection.zrange(keys.JOBS, 0, -1)):
+        unlisted += _unlist(connection, member.decode())
+    return {"rows listed again": relisted, "ids without a row": unlisted, "keys without a row": deleted}
+
+
+def _pages(connection: redis.Redis, pattern: str) -> Iterator[list[str]]:
+    cursor = 0
+    while True:
+        cursor, found = cast(tuple[int, list[bytes]], connection.scan(cursor, match=pattern, count=_PAGE))
+        yield [name.decode("utf-8", "replace") for name in found]
+        if not cursor:
+            return
+
+
+def _idle(connection: redis.Redis, name: str) -> float:
+    """Return the seconds since a key was last used, or 0 if Redis does not say."""
+    try:
+        return float(cast(Any, connection.object("idletime", name)) or 0.0)
+    except redis.ResponseError:  # the policy maxmemory-policy *-lfu keeps no times
+        return 0.0
+
+
+def _list_again(connection: redis.Redis, job_id: str) -> int:
+    """Put a row into the list of jobs if it is missing there, and among the unfinished jobs, which the reaper sorts."""
+    if connection.zscore(keys.JOBS, job_id) is not None:
+        return 0
+
+    def repair(pipe: Any) -> None:
+        created = pipe.hget(keys.job(job_id), "created_at")
+        known = pipe.exists(keys.job(job_id))
+        pipe.multi()
+        if known:
+            pipe.zadd(keys.JOBS, {job_id: _milliseconds(created)}, nx=True)
+            pipe.sadd(keys.ACTIVE, job_id)
+
+    connection.transaction(repair, keys.job(job_id))
+    return 1
+
+
+def _milliseconds(created: bytes | None) -> int:
+    try:
+        return int(datetime.fromisoformat((created or b"").decode()).timestamp() * 1000)
+    except ValueError:
+        return int(datetime.now(UTC).timestamp() * 1000)
+
+
+def _unlist(connection: redis.Redis, job_id: str) -> int:
+    """Remove an id from the list of jobs if there is no row."""
+    removed = 0
+
+    def remove(pipe: Any) -> None:
+        nonlocal removed
+        removed = 0 if pipe.exists(keys.job(job_id)) else 1
+        pipe.multi()
+        if removed:
+            pipe.zrem(keys.JOBS, job_id)
+            pipe.srem(keys.ACTIVE, job_id)
+
+    connection.transaction(remove, keys.job(job_id))
+    return removed
