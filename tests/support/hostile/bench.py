@@ -158,6 +158,7 @@ class Bench:
 def bench() -> Iterator[Bench]:
     """Start the server and its Redis."""
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
+    logging.getLogger("python_multipart").setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
         place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hostile-")))
         url = stack.enter_context(empty_redis(place / "redis"))

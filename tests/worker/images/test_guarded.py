@@ -14,6 +14,7 @@ import av
 import pytest
 from PIL import Image
 
+from splatmill_worker import memory
 from splatmill_worker.errors import Refusal, UnusablePicture, UnusableVideo
 from splatmill_worker.images import archive, decode, guarded, video
 from splatmill_worker.images.prepare import prepare
@@ -135,6 +136,16 @@ def test_decoding_waits_for_room() -> None:
         assert order == ["small"]
     waiting.join(10)
     assert order == ["small", "large"]
+
+
+def test_the_memory_for_decoding_is_a_part_of_the_containers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "_ROOT", tmp_path)
+    everything = guarded.decoding_pixels()
+    write(tmp_path / "proc/self/cgroup", b"0::/\n")
+    write(tmp_path / "sys/fs/cgroup/memory.max", b"%d\n" % 2**30)
+    assert guarded.decoding_pixels() == 2**30 // 16 < everything
 
 
 @pytest.mark.parametrize("data", [videos.PLAYLIST, videos.CONCAT, b"x" * 5000, videos.video()[:300]])

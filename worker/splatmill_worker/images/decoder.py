@@ -57,7 +57,7 @@ def main() -> None:
     )
     from splatmill_worker.images import guarded
 
-    guarded.share_room(int(given["processes"]), int(given["room"]))
+    guarded.share_room(int(given["pixels"]), int(given["room"]))
     answered = _answers()
     write_message(answers, {"held": held})
     while (message := read_message(calls)) is not None:

@@ -147,7 +147,7 @@ class Decoders:
             "read": [str(path) for path in read],
             "write": [str(path) for path in write],
             "memory": MEMORY,
-            "processes": processes,
+            "pixels": guarded.decoding_pixels() // processes,
             "room": self._room.fileno(),
         }
         self._free: queue.LifoQueue[_Process | None] = queue.LifoQueue()

@@ -24,6 +24,7 @@ import pillow_heif
 from PIL import Image, UnidentifiedImageError
 
 from splatmill.schema.photos import MAX_PHOTO_PIXELS
+from splatmill_worker import memory
 from splatmill_worker.errors import UnusablePicture, UnusableVideo
 
 pillow_heif.register_heif_opener()
@@ -260,12 +261,19 @@ class _Room:
                 self._changed.notify_all()
 
 
-# A quarter of the machine's memory: what is decoded is copied once or twice before it is reduced.
-_ALL_PIXELS = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4 // _BYTES_PER_PIXEL
-_room = _Room(_ALL_PIXELS)
+def decoding_pixels() -> int:
+    """Return how many pixels may be in decoding at a time: a quarter of the memory of the machine or container.
+
+    What is decoded is copied once or twice before it is reduced.
+    """
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return min(total, memory.group_limit() or total) // 4 // _BYTES_PER_PIXEL
 
 
-def share_room(processes: int, lock: int) -> None:
-    """Take one of `processes` equal shares of the memory for decoding; larger pictures take turns by `lock`."""
+_room = _Room(decoding_pixels())
+
+
+def share_room(pixels: int, lock: int) -> None:
+    """Decode so many pixels at a time in this process; larger pictures take turns with other processes by `lock`."""
     global _room
-    _room = _Room(_ALL_PIXELS // processes, lock)
+    _room = _Room(pixels, lock)
