@@ -135,3 +135,15 @@ def test_files_have_the_digests_that_the_worker_stored(app: ServedApp) -> None:
     assert {name: found for name, found in digests().items() if found} == {"model.ply": digest}
     app.service.storage.put(path, json.dumps(record | {"sha256": "x"}).encode())
     assert set(digests().values()) == {None}
+
+
+def test_a_report_of_a_later_format_is_refused_by_name(app: ServedApp) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.finish(job_id)
+    path = layout.model_file(job_id, "report.json")
+    report = json.loads(app.service.storage.get(path)) | {"format": 2}
+    app.service.storage.put(path, json.dumps(report).encode())
+    found = problem(app.http.get(f"/v1/jobs/{job_id}/report"), 500, "model_corrupt")
+    assert "it has format 2, and this version reads formats up to 1" in found["detail"]
+    assert app.http.get(f"/v1/models/{job_id}").status_code == 200

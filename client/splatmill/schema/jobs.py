@@ -45,6 +45,15 @@ def _readable_options(value: Any) -> Any:
     return keep_readable(TrainOptions.model_validate, value)[0] if isinstance(value, dict) else value
 
 
+def _named_state(value: Any) -> Any:
+    # A newer server may have states that this version does not know; they are named as they are, and are not final.
+    if not isinstance(value, str) or value in set(JobState):
+        return value
+    state = str.__new__(JobState, value)
+    state._name_, state._value_ = value, value
+    return state
+
+
 class Job(Response):
     """A job as clients see it: the request, its state, and what its attempts reported."""
 
@@ -52,7 +61,7 @@ class Job(Response):
     capture: str
     name: str | None = None
     owner: Owner = DEFAULT_OWNER
-    state: JobState
+    state: Annotated[JobState, BeforeValidator(_named_state)]
     options: Annotated[TrainOptions, BeforeValidator(_readable_options)]
     priority: int = Field(default=0, description="Jobs of the owner with a higher priority are run first.")
     queue_position: int | None = Field(

@@ -77,6 +77,7 @@ class Report(Response):
 
     model_config = ConfigDict(extra="allow")
 
+    format: int = Field(default=1, description="Version of the format of the report.")
     curve: list[CurveRow]
     seconds: StageSeconds
     plan: dict[str, Any] = Field(default_factory=dict)

@@ -1,5 +1,6 @@
 """The endpoints for the outputs of a job: events, log, preview and report."""
 
+import json
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Header, Query
@@ -8,6 +9,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 
 from splatmill.backplane import events, layout
+from splatmill.backplane.records import check_format
 from splatmill.schema import Curve, LogPage, PreviewEvent, Report
 from splatmill_server import job_log
 from splatmill_server.files import file_response
@@ -140,10 +142,12 @@ def get_report(service: Shared, job_id: JobId) -> Report:
 def _report(service: Service, job_id: str) -> Report | None:
     """Return the stored report of a job, or None. Raises a problem for one that cannot be read."""
     try:
-        return Report.model_validate_json(service.storage.get(layout.model_file(job_id, "report.json")))
+        stored = json.loads(service.storage.get(layout.model_file(job_id, "report.json")))
+        check_format(stored)
+        return Report.model_validate(stored)
     except FileNotFoundError:
         return None
-    except ValueError as error:
+    except (ValueError, TypeError, AttributeError) as error:
         raise ProblemError(
             "model_corrupt", f"The report of the job {job_id} cannot be read: {error}."
         ) from error

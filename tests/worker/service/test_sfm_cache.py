@@ -16,7 +16,7 @@ def test_recovered_cameras_serve_the_next_job_on_the_capture(remote: Storage, tm
     for folder, names in ((whole, ("a.bin", "facts.json", "points3D.bin")), (unfinished, ("a.bin",))):
         folder.mkdir(parents=True)
         for name in names:
-            (folder / name).write_text(name)
+            (folder / name).write_text("{}" if name == "facts.json" else name)
     (first / "sfm/photos/database.db").write_text("only of use while the cameras are being recovered")
     assert sfm_cache.fetch(remote, CAPTURE, second) == 0
     assert sfm_cache.store(remote, CAPTURE, first) == 1
@@ -28,3 +28,16 @@ def test_recovered_cameras_serve_the_next_job_on_the_capture(remote: Storage, tm
     # A copy that broke off before its last file is no model, and is completed by the next.
     (second / "sfm/photos/model-1/facts.json").unlink()
     assert sfm_cache.fetch(remote, CAPTURE, second) == 1
+
+
+def test_cameras_whose_facts_are_damaged_are_not_used_and_replaced(remote: Storage, tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    model = "sfm/photos/model-1"
+    for folder, facts in ((first, "{"), (second, '{"facts": {}}')):
+        (folder / model).mkdir(parents=True)
+        (folder / model / "facts.json").write_text(facts)
+    assert sfm_cache.store(remote, CAPTURE, first) == 1
+    assert sfm_cache.fetch(remote, CAPTURE, tmp_path / "third") == 0
+    assert sfm_cache.store(remote, CAPTURE, second) == 1
+    assert sfm_cache.fetch(remote, CAPTURE, tmp_path / "third") == 1
+    assert (tmp_path / "third" / model / "facts.json").read_text() == '{"facts": {}}'

@@ -6,6 +6,7 @@ Not proven here: speed and quality on larger sets, which `bench sfm` measures.
 
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -95,6 +96,27 @@ def test_the_same_photos_are_read_back(
     np.testing.assert_array_equal(again.points, first.points)
     for a, b in zip(again.views, first.views, strict=True):
         np.testing.assert_array_equal(a.camera.viewmat, b.camera.viewmat)
+
+
+def test_a_stored_model_that_is_damaged_is_recovered_anew(
+    still_life: tuple[Path, dict[str, Camera]], solved: tuple[Scene, Path], tmp_path: Path
+) -> None:
+    first, workdir = solved
+    shutil.copytree(workdir, tmp_path / "work")
+    (facts,) = (tmp_path / "work").glob("sfm/*/model-*/facts.json")
+    facts.write_text("{")
+    stages: list[str] = []
+    again = sfm.reconstruct(
+        still_life[0],
+        None,
+        tmp_path / "work",
+        sfm.SfmOptions(),
+        lambda stage, *_: stages.append(stage),
+        lambda: False,
+    )
+    assert "mapping" in stages
+    assert "features" not in stages
+    assert len(again.views) == len(first.views)
 
 
 def test_a_cancelled_run_continues_from_what_it_stored(

@@ -4,10 +4,14 @@
 of the same name is the same model. The cache holds the same tree under `captures/{id}/sfm`.
 """
 
+import json
+import logging
 from pathlib import Path
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage
+
+log = logging.getLogger("splatmill_worker")
 
 _FOLDER = "sfm"
 _LAST_FILE = "facts.json"
@@ -23,10 +27,21 @@ def fetch(storage: Storage, capture_id: str, run: Path) -> int:
         folder = last.removesuffix(_LAST_FILE)
         if (run / _FOLDER / last).is_file():
             continue
+        if not _readable(storage.get(f"{prefix}/{last}")):
+            log.warning("The stored cameras %s of this capture are not readable and are not used.", folder)
+            storage.delete(f"{prefix}/{last}")  # so that `store` replaces them
+            continue
         for name in [*(n for n in names if n.startswith(folder) and n != last), last]:
             storage.download(f"{prefix}/{name}", run / _FOLDER / name)
         fetched += 1
     return fetched
+
+
+def _readable(document: bytes) -> bool:
+    try:
+        return isinstance(json.loads(document), dict)
+    except ValueError:
+        return False
 
 
 def store(storage: Storage, capture_id: str, run: Path) -> int:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -21,6 +23,8 @@ from splatmill_worker.sfm.final_model import final_model
 from splatmill_worker.sfm.model_store import is_stored, load_model, store_model
 from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions, fitted
 from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest, torch_threads
+
+log = logging.getLogger("splatmill_worker")
 
 
 def reconstruct(
@@ -60,14 +64,21 @@ def reconstruct_photos(
     stop_if(cancelled)
     folder = workdir / "sfm" / prepared.key[:24]
     stored = folder / f"model-{digest(VERSION, stereo.VERSION, pycolmap.__version__, options)}"
-    if not is_stored(stored):
-        threads = options.threads or os.cpu_count() or 1
-        groups = cameras.group(prepared.photos)
-        model = options.camera_model if options.camera_model != "auto" else "SIMPLE_RADIAL"
-        # Several pairs are matched at the same time, so that each torch call gets one thread.
-        with ThreadPoolExecutor(threads) as pool, torch_threads(1):
-            run = SfmRun(prepared, groups, model, options, folder, threads, pool, on_progress, cancelled)
-            store_model(run, final_model(run, _solve(run)), stored)
+    if is_stored(stored):
+        try:
+            return load_model(prepared, stored)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+            log.warning(
+                "The stored cameras are not readable and are recovered anew: %s: %s", stored.name, error
+            )
+            shutil.rmtree(stored)
+    threads = options.threads or os.cpu_count() or 1
+    groups = cameras.group(prepared.photos)
+    model = options.camera_model if options.camera_model != "auto" else "SIMPLE_RADIAL"
+    # Several pairs are matched at the same time, so that each torch call gets one thread.
+    with ThreadPoolExecutor(threads) as pool, torch_threads(1):
+        run = SfmRun(prepared, groups, model, options, folder, threads, pool, on_progress, cancelled)
+        store_model(run, final_model(run, _solve(run)), stored)
     return load_model(prepared, stored)
 
 

@@ -215,3 +215,15 @@ def test_a_checkpoint_that_the_disk_does_not_take_is_an_error_of_the_disk_and_ke
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert checkpoint.load(tmp_path) is not None
     assert [path.name for path in tmp_path.iterdir()] == [checkpoint.NAME]
+
+
+@pytest.mark.parametrize("damage", [b"", b"not a checkpoint", b"PK"])
+def test_a_checkpoint_that_is_not_readable_is_left_out_and_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: bytes
+) -> None:
+    (tmp_path / checkpoint.NAME).write_bytes(damage)
+    assert checkpoint.load(tmp_path) is None
+    assert "The checkpoint cannot be used" in caplog.text
+    torch.save({"format": 2}, tmp_path / checkpoint.NAME)
+    assert checkpoint.load(tmp_path) is None
+    assert "it has format 2, and this version reads 1" in caplog.text

@@ -66,6 +66,10 @@ class FinishedTraining:
     warnings: Sequence[str]
 
 
+FORMAT = 1
+"""Version of the format of report.json. A report without one has version 1."""
+
+
 def write_report(
     out: Path, planned: PlannedScene, finished: FinishedTraining, render: Renderer
 ) -> dict[str, Any]:
@@ -76,6 +80,7 @@ def write_report(
     trained, plan, offset = finished.trained, planned.plan, finished.exported.world.offset
     report: dict[str, Any] = plain(
         {
+            "format": FORMAT,
             "curve": [asdict(point) for point in trained.curve],
             "result": _result(trained, finished.exported.gaussians),
             "seconds": {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,13 +11,22 @@ from pathlib import Path
 
 from splatmill.files import atomic_write
 
+log = logging.getLogger("splatmill_worker")
+
 
 class Stages:
     """Wall seconds by stage name, kept in a file, so that a later attempt adds to those of earlier ones."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.seconds: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
+        self.seconds: dict[str, float] = {}
+        if path.is_file():
+            try:
+                self.seconds = {
+                    str(stage): float(seconds) for stage, seconds in json.loads(path.read_text()).items()
+                }
+            except (ValueError, TypeError, AttributeError) as error:
+                log.warning("The times of earlier attempts are not readable and count as 0: %s", error)
 
     @contextmanager
     def measured(self, stage: str) -> Iterator[None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import pickle
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +16,8 @@ from splatmill_worker.splat.train.curve import CurvePoint
 from splatmill_worker.splat.train.snapshot import Snapshot
 
 NAME = "checkpoint.pt"
+log = logging.getLogger("splatmill_worker")
+
 FORMAT = 1
 """Number of the file's format: the keys of `_encoded`. A file with another number is not read."""
 
@@ -58,8 +61,15 @@ def load(directory: Path) -> Snapshot | None:
         return None
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-        return _decoded(state) if state.get("format") == FORMAT else None
-    except (RuntimeError, EOFError, ValueError, OSError, KeyError, TypeError, pickle.UnpicklingError):
+        if state.get("format") != FORMAT:
+            raise ValueError(f"it has format {state.get('format')}, and this version reads {FORMAT}")
+        return _decoded(state)
+    except (
+        *(RuntimeError, EOFError, ValueError, OSError, KeyError, TypeError, AttributeError),
+        pickle.UnpicklingError,
+    ) as error:
+        text = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+        log.warning("The checkpoint cannot be used, so training starts anew: %s", text)
         return None
 
 
