@@ -3,11 +3,12 @@
 import uuid
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, Unpack
 
 import httpx
 from pydantic import ValidationError
 
+from splatmill.arguments import TrainArguments
 from splatmill.connection import RETRIES, TIMEOUT, Connection, read_answer
 from splatmill.downloads import AnyPath
 from splatmill.errors import invalid_request
@@ -31,6 +32,7 @@ from splatmill.schema import (
     StorageUse,
     TrainOptions,
 )
+from splatmill.server_choice import Verify
 from splatmill.uploads import OnProgress, Uploaded, key_of, upload
 from splatmill.webhooks import AsyncWebhooks
 
@@ -44,11 +46,19 @@ T = TypeVar("T")
 class AsyncClient:
     """A client of a Splatmill server. Use it as a context manager, or call `close`.
 
-    server: address of the server; by default SPLATMILL_SERVER, else the server on this machine.
-    api_key: key of the server; by default SPLATMILL_API_KEY.
+    server: address of the server; by default SPLATMILL_SERVER, else that of the profile SPLATMILL_PROFILE, else the
+        server on this machine.
+    api_key: key of the server; by default SPLATMILL_API_KEY, or that of the profile.
     timeout: seconds to wait for a connection or for data.
     transport: httpx transport; an `httpx.ASGITransport` calls an app in this process without a socket.
     retries: how often a failed request is sent again, if that is safe.
+    profile: name of a server in the file `config.toml`, in place of `server`.
+    verify: file or folder of the certificates to trust, an `ssl.SSLContext`, or False, which checks no certificate; by
+        default SPLATMILL_CA_BUNDLE, else the usual certificates.
+    headers: headers to send with every request, such as those that a proxy before the server asks for.
+    proxy: address of an HTTP proxy; by default that of the environment (HTTPS_PROXY).
+
+    Raises ConfigurationInvalid for a profile or certificates that cannot be used.
     """
 
     def __init__(
@@ -59,9 +69,21 @@ class AsyncClient:
         timeout: float | httpx.Timeout = TIMEOUT,
         transport: httpx.AsyncBaseTransport | None = None,
         retries: int = RETRIES,
+        profile: str | None = None,
+        verify: Verify | None = None,
+        headers: Mapping[str, str] | None = None,
+        proxy: str | None = None,
     ) -> None:
         self.connection = Connection(
-            server, api_key=api_key, timeout=timeout, transport=transport, retries=retries
+            server,
+            api_key=api_key,
+            timeout=timeout,
+            transport=transport,
+            retries=retries,
+            profile=profile,
+            verify=verify,
+            headers=headers,
+            proxy=proxy,
         )
         self.keys = AsyncKeys(self.connection)
         self.webhooks = AsyncWebhooks(self.connection)
@@ -82,7 +104,12 @@ class AsyncClient:
         return self.connection.server
 
     async def train(
-        self, path: AnyPath, *, name: str | None = None, on_progress: OnProgress | None = None, **options: Any
+        self,
+        path: AnyPath,
+        *,
+        name: str | None = None,
+        on_progress: OnProgress | None = None,
+        **options: Unpack[TrainArguments],
     ) -> AsyncJobHandle:
         """Upload the capture at `path` (photos, a zip archive, a video or a posed data set) and start a job on it.
 
@@ -93,8 +120,8 @@ class AsyncClient:
 
         Raises NothingToUpload, ConnectionFailed, or a subclass of `Refused`.
         """
-        options, model = with_start_model(options, path)
-        checked = train_options(options)
+        given, model = with_start_model(options, path)
+        checked = train_options(given)
         capture, uploaded = await self.upload(
             path, name=name, on_progress=on_progress, model=model, resume=True
         )

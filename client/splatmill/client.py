@@ -2,11 +2,12 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, Unpack
 
 import httpx
 
 from splatmill.aio import AsyncClient
+from splatmill.arguments import OrbitArguments, RenderArguments, TrainArguments
 from splatmill.connection import RETRIES, TIMEOUT
 from splatmill.downloads import AnyPath, OnBytes
 from splatmill.job import MOST_LINES, AsyncJobHandle
@@ -32,6 +33,7 @@ from splatmill.schema import (
     StorageUse,
     TrainOptions,
 )
+from splatmill.server_choice import Verify
 from splatmill.uploads import OnProgress, Uploaded
 from splatmill.webhooks import Webhooks
 
@@ -39,11 +41,19 @@ from splatmill.webhooks import Webhooks
 class Client:
     """A client of a Splatmill server. Use it as a context manager, or call `close`.
 
-    server: address of the server; by default SPLATMILL_SERVER, else the server on this machine.
-    api_key: key of the server; by default SPLATMILL_API_KEY.
+    server: address of the server; by default SPLATMILL_SERVER, else that of the profile SPLATMILL_PROFILE, else the
+        server on this machine.
+    api_key: key of the server; by default SPLATMILL_API_KEY, or that of the profile.
     timeout: seconds to wait for a connection or for data.
     transport: httpx transport; an `httpx.ASGITransport` calls an app in this process without a socket.
     retries: how often a failed request is sent again, if that is safe.
+    profile: name of a server in the file `config.toml`, in place of `server`.
+    verify: file or folder of the certificates to trust, an `ssl.SSLContext`, or False, which checks no certificate; by
+        default SPLATMILL_CA_BUNDLE, else the usual certificates.
+    headers: headers to send with every request, such as those that a proxy before the server asks for.
+    proxy: address of an HTTP proxy; by default that of the environment (HTTPS_PROXY).
+
+    Raises ConfigurationInvalid for a profile or certificates that cannot be used.
     """
 
     def __init__(
@@ -54,9 +64,21 @@ class Client:
         timeout: float | httpx.Timeout = TIMEOUT,
         transport: httpx.AsyncBaseTransport | None = None,
         retries: int = RETRIES,
+        profile: str | None = None,
+        verify: Verify | None = None,
+        headers: Mapping[str, str] | None = None,
+        proxy: str | None = None,
     ) -> None:
         self._async = AsyncClient(
-            server, api_key=api_key, timeout=timeout, transport=transport, retries=retries
+            server,
+            api_key=api_key,
+            timeout=timeout,
+            transport=transport,
+            retries=retries,
+            profile=profile,
+            verify=verify,
+            headers=headers,
+            proxy=proxy,
         )
         self._loop = BackgroundLoop()
         self.keys = Keys(self._loop, self._async.keys)
@@ -80,7 +102,12 @@ class Client:
         return self._async.connection.server
 
     def train(
-        self, path: AnyPath, *, name: str | None = None, on_progress: OnProgress | None = None, **options: Any
+        self,
+        path: AnyPath,
+        *,
+        name: str | None = None,
+        on_progress: OnProgress | None = None,
+        **options: Unpack[TrainArguments],
     ) -> "JobHandle":
         """Upload the capture at `path` (photos, a zip archive, a video or a posed data set) and start a job on it."""
         handle = self._loop.run_reporting(
@@ -296,14 +323,16 @@ class ModelHandle:
         """Return the cameras of the capture in the coordinates of the model; `split` marks the held-out ones."""
         return self._loop.run(self._async.cameras())
 
-    def render(self, camera: CameraSpec | Mapping[str, Any], **options: Any) -> bytes:
+    def render(self, camera: CameraSpec | Mapping[str, Any], **options: Unpack[RenderArguments]) -> bytes:
         """Render an image from `camera`, and return the bytes of the file.
 
         `options` are output, format, background and quality of `RenderRequest`.
         """
         return self._loop.run(self._async.render(camera, **options))
 
-    def orbit(self, path: AnyPath, *, timeout: float | None = None, **options: Any) -> Path:
+    def orbit(
+        self, path: AnyPath, *, timeout: float | None = None, **options: Unpack[OrbitArguments]
+    ) -> Path:
         """Render a video (MP4) that circles the scene, write it to `path`, and return the path written.
 
         `options` are the fields of `OrbitRequest`. `timeout` is the number of seconds to wait for the video; left out,

@@ -1,7 +1,6 @@
 """The HTTP connection to a server: API key, retries, and the conversion of responses into errors."""
 
 import asyncio
-import os
 import random
 from collections.abc import AsyncIterable, AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
@@ -13,12 +12,8 @@ import httpx
 from pydantic import BaseModel, ValidationError
 
 from splatmill.errors import ConnectionFailed, error_for
-from splatmill.schema.info import DEFAULT_PORT
 from splatmill.schema.problems import PROBLEM_MEDIA_TYPE, Problem, code_for_status
-
-DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
-SERVER_VARIABLE = "SPLATMILL_SERVER"
-API_KEY_VARIABLE = "SPLATMILL_API_KEY"
+from splatmill.server_choice import API_KEY_VARIABLE, DEFAULT_SERVER, Verify, choose_server, ssl_context
 
 # A read may have to wait for a render or for Redis to restart; connecting to a running server is quick.
 TIMEOUT = httpx.Timeout(60.0, connect=10.0)
@@ -53,19 +48,25 @@ class Connection:
         timeout: float | httpx.Timeout = TIMEOUT,
         transport: httpx.AsyncBaseTransport | None = None,
         retries: int = RETRIES,
+        profile: str | None = None,
+        verify: Verify | None = None,
+        headers: Mapping[str, str] | None = None,
+        proxy: str | None = None,
     ) -> None:
-        self.server = server or os.environ.get(SERVER_VARIABLE) or DEFAULT_SERVER
-        key = api_key if api_key is not None else os.environ.get(API_KEY_VARIABLE)
+        choice = choose_server(server, api_key=api_key, profile=profile, verify=verify, proxy=proxy)
+        self.server = choice.server
         url = _checked(self.server)
-        headers = {"User-Agent": "splatmill", "Accept": f"application/json, {PROBLEM_MEDIA_TYPE}, */*"}
-        if key:
-            headers["Authorization"] = f"Bearer {key}"
+        sent = {"User-Agent": "splatmill", "Accept": f"application/json, {PROBLEM_MEDIA_TYPE}, */*"}
+        if choice.api_key:
+            sent["Authorization"] = f"Bearer {choice.api_key}"
         self.retries = retries
         self.http = httpx.AsyncClient(
             base_url=url,
-            headers=headers,
+            headers=sent | dict(headers or {}),
             timeout=timeout,
             transport=transport,
+            verify=ssl_context(choice.verify) if url.scheme == "https" else True,
+            proxy=choice.proxy,
             # Requests to this machine must not go through a proxy that is set for other hosts.
             trust_env=url.host not in ("127.0.0.1", "localhost", "::1"),
         )

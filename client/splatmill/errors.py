@@ -15,6 +15,7 @@ SplatmillError
 ├── JobCancelled              the job was cancelled
 ├── WaitTimeout               the job has not ended within the given time; it continues
 ├── NothingToUpload           the path holds no photos, video or zip archive
+├── ConfigurationInvalid      a profile, or the certificates to trust, cannot be used
 ├── DownloadFailed            the downloaded bytes are not those of the file
 └── ServiceFailed             the embedded service could not be started
 """
@@ -132,6 +133,10 @@ class WaitTimeout(SplatmillError, TimeoutError):
 
 class NothingToUpload(SplatmillError):
     """The path holds no photos, video or zip archive, or a file that cannot be read or uploaded."""
+
+
+class ConfigurationInvalid(SplatmillError):
+    """A profile, or the certificates to trust, cannot be used."""
 
 
 class DownloadFailed(SplatmillError):

@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import httpx
 from pydantic import ValidationError
 
+from splatmill.arguments import OrbitArguments, RenderArguments
 from splatmill.connection import Connection, read_answer
 from splatmill.downloads import AnyPath, OnBytes, download, target_of
 from splatmill.errors import invalid_request
@@ -57,14 +58,16 @@ class AsyncModelHandle:
         response = await self.connection.request("GET", f"/v1/models/{self.id}/cameras")
         return read_answer(ModelCameras, response).cameras
 
-    async def render(self, camera: CameraSpec | Mapping[str, Any], **options: Any) -> bytes:
+    async def render(
+        self, camera: CameraSpec | Mapping[str, Any], **options: Unpack[RenderArguments]
+    ) -> bytes:
         """Render an image from `camera`, and return the bytes of the file.
 
         `options` are output, format, background and quality of `RenderRequest`. Raises InvalidRequest for a camera or
         options that are not valid.
         """
         try:
-            request = RenderRequest.model_validate({"camera": camera} | options)
+            request = RenderRequest.model_validate({**options, "camera": camera})
         except ValidationError as error:
             raise invalid_request(error, "camera_invalid") from error
         response = await self.connection.request(
@@ -77,7 +80,9 @@ class AsyncModelHandle:
         )
         return response.content
 
-    async def orbit(self, path: AnyPath, *, timeout: float | None = None, **options: Any) -> Path:
+    async def orbit(
+        self, path: AnyPath, *, timeout: float | None = None, **options: Unpack[OrbitArguments]
+    ) -> Path:
         """Render a video (MP4) that circles the scene, write it to `path`, and return the path written.
 
         `options` are the fields of `OrbitRequest`. `timeout` is the number of seconds to wait for the video; left out,

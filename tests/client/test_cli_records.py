@@ -4,7 +4,10 @@ A worker's part is played through the backplane. Does not prove what trains, nor
 """
 
 import json
+import os
 import signal
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -229,3 +232,22 @@ def test_a_download_shows_a_bar_and_resumes(service, at, jobs, tmp_path: Path):
     done = invoke("download", jobs[0], "-o", tmp_path, "--file", "none.txt", *at)
     assert done.exit_code == Exit.not_found
     assert "The files of a model are" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        (["rest"], {"restart"}),
+        (["train", "--preset", ""], {"draft", "balanced", "quality"}),
+        (["jobs", "--state", "f"], {"failed"}),
+        (["train", "--time-b"], {"--time-budget"}),
+        (["download", "--file", "rep"], {"report.json", "report.png", "report.html"}),
+    ],
+)
+def test_a_shell_completes_commands_options_and_values(words: list[str], offered: set[str]):
+    command = ["splatmill", *words]
+    asked = {"_SPLATMILL_COMPLETE": "complete_bash", "COMP_CWORD": str(len(words))}
+    asked["COMP_WORDS"] = " ".join(command)
+    program = Path(sys.executable).with_name("splatmill")
+    done = subprocess.run([program], env=os.environ | asked, capture_output=True, text=True, timeout=60)
+    assert set(done.stdout.split()) == offered

@@ -23,6 +23,7 @@ def test_every_problem_has_its_error(code: str):
         409: errors.Conflict,
         429: errors.TooManyRequests,
         500: errors.ServerError,
+        502: errors.ServerError,
         503: errors.Unavailable,
         504: errors.Unavailable,
         507: errors.Unavailable,

@@ -8,6 +8,7 @@ import typer.main
 from typer.core import TyperGroup
 
 from splatmill import __version__
+from splatmill.cli.servers import with_profile
 
 # The module and function of each command.
 COMMANDS = {
@@ -63,10 +64,13 @@ class Commands(TyperGroup):
             return None
         module, function = COMMANDS[cmd_name]
         found = getattr(import_module(module), function)
-        if not isinstance(found, typer.Typer):  # it is a group of commands otherwise
+        if isinstance(found, typer.Typer):  # a group of commands
+            for registered in found.registered_commands:
+                registered.callback = with_profile(registered.callback) if registered.callback else None
+        else:
             single = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
             settings = PASS_ARGUMENTS_ON if cmd_name in ("up", "doctor", "bench") else None
-            single.command(cmd_name, context_settings=settings)(found)
+            single.command(cmd_name, context_settings=settings)(with_profile(found))
             found = single
         command: Any = typer.main.get_command(found)
         command.name, command.rich_help_panel = cmd_name, heading_of(cmd_name)

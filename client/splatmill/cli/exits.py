@@ -33,6 +33,7 @@ _CODES: tuple[tuple[type[Exception], Exit], ...] = (
     (errors.InvalidRequest, Exit.refused),
     (errors.NothingToUpload, Exit.refused),
     (errors.ServiceFailed, Exit.no_service),
+    (errors.ConfigurationInvalid, Exit.usage),
 )
 
 MOST_ENTRIES = 10  # of a list among the facts of a problem

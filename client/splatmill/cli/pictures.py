@@ -110,7 +110,7 @@ def orbit(
     server: ServerOption = None,
 ) -> None:
     """Render a video that circles the scene of a model on a server, or of a .ply on this machine."""
-    options = {"seconds": seconds, "fps": fps, "width": width, "height": height}
+    options: dict[str, Any] = {"seconds": seconds, "fps": fps, "width": width, "height": height}
     if is_local(model_id):
         cameras = local_cameras(Path(model_id))
         _check_up(up, used=not cameras)

@@ -1,0 +1,70 @@
+"""The keyword arguments of `train`, `render` and `orbit`, for editors and type checkers.
+
+Generated from the schema by `python -m tests.support.arguments`.
+"""
+
+import os
+from collections.abc import Sequence
+from typing import Literal, TypedDict
+
+from splatmill.schema import (
+    Backend,
+    Background,
+    Effort,
+    Format,
+    Mapper,
+    Matcher,
+    Output,
+    Preset,
+    Switch,
+)
+
+
+class TrainArguments(TypedDict, total=False):
+    """The settings of a training: the fields of `TrainOptions`."""
+
+    preset: Preset | Literal["draft", "balanced", "quality"]
+    steps: int | None
+    time_budget: float | str | None
+    target_psnr: float | None
+    max_gaussians: int | None
+    max_memory: int | str | None
+    image_size: int | None
+    holdout: int
+    test_views: Sequence[str] | None
+    max_video_frames: int
+    start: str | os.PathLike[str] | None
+    progress_video: bool
+    background: Background | Literal["auto", "black", "white", "random"]
+    exposure: Switch | Literal["auto", "on", "off"]
+    far_shell: Switch | Literal["auto", "on", "off"]
+    gaps: Switch | Literal["auto", "on", "off"]
+    mapper: Mapper | Literal["auto", "incremental", "global"]
+    matcher: Matcher | Literal["auto", "exhaustive", "sequential", "spatial"]
+    sfm_effort: Effort | Literal["auto", "lean", "standard", "high"]
+    pose_refinement: Switch | Literal["auto", "on", "off"]
+    sh_degree: int | None
+    densify: Switch | Literal["auto", "on", "off"]
+    antialias: Switch | Literal["auto", "on", "off"]
+    backend: Backend | Literal["auto", "reference", "cpu", "gpu"]
+    seed: int
+
+
+class RenderArguments(TypedDict, total=False):
+    """How an image is rendered: the fields of `RenderRequest` but the camera."""
+
+    output: Output | Literal["color", "depth", "alpha"]
+    format: Format | Literal["png", "jpeg", "webp", "npy"]
+    background: Literal["black", "white", "transparent"]
+    quality: int
+
+
+class OrbitArguments(TypedDict, total=False):
+    """How a video is rendered: the fields of `OrbitRequest`."""
+
+    seconds: float
+    fps: int
+    width: int
+    height: int
+    fov_y_deg: float | None
+    background: Literal["black", "white"]

@@ -1,0 +1,92 @@
+"""The text of `splatmill/arguments.py` as it follows from the schema. `python -m tests.support.arguments` writes it."""
+
+import json
+import types
+import typing
+from enum import StrEnum
+from typing import Any, Literal
+
+from pydantic.fields import FieldInfo
+
+from splatmill.schema import OrbitRequest, RenderRequest, TrainOptions
+from splatmill.schema.base import Request
+from tests.support.paths import ROOT
+
+PATH = ROOT / "client" / "splatmill" / "arguments.py"
+
+CLASSES: tuple[tuple[str, type[Request], str], ...] = (
+    ("TrainArguments", TrainOptions, "The settings of a training: the fields of `TrainOptions`."),
+    (
+        "RenderArguments",
+        RenderRequest,
+        "How an image is rendered: the fields of `RenderRequest` but the camera.",
+    ),
+    ("OrbitArguments", OrbitRequest, "How a video is rendered: the fields of `OrbitRequest`."),
+)
+
+WIDER = {"duration": "float | str", "bytes": "int | str"}
+"""Types that are also accepted as text, by the field's kind."""
+
+PATHS = {"start": "str | os.PathLike[str]"}
+"""Arguments of the SDK that may be paths."""
+
+
+def text() -> str:
+    """The whole module."""
+    enums = sorted({name for _, model, _ in CLASSES for name in _enums(model)})
+    head = [
+        '"""The keyword arguments of `train`, `render` and `orbit`, for editors and type checkers.',
+        "",
+        "Generated from the schema by `python -m tests.support.arguments`.",
+        '"""',
+        "",
+        "import os",
+        "from collections.abc import Sequence",
+        "from typing import Literal, TypedDict",
+        "",
+        "from splatmill.schema import (",
+        *(f"    {name}," for name in enums),
+        ")",
+    ]
+    return "\n".join([*head, *(line for entry in CLASSES for line in _class(*entry))]) + "\n"
+
+
+def _class(name: str, model: type[Request], doc: str) -> list[str]:
+    fields = {field: info for field, info in model.model_fields.items() if field != "camera"}
+    lines = [f"    {field}: {_type(field, info)}" for field, info in fields.items()]
+    return ["", "", f"class {name}(TypedDict, total=False):", f'    """{doc}"""', "", *lines]
+
+
+def _members(annotation: Any) -> list[Any]:
+    """The members of a union; an annotation that is none is its only member."""
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        return [each for member in typing.get_args(annotation) for each in _members(member)]
+    return [annotation]
+
+
+def _enums(model: type[Request]) -> list[str]:
+    kinds = [kind for info in model.model_fields.values() for kind in _members(info.annotation)]
+    return [kind.__name__ for kind in kinds if isinstance(kind, type) and issubclass(kind, StrEnum)]
+
+
+def _type(name: str, info: FieldInfo) -> str:
+    extra = info.json_schema_extra
+    kind = extra.get("kind") if isinstance(extra, dict) else None
+    members = _members(info.annotation)
+    wider = PATHS.get(name) or (WIDER.get(kind) if isinstance(kind, str) else None)
+    parts = [wider] if wider else [_one(member) for member in members if member is not types.NoneType]
+    return " | ".join([*parts, "None"] if types.NoneType in members else parts)
+
+
+def _one(kind: Any) -> str:
+    if typing.get_origin(kind) is Literal:
+        return f"Literal[{', '.join(map(json.dumps, typing.get_args(kind)))}]"
+    if typing.get_origin(kind) is tuple:
+        return "Sequence[str]"
+    if issubclass(kind, StrEnum):
+        return f"{kind.__name__} | Literal[{', '.join(json.dumps(str(member)) for member in kind)}]"
+    return str(kind.__name__)
+
+
+if __name__ == "__main__":
+    PATH.write_text(text())
