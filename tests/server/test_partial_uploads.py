@@ -138,7 +138,7 @@ def test_a_body_that_breaks_off_is_kept_as_far_as_it_came(app: ServedApp) -> Non
     address = begin(app, capture_id).headers["location"]
     with socket.create_connection(app.address, 10) as link:
         head = (
-            f"PATCH {address} HTTP/1.1\r\nHost: t\r\nContent-Length: {len(DATA)}\r\nUpload-Offset: 0\r\n"
+            f"PATCH {address} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(DATA)}\r\nUpload-Offset: 0\r\n"
             "Upload-Complete: ?1\r\nContent-Type: application/partial-upload\r\n\r\n"
         )
         link.sendall(head.encode() + DATA[:2_000_000])
@@ -177,7 +177,7 @@ def test_a_later_request_takes_over_from_one_that_hangs(app: ServedApp) -> None:
     address = begin(app, capture_id).headers["location"]
     with socket.create_connection(app.address, 10) as hanging:
         head = (
-            f"PATCH {address} HTTP/1.1\r\nHost: t\r\nContent-Length: {len(DATA)}\r\nUpload-Offset: 0\r\n"
+            f"PATCH {address} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(DATA)}\r\nUpload-Offset: 0\r\n"
             "Upload-Complete: ?1\r\nContent-Type: application/partial-upload\r\n\r\n"
         )
         hanging.sendall(head.encode() + DATA[:1_000_000])

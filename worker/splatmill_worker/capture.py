@@ -11,6 +11,7 @@ from splatmill_worker.errors import Refusal
 from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.scene import Scene, View, split
 from splatmill_worker.sfm import posed
+from splatmill_worker.sfm.posed import zipped
 from splatmill_worker.splat.plan.plan import Kernels
 
 OnProgress = Callable[[str, int, int, str], None]
@@ -26,7 +27,8 @@ def posed_scene(
 ) -> Scene:
     """Return the scene with the cameras that the capture brings, or else with cameras recovered from the photos.
 
-    capture: folder with images/, and masks/ and poses/ where they were given; or the folder of a posed data set.
+    capture: folder with images/, and masks/ and poses/ where they were given; or the folder of a posed data set. The
+        only file in images/ may be a zip of a whole data set.
     workdir: folder where structure from motion and stereo store their results, and from which they read earlier ones.
     options: only those of structure from motion are read.
     on_progress: called with the progress of structure from motion and stereo.
@@ -34,6 +36,7 @@ def posed_scene(
 
     Raises Refusal for poses that cannot be used, and SfmFailed.
     """
+    capture = zipped.data_set(capture, workdir, cancelled)
     given = posed.find(capture)
     if given is not None:
         try:

@@ -117,7 +117,7 @@ def prepare(
     CaptureIncomplete when a file is neither used nor skipped, and Cancelled.
     """
     found = _Found()
-    given = _files(images)
+    given = given_files(images)
     for path in given:
         _expand(path.relative_to(images).as_posix(), path, None, workdir, frames, found, cancelled)
     beside = {name: path for name, path, _ in found.files}
@@ -152,7 +152,7 @@ def prepare(
     return Prepared(ordered, tuple(found.skipped), tuple(found.notes))
 
 
-def _files(images: Path) -> list[Path]:
+def given_files(images: Path) -> list[Path]:
     """What lies under `images` and is no folder, sorted by name; hidden files are left out."""
     if not images.is_dir():
         return []
@@ -185,12 +185,8 @@ def _expand(
         if path.is_symlink() or not path.is_file():
             found.skipped.append((name, "it is a link or a device, not a file"))
         elif suffix in ARCHIVE_SUFFIXES and inside is None:
-            folder = workdir / "unpacked" / _sha256(path)[:24]
-            if folder.is_dir():  # of an earlier attempt
-                unpacked = _files(folder)
-                found.allowance.take(name, len(unpacked), sum(inner.stat().st_size for inner in unpacked))
-            _filled_once(folder, lambda place: archive.unpack(path, place, cancelled, found.allowance))
-            for inner in _files(folder):
+            folder = unpacked(name, path, workdir, found.allowance, cancelled)
+            for inner in given_files(folder):
                 inner_name = f"{Path(name).with_suffix('').as_posix()}/{inner.relative_to(folder).as_posix()}"
                 _expand(inner_name, inner, name, workdir, frames, found, cancelled)
             found.opened.add(name)
@@ -201,7 +197,7 @@ def _expand(
                 workdir / "frames" / f"{_sha256(path)[:24]}_{frames}",
                 lambda place: decoders.sharpest_frames(path, place, frames, cancelled=cancelled),
             )
-            pictures = _files(folder)
+            pictures = given_files(folder)
             prefix = Path(name).with_suffix("").as_posix()
             found.files += [(f"{prefix}_{p.stem.rpartition('_')[2]}.jpg", p, name) for p in pictures]
             found.opened.add(name)
@@ -216,6 +212,22 @@ def _expand(
         if error.errno in MACHINE_ERRORS:
             raise
         found.skipped.append((name, str(error)))
+
+
+def unpacked(
+    name: str, path: Path, workdir: Path, allowance: archive.Allowance, cancelled: Callable[[], bool]
+) -> Path:
+    """The folder in `workdir` with the content of the zip at `path`, unpacked if no earlier attempt has done so.
+
+    allowance: what the capture's zips may still unpack to; this one is subtracted.
+
+    Raises what `archive.unpack` raises.
+    """
+    folder = workdir / "unpacked" / _sha256(path)[:24]
+    if folder.is_dir():
+        files = given_files(folder)
+        allowance.take(name, len(files), sum(inner.stat().st_size for inner in files))
+    return _filled_once(folder, lambda place: archive.unpack(path, place, cancelled, allowance))
 
 
 def _filled_once(folder: Path, make: Callable[[Path], object]) -> Path:

@@ -1,0 +1,48 @@
+"""Finds the data set in a capture that is a single zip: photos, masks and cameras as tools lay them out in a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from splatmill.schema.photos import ARCHIVE_SUFFIXES, MASK_FOLDERS
+from splatmill_worker.images import prepare
+from splatmill_worker.images.archive import Allowance
+from splatmill_worker.sfm.posed.capture import find
+
+MAX_DEPTH = 4
+"""Folders around a data set that are looked into: zips often hold a folder that has all the rest."""
+
+
+def data_set(capture: Path, workdir: Path, cancelled: Callable[[], bool] = lambda: False) -> Path:
+    """The folder to read a capture from: that of the unpacked data set if the capture is a zip of one, else `capture`.
+
+    A capture is a zip of a data set if a single zip is its only file besides .ply models, and the zip holds cameras
+    (transforms*.json or a COLMAP model), or the folders images/ and masks/. Other zips hold photos, which `prepare`
+    finds. It unpacks to the same folder in `workdir`, so nothing is unpacked twice.
+
+    Raises Refusal for an archive that unpacks to too much, and Cancelled.
+    """
+    images = prepare.given_files(capture / "images")
+    others = [path for folder in ("masks", "poses") for path in prepare.given_files(capture / folder)]
+    if len(images) != 1 or images[0].suffix.lower() not in ARCHIVE_SUFFIXES or images[0].is_symlink():
+        return capture
+    if any(path.suffix.lower() != ".ply" for path in others):
+        return capture
+    try:
+        folder = prepare.unpacked(images[0].name, images[0], workdir, Allowance(), cancelled)
+    except ValueError:
+        return capture  # `prepare` names the reason for which the zip is not used
+    for _ in range(MAX_DEPTH):
+        if _is_data_set(folder):
+            return folder
+        inside = sorted(folder.iterdir())
+        if len(inside) != 1 or not inside[0].is_dir():
+            break
+        folder = inside[0]
+    return capture
+
+
+def _is_data_set(folder: Path) -> bool:
+    masked = (folder / "images").is_dir() and any((folder / name).is_dir() for name in MASK_FOLDERS)
+    return masked or find(folder) is not None
