@@ -234,16 +234,19 @@ class Webhooks:
     def announce(self, job: Job, generation: int) -> None:
         """Record the deliveries of a job that has ended. Repeated calls for the same end have no further effect."""
         event = WebhookEvent(f"job.{job.state.value}")
+        ended = job.finished_at or datetime.now(UTC)
+        if ended < datetime.now(UTC) - timedelta(days=KEPT_DAYS):
+            return  # the record of its delivery may be gone, and without it the end would be sent twice
         for webhook in self.of_owner(job.owner):
             if event not in webhook.events or webhook.disabled_at is not None:
                 continue
-            if job.finished_at is not None and job.finished_at < webhook.created_at:
+            if ended < webhook.created_at:
                 continue
             delivery_id = hashlib.sha256(f"{webhook.id} {job.id} {generation}".encode()).hexdigest()[:24]
             known = self.delivery(webhook.id, delivery_id)
             if known is None:
                 now = datetime.now(UTC)
-                payload = WebhookPayload(type=event, timestamp=job.finished_at or now, data=job)
+                payload = WebhookPayload(type=event, timestamp=ended, data=job)
                 known = DeliveryRecord(
                     id=delivery_id,
                     webhook=webhook.id,

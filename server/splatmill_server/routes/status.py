@@ -26,7 +26,7 @@ from splatmill.schema import (
 from splatmill_server import metrics
 from splatmill_server.caller import Caller, Who
 from splatmill_server.docs_page import CONTENT_SECURITY_POLICY, docs_page
-from splatmill_server.routes.openapi import problems
+from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.service import Service, Shared
 
 router = APIRouter(tags=["service"])
@@ -88,7 +88,11 @@ async def readyz(service: Shared) -> Response:
     return JSONResponse(Ready(ready=ready, checks=checks).model_dump(), 200 if ready else 503)
 
 
-@router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses=answer(200, "The metrics", content={"text/plain": {}}) | problems(),
+)
 def get_metrics(service: Shared) -> Response:
     """Get the metrics in the text format of Prometheus."""
     gauges = service.metrics
