@@ -6,5 +6,6 @@ from tests.support.hostile.entry import Hostile
 from tests.support.hostile.table_files import FILES
 from tests.support.hostile.table_poses import POSES
 from tests.support.hostile.table_requests import REQUESTS
+from tests.support.hostile.table_services import SERVICES
 
-HOSTILE: tuple[Hostile, ...] = (*REQUESTS, *FILES, *POSES)
+HOSTILE: tuple[Hostile, ...] = (*REQUESTS, *SERVICES, *FILES, *POSES)
