@@ -136,7 +136,9 @@ class Sweeper:
         """Return whether the folder is as old as planned, now that no job can begin to use it."""
         held, now = found.held, self.usage.ledger.clock()
         seen = sums(self.storage.walk(held.folder)).get((held.kind, held.id), held)
-        if seen.modified > held.modified or now < found.due:
+        # Times of modification are whole seconds in a bucket.
+        before, after = ((at.modified, at.files, at.size) for at in (held, seen))
+        if before != after or now < found.due:
             return False
         if found.action == "orphan":
             return not seen.whole

@@ -1,6 +1,7 @@
 """Fixtures of the tests of storage space: callers of several owners, a clock, and a storage that is no folder."""
 
-from collections.abc import Callable
+import secrets
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import httpx
@@ -11,6 +12,7 @@ from obstore.store import MemoryStore
 from splatmill.backplane.storage import Storage
 from splatmill.schema import KeyLimits, Scope
 from splatmill_server import caller
+from tests.support.bucket import bucket
 from tests.support.served_app import Serve, ServedApp
 
 
@@ -75,13 +77,19 @@ def serve_people(serve: Serve) -> ServePeople:
     return start
 
 
-@pytest.fixture(params=["folder", "objects"])
-def people(request: pytest.FixtureRequest, serve_people: ServePeople) -> ServedApp:
-    """The app with its default settings, once on a folder and once on an object store."""
+@pytest.fixture(params=["folder", "objects", "bucket"])
+def people(request: pytest.FixtureRequest, serve_people: ServePeople) -> Iterator[ServedApp]:
+    """The app with its default settings: on a folder, on an object store in memory, and on a bucket played by moto."""
+    if request.param == "bucket":
+        with bucket() as url:
+            yield serve_people(
+                storage=f"{url}/{secrets.token_hex(8)}"
+            )  # moto keeps its objects between tests
+        return
     served = serve_people()
     if request.param == "objects":
         as_object_store(served.service.storage)
-    return served
+    yield served
 
 
 def as_object_store(storage: Storage) -> None:

@@ -1,6 +1,6 @@
 """Who holds how much: bytes by owner and kind, right after uploads and deletions, and right again after a crash.
 
-Not proved here: a bucket of S3 itself; a store of obstore in memory stands for one.
+Not proved here: S3 itself; moto's server stands for it, and obstore's store in memory where moto is missing.
 """
 
 import json
