@@ -1,0 +1,1 @@
+"""Parts of `bench stability`: scenes along axes, their conditioning, the engines, and the oracle."""
