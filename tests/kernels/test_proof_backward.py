@@ -1,6 +1,7 @@
 """Every backend differentiates every case as the definition does: the chain of ops, and project and composite alone.
 
-The definition is the float64 reference; that its gradient is right is shown by test_reference_order. Pixels within
+The definition is the float64 reference; that its gradient is right is shown by test_reference_order. Every Gaussian's
+gradient is compared in units of what rounding does to it (`units`); a norm over all would hide one. Pixels within
 the error of float32 of a threshold get no weight here, since the gradient jumps there; test_proof_forward shows that
 they are few.
 """
@@ -13,7 +14,9 @@ from torch import Tensor
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import Projected
-from tests.support.kernels.cases import CASES, GROUPS, Case
+from tests.support.kernels.bounds import within
+from tests.support.kernels.cases import CASES, GROUPS
+from tests.support.kernels.exact import exact, image_weights
 from tests.support.kernels.proof import (
     EPS,
     Run,
@@ -21,58 +24,25 @@ from tests.support.kernels.proof import (
     backends,
     define,
     filled,
-    margins,
     run,
     use,
     weighted,
 )
 
-_exact: dict[str, tuple[Run, tuple[Tensor, Tensor, Tensor], dict[str, Tensor]]] = {}
-
-
-def exact(name: str) -> tuple[Run, tuple[Tensor, Tensor, Tensor], dict[str, Tensor]]:
-    """The definition of a case, weights for its three images, and the gradients of the weighted sum."""
-    if name not in _exact:
-        case = CASES[name]()
-        want = define(case)
-        weights = image_weights(case, want, alpha_error(case, want.projected))
-        _exact[name] = want, weights, want.gradients(*weights)
-    return _exact[name]
-
-
-def image_weights(case: Case, want: Run, error: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Random weights, zero where a decision could go either way."""
-    near = margins(want.projected, want.bins, case.width, case.height, error)
-    sure = (near.jump > 1) & (near.gate > 1)
-    g = torch.Generator().manual_seed(5)
-    shape = (case.height, case.width)
-    d_color = torch.randn(*shape, 3, generator=g) * sure[..., None]
-    return d_color, torch.randn(shape, generator=g) * sure, torch.randn(shape, generator=g) * sure
-
 
 @pytest.mark.parametrize("backend", backends())
 @pytest.mark.parametrize("name", CASES)
 def test_gradient_is_the_definitions(name: str, backend: str) -> None:
-    case = CASES[name]()
-    want, weights, expected = exact(name)
+    known = exact(name)
+    case, want = known.case, known.want
     with use(backend) as op:
-        got = run(case, op).gradients(*weights)
-    error = alpha_error(case, want.projected)
-    rho = float(error.max()) if len(error) else 0.0
-    # A gradient is a sum over pixels of products of alpha (relative error rho), of d (its error is in rho) and of
-    # what lies behind, C_final - C_before (two images, each within rho): 4 rho in all, and 64 eps for the products of
-    # the chain rule.
-    relative = 4 * rho + 64 * EPS
-    size = {k: float(g.norm()) for k, g in expected.items()}
-    # Terms that cancel leave their rounding: each log-scale's are alpha dL/dalpha q with q <= 11; a quaternion's are
-    # differences of the log-scales' (all of it, where the Gaussian is round), over its norm.
-    shape = 11 * size["logit_opacities"]
-    quat = float(case.quats.norm(dim=1).min()) if len(case.quats) else 1.0
-    floor = {"log_scales": shape, "quats": 2 * (size["log_scales"] + shape) / quat}
-    for k, b in expected.items():
-        a = got[k].cpu().double()
+        got = run(case, op).gradients(*known.weights)
+    for k, b in known.gradients.items():
+        a, unit = got[k].cpu().double(), known.units.separate[k]
         assert torch.isfinite(a).all(), k
-        assert float((a - b).norm()) <= relative * (size[k] + floor.get(k, 0.0)) + 1e-12, k
+        # The gradients to the camera and the background are one vector each; all others have a row for every Gaussian.
+        alone = k not in GROUPS
+        within(f"gradient to {k}", name, (a - b)[None] if alone else a - b, unit[None] if alone else unit)
     culled = (want.projected.extents == 0).all(1)
     for k in GROUPS:
         assert (got[k].cpu()[culled] == 0).all(), f"{k}: a culled Gaussian has no gradient"

@@ -1,4 +1,4 @@
-"""Every backend draws every case as the definition does, within the error that float32 arithmetic allows.
+"""Every backend draws every pixel of every case as the definition does, within what rounding explains there (`units`).
 
 The definition is the float64 reference; that it is right is shown by test_reference_*. Nothing here is about
 gradients.
@@ -9,47 +9,31 @@ from __future__ import annotations
 import pytest
 import torch
 
+from tests.support.kernels.bounds import within
 from tests.support.kernels.cases import CASES
-from tests.support.kernels.proof import EPS, Run, alpha_error, backends, brightest, define, margins, run, use
-
-_exact: dict[str, Run] = {}
-
-
-def exact(name: str) -> Run:
-    """The definition of a case, drawn once for all backends."""
-    if name not in _exact:
-        _exact[name] = define(CASES[name]())
-    return _exact[name]
+from tests.support.kernels.exact import exact
+from tests.support.kernels.proof import Run, alpha_error, backends, brightest, run, use
 
 
 @pytest.mark.parametrize("backend", backends())
 @pytest.mark.parametrize("name", CASES)
 def test_image_is_the_definitions(name: str, backend: str) -> None:
-    case, want = CASES[name](), exact(name)
+    known = exact(name)
+    case, want, near = known.case, known.want, known.undecided
     with use(backend) as op:
         got = run(case, op)
-    error = alpha_error(case, want.projected)
-    rho = float(error.max()) if len(error) else 0.0
-    near = margins(want.projected, want.bins, case.width, case.height, error).jump <= 1.0
-    # Errors of alpha reach the pixel through weights that sum to at most 1 and colours that differ by at most the
-    # brightest: |dC| <= rho * brightest; the colours' own rounding is 64 eps of the sum of up to 17 terms, depths' 8
-    # eps.
+    unit = known.units.separate
     color, depth = brightest(want)
-    for label, a, b, largest, own in (
-        ("color", got.color, want.color, color, 64 * EPS),
-        ("alpha", got.alpha, want.alpha, 1.0, 8 * EPS),
-        ("depth", got.depth, want.depth, depth, 8 * EPS + rho),
+    for label, a, b, largest in (
+        ("color", got.color, want.color, color),
+        ("alpha", got.alpha, want.alpha, 1.0),
+        ("depth", got.depth, want.depth, depth),
     ):
         off = (a.detach().cpu().double() - b.detach()).abs()
-        off = off.amax(2) if off.dim() == 3 else off
-        bound = (rho + own) * largest
-        wrong = (off > bound) & ~near
-        assert not wrong.any(), (
-            f"{label}: {float(off[wrong].max()):.2e} over {bound:.2e} away from any threshold"
-        )
+        within(label, name, off[~near], unit[label][~near])
         # A crossing may drop or add one splat at the cut (weight 1/255), or all that is left at the end (weight
         # 1e-4).
-        assert float(off.max()) <= bound + 2 * (1 / 255) * largest, f"{label}: more than a crossing explains"
+        assert float(off.max()) <= (known.rho + 2 / 255) * largest, f"{label}: more than a crossing explains"
     # Crossings are rare, or they would hide an error; the piles put one threshold on many pixels at once.
     if not name.startswith("pile") and near.numel() > 500:
         assert near.double().mean() < 0.15
@@ -58,7 +42,7 @@ def test_image_is_the_definitions(name: str, backend: str) -> None:
 @pytest.mark.parametrize("backend", backends())
 @pytest.mark.parametrize("name", CASES)
 def test_culled_rows_are_exactly_zero_and_the_same(name: str, backend: str) -> None:
-    case, want = CASES[name](), exact(name).projected
+    case, want = CASES[name](), exact(name).want.projected
     with use(backend) as op:
         got = run(case, op).projected
     seen, should = (got.extents.cpu() > 0).all(1), (want.extents > 0).all(1)
@@ -71,7 +55,7 @@ def test_culled_rows_are_exactly_zero_and_the_same(name: str, backend: str) -> N
 @pytest.mark.parametrize("backend", backends())
 @pytest.mark.parametrize("name", CASES)
 def test_no_pair_that_reaches_a_pixel_is_missing(name: str, backend: str) -> None:
-    case, want = CASES[name](), exact(name)
+    case, want = CASES[name](), exact(name).want
     with use(backend) as op:
         got = run(case, op)
     tiles = len(want.bins.offsets) - 1

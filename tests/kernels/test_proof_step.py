@@ -1,7 +1,6 @@
-"""The fused CPU training step is the ops one after another: the same image, gradients and Adam update, on every
-build.
+"""The fused CPU training step has the definition's image and gradients, and the Adam update of the ops, on every build.
 
-That the ops are right is shown elsewhere; here is only that fusing them changed nothing.
+Not proven here: the gradient to the camera (test_cpu_pose).
 """
 
 from __future__ import annotations
@@ -13,22 +12,12 @@ from splatmill_worker.kernels import ops, reference
 from splatmill_worker.kernels.cpu import isa
 from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.kernels.records import Rates
+from tests.support.kernels.bounds import within
 from tests.support.kernels.cases import CASES, GROUPS
-from tests.support.kernels.proof import EPS, alpha_error, brightest, define, run, use
+from tests.support.kernels.exact import exact
+from tests.support.kernels.proof import EPS, run, use
+from tests.support.kernels.units import IMAGES
 
-from .test_proof_backward import image_weights
-
-NAMES = [
-    "ordinary",
-    "degree 0",
-    "antialias",
-    "needles 1e+04",
-    "near plane",
-    "pile of opaque",
-    "side 17x257",
-    "dark",
-    "all culled",
-]
 RATES = Rates(1.6e-4, 5e-3, 1e-3, 5e-2, 2.5e-3, 1.25e-4)
 
 
@@ -39,16 +28,11 @@ def photo(width: int, height: int, seed: int = 0) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("build", isa.supported())
-@pytest.mark.parametrize("name", NAMES)
-def test_image_and_gradients_are_the_ops(name: str, build: str) -> None:
-    case = CASES[name]()
-    want = define(case)
-    error = alpha_error(case, want.projected)
-    rho = float(error.max())
-    weights = image_weights(case, want, error)
+@pytest.mark.parametrize("name", CASES)
+def test_image_and_gradients_are_the_definitions(name: str, build: str) -> None:
+    known = exact(name)
+    case, sure = known.case, ~known.undecided
     with use(f"cpu:{build}"):
-        alone = run(case, "cpu")
-        expected = alone.gradients(*weights)
         step = Step(*case.groups())
         image = step.forward(
             *case.camera(),
@@ -58,23 +42,14 @@ def test_image_and_gradients_are_the_ops(name: str, build: str) -> None:
             background=case.background,
             antialias=case.antialias,
         )
-        # Alone, composite gets conics that were rounded to three numbers; fused, it gets the factor. Both are within
-        # rho of the definition, so within 2 rho of one another; a pixel at a threshold may differ by the splat at
-        # stake.
-        color, depth = brightest(want)
-        for got, other, largest in (
-            (image[0], alone.color, color),
-            (image[1], alone.alpha, 1.0),
-            (image[2], alone.depth, depth),
-        ):
-            off = (got - other.detach()).abs()
-            assert float(off.max()) <= (2 * rho + 64 * EPS) * largest + (1 / 255) * largest
-            assert float(off.mean()) <= (2 * rho + 64 * EPS) * largest
-        gradients = step.gradients(*weights)
+        want = known.want
+        for label, got, other in zip(IMAGES, image, (want.color, want.alpha, want.depth), strict=True):
+            off = (got.double() - other.detach()).abs()
+            within(f"fused, {label}", name, off[sure], known.units.fused[label][sure])
+        gradients = step.gradients(*known.weights)
     for k in GROUPS:
-        a, b = gradients[k].double(), expected[k].double()
-        size = float(b.norm()) + 22 * float(expected["logit_opacities"].norm())
-        assert float((a - b).norm()) <= (8 * rho + 64 * EPS) * size + 1e-12, k
+        error = gradients[k].double() - known.gradients[k]
+        within(f"fused, gradient to {k}", name, error, known.units.fused[k])
 
 
 @pytest.mark.parametrize("build", isa.supported())

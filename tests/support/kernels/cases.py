@@ -172,6 +172,14 @@ def _opacity_ends() -> Case:
     return replace(case, logit_opacities=torch.tensor([values[i % len(values)] for i in range(64)]))
 
 
+def _opaque_and_wide() -> Case:
+    """Many pixels of every Gaussian stand above 0.999, where alpha is held and its gradient ends."""
+    case = scene("opaque and wide", 20, seed=27)
+    return replace(
+        case, log_scales=torch.full((20, 3), math.log(1.5)), logit_opacities=torch.linspace(6.9, 14.0, 20)
+    )
+
+
 def _principal_point() -> Case:
     case = scene("principal point off centre", seed=11)
     K = case.K.clone()
@@ -243,6 +251,7 @@ _MAKERS: list[Callable[[], Case]] = [
     lambda: _pile("pile of transparent", 3000, -4.5),
     lambda: _pile("pile of opaque", 1000, 4.0),
     _opacity_ends,
+    _opaque_and_wide,
     _principal_point,
     lambda: scene("portrait", 150, width=33, height=90, seed=18),
     lambda: scene("side 1x1", 60, width=1, height=1, seed=19),
