@@ -1,6 +1,8 @@
 """Forwards render requests to the renderer process, and streams its responses back."""
 
-from collections.abc import AsyncIterator
+import asyncio
+from collections.abc import AsyncIterator, Coroutine
+from typing import Any, TypeVar
 
 import httpx
 from pydantic import BaseModel
@@ -18,6 +20,11 @@ _PASSED_BACK = (
     "last-modified",
     "retry-after",
 )
+CLIENT_GONE = 499
+"""Status of a response to a client that has closed its connection, which nobody reads."""
+
+T = TypeVar("T")
+
 _OWN_PREFIX = "splatmill-"
 
 
@@ -25,6 +32,8 @@ async def forward(
     renderer: httpx.AsyncClient | None, request: Request, path: str, body: BaseModel, seconds: float
 ) -> Response:
     """Post `body` to the renderer and return its response, whatever its status.
+
+    When the client closes its connection, that to the renderer is closed as well, so that it renders no further.
 
     Raises a 503 problem if there is no renderer, and a 504 problem if it does not answer within `seconds`.
     """
@@ -40,12 +49,10 @@ async def forward(
         headers["If-None-Match"] = known
     content = body.model_dump_json(exclude_none=True)
     try:
-        answer = await renderer.send(
-            renderer.build_request(
-                "POST", path, content=content, headers=headers, timeout=httpx.Timeout(seconds, connect=5.0)
-            ),
-            stream=True,
+        sent = renderer.build_request(
+            "POST", path, content=content, headers=headers, timeout=httpx.Timeout(seconds, connect=5.0)
         )
+        answer = await _while_connected(request, renderer.send(sent, stream=True))
     except httpx.TimeoutException as error:
         raise ProblemError(
             "render_timeout",
@@ -60,6 +67,8 @@ async def forward(
             "`python -m splatmill_worker renderer`. Models can be downloaded without it.",
             headers={"Retry-After": "5"},
         ) from error
+    if answer is None:
+        return Response(status_code=CLIENT_GONE)
     passed = {
         name: value
         for name, value in answer.headers.items()
@@ -69,6 +78,27 @@ async def forward(
         await answer.aclose()
         return Response(status_code=answer.status_code, headers=passed)
     return StreamingResponse(_pass(answer), answer.status_code, passed)
+
+
+async def _while_connected(request: Request, pending: Coroutine[Any, Any, T]) -> T | None:
+    """Return the result of `pending`, or cancel it and return None if the client closes its connection before."""
+    work = asyncio.create_task(pending)
+    gone = asyncio.create_task(_disconnect(request))
+    try:
+        await asyncio.wait({work, gone}, return_when=asyncio.FIRST_COMPLETED)
+        return await work if work.done() else None
+    finally:
+        unfinished = [task for task in (work, gone) if not task.done()]
+        for task in unfinished:
+            task.cancel()
+        if unfinished:
+            await asyncio.wait(unfinished)
+
+
+async def _disconnect(request: Request) -> None:
+    """Wait until the client closes its connection. The request's body must have been read."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
 
 
 async def _pass(answer: httpx.Response) -> AsyncIterator[bytes]:

@@ -3,6 +3,7 @@
 Not proved here: pictures. The renderer of these tests answers with what it was asked for.
 """
 
+import asyncio
 import json
 import socket
 import threading
@@ -10,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 import uvicorn
 from fastapi import FastAPI, Request
@@ -25,6 +27,11 @@ MODEL = "a" * 16
 EYE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -4], [0, 0, 0, 1]]
 CAMERA: dict[str, Any] = {"camera_to_world": EYE, "width": 64, "height": 48, "fov_y_deg": 50}
 
+SLOW_FPS = 7
+"""The renderer of these tests answers a video of this speed only when its client has left."""
+
+LEFT = threading.Event()
+
 
 @pytest.fixture
 def renderer(tmp_path: Path) -> Iterator[str]:
@@ -34,6 +41,10 @@ def renderer(tmp_path: Path) -> Iterator[str]:
     @echo.post("/v1/models/{model_id}/{kind}")
     async def answer(model_id: str, kind: str, request: Request) -> Response:
         body = await request.body()
+        if json.loads(body).get("fps") == SLOW_FPS:
+            while not await request.is_disconnected():
+                await asyncio.sleep(0.01)
+            LEFT.set()
         if b'"jpeg"' in body:
             return JSONResponse({"code": "render_failed"}, 500, media_type="application/problem+json")
         etag = f'"{hash(body):x}"'
@@ -113,6 +124,14 @@ def test_a_video_with_and_without_wishes(app: ServedApp) -> None:
     assert json.loads(video.content.splitlines()[0])["asked"]["seconds"] == 2
     assert app.http.post(f"/v1/models/{MODEL}/orbit").status_code == 200
     problem(app.http.post(f"/v1/models/{MODEL}/orbit", json={"width": 100_000}), 422, "size_out_of_range")
+
+
+def test_the_renderer_learns_that_the_client_has_left(app: ServedApp) -> None:
+    LEFT.clear()
+    with pytest.raises(httpx.ReadTimeout):
+        app.http.post(f"/v1/models/{MODEL}/orbit", json={"fps": SLOW_FPS}, timeout=0.5)
+    assert LEFT.wait(10)
+    assert app.http.post(f"/v1/models/{MODEL}/orbit").status_code == 200
 
 
 SHEARED = [[1, 0.5, 0, 0], [0, 0.87, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]

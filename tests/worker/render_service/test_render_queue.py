@@ -1,9 +1,12 @@
-"""Proves that requests run one at a time, and that those beyond the bound are sent away at once."""
+"""Proves that requests run one at a time, and that those beyond the bound are sent away at once; and that nothing runs
+for a client that has left."""
 
 import asyncio
 import threading
 
-from splatmill_worker.render_service.render_queue import QueueFull, RenderQueue
+import pytest
+
+from splatmill_worker.render_service.render_queue import ClientGone, QueueFull, RenderQueue
 
 
 def test_more_requests_than_may_wait_are_sent_away() -> None:
@@ -32,3 +35,26 @@ def test_more_requests_than_may_wait_are_sent_away() -> None:
         return len(done), sum(served), most
 
     assert asyncio.run(crowd()) == (2, 3, 1)
+
+
+def test_work_of_a_client_that_left_while_it_waited_is_not_done() -> None:
+    async def wait_in_vain() -> bool:
+        queue, release, done = RenderQueue(max_waiting=2), threading.Event(), False
+
+        def work() -> None:
+            nonlocal done
+            done = True
+
+        async def gone() -> bool:
+            return True
+
+        before = asyncio.create_task(queue.run(lambda: release.wait(10)))
+        waiting = asyncio.create_task(queue.run(work, gone))
+        await asyncio.sleep(0)
+        release.set()
+        await before
+        with pytest.raises(ClientGone):
+            await waiting
+        return done
+
+    assert asyncio.run(wait_in_vain()) is False

@@ -37,13 +37,21 @@ def storage(tmp_path_factory: pytest.TempPathFactory) -> Storage:
     return storage
 
 
+def temporary(storage: Storage) -> Path:
+    """The folder in which the renderer writes videos before it sends them."""
+    assert storage.root is not None
+    folder = storage.root.parent / "tmp"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
 @pytest.fixture(scope="module")
 def http(storage: Storage) -> Iterator[httpx.Client]:
     assert storage.root is not None
     path = storage.root.parent / "r.sock"
     process = subprocess.Popen(
         [sys.executable, "-m", "splatmill_worker", "renderer", "--uds", str(path)],
-        env=dict(os.environ) | {"SPLATMILL_STORAGE": storage.url},
+        env=dict(os.environ) | {"SPLATMILL_STORAGE": storage.url, "TMPDIR": str(temporary(storage))},
     )
 
     def listens() -> bool:
@@ -166,6 +174,15 @@ def test_an_orbit_is_a_video_that_shows_both_sides(http: httpx.Client) -> None:
         rendering.orbit_path(BALL), content=body.model_dump_json(exclude_none=True), headers=etag
     )
     assert again.status_code == 304
+
+
+def test_an_orbit_that_nobody_waits_for_is_not_rendered_on(http: httpx.Client, storage: Storage) -> None:
+    body = OrbitRequest(seconds=60, fps=60, width=1280, height=720).model_dump_json(exclude_none=True)
+    with pytest.raises(httpx.ReadTimeout):
+        http.post(rendering.orbit_path(BALL), content=body, timeout=1.0)
+    # 3600 frames take minutes
+    wait_for(lambda: not list(temporary(storage).glob("splatmill-orbit-*")), 20)
+    assert picture(http, RenderRequest(camera=FRONT)).status_code == 200
 
 
 def _flipped(camera: CameraSpec) -> list[list[float]]:

@@ -27,7 +27,7 @@ from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import PROBLEM_MEDIA_TYPE, ModelCameras, OrbitRequest, Problem, RenderRequest
 from splatmill_worker.errors import ModelNotFound, ModelUnreadable
 from splatmill_worker.render_service.model_cache import LoadedModel, ModelCache
-from splatmill_worker.render_service.render_queue import QueueFull, RenderQueue
+from splatmill_worker.render_service.render_queue import ClientGone, QueueFull, RenderQueue
 from splatmill_worker.scene import Camera
 
 MAX_WAITING = 8
@@ -36,6 +36,9 @@ a few at a time."""
 
 RETRY_AFTER = 2
 """Seconds after which a client may repeat a request that found the queue full."""
+
+CLIENT_GONE = 499
+"""Status of a response to a client that has closed its connection, which nobody reads."""
 
 _ENCODING_VERSION = b"1"
 """Part of each ETag, to be raised when the same request gives other bytes than before."""
@@ -101,6 +104,8 @@ class RenderApp:
         except ModelUnreadable as error:
             advice = f"Restart the job {model_id}."
             return _problem_response(Problem.of(error.code, error.message, advice=advice))
+        except ClientGone:
+            return Response(status_code=CLIENT_GONE)
         except QueueFull:
             problem = Problem.of(
                 "renderer_unavailable",
@@ -131,12 +136,13 @@ class RenderApp:
             image = render_image(self._cache.get(model_id), body)
             return Response(image.data, media_type=image.media_type, headers=headers | dict(image.headers))
 
-        return await self._queue.run(work)
+        return await self._queue.run(work, request.is_disconnected)
 
     async def _video(
         self, request: Request, model_id: str, body: OrbitRequest, headers: dict[str, str]
     ) -> Response:
-        """Render frame by frame, so that images can be rendered in between and a client that has left is noticed."""
+        """Render frame by frame, so that images can be rendered in between, and none is rendered for a client that has
+        left."""
         from splatmill_worker.film import Film
         from splatmill_worker.render_service.encoding import render_frame
 
@@ -153,9 +159,7 @@ class RenderApp:
 
             try:
                 for camera in cameras:
-                    if await request.is_disconnected():
-                        break
-                    await self._queue.run(partial(add, camera))
+                    await self._queue.run(partial(add, camera), request.is_disconnected)
             finally:
                 await run_in_threadpool(film.close)
         except BaseException:

@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import TypeVar
 
 from starlette.concurrency import run_in_threadpool
@@ -12,6 +12,10 @@ Result = TypeVar("Result")
 
 class QueueFull(Exception):
     """The queue has no place for another request."""
+
+
+class ClientGone(Exception):
+    """The client that asked for the work has closed its connection."""
 
 
 class RenderQueue:
@@ -33,7 +37,14 @@ class RenderQueue:
         finally:
             self._admitted -= 1
 
-    async def run(self, work: Callable[[], Result]) -> Result:
-        """Run blocking work in a thread, once no other work runs, and return its result."""
+    async def run(
+        self, work: Callable[[], Result], gone: Callable[[], Awaitable[bool]] | None = None
+    ) -> Result:
+        """Run blocking work in a thread, once no other work runs, and return its result.
+
+        Raises ClientGone in place of running it if `gone`, which is asked then, returns true.
+        """
         async with self._lock:
+            if gone is not None and await gone():
+                raise ClientGone
             return await run_in_threadpool(work)
