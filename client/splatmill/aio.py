@@ -12,6 +12,7 @@ from splatmill.arguments import TrainArguments
 from splatmill.connection import RETRIES, TIMEOUT, Connection, read_answer
 from splatmill.downloads import AnyPath
 from splatmill.errors import invalid_request
+from splatmill.imports import AsyncImports
 from splatmill.job import AsyncJobHandle
 from splatmill.keys import AsyncKeys
 from splatmill.local_capture import find_files, start_model
@@ -87,6 +88,7 @@ class AsyncClient:
         )
         self.keys = AsyncKeys(self.connection)
         self.webhooks = AsyncWebhooks(self.connection)
+        self.imports = AsyncImports(self.connection)
 
     async def __aenter__(self) -> Self:
         return self

@@ -10,6 +10,7 @@ from splatmill.aio import AsyncClient
 from splatmill.arguments import OrbitArguments, RenderArguments, TrainArguments
 from splatmill.connection import RETRIES, TIMEOUT
 from splatmill.downloads import AnyPath, OnBytes
+from splatmill.imports import Imports
 from splatmill.job import MOST_LINES, AsyncJobHandle
 from splatmill.keys import Keys
 from splatmill.loop import BackgroundLoop
@@ -83,6 +84,7 @@ class Client:
         self._loop = BackgroundLoop()
         self.keys = Keys(self._loop, self._async.keys)
         self.webhooks = Webhooks(self._loop, self._async.webhooks)
+        self.imports = Imports(self._loop, self._async.imports)
 
     def __enter__(self) -> Self:
         return self

@@ -27,6 +27,7 @@ COMMANDS = {
     "render": ("splatmill.cli.pictures", "render"),
     "orbit": ("splatmill.cli.pictures", "orbit"),
     "captures": ("splatmill.cli.records", "captures"),
+    "import": ("splatmill.cli.imports", "import_file"),
     "up": ("splatmill.cli.service", "up"),
     "storage": ("splatmill.cli.storage", "storage"),
     "keys": ("splatmill.cli.keys", "keys"),
@@ -39,8 +40,8 @@ COMMANDS = {
 HEADINGS = {
     "Make a model": ("train", "fit-image", "options"),
     "Jobs on a server": ("jobs", "status", "follow", "logs", "cancel", "restart", "delete"),
-    "Models and captures": ("models", "download", "render", "orbit", "captures"),
-    "The service and this machine": ("up", "keys", "storage", "doctor", "bench"),
+    "Models and captures": ("models", "download", "render", "orbit", "captures", "import"),
+    "The service and this machine": ("up", "keys", "webhooks", "storage", "doctor", "bench"),
 }
 
 
