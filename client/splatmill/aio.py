@@ -161,11 +161,21 @@ class AsyncClient:
         return target, await upload(self.connection, target.id, files, on_progress, stored_files=target.files)
 
     async def submit(
-        self, capture: str, options: TrainOptions | None = None, *, name: str | None = None
+        self,
+        capture: str,
+        options: TrainOptions | None = None,
+        *,
+        name: str | None = None,
+        priority: int = 0,
     ) -> AsyncJobHandle:
-        """Start a job on the stored capture with the id `capture`."""
+        """Start a job on the stored capture with the id `capture`.
+
+        Of the owner's jobs, those with a higher `priority` (-100 to 100) are run first.
+        """
         chosen = options.model_dump(mode="json", exclude_unset=True) if options is not None else {}
-        body = {"capture": capture, "name": name, "options": chosen}
+        body: dict[str, Any] = {"capture": capture, "name": name, "options": chosen}
+        if priority:
+            body["priority"] = priority
         response = await self.connection.request(
             "POST",
             "/v1/jobs",

@@ -140,10 +140,19 @@ class Client:
         )
 
     def submit(
-        self, capture: str, options: TrainOptions | None = None, *, name: str | None = None
+        self,
+        capture: str,
+        options: TrainOptions | None = None,
+        *,
+        name: str | None = None,
+        priority: int = 0,
     ) -> "JobHandle":
-        """Start a job on the stored capture with the id `capture`."""
-        return JobHandle(self._loop, self._loop.run(self._async.submit(capture, options, name=name)))
+        """Start a job on the stored capture with the id `capture`.
+
+        Of the owner's jobs, those with a higher `priority` (-100 to 100) are run first.
+        """
+        made = self._async.submit(capture, options, name=name, priority=priority)
+        return JobHandle(self._loop, self._loop.run(made))
 
     def capture(self, capture_id: str) -> Capture:
         """Return a stored capture with its files."""

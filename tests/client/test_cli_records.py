@@ -251,3 +251,16 @@ def test_a_shell_completes_commands_options_and_values(words: list[str], offered
     program = Path(sys.executable).with_name("splatmill")
     done = subprocess.run([program], env=os.environ | asked, capture_output=True, text=True, timeout=60)
     assert set(done.stdout.split()) == offered
+
+
+def test_status_says_where_a_waiting_job_stands(service, at, photos):
+    with Client(service.url) as client:
+        capture, _ = client.upload(photos)
+        usual = client.submit(capture.id)
+        urgent = client.submit(capture.id, priority=5)
+        assert (usual.job.priority, usual.refresh().queue_position) == (0, 1)
+        assert (urgent.job.priority, urgent.job.queue_position) == (5, 0)
+    assert "next; no worker serves the queue 'any'" in invoke("status", urgent.id, *at).stdout
+    assert "1 job before it" in invoke("status", usual.id, *at).stdout
+    service.begin(usual.id)
+    assert "before it" not in invoke("status", usual.id, *at).stdout

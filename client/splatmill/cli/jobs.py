@@ -81,6 +81,7 @@ def status(
         ("owner", job.owner),
         ("capture", job.capture),
         ("state", job.state.value + (" (cancel requested)" if _cancelling(job) else "")),
+        ("queue", _queue(job)),
         ("attempt", str(job.attempt)),
         ("created", job.created_at.astimezone().strftime("%Y-%m-%d %H:%M:%S")),
         ("took", format_duration(took) if took is not None else ""),
@@ -88,6 +89,18 @@ def status(
         ("problem", job.problem.sentence if job.problem else ""),
     ]
     print_facts([*facts, *(("plan", line) for line in plan_lines(job.plan or {}))])
+
+
+def _queue(job: "Job") -> str:
+    """Return where a waiting job stands, or "" for another one."""
+    if job.queue_position is None:
+        return ""
+    before = {0: "next", 1: "1 job before it"}.get(job.queue_position, f"{job.queue_position} jobs before it")
+    if job.waiting_for is not None:
+        return f"{before}; no worker serves the queue {job.waiting_for!r}"
+    if job.estimated_start is not None:
+        return f"{before}; starts about {job.estimated_start.astimezone().strftime('%Y-%m-%d %H:%M')}"
+    return before
 
 
 def cancel(job_id: JobId, server: ServerOption = None) -> None:
