@@ -41,8 +41,9 @@ def reply() -> type[Reply]:
 
 @pytest.fixture(autouse=True)
 def _no_settings_of_the_person(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("SPLATMILL_SERVER", raising=False)
-    monkeypatch.delenv("SPLATMILL_API_KEY", raising=False)
+    for name in ("SERVER", "API_KEY", "PROFILE", "CA_BUNDLE"):
+        monkeypatch.delenv(f"SPLATMILL_{name}", raising=False)
+    monkeypatch.setenv("XDG_CONFIG_HOME", "/nonexistent")
 
 
 @pytest.fixture(autouse=True)

@@ -53,6 +53,20 @@ def test_the_command_line_prints_the_sentence_and_ends_with_its_status(capsys, c
     assert capsys.readouterr().err == f"Error: It was so.\nDo that.\n{waits}"
 
 
+def test_the_command_line_advises_commands_in_place_of_requests(capsys):
+    for code, facts, said in (
+        ("job_not_found", {}, "`splatmill jobs` lists the jobs."),
+        ("capture_in_use", {"job": "j1"}, "cancel it: splatmill cancel j1"),
+        ("job_running", {}, "cancel it: splatmill cancel JOB"),
+        ("cursor_invalid", {}, "GET /v1/jobs"),
+    ):
+        print_error(errors.error_for(Problem.of(code, "So.", facts=facts, advice="GET /v1/jobs")))
+        assert said in capsys.readouterr().err
+    own = Problem.of("job_running", "So.", advice="Do that.")
+    print_error(errors.error_for(own))
+    assert capsys.readouterr().err == "Error: So.\nDo that.\n"
+
+
 def test_the_tree_drawn_at_the_top_is_the_tree():
     drawn = [
         line.replace("│", " ").split("── ")[1].split()[0]

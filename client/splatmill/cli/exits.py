@@ -16,7 +16,7 @@ class Exit(IntEnum):
     job_failed = 3
     unreachable = 4  # the server or a part of it does not answer
     refused = 5  # the photos or the request are not valid
-    unauthorized = 6
+    unauthorized = 6  # the API key is missing or wrong, or does not permit the request
     not_found = 7  # no such job or model, or it is in the wrong state
     no_service = 8  # the embedded service could not be started
     cancelled = 130  # by Ctrl-C, SIGTERM or another client
@@ -41,6 +41,26 @@ MOST_ENTRIES = 10  # of a list among the facts of a problem
 USAGE_CODES = frozenset({"unknown_option", "option_out_of_range"})
 
 
+_ADVICE = {
+    "job_not_found": "`splatmill jobs` lists the jobs.",
+    "capture_not_found": "`splatmill captures` lists the captures.",
+    "model_not_found": "`splatmill models` lists the models.",
+    "job_running": "Wait until it has ended, or cancel it: splatmill cancel {job}",
+    "job_finished": "Delete it if it is no longer needed: splatmill delete {job}",
+    "capture_in_use": "Wait until its job has ended, or cancel it: splatmill cancel {job}",
+    "model_not_ready": "See how its job gets on: splatmill follow {job}",
+}
+"""What to do on the command line, by the code of a problem whose own advice is a request of the REST API."""
+
+
+def advice_of(error: errors.SplatmillError) -> str | None:
+    """Return what a person on the command line can do about an error."""
+    if not isinstance(error, errors.Refused) or "/v1/" not in (error.advice or ""):
+        return error.advice
+    known = _ADVICE.get(error.code, error.advice)
+    return known.replace("{job}", str(error.problem.facts.get("job", "JOB"))) if known else None
+
+
 def code_of(error: Exception) -> Exit:
     """Return the exit code for an error."""
     if isinstance(error, errors.Refused) and error.code in USAGE_CODES:
@@ -51,7 +71,7 @@ def code_of(error: Exception) -> Exit:
 def print_error(error: Exception) -> Exit:
     """Print the message of an error, the facts of a failed job, and the advice; return the exit code."""
     if isinstance(error, errors.SplatmillError):
-        message, advice = error.message, error.advice
+        message, advice = error.message, advice_of(error)
     elif isinstance(error, OSError):
         place = f"{error.filename}: " if error.filename else ""
         message, advice = f"{place}{error.strerror or error}.", None
