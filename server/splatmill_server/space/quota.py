@@ -95,7 +95,10 @@ class Quota:
 
         Raises a 404 problem without a capture, and a 507 problem where the quota does not suffice.
         """
-        owner = (await run_in_threadpool(self.captures.record, capture_id)).owner
+        try:
+            owner = (await run_in_threadpool(self.captures.record, capture_id)).owner
+        except ProblemError as error:
+            raise (error.about_file(file) if file is not None else error) from error
         limit = await run_in_threadpool(self._begin, who, owner)
         arrival = Arrival(self.usage, owner, capture_id, limit, is_stored)
         arrival.file = file
