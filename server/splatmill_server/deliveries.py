@@ -40,7 +40,9 @@ MAX_ANSWER = 500
 LONGEST_RETRY_AFTER = 86400
 """Seconds of the header Retry-After that are followed."""
 
-_LOOK_SECONDS = 2.0
+_LOOK_SECONDS = 5.0
+"""Seconds between two looks for deliveries that are due. Each is a request to a bucket."""
+
 _LOST_SECONDS = 60.0
 """Seconds between two looks for jobs that Redis has lost."""
 
