@@ -36,6 +36,12 @@ def _file_and_folder(bench: Bench) -> Answer:
     return bench.put("images/x/a.jpg", b"two", capture=capture)
 
 
+def _folder_and_file(bench: Bench) -> Answer:
+    capture = bench.capture()
+    assert bench.put("images/x/a.jpg", b"one", capture=capture).kind == "201"
+    return bench.put("images/x", b"two", capture=capture)
+
+
 def _cut_off(bench: Bench) -> Answer:
     """A body that ends early leaves nothing behind."""
     capture = bench.capture()
@@ -136,6 +142,7 @@ REQUESTS = (
     ),
     Hostile("Names", "`x.jpg`, then `X.jpg` with other bytes", _case, "201", "'X.jpg'"),
     Hostile("Names", "`x`, then `x/a.jpg`", _file_and_folder, "409 `name_taken`", "images/x"),
+    Hostile("Names", "`x/a.jpg`, then `x`", _folder_and_file, "409 `name_taken`", "images/x/a.jpg"),
     Hostile("Names", "a role of its own, `secrets/a.jpg`", lambda b: b.put("secrets/a.jpg"), SCHEMA, "role"),
     Hostile(
         "Names",
