@@ -5,6 +5,7 @@ Not proved here: the figures themselves (tests/server/space).
 
 import asyncio
 import json
+from datetime import UTC, datetime, timedelta
 
 from typer.testing import CliRunner
 
@@ -65,3 +66,44 @@ def test_a_capture_in_use_names_its_job(service: Service, tmp_path) -> None:
         job = client.submit(capture).id
     shown = CliRunner().invoke(app, ["storage", "--server", service.url], env=WIDE)
     assert f"not before job {job} ends" in shown.output
+
+
+def test_planned_deletions_and_expiries_are_shown_with_whole_ids(peer, reply) -> None:
+    now = datetime.now(UTC)
+    capture, model = "c" * 32, "d" * 16
+    known = {"owner": "lab", "bytes": 2_000_000, "last_used": (now - timedelta(days=40)).isoformat()}
+    use = {
+        "scanned_at": now.isoformat(),
+        "owners": [
+            {"owner": "lab", "bytes": 3_000_000, "limit": 5_000_000},
+            {"owner": None, "bytes": 7},
+        ],
+        "largest": [
+            {"kind": "capture", "id": capture, "files": 3, **known, "expires_at": now.isoformat()},
+            {"kind": "model", "id": model, "files": 3, **known, "expires_at": _later(now, days=9.9)},
+        ],
+        "deletions": [
+            {
+                "kind": "capture",
+                "id": capture,
+                "owner": "lab",
+                "bytes": 2_000_000,
+                "reason": "It was not used for 30 days.",
+            }
+        ],
+    }
+    peer.answer = lambda _: reply(body=json.dumps(use).encode())
+    shown = CliRunner().invoke(app, ["storage", "--server", peer.url, "--owner", "lab", "-n", "2"])
+    assert shown.exit_code == 0, shown.output
+    assert peer.seen[0].path == "/v1/storage?largest=2&owner=lab"
+    lines = [" ".join(line.split()) for line in shown.output.splitlines()]
+    assert "lab 3.0 MB 0 B 0 B 0 B 0 B 0 B 5.0 MB" in lines
+    assert "(nobody) 7 B 0 B 0 B 0 B 0 B 0 B none" in lines
+    assert f"capture {capture} lab 2.0 MB 40 d ago by the next sweep" in lines
+    assert f"model {model} lab 2.0 MB 40 d ago in 10 d" in lines
+    assert "The next sweep deletes 2.0 MB:" in lines
+    assert lines[-1] == f"capture {capture} 2.0 MB It was not used for 30 days."
+
+
+def _later(now: datetime, *, days: float) -> str:
+    return (now + timedelta(days=days)).isoformat()

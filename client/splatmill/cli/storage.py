@@ -11,6 +11,9 @@ from splatmill.cli.servers import ServerOption, open_client
 if TYPE_CHECKING:
     from splatmill.schema import StorageUse, StoredRecord
 
+WIDTH = 200
+"""Characters per line of what is not printed on a terminal."""
+
 
 def storage(
     server: ServerOption = None,
@@ -30,7 +33,9 @@ def storage(
         return
     from rich.console import Console
 
-    console = Console(soft_wrap=True)
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH)  # for programs and files, which have no width of their own
     _print_owners(console, use)
     _print_largest(console, use)
     _print_deletions(console, use)
@@ -89,7 +94,9 @@ def _print_table(console: object, heads: tuple[str, ...], rows: Sequence[tuple[s
     from rich.table import Table
 
     assert isinstance(console, Console)
-    table = Table(*heads, box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False)
+    for head in heads:
+        table.add_column(head, overflow="fold")
     for row in rows:
         table.add_row(*row)
     console.print(table)
