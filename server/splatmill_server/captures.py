@@ -40,6 +40,9 @@ _COUNTED_CAPTURES = 1000
 STALE_SECONDS = 24 * 3600
 """Age at which an unfinished upload counts as abandoned."""
 
+_IDS_OF_KEY = 3
+"""Number of ids that the capture of a key may have."""
+
 _CLAIM_SECONDS = 60
 """Seconds for which a digest without a file counts as an upload that is about to be renamed into place."""
 
@@ -59,7 +62,15 @@ class Captures:
 
         With a `key` that the owner has used before, the record is that of the same capture. Its id follows from both.
         """
-        capture_id = secrets.token_hex(8) if key is None else _id_of_key(owner, key)
+        capture_id = secrets.token_hex(8)
+        if key is not None:
+            ids = [_id_of_key(owner, key, number) for number in range(_IDS_OF_KEY)]
+            for known in ids:
+                if self.storage.exists(layout.capture_record(known)):
+                    return self.record(known), False
+            # Files without a record belong to a capture that is being deleted, and new ones would go with them.
+            free = (known for known in ids if not any(self.storage.entries(layout.capture(known))))
+            capture_id = next(free, capture_id)
         capture = Capture(id=capture_id, name=name, owner=owner, created_at=datetime.now(UTC))
         record = json.dumps(capture.model_dump(mode="json", exclude={"files"}) | {"format": FORMAT}).encode()
         if self.storage.put_new(layout.capture_record(capture.id), record):
@@ -438,8 +449,9 @@ def check_whole(
         )
 
 
-def _id_of_key(owner: str, key: str) -> str:
-    return hashlib.sha256(f"{owner}\0{key}".encode()).hexdigest()[:32]
+def _id_of_key(owner: str, key: str, number: int) -> str:
+    """Return one of the ids that the capture of a key may have: the first, unless that is being deleted."""
+    return hashlib.sha256(f"{owner}\0{key}\0{number}".encode()).hexdigest()[:32]
 
 
 def sent_name(name: str) -> str:

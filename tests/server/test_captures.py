@@ -307,3 +307,17 @@ def test_requests_with_the_same_key_get_the_same_capture(app: ServedApp) -> None
         answers = list(pool.map(create, range(6)))
     assert sorted(code for code, _ in answers) == [200] * 5 + [201]
     assert len({capture_id for _, capture_id in answers}) == 1
+
+
+def test_a_key_gives_no_capture_that_is_being_deleted(app: ServedApp) -> None:
+    """Its files are deleted after its record, one by one; a file that was uploaded again would be deleted with them."""
+    body = {"key": "digest of the photos"}
+    first = app.http.post("/v1/captures", json=body).json()["id"]
+    assert app.http.put(f"/v1/captures/{first}/images/a.jpg", content=PHOTO).status_code == 201
+    app.service.storage.delete(layout.capture_record(first))
+    second = app.http.post("/v1/captures", json=body)
+    assert second.status_code == 201
+    assert second.json()["id"] != first
+    app.service.storage.delete_prefix(layout.capture(first))
+    again = app.http.post("/v1/captures", json=body)
+    assert (again.status_code, again.json()["id"]) == (200, second.json()["id"])
