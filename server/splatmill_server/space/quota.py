@@ -36,8 +36,8 @@ class Quota:
 
     default: the limit of owners whose key has none; None is no limit.
 
-    Methods raise redis.RedisError only where there is a limit. Uploads without one do not depend on Redis; the next
-    scan of storage counts them.
+    Methods raise redis.RedisError, and 503 problems, only where there is a limit. Uploads without one do not depend on
+    Redis; the next scan of storage counts them.
     """
 
     def __init__(self, usage: Usage, captures: Captures, default: int | None) -> None:
@@ -64,11 +64,21 @@ class Quota:
         limit = self.limit(who, owner)
         if limit is None:
             return
-        self.usage.refresh(_OLDEST)
+        self._refresh()
         self._note(who, owner)
         used = self.usage.ledger.bytes_of(owner)
         if used + max(size, 1) > limit:
             raise _exceeded(owner, used, limit, size or None)
+
+    def _refresh(self) -> None:
+        """Scan storage if the figures are old. Raises a 503 problem if there are none yet."""
+        self.usage.refresh(_OLDEST)
+        if self.usage.ledger.last_scan() is None:
+            raise ProblemError(
+                "storage_unavailable",
+                "It is not known yet how many bytes are stored: storage is being listed for the first time.",
+                advice="Try again in a minute.",
+            )
 
     def _note(self, who: Caller, owner: str) -> None:
         if who.owner == owner:
@@ -117,7 +127,7 @@ class Quota:
             if who is not None:
                 self._note(who, owner)
             if limit is not None:
-                self.usage.refresh(_OLDEST)
+                self._refresh()
         except redis.RedisError:
             if who is None or self.limit(who, owner) is not None:
                 raise

@@ -13,6 +13,7 @@ import pytest
 from splatmill.backplane import keys, layout
 from splatmill_server.problems import ProblemError
 from splatmill_server.space import quota as quota_module
+from splatmill_server.space import usage as usage_module
 from tests.server.space.conftest import Person, ServePeople
 from tests.support.served_app import ServedApp, problem, stored
 from tests.support.waiting import wait_for
@@ -219,4 +220,17 @@ def test_figures_lost_with_redis_are_scanned_before_an_upload_is_judged(
 ) -> None:
     capture = ann.capture(9000)
     people.redis.delete(*people.redis.keys(f"{keys.PREFIX}stored*"))
+    problem(ann.put(capture, "more.jpg", b"x" * 2000), 507, "quota_exceeded")
+
+
+def test_nothing_is_admitted_before_it_is_known_what_is_stored(
+    people: ServedApp, ann: Person, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = Person(people.http, "ann").capture(9000)
+    monkeypatch.setattr(usage_module, "_FIRST_SCAN_SECONDS", 0.1)
+    people.redis.delete(*people.redis.keys(f"{keys.PREFIX}stored*"))
+    people.redis.set(keys.SCAN_LOCK, "another process", ex=60)
+    problem(ann.put(capture, "more.jpg", b"x" * 2000), 503, "storage_unavailable")
+    problem(ann("POST", "/v1/captures", json={}), 503, "storage_unavailable")
+    people.redis.delete(keys.SCAN_LOCK)
     problem(ann.put(capture, "more.jpg", b"x" * 2000), 507, "quota_exceeded")
