@@ -191,12 +191,17 @@ class AsyncClient:
         response = await self.connection.request("GET", f"/v1/captures/{capture_id}")
         return read_answer(Capture, response)
 
-    def captures(self, *, limit: int | None = None, name: str | None = None) -> AsyncIterator[Capture]:
+    def captures(
+        self, *, limit: int | None = None, name: str | None = None, owner: str | None = None
+    ) -> AsyncIterator[Capture]:
         """Yield the captures without their files, newest first, at most `limit` of them.
 
-        `name` leaves those whose name contains this text, in any case of letters. Pages are requested as needed.
+        `name` chooses those whose name contains this text, in any case of letters. `owner` chooses those of one
+        owner, for callers with the scope admin. Pages are requested as needed.
         """
-        return self._entries(CapturePage, "/v1/captures", lambda page: page.captures, limit, {"name": name})
+        return self._entries(
+            CapturePage, "/v1/captures", lambda page: page.captures, limit, {"name": name, "owner": owner}
+        )
 
     async def delete_capture(self, capture_id: str) -> None:
         """Delete a capture and its files. Raises Conflict while an unfinished job uses it."""
@@ -214,26 +219,33 @@ class AsyncClient:
         state: str | Iterable[str] | None = None,
         name: str | None = None,
         capture: str | None = None,
+        owner: str | None = None,
     ) -> AsyncIterator[Job]:
         """Yield the jobs, newest first, at most `limit` of them.
 
-        `state` leaves those in this state, or in one of several. `name` leaves those whose name contains this text, in
-        any case of letters, and `capture` those on the capture with this id. Pages are requested as needed.
+        `state` chooses those in this state, or one of several. `name` chooses those whose name contains this text, in
+        any case of letters, `capture` those on the capture with this id, and `owner` those of one owner, for callers
+        with the scope admin. Pages are requested as needed.
         """
         states = [state] if isinstance(state, str) else list(state or ())
-        wanted = {"state": states or None, "name": name, "capture": capture}
+        wanted = {"state": states or None, "name": name, "capture": capture, "owner": owner}
         return self._entries(JobPage, "/v1/jobs", lambda page: page.jobs, limit, wanted)
 
     async def model(self, model_id: str) -> AsyncModelHandle:
         """Return the finished model with this id, which is that of its job."""
         return await find_model(self.connection, model_id)
 
-    def models(self, *, limit: int | None = None, name: str | None = None) -> AsyncIterator[Model]:
+    def models(
+        self, *, limit: int | None = None, name: str | None = None, owner: str | None = None
+    ) -> AsyncIterator[Model]:
         """Yield the finished models, newest first, at most `limit` of them.
 
-        `name` leaves those whose name contains this text, in any case of letters. Pages are requested as needed.
+        `name` chooses those whose name contains this text, in any case of letters. `owner` chooses those of one
+        owner, for callers with the scope admin. Pages are requested as needed.
         """
-        return self._entries(ModelPage, "/v1/models", lambda page: page.models, limit, {"name": name})
+        return self._entries(
+            ModelPage, "/v1/models", lambda page: page.models, limit, {"name": name, "owner": owner}
+        )
 
     async def options(self) -> list[OptionHelp]:
         """Return the training options of the server, with type, default, range and help."""

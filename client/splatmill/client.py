@@ -158,12 +158,15 @@ class Client:
         """Return a stored capture with its files."""
         return self._loop.run(self._async.capture(capture_id))
 
-    def captures(self, *, limit: int | None = None, name: str | None = None) -> Iterator[Capture]:
+    def captures(
+        self, *, limit: int | None = None, name: str | None = None, owner: str | None = None
+    ) -> Iterator[Capture]:
         """Yield the captures without their files, newest first, at most `limit` of them.
 
-        `name` leaves those whose name contains this text, in any case of letters.
+        `name` chooses those whose name contains this text, in any case of letters. `owner` chooses those of one
+        owner, for callers with the scope admin.
         """
-        return self._loop.iterate(self._async.captures(limit=limit, name=name))
+        return self._loop.iterate(self._async.captures(limit=limit, name=name, owner=owner))
 
     def delete_capture(self, capture_id: str) -> None:
         """Delete a capture and its files. Raises Conflict while an unfinished job uses it."""
@@ -180,24 +183,31 @@ class Client:
         state: str | Iterable[str] | None = None,
         name: str | None = None,
         capture: str | None = None,
+        owner: str | None = None,
     ) -> Iterator[Job]:
         """Yield the jobs, newest first, at most `limit` of them.
 
-        `state` leaves those in this state, or in one of several. `name` leaves those whose name contains this text, in
-        any case of letters, and `capture` those on the capture with this id.
+        `state` chooses those in this state, or one of several. `name` chooses those whose name contains this text, in
+        any case of letters, `capture` those on the capture with this id, and `owner` those of one owner, for callers
+        with the scope admin.
         """
-        return self._loop.iterate(self._async.jobs(limit=limit, state=state, name=name, capture=capture))
+        return self._loop.iterate(
+            self._async.jobs(limit=limit, state=state, name=name, capture=capture, owner=owner)
+        )
 
     def model(self, model_id: str) -> "ModelHandle":
         """Return the finished model with this id, which is that of its job."""
         return ModelHandle(self._loop, self._loop.run(self._async.model(model_id)))
 
-    def models(self, *, limit: int | None = None, name: str | None = None) -> Iterator[Model]:
+    def models(
+        self, *, limit: int | None = None, name: str | None = None, owner: str | None = None
+    ) -> Iterator[Model]:
         """Yield the finished models, newest first, at most `limit` of them.
 
-        `name` leaves those whose name contains this text, in any case of letters.
+        `name` chooses those whose name contains this text, in any case of letters. `owner` chooses those of one
+        owner, for callers with the scope admin.
         """
-        return self._loop.iterate(self._async.models(limit=limit, name=name))
+        return self._loop.iterate(self._async.models(limit=limit, name=name, owner=owner))
 
     def options(self) -> list[OptionHelp]:
         """Return the training options of the server, with type, default, range and help."""

@@ -124,6 +124,8 @@ class Connection:
             wish = retry_after(response)
             unhandled = response.status_code == 429 and wish is not None
             repeats = (may_repeat or unhandled) and response.status_code in TRANSIENT
+            # Without a time, it is a limit that waiting does not lift, such as that of unfinished jobs.
+            repeats = repeats and (method != "POST" or response.status_code != 429 or unhandled)
             if last or too_slow or not repeats or (wish or 0.0) > LONGEST_WISH:
                 raise error_for(read_problem(response), wish)
             await asyncio.sleep(max(backoff(tries), wish or 0.0))

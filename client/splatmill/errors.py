@@ -9,7 +9,7 @@ SplatmillError
 │   ├── NotFound              there is no such capture, job, model or file, or it was deleted
 │   ├── Conflict              the job or model is in the wrong state, or the name is taken
 │   ├── Unavailable           a part of the service is down or full; try again later
-│   │   └── TooManyRequests   the caller has sent more than it may (`.retry_after` says when to go on)
+│   │   └── TooManyRequests   the caller has sent or started more than it may (`.retry_after` says when to go on)
 │   └── ServerError           the service failed to handle the request
 ├── JobFailed                 the job ended without a model (`.problem` says why)
 ├── JobCancelled              the job was cancelled
@@ -89,7 +89,10 @@ class Unavailable(Refused):
 
 
 class TooManyRequests(Unavailable):
-    """The caller has sent more requests than it may. Try again after `retry_after` seconds."""
+    """The caller has sent more requests, or has more unfinished jobs, than it may.
+
+    Try again after `retry_after` seconds, if that is given.
+    """
 
 
 class ServerError(Refused):

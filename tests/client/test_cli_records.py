@@ -71,6 +71,11 @@ def test_lists_are_narrowed_by_options(at, jobs):
     assert listed("--name", "KITCHEN") == [jobs[0]]
     assert listed("--capture", capture_of(at, jobs[0])) == jobs[::-1]
     assert listed("--capture", "0" * 16) == []
+    assert listed("--owner", "default") == jobs[::-1]
+    assert listed("--owner", "nobody") == []
+    for command in ("captures", "models"):
+        assert invoke(command, "--json", "--owner", "default", *at).stdout
+        assert not invoke(command, "--json", "--owner", "nobody", *at).stdout
     assert invoke("jobs", "--name", "none such", *at).stdout == "No job matches.\n"
     assert invoke("jobs", "--state", "sleeping", *at).exit_code == Exit.usage
 
@@ -87,8 +92,8 @@ def test_captures_and_models_are_listed_and_shown(at, jobs):
     for line in (f"model     {jobs[0]}", "Gaussians 1, spherical", "held out  PSNR 25.00 dB", "model.ply"):
         assert line in shown
     assert json.loads(invoke("models", jobs[0], "--json", *at).stdout)["gaussians"] == 1
-    assert invoke("models", "--name", "garden", *at).stdout == "No model has such a name.\n"
-    assert invoke("captures", "--name", "garden", *at).stdout == "No capture has such a name.\n"
+    assert invoke("models", "--name", "garden", *at).stdout == "No model matches.\n"
+    assert invoke("captures", "--name", "garden", *at).stdout == "No capture matches.\n"
     assert invoke("models", jobs[1], *at).exit_code == Exit.not_found
     assert invoke("captures", "0" * 16, *at).exit_code == Exit.not_found
 

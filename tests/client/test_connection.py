@@ -63,6 +63,14 @@ def test_a_request_that_was_not_handled_is_sent_again_when_the_server_says_so(pe
     assert [seen.method for seen in peer.seen] == ["POST", "POST", "PUT"]
 
 
+def test_a_limit_that_no_time_lifts_is_told_at_once(peer, reply):
+    peer.answer = lambda _: reply(**problem("too_many_jobs"))
+    with Client(peer.url) as client, pytest.raises(TooManyRequests) as error:
+        client.submit("c1")
+    assert error.value.retry_after is None
+    assert len(peer.seen) == 1
+
+
 def test_a_long_time_to_wait_is_told_and_not_slept_through(peer, reply):
     busy = problem("too_many_requests")
     busy["headers"] |= {"Retry-After": "3600"}

@@ -39,13 +39,17 @@ def jobs(
     capture: Annotated[
         str | None, typer.Option("--capture", metavar="ID", help="List only jobs on this capture.")
     ] = None,
+    owner: Annotated[
+        str | None,
+        typer.Option("--owner", help="List only this owner's jobs; it needs a key with the scope admin."),
+    ] = None,
     limit: Annotated[int, typer.Option("-n", "--limit", min=1, help="Largest number of jobs to list.")] = 20,
     as_json: JsonLines = False,
     server: ServerOption = None,
 ) -> None:
     """List the jobs, newest first."""
     with open_client(server) as client:
-        found = list(client.jobs(limit=limit, state=state, name=name, capture=capture))
+        found = list(client.jobs(limit=limit, state=state, name=name, capture=capture, owner=owner))
     if as_json:
         print_lines(found)
     elif found:
@@ -54,7 +58,7 @@ def jobs(
             for job in found
         ]
         print_table(("job", "name", "state", "progress", "created"), rows)
-    elif state or name or capture:
+    elif state or name or capture or owner:
         typer.echo("No job matches.")
     else:
         typer.echo("There are no jobs yet. Start one with: splatmill train PHOTOS --server URL")

@@ -23,12 +23,18 @@ NamePart = Annotated[
     typer.Option("--name", help="List only records whose name contains this text, in any case of letters."),
 ]
 
+Owner = Annotated[
+    str | None,
+    typer.Option("--owner", help="List only this owner's records; it needs a key with the scope admin."),
+]
+
 
 def captures(
     capture_id: Annotated[
         str | None, typer.Argument(metavar="CAPTURE", help="Id of a capture to show.", show_default=False)
     ] = None,
     name: NamePart = None,
+    owner: Owner = None,
     limit: Limit = 20,
     as_json: JsonLines = False,
     server: ServerOption = None,
@@ -38,14 +44,14 @@ def captures(
         if capture_id is not None:
             _show_capture(client.capture(capture_id), as_json)
             return
-        found = list(client.captures(name=name, limit=limit))
+        found = list(client.captures(name=name, owner=owner, limit=limit))
     if as_json:
         print_lines(found)
     elif found:
         rows = [(entry.id, entry.name or "", local_time(entry.created_at)) for entry in found]
         print_table(("capture", "name", "created"), rows)
     else:
-        typer.echo("No capture is stored." if name is None else "No capture has such a name.")
+        typer.echo("No capture is stored." if name is owner is None else "No capture matches.")
 
 
 def models(
@@ -53,6 +59,7 @@ def models(
         str | None, typer.Argument(metavar="MODEL", help="Id of a model to show.", show_default=False)
     ] = None,
     name: NamePart = None,
+    owner: Owner = None,
     limit: Limit = 20,
     as_json: JsonLines = False,
     server: ServerOption = None,
@@ -64,7 +71,7 @@ def models(
         if model_id is not None:
             _show_model(client.model(model_id).model, as_json)
             return
-        found = list(client.models(name=name, limit=limit))
+        found = list(client.models(name=name, owner=owner, limit=limit))
     if as_json:
         print_lines(found)
     elif found:
@@ -81,7 +88,7 @@ def models(
         ]
         print_table(("model", "name", "Gaussians", "size", "PSNR", "created"), rows)
     else:
-        typer.echo("No model is finished." if name is None else "No model has such a name.")
+        typer.echo("No model is finished." if name is owner is None else "No model matches.")
 
 
 def _show_capture(capture: "Capture", as_json: bool) -> None:
