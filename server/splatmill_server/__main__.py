@@ -17,8 +17,8 @@ from pydantic import ValidationError
 from splatmill.backplane.connection import InvalidRedisUrl
 from splatmill.backplane.redact import redacted
 from splatmill.backplane.storage import StorageError
+from splatmill_server.access.exposure import NeedsKey
 from splatmill_server.app import create_app
-from splatmill_server.exposure import NeedsKey
 from splatmill_server.settings import Settings
 
 log = structlog.get_logger()

@@ -14,9 +14,10 @@ import splatmill
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import CreateJob, EventRecord, Problem
 from splatmill_server import problems
-from splatmill_server.exposure import check_exposure
+from splatmill_server.access.exposure import check_exposure
+from splatmill_server.access.permission import PERMITTED
+from splatmill_server.access.sessions import COOKIE
 from splatmill_server.middleware import RequestMiddleware
-from splatmill_server.permission import PERMITTED
 from splatmill_server.routes import (
     captures,
     imports,
@@ -31,7 +32,6 @@ from splatmill_server.routes import (
 )
 from splatmill_server.routes import keys as key_routes
 from splatmill_server.service import Service
-from splatmill_server.sessions import COOKIE
 from splatmill_server.settings import Settings
 
 log = structlog.get_logger()

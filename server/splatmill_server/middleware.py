@@ -16,10 +16,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import Problem, format_bytes
-from splatmill_server.caller import NOBODY, Caller
-from splatmill_server.permission import OPEN_PATHS
+from splatmill_server.access.caller import NOBODY, Caller
+from splatmill_server.access.permission import OPEN_PATHS
+from splatmill_server.access.rate import Rate
 from splatmill_server.problems import ProblemError, ProblemResponse, problem_of_redis, problem_of_storage
-from splatmill_server.rate import Rate
 from splatmill_server.service import Service
 
 log = structlog.get_logger()

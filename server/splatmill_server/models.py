@@ -12,7 +12,7 @@ from splatmill.backplane.records import UnreadableRecord, warn
 from splatmill.backplane.storage import Entry, Storage
 from splatmill.schema import JobState, Model, ModelCameras, ModelFile, ModelPage, Report
 from splatmill_server.filters import Filter
-from splatmill_server.jobs import Jobs, read_record
+from splatmill_server.jobs.records import Jobs, read_record
 from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError
 

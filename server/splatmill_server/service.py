@@ -14,18 +14,17 @@ from redis.asyncio import Redis as AsyncRedis
 from splatmill.backplane import rendering
 from splatmill.backplane.connection import connect, connect_async
 from splatmill.backplane.storage import Storage, StorageError
-from splatmill_server.authentication import Authentication
-from splatmill_server.captures import Captures
-from splatmill_server.deliveries import Deliveries
-from splatmill_server.imports import Imports
-from splatmill_server.jobs import Jobs
-from splatmill_server.keys import Keys
+from splatmill_server.access.authentication import Authentication
+from splatmill_server.access.keys import Keys
+from splatmill_server.access.sessions import Sessions
+from splatmill_server.captures.imports import Imports
+from splatmill_server.captures.partial_uploads import PartialUploads
+from splatmill_server.captures.records import Captures
+from splatmill_server.jobs.reaper import Reaper
+from splatmill_server.jobs.records import Jobs
 from splatmill_server.metrics import Metrics
 from splatmill_server.models import Models
 from splatmill_server.outgoing import Outgoing
-from splatmill_server.partial_uploads import PartialUploads
-from splatmill_server.reaper import Reaper
-from splatmill_server.sessions import Sessions
 from splatmill_server.settings import Settings
 from splatmill_server.space.deletion import Deletion
 from splatmill_server.space.ledger import Ledger
@@ -33,7 +32,8 @@ from splatmill_server.space.quota import Quota
 from splatmill_server.space.retention import Ages
 from splatmill_server.space.sweeper import Sweeper
 from splatmill_server.space.usage import Usage
-from splatmill_server.webhooks import Webhooks
+from splatmill_server.webhooks.deliveries import Deliveries
+from splatmill_server.webhooks.records import Webhooks
 
 CHECK_SECONDS = 5.0
 """Seconds for which a check of storage holds: everybody may request `/readyz`, and each check writes a file."""

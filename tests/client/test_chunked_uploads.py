@@ -1,7 +1,7 @@
 """Large files against the real server: they go on where they stopped, whatever breaks, and arrive as they were.
 
 Breaks are real: connections are cut by a proxy in between, the server is stopped and started again, and the command is
-killed. Not proved here: the server's side in detail (tests/server/test_partial_uploads.py).
+killed. Not proved here: the server's side in detail (tests/server/captures/test_partial_uploads.py).
 """
 
 import asyncio

@@ -1,6 +1,6 @@
 """Imports through the SDK and through `splatmill import`, against the real server and a real other one.
 
-Not proved here: how a file is fetched, and what is refused (tests/server/test_imports.py, test_outgoing.py).
+Not proved here: how a file is fetched, and what is refused (tests/server/captures/test_imports.py, test_outgoing.py).
 """
 
 import asyncio

@@ -1,6 +1,6 @@
 """Keys through the SDK, synchronous and asynchronous, and through `splatmill keys`, against the real server.
 
-Not proved here: what the server does with a key (tests/server/test_keys.py).
+Not proved here: what the server does with a key (tests/server/access/test_keys.py).
 """
 
 import asyncio

@@ -1,6 +1,6 @@
 """Webhooks through the SDK, synchronous and asynchronous, and through `splatmill webhooks`, against the real server.
 
-Not proved here: what is sent and when (tests/server/test_webhooks.py).
+Not proved here: what is sent and when (tests/server/webhooks/test_webhooks.py).
 """
 
 import asyncio

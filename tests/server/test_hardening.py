@@ -13,8 +13,8 @@ import pytest
 from splatmill.backplane.connection import InvalidRedisUrl, connect, connect_async
 from splatmill.backplane.redact import redacted
 from splatmill_server import service
+from splatmill_server.access.exposure import NeedsKey
 from splatmill_server.app import create_app
-from splatmill_server.exposure import NeedsKey
 from splatmill_server.settings import Settings
 from tests.support.served_app import Serve, ServedApp
 

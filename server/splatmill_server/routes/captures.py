@@ -8,13 +8,13 @@ from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import SHA256_HEADER, Capture, CaptureFile, CapturePage, CreateCapture, Role, safe_name
 from splatmill.schema.uploads import UPLOAD_COMPLETE, UPLOAD_LENGTH, read_boolean
-from splatmill_server.caller import Who
+from splatmill_server.access.caller import Who
 from splatmill_server.filters import Filter
-from splatmill_server.ownership import CaptureId, ListedOwner
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.problems import ProblemError
 from splatmill_server.routes import uploads
 from splatmill_server.routes.openapi import CAPTURE_EXAMPLE, answer, example, problems
+from splatmill_server.routes.ownership import CaptureId, ListedOwner
 from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit, NamePart
 from splatmill_server.service import Shared
 

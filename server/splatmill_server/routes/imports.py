@@ -7,9 +7,9 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from splatmill.schema import CreateImport, Import, ImportList
-from splatmill_server.caller import Who
-from splatmill_server.ownership import CaptureId
+from splatmill_server.access.caller import Who
 from splatmill_server.routes.openapi import problems
+from splatmill_server.routes.ownership import CaptureId
 from splatmill_server.routes.requests import JSON_ONLY
 from splatmill_server.service import Shared
 

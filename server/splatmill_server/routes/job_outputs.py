@@ -11,13 +11,13 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response, Strea
 from splatmill.backplane import events, layout
 from splatmill.backplane.records import check_format
 from splatmill.schema import Curve, LogPage, PreviewEvent, Report
-from splatmill_server import job_log
-from splatmill_server.files import file_response
-from splatmill_server.ownership import JobId
+from splatmill_server.answers.files import file_response
+from splatmill_server.answers.sse import Follower, Position, event_stream, stored_stream
+from splatmill_server.jobs import log as job_log
 from splatmill_server.problems import ProblemError
 from splatmill_server.routes.openapi import answer, binary, problems
+from splatmill_server.routes.ownership import JobId
 from splatmill_server.service import Service, Shared
-from splatmill_server.sse import Follower, Position, event_stream, stored_stream
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
 

@@ -9,13 +9,13 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import IDEMPOTENCY_HEADER, CreateJob, Job, JobPage, JobState
-from splatmill_server.caller import Caller, Who
+from splatmill_server.access.caller import Caller, Who
 from splatmill_server.filters import JobFilter
-from splatmill_server.job_form import check_start_model, create_from_form
-from splatmill_server.ownership import JobId, ListedOwner, check_capture
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.problems import ProblemError
+from splatmill_server.routes.job_form import check_start_model, create_from_form
 from splatmill_server.routes.openapi import JOB_REQUESTS, answer, problems
+from splatmill_server.routes.ownership import JobId, ListedOwner, check_capture
 from splatmill_server.routes.requests import Cursor, Limit, NamePart
 from splatmill_server.service import Service, Shared
 

@@ -10,13 +10,13 @@ from starlette.responses import Response
 
 from splatmill.backplane import layout, rendering
 from splatmill.schema import Model, ModelCameras, ModelPage, OrbitRequest, RenderRequest, Scope
-from splatmill_server.files import file_response
+from splatmill_server.access.permission import needs
+from splatmill_server.answers.files import file_response
+from splatmill_server.answers.forward import forward
 from splatmill_server.filters import Filter
-from splatmill_server.forward import forward
-from splatmill_server.ownership import ListedOwner, ModelId
 from splatmill_server.paging import DEFAULT_LIMIT
-from splatmill_server.permission import needs
 from splatmill_server.routes.openapi import CAMERA, RENDER_REQUESTS, answer, binary, problems
+from splatmill_server.routes.ownership import ListedOwner, ModelId
 from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit, NamePart
 from splatmill_server.service import Shared
 

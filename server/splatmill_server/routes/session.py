@@ -4,15 +4,15 @@ from fastapi import APIRouter, Request
 from starlette.responses import Response
 
 from splatmill.schema import Scope
-from splatmill_server.authentication import bearer, session_cookie
-from splatmill_server.browsers import check_origin
-from splatmill_server.caller import Who
-from splatmill_server.keys import digest
-from splatmill_server.permission import needs
+from splatmill_server.access.authentication import bearer, session_cookie
+from splatmill_server.access.browsers import check_origin
+from splatmill_server.access.caller import Who
+from splatmill_server.access.keys import digest
+from splatmill_server.access.permission import needs
+from splatmill_server.access.sessions import COOKIE, Session
 from splatmill_server.problems import ProblemError
 from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.service import Shared
-from splatmill_server.sessions import COOKIE, Session
 
 router = APIRouter(prefix="/v1/session", tags=["keys"])
 

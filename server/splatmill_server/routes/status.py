@@ -24,8 +24,8 @@ from splatmill.schema import (
     describe_options,
 )
 from splatmill_server import metrics
-from splatmill_server.caller import Caller, Who
-from splatmill_server.docs_page import CONTENT_SECURITY_POLICY, docs_page
+from splatmill_server.access.caller import Caller, Who
+from splatmill_server.answers.docs_page import CONTENT_SECURITY_POLICY, docs_page
 from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.service import Service, Shared
 

@@ -5,9 +5,9 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 
 from splatmill.schema import PlannedDeletion, StorageUse
-from splatmill_server.caller import Caller, Who
-from splatmill_server.ownership import ListedOwner
+from splatmill_server.access.caller import Caller, Who
 from splatmill_server.routes.openapi import problems
+from splatmill_server.routes.ownership import ListedOwner
 from splatmill_server.service import Service, Shared
 from splatmill_server.space.ledger import NOBODY
 from splatmill_server.space.retention import expiry, plan

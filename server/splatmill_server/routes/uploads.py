@@ -22,12 +22,12 @@ from splatmill.schema.uploads import (
     read_integer,
     write_boolean,
 )
-from splatmill_server.caller import Caller, Who
-from splatmill_server.captures import STALE_SECONDS
-from splatmill_server.ownership import CaptureId
-from splatmill_server.partial_uploads import Standing
+from splatmill_server.access.caller import Caller, Who
+from splatmill_server.captures.partial_uploads import Standing
+from splatmill_server.captures.records import STALE_SECONDS
 from splatmill_server.problems import ProblemError
 from splatmill_server.routes.openapi import Responses, answer, problems
+from splatmill_server.routes.ownership import CaptureId
 from splatmill_server.service import Service, Shared
 
 router = APIRouter(prefix="/v1/captures", tags=["captures"])

@@ -15,8 +15,8 @@ from splatmill.backplane import keys, layout
 from splatmill.backplane.records import UnreadableRecord
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Capture, StoredKind
-from splatmill_server.captures import Captures
-from splatmill_server.jobs import Jobs
+from splatmill_server.captures.records import Captures
+from splatmill_server.jobs.records import Jobs
 from splatmill_server.problems import ProblemError
 from splatmill_server.space.holdings import Holding
 from splatmill_server.space.job_uses import JobUse, unfinished_jobs

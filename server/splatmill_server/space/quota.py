@@ -14,8 +14,8 @@ import structlog
 from starlette.concurrency import run_in_threadpool
 
 from splatmill.schema import format_bytes
-from splatmill_server.caller import Caller
-from splatmill_server.captures import Captures
+from splatmill_server.access.caller import Caller
+from splatmill_server.captures.records import Captures
 from splatmill_server.problems import ProblemError
 from splatmill_server.space.ledger import Upload
 from splatmill_server.space.usage import Usage

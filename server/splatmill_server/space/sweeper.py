@@ -11,7 +11,7 @@ from starlette.concurrency import run_in_threadpool
 from splatmill.backplane import keys, layout
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import StoredKind
-from splatmill_server.captures import Captures
+from splatmill_server.captures.records import Captures
 from splatmill_server.leases import lease
 from splatmill_server.problems import ProblemError
 from splatmill_server.space import leftovers

@@ -107,8 +107,8 @@ def _check_exposure(address: str, data: Path) -> None:
     if ipaddress.ip_address(address).is_loopback:
         return
     from splatmill.backplane.storage import Storage, StorageError
-    from splatmill_server.exposure import check_exposure
-    from splatmill_server.keys import Keys
+    from splatmill_server.access.exposure import check_exposure
+    from splatmill_server.access.keys import Keys
     from splatmill_server.settings import Settings
 
     try:

@@ -11,7 +11,7 @@ from obstore.store import MemoryStore
 
 from splatmill.backplane.storage import Storage
 from splatmill.schema import KeyLimits, Scope
-from splatmill_server import caller
+from splatmill_server.access import caller
 from tests.support.bucket import bucket
 from tests.support.served_app import Serve, ServedApp
 

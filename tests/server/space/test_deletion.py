@@ -11,7 +11,7 @@ import pytest
 from splatmill.backplane import keys, layout
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import CreateJob, TrainOptions
-from splatmill_server.jobs import Jobs
+from splatmill_server.jobs.records import Jobs
 from splatmill_server.problems import ProblemError
 from splatmill_server.space import deletion as deletion_module
 from splatmill_server.space import job_uses, marks
@@ -116,7 +116,7 @@ def test_a_mark_that_is_set_while_the_job_is_inserted_makes_the_insertion_look_a
         if len(looks) == 1:
             app.redis.set(keys.deleting(f"capture/{capture}"), "deleting")
 
-    monkeypatch.setattr("splatmill_server.jobs.check_marks", checked)
+    monkeypatch.setattr("splatmill_server.jobs.records.check_marks", checked)
     request = CreateJob(capture=capture)
     assert code_of(lambda: app.service.jobs.create(request, owner="ann")) == "capture_not_found"
     assert looks == [1]
@@ -155,7 +155,7 @@ def test_a_restarted_job_is_active_in_the_same_step(app: ServedApp, monkeypatch:
         check(*arguments)  # type: ignore[arg-type]  # passed on
         app.service.jobs.active()  # the reaper retires ended jobs at any moment
 
-    monkeypatch.setattr("splatmill_server.jobs.check_marks", checked)
+    monkeypatch.setattr("splatmill_server.jobs.records.check_marks", checked)
     assert app.http.post(f"/v1/jobs/{job_id}/restart").status_code == 202
     assert app.redis.smembers(keys.ACTIVE) == {job_id.encode()}
 

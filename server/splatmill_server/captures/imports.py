@@ -1,0 +1,278 @@
+"""Imports: the server fetches files of a capture from addresses that users give.
+
+An import is a record in storage and a mark that it has not ended, so it survives a restart: any API process takes up
+marked imports, under a lease in Redis. A file is always fetched from its beginning, and stored as an upload is.
+"""
+
+import asyncio
+import json
+import secrets
+import time
+from collections.abc import AsyncIterator
+from contextlib import suppress
+from datetime import UTC, datetime
+from functools import partial
+from urllib.parse import unquote
+
+import httpx
+import redis
+import structlog
+from starlette.concurrency import run_in_threadpool
+
+from splatmill.backplane import layout
+from splatmill.backplane.records import FORMAT, warn
+from splatmill.backplane.storage import Storage, StorageError
+from splatmill.schema import CreateImport, Import, ImportState, Problem, UnsafeName, safe_name
+from splatmill_server.captures.records import Captures
+from splatmill_server.leases import lease
+from splatmill_server.outgoing import AddressRefused, Answer, NoAnswer, Outgoing
+from splatmill_server.problems import ProblemError, problem_of_storage
+from splatmill_server.settings import Settings
+from splatmill_server.space.quota import Quota
+
+log = structlog.get_logger()
+
+MAX_REDIRECTS = 5
+MAX_ATTEMPTS = 4
+MAX_UNFINISHED = 100
+"""Imports of one capture that may be unfinished at once."""
+
+_CONCURRENT = 4
+"""Imports that one API process runs at once."""
+
+_LOOK_SECONDS = 15.0
+"""Seconds between two looks for imports that another process has left."""
+
+_RECORD_SECONDS = 3.0
+"""Seconds between two records of the bytes received."""
+
+_PAUSE_SECONDS = 5.0
+"""Seconds before the second attempt; doubled for each further one."""
+
+
+class Imports:
+    """All operations on imports."""
+
+    def __init__(
+        self,
+        connection: redis.Redis,
+        storage: Storage,
+        captures: Captures,
+        quota: Quota,
+        outgoing: Outgoing,
+        settings: Settings,
+    ) -> None:
+        self.connection = connection
+        self.storage = storage
+        self.captures = captures
+        self.quota = quota
+        self.outgoing = outgoing
+        self.settings = settings
+        self._wake = asyncio.Event()
+        self._gate = asyncio.Semaphore(_CONCURRENT)
+        self._running: dict[tuple[str, str], asyncio.Task[None]] = {}
+
+    async def create(self, capture_id: str, request: CreateImport) -> Import:
+        """Accept an import, which then runs in the background.
+
+        Raises problems for an address that is refused (422), and for too many imports (429), and those of a capture.
+        """
+        await run_in_threadpool(self.captures.record, capture_id)
+        try:
+            await self.outgoing.check(request.url)
+        except (AddressRefused, NoAnswer) as error:
+            raise ProblemError("url_refused", str(error), advice="Give an address that is public.") from error
+        made = Import(
+            id=secrets.token_hex(8),
+            capture=capture_id,
+            url=request.url,
+            role=request.role,
+            name=request.name or _name_of(request.url),
+            sha256=request.sha256,
+            state=ImportState.queued,
+            created_at=datetime.now(UTC),
+        )
+        await run_in_threadpool(self._accept, made)
+        self._wake.set()
+        return made
+
+    def _accept(self, made: Import) -> None:
+        self.captures.check_room(made.capture, None)
+        marks = self.storage.entries(layout.unfinished_imports())
+        if sum(entry.path.split("/")[-1].startswith(made.capture) for entry in marks) >= MAX_UNFINISHED:
+            raise ProblemError(
+                "too_many_requests",
+                f"The capture has {MAX_UNFINISHED} imports that have not ended.",
+                advice="Wait until some have ended, or import one zip archive in place of many files.",
+            )
+        self._write(made)
+        self.storage.put(layout.unfinished_import(made.capture, made.id), b"{}")
+
+    def get(self, capture_id: str, import_id: str) -> Import:
+        """Return an import. Raises a 404 problem."""
+        found = self._read(capture_id, import_id) if layout.is_id(import_id) else None
+        if found is None:
+            raise ProblemError(
+                "import_not_found",
+                f"The capture has no import {import_id[:80]!r}.",
+                advice="List the imports with GET /v1/captures/{id}/imports.",
+            )
+        return found
+
+    def of_capture(self, capture_id: str) -> list[Import]:
+        """Return the imports of a capture, newest first."""
+        self.captures.record(capture_id)
+        entries = self.storage.entries(layout.capture_imports(capture_id))
+        names = [entry.path.rsplit("/", 1)[-1].removesuffix(".json") for entry in entries]
+        found = [record for name in names if (record := self._read(capture_id, name)) is not None]
+        return sorted(found, key=lambda record: record.created_at, reverse=True)
+
+    async def run(self) -> None:
+        """Take up unfinished imports until this task is cancelled. A cancelled import is taken up again later."""
+        try:
+            while True:
+                self._wake.clear()
+                try:
+                    await self._take_up()
+                except (StorageError, redis.RedisError) as error:
+                    log.warning("imports cannot be looked for", error=str(error))
+                except Exception:
+                    log.exception("imports cannot be looked for")
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._wake.wait(), _LOOK_SECONDS)
+        finally:
+            tasks = list(self._running.values())
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _take_up(self) -> None:
+        marks = await run_in_threadpool(lambda: list(self.storage.entries(layout.unfinished_imports())))
+        for entry in marks:
+            capture_id, _, import_id = entry.path.rsplit("/", 1)[-1].partition(".")
+            key = (capture_id, import_id)
+            if key not in self._running and layout.is_id(capture_id) and layout.is_id(import_id):
+                task = asyncio.create_task(self._work(*key))
+                self._running[key] = task
+                task.add_done_callback(partial(self._running.pop, key))
+
+    async def _work(self, capture_id: str, import_id: str) -> None:
+        try:
+            async with self._gate, lease(self.connection, "import", f"{capture_id}.{import_id}") as mine:
+                if mine:
+                    await self._fetch_to_the_end(capture_id, import_id)
+        except (StorageError, redis.RedisError) as error:
+            log.warning("an import waits", capture=capture_id, id=import_id, error=str(error))
+        except Exception:
+            log.exception("an import waits", capture=capture_id, id=import_id)
+
+    async def _fetch_to_the_end(self, capture_id: str, import_id: str) -> None:
+        found = await run_in_threadpool(self._read, capture_id, import_id)
+        while found is not None and not found.state.final:
+            found = found.model_copy(
+                update={"state": ImportState.running, "attempts": found.attempts + 1, "received": 0}
+            )
+            await run_in_threadpool(self._write, found)
+            try:
+                async with asyncio.timeout(self.settings.import_seconds):
+                    found = await self._fetch(found)
+            except TimeoutError:
+                limit = f"{self.settings.import_seconds:.0f} seconds"
+                found = _failed(found, "import_failed", f"The file did not arrive within {limit}.")
+            except AddressRefused as error:
+                found = _failed(found, "url_refused", str(error))
+            except ProblemError as error:
+                found = found.model_copy(update={"state": ImportState.failed, "problem": error.problem})
+            except StorageError as error:
+                problem = problem_of_storage(error)
+                found = found.model_copy(update={"state": ImportState.failed, "problem": problem})
+            except NoAnswer as error:
+                if found.attempts >= MAX_ATTEMPTS:
+                    tried = f"It was tried {found.attempts} times."
+                    found = _failed(found, "import_failed", f"{error} {tried}")
+                else:
+                    log.info(
+                        "an import is tried again", id=import_id, attempt=found.attempts, reason=str(error)
+                    )
+                    await asyncio.sleep(_PAUSE_SECONDS * 2 ** (found.attempts - 1))
+            if found.state.final:
+                found = found.model_copy(update={"finished_at": datetime.now(UTC)})
+                await run_in_threadpool(self._write, found)
+        await run_in_threadpool(self.storage.delete, layout.unfinished_import(capture_id, import_id))
+
+    async def _fetch(self, found: Import) -> Import:
+        async with self.outgoing.request("GET", found.url, redirects=MAX_REDIRECTS) as answer:
+            _check(answer)
+            found = found.model_copy(update={"size": answer.size})
+            chunks = self._recorded(found, answer.chunks)
+            async with self.quota.upload(None, found.capture, answer.size) as arrival:
+                file, new = await self.captures.store(
+                    found.capture,
+                    found.role,
+                    found.name,
+                    arrival.counted(chunks),
+                    announced_sha256=found.sha256,
+                    announced_size=answer.size,
+                )
+                arrival.stored = file.size if new else 0
+        return found.model_copy(
+            update={"state": ImportState.succeeded, "received": file.size, "file": file, "name": file.name}
+        )
+
+    async def _recorded(self, found: Import, chunks: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+        """Pass the bytes on, and record their number every few seconds."""
+        received, written = 0, time.monotonic()
+        async for chunk in chunks:
+            received += len(chunk)
+            if time.monotonic() - written >= _RECORD_SECONDS:
+                await run_in_threadpool(self._write, found.model_copy(update={"received": received}))
+                written = time.monotonic()
+            yield chunk
+
+    def _read(self, capture_id: str, import_id: str) -> Import | None:
+        path = layout.import_record(capture_id, import_id)
+        try:
+            return Import.model_validate(json.loads(self.storage.get(path)))
+        except FileNotFoundError:
+            return None
+        except ValueError as error:
+            warn(path, str(error).splitlines()[0])
+            return None
+
+    def _write(self, record: Import) -> None:
+        """Store the record, unless its capture was deleted."""
+        if self.storage.exists(layout.capture_record(record.capture)):
+            fields = record.model_dump(mode="json", exclude_none=True) | {"format": FORMAT}
+            self.storage.put(layout.import_record(record.capture, record.id), json.dumps(fields).encode())
+
+
+def _check(answer: Answer) -> None:
+    """Raise NoAnswer for a status that may pass, and a problem for one that will not, or for an encoded body."""
+    if answer.status in (408, 425, 429) or answer.status >= 500:
+        raise NoAnswer(f"The other server answered with the status {answer.status}.")
+    if answer.status != 200:
+        raise ProblemError(
+            "import_failed",
+            f"The other server answered with the status {answer.status}.",
+            advice="Check the address, and that it needs no login.",
+            facts={"status": answer.status},
+        )
+    if answer.headers.get("content-encoding", "identity") != "identity":
+        raise ProblemError(
+            "import_failed", "The other server sent the file compressed, which was not asked for."
+        )
+
+
+def _failed(found: Import, code: str, detail: str) -> Import:
+    return found.model_copy(update={"state": ImportState.failed, "problem": Problem.of(code, detail)})
+
+
+def _name_of(url: str) -> str:
+    """Return the last part of an address as a file name. Raises a 422 problem if it is not one."""
+    last = unquote(httpx.URL(url).raw_path.decode("ascii").partition("?")[0].rsplit("/", 1)[-1])
+    try:
+        return safe_name(last)
+    except UnsafeName as error:
+        raise ProblemError(
+            "name_invalid", f"The address gives the file no name: {error}", advice="Send a `name`."
+        ) from error

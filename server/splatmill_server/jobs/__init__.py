@@ -1,0 +1,1 @@
+"""Jobs: their records, logs and places in the queue, and the reaper that repairs what workers cannot."""

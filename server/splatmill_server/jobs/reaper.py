@@ -1,0 +1,154 @@
+"""The reaper, which repairs what workers and the queue cannot.
+
+It requeues the attempts of crashed workers, fails jobs whose attempts are used up, enqueues jobs again that the queue
+has lost (Redis may restart without its last second of writes), and repeats the cancellation of a job until no process
+is left. Its actions are idempotent, so every API process may run one.
+"""
+
+import asyncio
+from collections.abc import Callable, Iterable
+from typing import TypeVar
+
+import redis
+import structlog
+from starlette.concurrency import run_in_threadpool
+
+from splatmill.backplane import entries, leases, lines, queue
+from splatmill.backplane.row import JobRow
+from splatmill.schema import Problem
+from splatmill_server.jobs.records import Jobs, last_stage
+from splatmill_server.metrics import Metrics
+from splatmill_server.settings import Settings
+
+log = structlog.get_logger()
+
+T = TypeVar("T")
+
+_ENDED = {"finished", "failed", "stopped"}
+
+
+class Reaper:
+    """Checks all unfinished jobs every few seconds, and more often while a job is being cancelled."""
+
+    def __init__(self, connection: redis.Redis, jobs: Jobs, metrics: Metrics, settings: Settings) -> None:
+        self.connection = connection
+        self.jobs = jobs
+        self.metrics = metrics
+        self.leases = leases.Reclaim(connection)
+        self.interval = settings.reaper_interval
+        self.stop_interval = settings.stop_interval
+        self._wake = asyncio.Event()
+        # Jobs whose attempt had ended without a final state at the last check: the state may still arrive.
+        self._unreported: set[tuple[str, int]] = set()
+
+    def wake(self) -> None:
+        """Check now, because a job is to be cancelled."""
+        self._wake.set()
+
+    async def run(self) -> None:
+        """Check the jobs until this task is cancelled, also while Redis cannot be reached."""
+        while True:
+            cancelling = False
+            try:
+                cancelling = await run_in_threadpool(self.tick)
+            except redis.RedisError as error:
+                log.warning("reaper cannot reach Redis", error=str(error))
+            except Exception:
+                log.exception("reaper tick failed")
+            pause = self.stop_interval if cancelling else self.interval
+            try:
+                await asyncio.wait_for(self._wake.wait(), pause)
+            except TimeoutError:
+                continue
+            self._wake.clear()
+
+    def tick(self) -> bool:
+        """Check every unfinished job once; return True while one is being cancelled."""
+        if self.leases.run():
+            lines.sort(self.connection)
+        active = self.jobs.active()
+        cancelling = [row for row in active if row.cancel_requested_at is not None]
+        unfinished = [row for row in cancelling if not _safely(self.cancel, row, True)]
+        self._check(row for row in active if row.cancel_requested_at is None)
+        return bool(unfinished)
+
+    def cancel(self, row: JobRow) -> bool:
+        """Take the next step of a cancellation; return True once no process is left and the job has ended."""
+        found = queue.status(self.connection, row.id, row.generation)
+        over = found.state in _ENDED or found.state == "absent"
+        if not over:
+            over = queue.withdraw(self.connection, row.id, row.generation)
+        if over:
+            self.jobs.give_verdict(row, "cancelled")
+            log.info("job cancelled", job=row.id)
+            return True
+        queue.stop(self.connection, row.id, row.generation)
+        return False
+
+    def _check(self, rows: Iterable[JobRow]) -> None:
+        self._unreported = {mark for row in rows if (mark := _safely(self._check_one, row, None)) is not None}
+
+    def _check_one(self, row: JobRow) -> tuple[str, int] | None:
+        """Repair one job. Return its mark if its attempt has ended and its final state may still arrive."""
+        found = queue.status(self.connection, row.id, row.generation)
+        if found.state == "absent":
+            if queue.enqueue(self.connection, row.id, row.generation):
+                self.metrics.requeued.inc()
+                log.warning("job was lost by the queue, enqueued again", job=row.id)
+        elif found.state in _ENDED:
+            mark = (row.id, row.generation)
+            if found.state == "finished" and mark not in self._unreported:
+                return mark
+            self._give_up(row, found)
+        return None
+
+    def _give_up(self, row: JobRow, found: queue.QueueStatus) -> None:
+        job = self.jobs.get(row.id)
+        facts = {"attempts": job.attempt, "stage": last_stage(job), "reason": found.reason}
+        lost = leases.lost(self.connection, entries.rq_id(row.id, row.generation))
+        during = f" during {facts['stage']}" if facts["stage"] else ""
+        if found.state == "failed" and lost >= leases.MAX_LOST:
+            problem = Problem.of(
+                "attempts_exhausted",
+                f"The worker that ran the job was lost {lost} times in a row{during}, each time without a new "
+                "checkpoint.",
+                advice="Probably the job itself ends the worker or its machine, by taking all memory: start a new job "
+                "with a smaller image_size or max_gaussians, or give the worker a limit of memory.",
+                facts=facts | {"lost_workers": lost},
+            )
+        elif found.state == "failed":
+            problem = Problem.of(
+                "attempts_exhausted",
+                f"The job's process ended unexpectedly in each of {job.attempt} attempts"
+                + (f", the last time{during}" if during else "")
+                + (f" ({found.reason})" if found.reason else "")
+                + ".",
+                advice="Often the machine has run out of memory: start a new job with a smaller "
+                "image_size or "
+                "max_gaussians. A restart resumes from the last checkpoint, with the same options.",
+                facts=facts,
+            )
+        else:
+            problem = Problem.of(
+                "worker_lost",
+                "The worker released the job without reporting how it ended.",
+                advice="Restart the job; it resumes from its last checkpoint.",
+                facts=facts,
+            )
+        if self.jobs.give_verdict(row, "failed", problem):
+            self.metrics.ended.labels(problem.code).inc()
+            log.warning("job given up", job=row.id, code=problem.code, reason=found.reason)
+
+
+def _safely(step: Callable[[JobRow], T], row: JobRow, otherwise: T) -> T:
+    """Return the result of a step on one job. An error in it is logged, so that it does not affect other jobs.
+
+    Raises redis.RedisError, which affects all.
+    """
+    try:
+        return step(row)
+    except redis.RedisError:
+        raise
+    except Exception:
+        log.exception("job could not be checked", job=row.id)
+        return otherwise

@@ -1,0 +1,556 @@
+"""Job records. No other code writes job rows.
+
+Each change is one optimistic transaction on the row, and on the states stream if the change depends on it, so that
+API processes and workers never overwrite each other's changes.
+"""
+
+import hashlib
+import json
+import secrets
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import redis
+import structlog
+
+from splatmill.backplane import events, keys, layout, queue, row
+from splatmill.backplane.events import StoredEvent
+from splatmill.backplane.fold import fold
+from splatmill.backplane.records import UnreadableRecord, check_format, reason, warn
+from splatmill.backplane.row import JobRow, Verdict
+from splatmill.backplane.storage import Storage, StorageError
+from splatmill.schema import DEFAULT_OWNER, CreateJob, Job, JobPage, JobState, Problem, StoredKind
+from splatmill.schema.tolerant import keep_readable
+from splatmill_server.filters import JobFilter
+from splatmill_server.jobs import log as job_log
+from splatmill_server.jobs.queue_places import with_places
+from splatmill_server.metrics import Metrics
+from splatmill_server.paging import read_cursor, write_cursor
+from splatmill_server.problems import ProblemError
+from splatmill_server.space.marks import DELETING, check_marks, mark_keys, needs_of
+
+log = structlog.get_logger()
+
+IDEMPOTENCY_DAYS = 7
+SCANNED = 2000
+"""Largest number of jobs that are looked at for one page of a list."""
+
+_BATCH = 200
+"""Number of jobs that are looked at together for a list that does not hold all of them."""
+
+_TIES = 16
+"""Number of jobs that may be created in one millisecond without being lost between two pages."""
+
+_Read = tuple[JobRow, list[StoredEvent]]
+"""The row and the states of a job."""
+
+
+class Jobs:
+    """All operations on jobs. Methods raise ProblemError, and redis.RedisError if Redis cannot be reached."""
+
+    def __init__(self, connection: redis.Redis, storage: Storage, metrics: Metrics) -> None:
+        self.connection = connection
+        self.storage = storage
+        self.metrics = metrics
+        self.on_begin: list[Callable[[JobRow], None]] = []
+        """Called with the row of a job that is new or restarted."""
+        self.on_end: list[Callable[[Job, int], None]] = []
+        """Called with a job that has ended, and its generation, before it is forgotten that it was unfinished.
+
+        A function may be called several times for one end, and by several processes.
+        """
+
+    def create(
+        self,
+        request: CreateJob,
+        *,
+        owner: str,
+        key: str | None = None,
+        body: str = "",
+        most: int | None = None,
+    ) -> tuple[Job, bool]:
+        """Create a job; return it, and whether it is new.
+
+        most: number of unfinished jobs that the owner may have; with as many, raise a 429 problem.
+
+        With an `Idempotency-Key` that this owner used before, return the job of that request. `body` identifies the
+        request: the same key with another body raises a 409 problem.
+        """
+        job_id = secrets.token_hex(8)
+        if key is not None:
+            job_id = self._claim_key(owner, key, hashlib.sha256(body.encode()).hexdigest(), job_id)
+        moment = row.now()
+        new = JobRow(
+            id=job_id,
+            capture=request.capture,
+            name=request.name,
+            owner=owner,
+            options=request.options,
+            priority=request.priority,
+            created_at=moment,
+            queued_at=moment,
+        )
+        known: JobRow | None = None
+        needs = needs_of(request.capture, request.options)
+
+        def insert(pipe: Any) -> None:
+            nonlocal known
+            known = row.read(self.connection, job_id)
+            if known is None:
+                check_marks(self.connection, self.storage, needs)
+                self._check_room(owner, most)
+            pipe.multi()
+            if known is None:
+                pipe.incr(keys.begun_jobs(owner))
+                pipe.hset(keys.job(job_id), mapping=new.fields())
+                pipe.zadd(keys.JOBS, {job_id: int(moment.timestamp() * 1000)})
+                pipe.sadd(keys.ACTIVE, job_id)
+
+        # Of two concurrent requests with the same key, only one inserts the job. No job is inserted whose capture is
+        # being deleted.
+        self.connection.transaction(insert, keys.job(job_id), keys.begun_jobs(owner), *mark_keys(needs))
+        if known is not None:
+            return self._placed(known), False
+        # A crash here leaves a row that is not in the queue; the reaper enqueues it.
+        queue.enqueue(self.connection, job_id, new.generation)
+        for begun in self.on_begin:
+            begun(new)
+        self.metrics.created.inc()
+        return self._placed(new), True
+
+    def id_of_key(self, owner: str, key: str) -> str | None:
+        """Return the id of the job that the owner first used an `Idempotency-Key` for, or None."""
+        stored = cast(bytes | None, self.connection.get(keys.idempotency(_digest(owner, key))))
+        return cast(str, json.loads(stored)["job"]) if stored else None
+
+    def row(self, job_id: str) -> JobRow:
+        """Return the row of a job. Raises a 404 problem if Redis has none, and a 500 problem if it is not readable."""
+        try:
+            found = row.read(self.connection, job_id) if layout.is_id(job_id) else None
+        except UnreadableRecord as error:
+            raise ProblemError(
+                "job_corrupt",
+                f"The record of the job {job_id} cannot be read: {error}.",
+                advice="It was probably written by a later version of the server; run that version, or delete the "
+                "job.",
+            ) from error
+        if found is None:
+            raise job_not_found(job_id)
+        return found
+
+    def owner(self, job_id: str) -> str | None:
+        """Return the owner of a job, or None if there is no such job or its owner cannot be read."""
+        if not layout.is_id(job_id):
+            return None
+        known, owner = self._owners([job_id])[0]
+        if known:
+            return owner
+        stored = self.stored(job_id)
+        return stored.owner if stored is not None else None
+
+    def _owners(self, job_ids: Sequence[str]) -> list[tuple[bool, str]]:
+        """Return, for each id, whether there is a row, and its owner. A row that is not readable has its owner too."""
+        with self.connection.pipeline(transaction=False) as pipe:
+            for job_id in job_ids:
+                pipe.hmget(keys.job(job_id), "id", "owner")
+            replies = pipe.execute()
+        return [
+            (known is not None, owner.decode("utf-8", "replace") if owner is not None else DEFAULT_OWNER)
+            for known, owner in replies
+        ]
+
+    def get(self, job_id: str) -> Job:
+        """Return the job as clients see it. A job that has ended is read from storage if Redis has lost it."""
+        try:
+            return self._placed(self.row(job_id))
+        except ProblemError:
+            if (stored := self.stored(job_id)) is not None:
+                return stored
+            raise
+
+    def stored(self, job_id: str) -> Job | None:
+        """Return an ended job from storage: from the `job.json` of its model or the file of its log, or None."""
+        if not layout.is_id(job_id):
+            return None
+        try:
+            return with_links(read_record(self.storage, job_id))
+        except FileNotFoundError:
+            pass
+        except UnreadableRecord as error:
+            warn(layout.job_record(job_id), str(error))
+        ended = job_log.stored_job(self.storage, job_id)
+        return with_links(ended) if ended is not None else None
+
+    def page(self, cursor: str | None, limit: int, wanted: JobFilter | None = None) -> JobPage:
+        """Return a page of the jobs that `wanted` admits, newest first.
+
+        At most SCANNED jobs are looked at; a page then holds fewer than `limit`, and has a cursor all the same.
+        """
+        wanted = wanted or JobFilter()
+        found: list[tuple[int, _Read]] = []
+        after = read_cursor(cursor) if cursor is not None else None
+        scanned, ended = 0, False
+        while len(found) <= limit and scanned < SCANNED and not ended:
+            size = limit + 1 if wanted == JobFilter() else max(limit + 1, _BATCH)
+            batch = self._ids(after, size)
+            ended = len(batch) < size
+            scanned += len(batch)
+            after = batch[-1] if batch else after
+            admitted = self._admitted([job_id for _, job_id in batch], wanted)
+            found += [(moment, admitted[job_id]) for moment, job_id in batch if job_id in admitted]
+        page = found[:limit]
+        following = None
+        if len(found) > limit:
+            following = write_cursor(page[-1][0], page[-1][1][0].id)
+        elif not ended and after is not None:
+            following = write_cursor(*after)
+        listed = [(self._job(read, states), read.generation) for _, (read, states) in page]
+        return JobPage(jobs=with_places(self.connection, listed), cursor=following)
+
+    def _admitted(self, job_ids: Sequence[str], wanted: JobFilter) -> dict[str, _Read]:
+        """Return the rows and states of those jobs that `wanted` admits, by id.
+
+        Jobs whose row is not readable are left out.
+        """
+        if wanted.by_row:
+            with self.connection.pipeline(transaction=False) as pipe:
+                for job_id in job_ids:
+                    pipe.hmget(keys.job(job_id), *JobFilter.FIELDS)
+                rows = [dict(zip(JobFilter.FIELDS, reply, strict=True)) for reply in pipe.execute()]
+            job_ids = [job_id for job_id, row in zip(job_ids, rows, strict=True) if wanted.admits_row(row)]
+        with self.connection.pipeline(transaction=False) as pipe:
+            for job_id in job_ids:
+                pipe.hgetall(keys.job(job_id))
+                pipe.xrange(keys.states(job_id))
+            replies = pipe.execute()
+        admitted = {}
+        for index, job_id in enumerate(job_ids):
+            try:
+                found = JobRow.of(replies[2 * index])
+            except UnreadableRecord as error:
+                warn(f"job {job_id} is not listed", str(error))
+                continue
+            states = events.decode(replies[2 * index + 1], keys.states(job_id))
+            if found is not None and (wanted.states is None or fold(found, states).state in wanted.states):
+                admitted[job_id] = (found, states)
+        return admitted
+
+    def active(self) -> list[JobRow]:
+        """Return the rows of all unfinished jobs. A job whose row is not readable stays active, but is left out."""
+        ids = sorted(entry.decode() for entry in cast(set[bytes], self.connection.smembers(keys.ACTIVE)))
+        found = []
+        for job_id in ids:
+            try:
+                known = row.read(self.connection, job_id)
+            except UnreadableRecord as error:
+                warn(f"job {job_id} is not looked after", str(error))
+                continue
+            if known is not None and not fold(known, events.read_states(self.connection, job_id)).state.final:
+                found.append(known)
+            else:
+                self._retire(job_id)
+        return found
+
+    def _retire(self, job_id: str) -> None:
+        """Store the log of a job that has ended, announce its end, and remove it from the set of active ones.
+
+        It stays there if either cannot be stored, so that this is tried again, and if it was restarted meanwhile.
+        """
+        try:
+            if (known := row.read(self.connection, job_id)) is not None:
+                job_log.store(self.connection, self.storage, self._job(known))
+                self._announce_end(known)
+        except StorageError as error:
+            log.warning("the end of a job cannot be stored", job=job_id, error=str(error))
+            return
+
+        def remove(pipe: Any) -> None:
+            known = row.read(self.connection, job_id)
+            ended = known is None or fold(known, events.read_states(self.connection, job_id)).state.final
+            pipe.multi()
+            if ended:
+                pipe.srem(keys.ACTIVE, job_id)
+
+        self.connection.transaction(remove, keys.job(job_id))
+
+    def _announce_end(self, found: JobRow) -> None:
+        """Tell that a job has ended, if it has. Raises StorageError if that cannot be stored."""
+        job = self._job(found)
+        if not job.state.final:
+            return
+        for ended in self.on_end:
+            try:
+                ended(job, found.generation)
+            except StorageError:
+                raise
+            except Exception:  # other jobs must still be looked after
+                log.exception("the end of a job could not be announced", job=found.id)
+
+    def _announce_unretired(self, job_id: str) -> None:
+        """Announce the end of a job that has ended so recently that it still counts as active."""
+        if self.connection.sismember(keys.ACTIVE, job_id):
+            self._announce_end(self.row(job_id))
+
+    def unfinished_of(self, owner: str) -> int:
+        """Return the number of unfinished jobs of an owner."""
+        ids = [entry.decode() for entry in cast(set[bytes], self.connection.smembers(keys.ACTIVE))]
+        own = [job_id for job_id, found in zip(ids, self._owners(ids), strict=True) if found == (True, owner)]
+        return sum(1 for job_id in own if not self._ended(job_id))
+
+    def _ended(self, job_id: str) -> bool:
+        """Return whether a job has ended or was deleted. A job whose row is not readable has not."""
+        try:
+            known = row.read(self.connection, job_id)
+        except UnreadableRecord:
+            return False
+        return known is None or fold(known, events.read_states(self.connection, job_id)).state.final
+
+    def _check_room(self, owner: str, most: int | None) -> None:
+        """Raise a 429 problem if the owner has `most` unfinished jobs. The caller watches `begun_jobs` of the owner."""
+        if most is not None and (count := self.unfinished_of(owner)) >= most:
+            raise ProblemError(
+                "too_many_jobs",
+                f"The owner {owner!r} has {count} unfinished jobs, and its API key permits {most} at once.",
+                advice="Wait until one has ended, or cancel one with POST /v1/jobs/{id}/cancel.",
+                facts={"unfinished_jobs": count, "limit": most},
+            )
+
+    def cancel(self, job_id: str) -> Job:
+        """Record the request to cancel a job. The reaper then kills its process and ends the job."""
+
+        def request_cancel(found: JobRow, job: Job) -> dict[str, str] | None:
+            if job.state is JobState.cancelled or found.cancel_requested_at is not None:
+                return None
+            if job.state.final:
+                raise ProblemError(
+                    "job_finished",
+                    f"The job has already ended: it {_ended(job)}.",
+                    advice="Delete it with DELETE /v1/jobs/{id} if it is no longer needed.",
+                    facts={"state": job.state.value},
+                )
+            return {"cancel_requested_at": row.now().isoformat()}
+
+        return self._change(job_id, request_cancel)
+
+    def restart(self, job_id: str, *, most: int | None = None) -> Job:
+        """Enqueue a job that has ended as a new generation, which resumes from its checkpoint if there is one.
+
+        most: number of unfinished jobs that the owner may have; with as many, raise a 429 problem.
+        """
+        known = self.row(job_id)
+        needs = [*needs_of(known.capture, known.options), (StoredKind.model, job_id)]
+
+        def begin_generation(found: JobRow, job: Job) -> dict[str, str] | None:
+            if job.state is JobState.queued and found.cancel_requested_at is None:
+                return None  # a repeated restart has no further effect
+            if not job.state.final:
+                raise ProblemError(
+                    "job_running",
+                    f"The job has not ended; its state is {job.state.value}.",
+                    advice="Cancel it first, or wait until it has ended.",
+                    facts={"state": job.state.value},
+                )
+            if not self.storage.exists(layout.capture_record(found.capture)):
+                raise ProblemError(
+                    "capture_not_found",
+                    f"The job's capture {found.capture} was deleted.",
+                    advice="Upload the photos again and create a new job.",
+                )
+            check_marks(self.connection, self.storage, needs[:-1])
+            if self.connection.get(mark_keys(needs)[-1]) == DELETING:
+                raise job_not_found(job_id)
+            self._check_room(found.owner, most)
+            return {
+                "generation": str(found.generation + 1),
+                "queued_at": row.now().isoformat(),
+                "cancel_requested_at": "",
+                "verdict": "",
+            }
+
+        self._announce_unretired(job_id)
+        self._change(job_id, begin_generation, *mark_keys(needs), begun=keys.begun_jobs(known.owner))
+        begun = self.row(job_id)
+        queue.enqueue(self.connection, job_id, begun.generation)
+        for begin in self.on_begin:
+            begin(begun)
+        return self._placed(begun)
+
+    def delete(self, job_id: str) -> None:
+        """Delete a job that has ended, its work files and its model. Raises 404 and 409 problems."""
+        try:
+            found = self.row(job_id)
+        except ProblemError as error:
+            if error.problem.code == "job_corrupt":
+                self._withdraw_unreadable(job_id)
+            elif self.stored(job_id) is None:
+                raise
+        else:
+            job = self._job(found)
+            if not job.state.final:
+                raise ProblemError(
+                    "job_running",
+                    f"The job has not ended; its state is {job.state.value}.",
+                    advice="Cancel it with POST /v1/jobs/{id}/cancel first.",
+                    facts={"state": job.state.value},
+                )
+            self._announce_unretired(job_id)
+            for generation in range(1, found.generation + 1):
+                queue.forget(self.connection, job_id, generation)
+        self.storage.delete(layout.watched_job(job_id))
+        # The record goes first, so that no model with missing files is visible.
+        self.storage.delete(layout.job_record(job_id))
+        self.storage.delete_prefix(layout.model(job_id))
+        self.storage.delete_prefix(layout.job(job_id))
+        with self.connection.pipeline(transaction=True) as pipe:
+            pipe.delete(*keys.of_job(job_id))
+            pipe.zrem(keys.JOBS, job_id)
+            pipe.srem(keys.ACTIVE, job_id)
+            pipe.execute()
+
+    def _withdraw_unreadable(self, job_id: str) -> None:
+        """Remove a job whose row is not readable from the queue. Raises a 409 problem while a worker runs it."""
+        stored = cast(bytes | None, self.connection.hget(keys.job(job_id), "generation")) or b"1"
+        for generation in range(1, (int(stored) if stored.isdigit() else 1) + 1):
+            if queue.status(self.connection, job_id, generation).state == "running":
+                raise ProblemError(
+                    "job_running",
+                    f"A worker runs the job {job_id}, whose record cannot be read.",
+                    advice="Delete it when the worker has ended it, or stop the worker first.",
+                )
+            queue.withdraw(self.connection, job_id, generation)
+            queue.forget(self.connection, job_id, generation)
+
+    def give_verdict(self, expected: JobRow, state: str, problem: Problem | None = None) -> bool:
+        """End a generation as `state`; return False if it has ended or was restarted meanwhile."""
+        given = False
+
+        def verdict(found: JobRow, job: Job) -> dict[str, str] | None:
+            nonlocal given
+            given = not job.state.final and found.generation == expected.generation
+            if not given:
+                return None
+            last = cast(list[Any], self.connection.xrevrange(keys.states(found.id), count=1))
+            after = last[0][0].decode() if last else events.START
+            ending = Verdict(state=cast(Any, state), at=row.now(), after=after, problem=problem)
+            return {"verdict": ending.model_dump_json(exclude_none=True)}
+
+        self._change(expected.id, verdict)
+        return given
+
+    def _job(self, found: JobRow, states: list[StoredEvent] | None = None) -> Job:
+        states = events.read_states(self.connection, found.id) if states is None else states
+        return with_links(fold(found, states, events.last_progress(self.connection, found.id)))
+
+    def _placed(self, found: JobRow) -> Job:
+        return with_places(self.connection, [(self._job(found), found.generation)])[0]
+
+    def _change(
+        self,
+        job_id: str,
+        decide: Callable[[JobRow, Job], dict[str, str] | None],
+        *watched: str,
+        begun: str | None = None,
+    ) -> Job:
+        """Apply the changes that `decide` returns for the row and the job, and return the job.
+
+        `decide` returns new values of fields, where an empty value deletes the field, or None for no change. It is
+        called again if the row, the states or the keys `watched` changed meanwhile.
+        """
+
+        def apply(pipe: Any) -> None:
+            found = self.row(job_id)
+            changes = decide(found, self._job(found))
+            pipe.multi()
+            if changes is None:
+                return
+            kept = {name: value for name, value in changes.items() if value}
+            deleted = [name for name, value in changes.items() if not value]
+            if begun is not None:
+                pipe.incr(begun)
+            pipe.hset(keys.job(job_id), mapping=kept)
+            if "generation" in kept:
+                pipe.sadd(keys.ACTIVE, job_id)
+            if deleted:
+                pipe.hdel(keys.job(job_id), *deleted)
+
+        seen = [keys.job(job_id), keys.states(job_id), *watched, *([begun] if begun is not None else [])]
+        self.connection.transaction(apply, *seen)
+        return self._placed(self.row(job_id))
+
+    def _ids(self, after: tuple[int, str] | None, count: int) -> list[tuple[int, str]]:
+        """Return up to `count` pairs (time of creation in milliseconds, id) of jobs after `after`, newest first."""
+        top = "+inf" if after is None else str(after[0])
+        reply = self.connection.zrevrangebyscore(
+            keys.JOBS, top, "-inf", start=0, num=count + _TIES, withscores=True
+        )
+        pairs = [(int(score), member.decode()) for member, score in cast(list[tuple[bytes, float]], reply)]
+        return [pair for pair in pairs if after is None or pair < after][:count]
+
+    def _claim_key(self, owner: str, key: str, body: str, job_id: str) -> str:
+        name = keys.idempotency(_digest(owner, key))
+        value = json.dumps({"job": job_id, "body": body})
+        if self.connection.set(name, value, nx=True, ex=IDEMPOTENCY_DAYS * 86400):
+            return job_id
+        known = json.loads(cast(bytes, self.connection.get(name)) or value)
+        if known["body"] != body:
+            raise ProblemError(
+                "idempotency_conflict",
+                "This Idempotency-Key was already used for a request with another body.",
+                advice="Use a new key for a new request, and the same key only to repeat a request.",
+                facts={"job": known["job"]},
+            )
+        return cast(str, known["job"])
+
+
+def read_record(storage: Storage, job_id: str) -> Job:
+    """Return the job in the `job.json` of a model, without what is not readable in it.
+
+    Raises FileNotFoundError, and UnreadableRecord.
+    """
+    try:
+        record = json.loads(storage.get(layout.job_record(job_id)))
+        check_format(record)
+        job, left_out = keep_readable(Job.model_validate, record)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise UnreadableRecord(f"job.json cannot be read: {reason(error)}") from error
+    if left_out:
+        warn(layout.job_record(job_id), f"left out what cannot be read: {'; '.join(left_out)[:300]}")
+    return job
+
+
+def with_links(job: Job) -> Job:
+    """Return the job with the addresses of what belongs to it."""
+    base = f"/v1/jobs/{job.id}"
+    links = {"self": base, "events": f"{base}/events", "logs": f"{base}/logs", "preview": f"{base}/preview"}
+    links["capture"] = f"/v1/captures/{job.capture}"
+    if job.state.final:
+        links["restart"] = f"{base}/restart"
+    else:
+        links["cancel"] = f"{base}/cancel"
+    if job.model is not None:
+        links |= {"report": f"{base}/report", "model": f"/v1/models/{job.model}"}
+    return job.model_copy(update={"links": links})
+
+
+def last_stage(job: Job) -> str | None:
+    """Return the stage of the job's last progress, or None."""
+    return job.progress.stage if job.progress is not None else None
+
+
+def _ended(job: Job) -> str:
+    return "was cancelled" if job.state is JobState.cancelled else job.state.value
+
+
+def job_not_found(job_id: str) -> ProblemError:
+    """Return the 404 problem for an id without a job."""
+    return ProblemError(
+        "job_not_found",
+        f"There is no job {job_id[:80]!r}.",
+        advice="List the jobs with GET /v1/jobs.",
+    )
+
+
+def _digest(owner: str, key: str) -> str:
+    # Keys stored before there were owners have no owner in their digest. No header value has a NUL.
+    named = key if owner == DEFAULT_OWNER else f"{owner}\0{key}"
+    return hashlib.sha256(named.encode()).hexdigest()

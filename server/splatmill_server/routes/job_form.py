@@ -1,0 +1,109 @@
+"""`POST /v1/jobs` with a form: uploads photos and starts a job in one request."""
+
+from fastapi.exceptions import RequestValidationError
+from pydantic import ValidationError
+from pydantic_core import from_json
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+
+from splatmill.schema import CaptureFile, CreateJob, Job, Role
+from splatmill_server.access.caller import Caller
+from splatmill_server.captures.records import fingerprints
+from splatmill_server.problems import ProblemError
+from splatmill_server.routes.multipart import Part, read_parts
+from splatmill_server.routes.ownership import check_model
+from splatmill_server.service import Service
+
+_FIELDS = ("name", "options", "priority")
+
+
+async def create_from_form(
+    service: Service, who: Caller, request: Request, key: str | None
+) -> tuple[Job, bool]:
+    """Store the files of a form in a new capture and start a job on it; return the job, and whether it is new.
+
+    The files are the parts `images`, `masks` and `poses`; the field `options` is JSON, `name` is text, and `priority` a
+    number. If any part
+    is refused, the capture is deleted.
+    """
+    await run_in_threadpool(service.quota.check_new, who)
+    capture, _ = await run_in_threadpool(lambda: service.captures.create(owner=who.owner))
+    kept = False
+    try:
+        files, fields = await _receive(service, who, request, capture.id)
+        create = _request(capture.id, fields)
+        await run_in_threadpool(service.captures.check_trainable, capture.id)
+        await run_in_threadpool(check_start_model, service, who, create)
+        described = create.described(with_capture=False) + "\n".join(fingerprints(files))
+        job, new = await run_in_threadpool(
+            lambda: service.jobs.create(
+                create, owner=who.owner, key=key, body=described, most=who.limits.unfinished_jobs
+            )
+        )
+        kept = job.capture == capture.id
+        return job, new
+    finally:
+        if not kept:
+            await run_in_threadpool(service.deletion.unused_capture, capture)
+
+
+def check_start_model(service: Service, who: Caller, create: CreateJob) -> None:
+    """Raise a problem if the model to start from, where the request names one, is not there for the caller."""
+    options = create.options
+    if options.start_file is not None:
+        service.captures.check_start_file(create.capture, options.start_file)
+    elif options.start_model is not None:
+        check_model(service, who, options.start_model)
+        service.models.check(options.start_model)
+
+
+async def _receive(
+    service: Service, who: Caller, request: Request, capture_id: str
+) -> tuple[list[CaptureFile], dict[str, str]]:
+    files: list[CaptureFile] = []
+    fields: dict[str, str] = {}
+    async for part in read_parts(request):
+        if part.filename is not None and part.name in Role.__members__:
+            files.append(await _store(service, who, capture_id, part, part.filename))
+        elif part.filename is None and part.name in fields:
+            raise ProblemError("invalid_request", f"The form contains the field {part.name!r} twice.")
+        elif part.filename is None and part.name in _FIELDS:
+            fields[part.name] = await part.text()
+        else:
+            kind = "file" if part.filename is not None else "field"
+            raise ProblemError(
+                "invalid_request",
+                f"The form contains an unknown {kind}, {part.name[:80]!r}.",
+                advice="Send the files as 'images', 'masks' and 'poses', and the fields 'options' "
+                "(JSON), 'name' and 'priority'.",
+            )
+    return files, fields
+
+
+async def _store(service: Service, who: Caller, capture_id: str, part: Part, filename: str) -> CaptureFile:
+    if not filename:
+        raise ProblemError("name_invalid", f"A file among the {part.name} of the form has no file name.")
+    async with service.quota.upload(who, capture_id, None) as arrival:
+        file, new = await service.captures.store(
+            capture_id, Role(part.name), filename, arrival.counted(part.chunks)
+        )
+        arrival.stored = file.size if new else 0
+    return file
+
+
+def _request(capture_id: str, fields: dict[str, str]) -> CreateJob:
+    try:
+        # Unlike json.loads, from_json refuses deep nesting with a ValueError.
+        options = from_json(fields.get("options") or "{}")
+    except ValueError as error:
+        raise ProblemError(
+            "malformed_body",
+            f"The field 'options' is not JSON: {error}.",
+            advice='Send a JSON object such as {"steps": 1000}.',
+        ) from error
+    body = {"capture": capture_id, "options": options, "name": fields.get("name") or None}
+    body |= {"priority": fields["priority"]} if "priority" in fields else {}
+    try:
+        return CreateJob.model_validate(body)
+    except ValidationError as error:
+        raise RequestValidationError(error.errors()) from error

@@ -1,0 +1,84 @@
+"""Checks that a caller may know of a record. Records of other owners answer as if there were none.
+
+Endpoints take ids as parameters of the types `CaptureId`, `JobId` and `ModelId`, which include the check: an endpoint
+that forgets the check does not exist, because it would have no id.
+"""
+
+from typing import Annotated
+
+from fastapi import Depends, Path, Query
+
+from splatmill.backplane.records import UnreadableRecord
+from splatmill_server.access.caller import Who
+from splatmill_server.captures.records import capture_not_found
+from splatmill_server.jobs.records import job_not_found
+from splatmill_server.models import model_not_found
+from splatmill_server.service import Service, Shared
+
+
+def check_capture(service: Service, who: Who, capture_id: str) -> None:
+    """Raise a 404 problem if another owner has the capture; the endpoint finds out whether it exists at all."""
+    if who.admin:
+        return
+    try:
+        owner = service.captures.record(capture_id).owner
+    except UnreadableRecord:
+        owner = None
+    if not who.may_see(owner):
+        raise capture_not_found(capture_id)
+
+
+def check_job(service: Service, who: Who, job_id: str) -> None:
+    """Raise a 404 problem if another owner has the job; the endpoint finds out whether it exists at all."""
+    if not who.admin and not who.may_see(service.jobs.owner(job_id)):
+        raise job_not_found(job_id)
+
+
+def check_model(service: Service, who: Who, model_id: str) -> None:
+    """Raise a 404 problem if another owner has the model, or the job that is to make it."""
+    if not who.admin and not who.may_see(service.models.owner(model_id)):
+        raise model_not_found(model_id)
+
+
+def _capture_id(
+    service: Shared, who: Who, capture_id: Annotated[str, Path(description="Id of the capture.")]
+) -> str:
+    check_capture(service, who, capture_id)
+    return capture_id
+
+
+def _job_id(service: Shared, who: Who, job_id: Annotated[str, Path(description="Id of the job.")]) -> str:
+    check_job(service, who, job_id)
+    return job_id
+
+
+def _model_id(
+    service: Shared,
+    who: Who,
+    model_id: Annotated[str, Path(description="Id of the model, which is that of its job.")],
+) -> str:
+    check_model(service, who, model_id)
+    return model_id
+
+
+def _listed_owner(
+    who: Who,
+    owner: Annotated[
+        str | None,
+        Query(max_length=64, description="List only this owner's records. It has a meaning for admins only."),
+    ] = None,
+) -> str | None:
+    return who.listed_owner(owner)
+
+
+CaptureId = Annotated[str, Depends(_capture_id)]
+"""The path parameter `capture_id`, the id of a capture that the caller may use."""
+
+JobId = Annotated[str, Depends(_job_id)]
+"""The path parameter `job_id`, the id of a job that the caller may know of."""
+
+ModelId = Annotated[str, Depends(_model_id)]
+"""The path parameter `model_id`, the id of a model that the caller may know of."""
+
+ListedOwner = Annotated[str | None, Depends(_listed_owner)]
+"""The owner whose records a list holds, or None for those of all owners."""

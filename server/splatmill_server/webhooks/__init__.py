@@ -1,0 +1,1 @@
+"""Webhooks: their records, and the deliveries of events."""

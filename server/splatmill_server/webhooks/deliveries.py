@@ -1,0 +1,200 @@
+"""Sends the deliveries of webhooks, signed by the Standard Webhooks specification, and repeats those that fail.
+
+Every API process runs one loop. Pending deliveries are marked in storage by the time of their next attempt, and a lease
+in Redis lets one process at a time make an attempt. If Redis is lost in that moment, a delivery may be sent twice, with
+the same `webhook-id`; none is lost.
+"""
+
+import asyncio
+import random
+import time
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+
+import redis
+import structlog
+from starlette.concurrency import run_in_threadpool
+
+from splatmill.backplane import layout
+from splatmill.backplane.storage import StorageError
+from splatmill.schema import DeliveryAttempt, DeliveryState, format_duration
+from splatmill.webhook_signature import sign
+from splatmill_server.leases import lease
+from splatmill_server.outgoing import Outgoing, OutgoingError
+from splatmill_server.webhooks.records import DeliveryRecord, WebhookRecord, Webhooks, mark_of
+
+log = structlog.get_logger()
+
+PAUSES = (5, 300, 1800, 7200, 18000, 36000, 50400, 72000, 86400)
+"""Seconds after each failed attempt: ten attempts in three days, as the specification proposes."""
+
+JITTER = 0.1
+"""Largest relative change of a pause, so that the attempts for many jobs spread."""
+
+ANSWER_SECONDS = 20.0
+"""Seconds for an attempt in all."""
+
+MAX_ANSWER = 500
+"""Bytes of an answer that are kept in the log."""
+
+LONGEST_RETRY_AFTER = 86400
+"""Seconds of the header Retry-After that are followed."""
+
+_LOOK_SECONDS = 5.0
+"""Seconds between two looks for deliveries that are due. Each is a request to a bucket."""
+
+_LOST_SECONDS = 60.0
+"""Seconds between two looks for jobs that Redis has lost."""
+
+_OLD_SECONDS = 3600.0
+"""Seconds between two looks for old records of deliveries."""
+
+_CONCURRENT = 8
+_CONCURRENT_EACH = 2
+"""Attempts that one process makes at once, in all and for one webhook: a slow one must not hold up the others."""
+
+
+class Deliveries:
+    """The loop that sends."""
+
+    def __init__(self, connection: redis.Redis, webhooks: Webhooks, outgoing: Outgoing) -> None:
+        self.connection = connection
+        self.webhooks = webhooks
+        self.storage = webhooks.storage
+        self.outgoing = outgoing
+        self._running: dict[tuple[str, str], asyncio.Task[None]] = {}
+        self._looked = {"lost": float("-inf"), "old": float("-inf")}
+        self._wake = asyncio.Event()
+
+    def wake(self) -> None:
+        """Look for deliveries now."""
+        self._wake.set()
+
+    async def run(self) -> None:
+        """Send what is due until this task is cancelled."""
+        try:
+            while True:
+                self._wake.clear()
+                try:
+                    await self._look()
+                except (StorageError, redis.RedisError) as error:
+                    log.warning("deliveries cannot be looked for", error=str(error))
+                except Exception:
+                    log.exception("deliveries cannot be looked for")
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._wake.wait(), _LOOK_SECONDS)
+        finally:
+            tasks = list(self._running.values())
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _look(self) -> None:
+        if self._is_time("lost", _LOST_SECONDS):
+            await run_in_threadpool(self.webhooks.announce_lost)
+        if self._is_time("old", _OLD_SECONDS):
+            await run_in_threadpool(self.webhooks.delete_old)
+        marks = await run_in_threadpool(lambda: list(self.storage.entries(layout.due_deliveries())))
+        for entry in marks:  # sorted by the time at which they are due
+            due, _, rest = entry.path.rsplit("/", 1)[-1].partition(".")
+            webhook_id, _, delivery_id = rest.partition(".")
+            key = (webhook_id, delivery_id)
+            if not (due.isdigit() and layout.is_id(webhook_id) and layout.is_id(delivery_id)):
+                continue
+            if int(due) > time.time() or len(self._running) >= _CONCURRENT:
+                break
+            each = sum(running[0] == webhook_id for running in self._running)
+            if key not in self._running and each < _CONCURRENT_EACH:
+                self._running[key] = asyncio.create_task(self._work(key, entry.path))
+
+    def _is_time(self, what: str, seconds: float) -> bool:
+        now = time.monotonic()
+        if now - self._looked[what] < seconds:
+            return False
+        self._looked[what] = now
+        return True
+
+    async def _work(self, key: tuple[str, str], mark: str) -> None:
+        try:
+            async with lease(self.connection, "delivery", ".".join(key)) as mine:
+                if mine:
+                    await self._attempt(key, mark)
+        except (StorageError, redis.RedisError) as error:
+            log.warning("a delivery waits", webhook=key[0], delivery=key[1], error=str(error))
+        except Exception:
+            log.exception("a delivery waits", webhook=key[0], delivery=key[1])
+        finally:
+            self._running.pop(key, None)
+            self._wake.set()
+
+    async def _attempt(self, key: tuple[str, str], mark: str) -> None:
+        """Make the attempt that a mark announces, unless another process has made it, and remove the mark."""
+        webhook = await run_in_threadpool(self.webhooks.read, key[0])
+        found = await run_in_threadpool(self.webhooks.delivery, *key)
+        if webhook is not None and found is not None and found.state is DeliveryState.pending:
+            assert found.next_at is not None
+            if found.next_at <= datetime.now(UTC):
+                found = await self._send(webhook, found)
+                await run_in_threadpool(self.webhooks.write_delivery, found)
+            if found.state is DeliveryState.pending:
+                await run_in_threadpool(self.webhooks.mark, found)
+                if mark == mark_of(found):
+                    return
+        await run_in_threadpool(self.storage.delete, mark)
+
+    async def _send(self, webhook: WebhookRecord, found: DeliveryRecord) -> DeliveryRecord:
+        """Return the delivery after one attempt. A webhook that refuses for good is disabled."""
+        if webhook.disabled_at is not None:
+            return _failed(found, "The webhook is disabled.")
+        begun, at, body = time.monotonic(), datetime.now(UTC), found.body.encode()
+        timestamp = int(at.timestamp())
+        headers = {
+            "Content-Type": "application/json",
+            "webhook-id": found.message,
+            "webhook-timestamp": str(timestamp),
+            "webhook-signature": " ".join(
+                sign(secret, found.message, timestamp, body) for secret in webhook.valid_secrets()
+            ),
+        }
+        status, answer, failure, retry_after = None, None, None, 0
+        try:
+            async with (
+                asyncio.timeout(ANSWER_SECONDS),
+                self.outgoing.request(
+                    "POST", webhook.url, headers=headers, body=body, read_seconds=ANSWER_SECONDS
+                ) as reply,
+            ):
+                status = reply.status
+                wished = reply.headers.get("retry-after", "")
+                retry_after = int(wished) if wished.isascii() and wished.isdigit() else 0
+                answer = (await reply.beginning(MAX_ANSWER)).decode("utf-8", "replace")
+        except TimeoutError:
+            failure = f"There was no whole answer within {ANSWER_SECONDS:.0f} seconds."
+        except OutgoingError as error:
+            failure = str(error)
+        made = DeliveryAttempt(
+            at=at,
+            seconds=round(time.monotonic() - begun, 3),
+            status=status,
+            answer=answer or None,
+            error=failure,
+        )
+        found = found.model_copy(update={"attempts": [*found.attempts, made], "tries": found.tries + 1})
+        if status is not None and 200 <= status < 300:
+            return found.model_copy(update={"state": DeliveryState.delivered, "next_at": None})
+        if status == 410:
+            await run_in_threadpool(self.webhooks.disable, webhook.id, "The address answered 410 (Gone).")
+            return _failed(found, "The address answered 410 (Gone).")
+        if found.tries > len(PAUSES):
+            since = format_duration((at - found.created_at).total_seconds())
+            reason = f"{found.tries} attempts to deliver {found.id} failed in {since}, the last one because: "
+            reason += failure or f"the answer had the status {status}."
+            await run_in_threadpool(self.webhooks.disable, webhook.id, reason)
+            return _failed(found, reason)
+        pause = PAUSES[found.tries - 1] * random.uniform(1 - JITTER, 1 + JITTER)
+        pause = max(pause, min(retry_after, LONGEST_RETRY_AFTER))
+        return found.model_copy(update={"next_at": datetime.now(UTC) + timedelta(seconds=pause)})
+
+
+def _failed(found: DeliveryRecord, reason: str) -> DeliveryRecord:
+    return found.model_copy(update={"state": DeliveryState.failed, "next_at": None, "reason": reason})
