@@ -91,45 +91,8 @@ MUTANTS = [
 ]  # fmt: skip
 
 NEXT = [
-    cpu("2^x loses a digit", "math.hpp", "p = fma(p, f, 6.931217909e-01f);", "p = fma(p, f, 6.931317909e-01f);"),
-    cpu("the opacity's slope cancels", "geometry.hpp", "o.complement = odds_against * o.sigmoid;",
-        "o.complement = 1.0f - o.sigmoid;"),
-    cpu("no bound on x/z in the Jacobian", "geometry.hpp", "o.u_held = min(max(o.u, cam.low_u), cam.high_u);",
-        "o.u_held = o.u;"),
-    cpu("gradient through the bound on x/z", "geometry.hpp", "keep(o.u_free, held_u)", "held_u"),
-    cpu("half the off-diagonal", "geometry.hpp", "o.b = fma(o.M0[n], o.M1[n], o.b);",
-        "o.b = fma(o.M0[n] * 0.5f, o.M1[n], o.b);"),
-    cpu("the determinant from the assembled conic", "geometry.hpp",
-        "o.det = fma(kBlur, trace0 + trace1, sharp) + kBlur * kBlur;", "o.det = o.a * o.c - o.b * o.b;"),
-    cpu("the first row of F M by the cancelling formula", "geometry.hpp",
-        "ux_c * fma(kBlur, o.M0[n], o.M1[n1] * minor[n2] - o.M1[n2] * minor[n1])", "f.ux * o.M0[n] + f.uy * o.M1[n]"),
-    cpu("a transposed entry of R", "geometry.hpp", "o.R[1][2] = fnma(w, ii, jj * k);", "o.R[1][2] = fma(w, ii, jj * k);"),
-    cpu("an index of R's gradient", "geometry.hpp", "s12 = dR[1][2] + dR[2][1];", "s12 = dR[1][2] + dR[1][2];"),
-    cpu("the quaternion's gradient keeps its radial part", "geometry.hpp", "fnma(along, o.quat[n], dq[n]) * o.quat_inv",
-        "dq[n] * o.quat_inv"),
-    cpu("the quaternion is squared unscaled", "geometry.hpp", "q[i] = q[i] / largest;", "largest = splat(1.0f);"),
-    cpu("1/z forgets the scales", "geometry.hpp", "fma(du, o.u, fma(dv, o.v, with_scale))", "fma(du, o.u, dv * o.v)"),
-    cpu("the direction's gradient keeps its radial part", "geometry.hpp", "fnma(radial, dir.x, dd.x) * inv_distance",
-        "dd.x * inv_distance"),
-    cpu("no gate at colour 0", "geometry.hpp", "keep(color[c] > 0.0f, d.color[c])", "d.color[c]"),
-    cpu("a factor in one harmonic's slope", "harmonics.hpp", "y * z * e[11] * (8 * k11)", "y * z * e[11] * (4 * k11)"),
-    cpu("no gradient to the camera's third row by x/z", "geometry.hpp", "fx_z * o.u_held * dT0[n] + fy_z * o.v_held",
-        "fy_z * o.v_held"),
-    cpu("antialiasing without its root", "geometry.hpp", "sqrt(max(sharp / o.det, kCompensationMin))",
-        "max(sharp / o.det, kCompensationMin)"),
-    cpu("the extent is 3 sigma", "geometry.hpp", "max(o.cut * (2.0f * kLn2), 0.0f)", "splat(4.0f) + 0.0f * o.cut"),
-    cpu("the scale's NaN is not looked for", "geometry.hpp", "o.visible &= not_finite == 0.0f;", ";"),
-    cpu("z = near is drawn", "geometry.hpp", "(o.z > cam.near)", "(o.z >= cam.near)"),
-    cpu("the reach of an ellipse has no corner", "reach.hpp", "static constexpr float kSpan = kBlockSide - 1;",
-        "static constexpr float kSpan = kBlockSide - 2;"),
-    cpu("a column of tiles is missing", "reach.hpp", "bounded((r.x + r.extent_x - 0.5f) * kPerTile + 1.0f, columns)",
-        "bounded((r.x + r.extent_x - 0.5f) * kPerTile, columns)"),
-    cpu("the motion's rotation has the wrong sign", "pose.hpp", "A(j, k) - A(k, j)", "A(k, j) - A(j, k)"),
-    cpu("the bias correction of the second moment", "adam.hpp", "1.0 / std::sqrt(1.0 - std::pow(kBeta2",
-        "1.0 / (1.0 - std::pow(kBeta2"),
-    cpu("the second moment from the first", "adam.hpp", "squared * static_cast<float>(1.0 - kBeta2)",
-        "squared * static_cast<float>(1.0 - kBeta1)"),
-    cpu("a NaN gradient is taken", "adam.hpp", "m = select(good, m1, m);", "m = m1;"),
-    cpu("the search ends at the nearest neighbour", "knn.cpp", "return squared[kNeighbors - 1];", "return squared[0];"),
 ]  # fmt: skip
-"""Faults that the proofs have not been run on yet, or do not catch: `run.py --next`. A caught one moves up."""
+"""Faults that the proofs have not been run on yet, or do not catch: `run.py --next`. A caught one moves up.
+
+"2^x loses a digit" survives: it only triples the error of 2^x, and the proofs allow 20 units.
+"""
