@@ -17,7 +17,11 @@ class Settings(BaseSettings):
     """The settings. Each is also an environment variable: `SPLATMILL_` and the name in capitals."""
 
     model_config = SettingsConfigDict(
-        env_prefix="SPLATMILL_", populate_by_name=True, extra="ignore", hide_input_in_errors=True
+        env_prefix="SPLATMILL_",
+        env_ignore_empty=True,  # Compose passes on a variable that is not set as an empty one
+        populate_by_name=True,
+        extra="ignore",
+        hide_input_in_errors=True,
     )
 
     redis_url: str = Field(

@@ -140,3 +140,12 @@ def test_the_number_of_open_streams_is_known(app: ServedApp) -> None:
         assert b"retry" in next(stream)
         assert streams() == "1.0"
     wait_for(lambda: streams() == "0.0")
+
+
+def test_an_empty_variable_is_as_one_that_is_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("SPLATMILL_QUOTA", "SPLATMILL_KEEP_CAPTURES", "SPLATMILL_PORT", "REDIS_URL", "SPLATMILL_STORAGE"):
+        monkeypatch.delenv(name, raising=False)
+    unset = Settings()
+    for name in ("SPLATMILL_QUOTA", "SPLATMILL_KEEP_CAPTURES", "SPLATMILL_PORT", "REDIS_URL", "SPLATMILL_STORAGE"):
+        monkeypatch.setenv(name, "")
+    assert Settings() == unset
