@@ -113,7 +113,7 @@ def test_storage_that_cannot_be_opened_is_said_so(tmp_path: Path) -> None:
 
 def test_importing_the_server_runs_nothing() -> None:
     root = Path(app_module.__file__).parent
-    assert (root / "reaper.py").is_file()
+    assert (root / "jobs" / "reaper.py").is_file()
     for path in root.rglob("*.py"):
         for node in ast.parse(path.read_text()).body:
             if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
@@ -143,9 +143,21 @@ def test_the_number_of_open_streams_is_known(app: ServedApp) -> None:
 
 
 def test_an_empty_variable_is_as_one_that_is_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("SPLATMILL_QUOTA", "SPLATMILL_KEEP_CAPTURES", "SPLATMILL_PORT", "REDIS_URL", "SPLATMILL_STORAGE"):
+    for name in (
+        "SPLATMILL_QUOTA",
+        "SPLATMILL_KEEP_CAPTURES",
+        "SPLATMILL_PORT",
+        "REDIS_URL",
+        "SPLATMILL_STORAGE",
+    ):
         monkeypatch.delenv(name, raising=False)
     unset = Settings()
-    for name in ("SPLATMILL_QUOTA", "SPLATMILL_KEEP_CAPTURES", "SPLATMILL_PORT", "REDIS_URL", "SPLATMILL_STORAGE"):
+    for name in (
+        "SPLATMILL_QUOTA",
+        "SPLATMILL_KEEP_CAPTURES",
+        "SPLATMILL_PORT",
+        "REDIS_URL",
+        "SPLATMILL_STORAGE",
+    ):
         monkeypatch.setenv(name, "")
     assert Settings() == unset

@@ -68,14 +68,18 @@ class Captures:
             for known in ids:
                 if self.storage.exists(layout.capture_record(known)):
                     return self.record(known), False
-            # Files without a record belong to a capture that is being deleted, and new ones would go with them.
-            free = (known for known in ids if not any(self.storage.entries(layout.capture(known))))
-            capture_id = next(free, capture_id)
+            capture_id = next((known for known in ids if not self._is_leftover(known)), capture_id)
         capture = Capture(id=capture_id, name=name, owner=owner, created_at=datetime.now(UTC))
         record = json.dumps(capture.model_dump(mode="json", exclude={"files"}) | {"format": FORMAT}).encode()
         if self.storage.put_new(layout.capture_record(capture.id), record):
             return capture, True
         return self.record(capture.id), False
+
+    def _is_leftover(self, capture_id: str) -> bool:
+        """Return whether there are files without a record: the capture is being deleted, and new files would go too."""
+        # The files are looked for first: a record that another request is just making comes with the first file.
+        found = any(True for _ in self.storage.entries(layout.capture(capture_id)))
+        return found and not self.storage.exists(layout.capture_record(capture_id))
 
     def record(self, capture_id: str) -> Capture:
         """Return the record without the files. Raises a 404 problem, and UnreadableRecord."""

@@ -75,10 +75,10 @@ class Reaper:
     def cancel(self, row: JobRow) -> bool:
         """Take the next step of a cancellation; return True once no process is left and the job has ended."""
         found = queue.status(self.connection, row.id, row.generation)
-        over = found.state in _ENDED or found.state == "absent"
-        if not over:
-            over = queue.withdraw(self.connection, row.id, row.generation)
-        if over:
+        withdrawn = queue.withdraw(
+            self.connection, row.id, row.generation
+        )  # from its line even without a record
+        if withdrawn or found.state in _ENDED or found.state == "absent":
             self.jobs.give_verdict(row, "cancelled")
             log.info("job cancelled", job=row.id)
             return True

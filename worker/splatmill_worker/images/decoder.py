@@ -76,7 +76,9 @@ def program_files() -> list[Path]:
     system = [
         Path(place) for place in ("/usr", "/lib", "/lib64", "/etc/ld.so.cache", "/dev/null", "/dev/urandom")
     ]
-    return [*modules, Path(sys.prefix), Path(sys.base_prefix), *system]
+    imported = [Path(place) for place in sys.path if os.path.isdir(place)]
+    linked = [entry.resolve() for place in imported for entry in place.iterdir() if entry.is_symlink()]
+    return [*modules, *imported, *linked, Path(sys.prefix), Path(sys.base_prefix), *system]
 
 
 def _answers() -> dict[str, Callable[[dict[str, Any]], Answer]]:
