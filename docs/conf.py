@@ -22,7 +22,8 @@ release = version = __version__
 copyright = "the Splatmill authors"
 
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
-exclude_patterns = ["build", "generate", "generated/python-errors.md"]  # the last one is a part of a page
+# The last two are parts of pages.
+exclude_patterns = ["build", "generate", "generated/python-errors.md", "generated/formats.md"]
 
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", r".*")]  # types in signatures; links in the text are checked all the same

@@ -21,6 +21,7 @@ from splatmill.schema import (
     IDEMPOTENCY_HEADER,
     Capture,
     CapturePage,
+    Estimate,
     Info,
     Job,
     JobPage,
@@ -33,6 +34,7 @@ from splatmill.schema import (
     StorageUse,
     TrainOptions,
 )
+from splatmill.schema.formats import is_model_file
 from splatmill.server_choice import Verify
 from splatmill.uploads import OnProgress, Uploaded, key_of, upload
 from splatmill.webhooks import AsyncWebhooks
@@ -115,7 +117,7 @@ class AsyncClient:
     ) -> AsyncJobHandle:
         """Upload the capture at `path` (photos, a zip archive, a video or a posed data set) and start a job on it.
 
-        `options` are the fields of `TrainOptions`. `start` may also be the path of a .ply file on this machine, or its
+        `options` are the fields of `TrainOptions`. `start` may also be the path of a model file on this machine, or its
         name in the folder `path`; the file is then uploaded with the poses. The options and the path are checked before
         anything is sent. The job continues when the connection is closed. `refused` of the returned handle lists the
         photos that the server refused. The same files are uploaded once: a second training uses the same capture.
@@ -145,7 +147,7 @@ class AsyncClient:
 
         With `resume`, the same files go into the same capture as before, and an upload that was interrupted is
         continued, also by another process. Files that are already stored are not sent again. `model` is the path of a
-        .ply file to start from, which is uploaded with the poses.
+        model file to start from, which is uploaded with the poses.
 
         Raises NothingToUpload, ConnectionFailed, or a subclass of `Refused`.
         """
@@ -252,6 +254,19 @@ class AsyncClient:
         response = await self.connection.request("GET", "/v1/options")
         return read_answer(OptionList, response).options
 
+    async def estimate(
+        self, photos: int, options: TrainOptions | None = None, *, posed: bool = False
+    ) -> Estimate:
+        """Return how long a job on `photos` photos would take, derived from the jobs that the server has finished.
+
+        `posed` tells that the cameras come with the photos. Nothing is created. Raises InvalidRequest for options that
+        the server does not accept.
+        """
+        chosen = options.model_dump(mode="json", exclude_unset=True) if options is not None else {}
+        body = {"photos": photos, "posed": posed, "options": chosen}
+        response = await self.connection.request("POST", "/v1/estimate", json=body, repeatable=True)
+        return read_answer(Estimate, response)
+
     async def me(self) -> Me:
         """Return who the server takes the caller for: owner, scopes, limits and their use."""
         return read_answer(Me, await self.connection.request("GET", "/v1/me"))
@@ -305,13 +320,13 @@ class AsyncClient:
 
 
 def with_start_model(options: Mapping[str, Any], folder: AnyPath) -> tuple[dict[str, Any], Path | None]:
-    """Return `options` with the path of a .ply in `start` replaced by its name in the capture, and that path or None.
+    """Return `options` with the path in `start` replaced by the name of the file in the capture, and that path or None.
 
     A relative path is looked up in the working folder, then in `folder`, the data set. Raises NothingToUpload where
     neither holds the file.
     """
     start = options.get("start")
-    if start is None or not str(start).lower().endswith(".ply"):
+    if start is None or not is_model_file(str(start)):
         return dict(options), None
     path = Path(start).expanduser()
     inside = Path(folder).expanduser() / path

@@ -35,6 +35,7 @@ class TrainArguments(TypedDict, total=False):
     max_video_frames: int
     start: str | os.PathLike[str] | None
     progress_video: bool
+    time_lapse: Switch | Literal["auto", "on", "off"]
     background: Background | Literal["auto", "black", "white", "random"]
     exposure: Switch | Literal["auto", "on", "off"]
     far_shell: Switch | Literal["auto", "on", "off"]

@@ -1,6 +1,6 @@
 """The synchronous SDK. Each method waits for the one of the same name in `aio`, `job` or `model`; see there."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self, Unpack
 
@@ -16,9 +16,12 @@ from splatmill.keys import Keys
 from splatmill.loop import BackgroundLoop
 from splatmill.model import AsyncModelHandle
 from splatmill.schema import (
+    Box,
     CameraSpec,
     Capture,
     CurveRow,
+    Edited,
+    Estimate,
     EventRecord,
     Info,
     Job,
@@ -27,7 +30,9 @@ from splatmill.schema import (
     Me,
     Model,
     ModelCamera,
+    ModelDownload,
     OptionHelp,
+    Placement,
     Problem,
     Ready,
     Report,
@@ -35,6 +40,7 @@ from splatmill.schema import (
     TrainOptions,
 )
 from splatmill.server_choice import Verify
+from splatmill.shares import Shares
 from splatmill.uploads import OnProgress, Uploaded
 from splatmill.webhooks import Webhooks
 
@@ -130,7 +136,7 @@ class Client:
         """Upload the capture at `path` into a new capture, or into the one with the id `capture`.
 
         With `resume`, the same files go into the same capture as before, and an interrupted upload is continued.
-        `model` is the path of a .ply file to start from, which is uploaded with the poses.
+        `model` is the path of a model file to start from, which is uploaded with the poses.
         """
         return self._loop.run_reporting(
             lambda report: self._async.upload(
@@ -212,6 +218,14 @@ class Client:
     def options(self) -> list[OptionHelp]:
         """Return the training options of the server, with type, default, range and help."""
         return self._loop.run(self._async.options())
+
+    def estimate(self, photos: int, options: TrainOptions | None = None, *, posed: bool = False) -> Estimate:
+        """Return how long a job on `photos` photos would take, derived from the jobs that the server has finished.
+
+        `posed` tells that the cameras come with the photos. Nothing is created. Raises InvalidRequest for options that
+        the server does not accept.
+        """
+        return self._loop.run(self._async.estimate(photos, options, posed=posed))
 
     def me(self) -> Me:
         """Return who the server takes the caller for: owner, scopes, limits and their use."""
@@ -311,6 +325,24 @@ class JobHandle:
         """Return the newest preview image (JPEG)."""
         return self._loop.run(self._async.preview())
 
+    def cameras(self) -> Placement:
+        """Return the cameras and points as structure from motion places them, and the photos that are not used."""
+        return self._loop.run(self._async.cameras())
+
+    def watch(self) -> float:
+        """Ask the job for snapshots of its scene, and return for how many seconds it makes them without being asked.
+
+        While it does, events announce the snapshots. Raises Conflict for a job that has ended.
+        """
+        return self._loop.run(self._async.watch())
+
+    def snapshot(self) -> bytes:
+        """Return the newest snapshot of the scene in training: a compressed .ply without spherical harmonics.
+
+        Only a job that is watched makes snapshots. Raises NotFound while there is none.
+        """
+        return self._loop.run(self._async.snapshot())
+
 
 class ModelHandle:
     """A finished model on the server."""
@@ -318,6 +350,7 @@ class ModelHandle:
     def __init__(self, loop: BackgroundLoop, handle: AsyncModelHandle) -> None:
         self._loop = loop
         self._async = handle
+        self.shares = Shares(loop, handle.shares)
 
     @property
     def id(self) -> str:
@@ -335,6 +368,17 @@ class ModelHandle:
         A partial download is resumed. `on_bytes` is called with the bytes received and the size, where it is known.
         """
         return self._loop.run(self._async.download(path, file=file, on_bytes=on_bytes))
+
+    def formats(self) -> list[ModelDownload]:
+        """Return the file formats in which the model can be downloaded, with bytes and quality where they are known."""
+        return self._loop.run(self._async.formats())
+
+    def download_as(self, format: str, path: AnyPath, *, on_bytes: OnBytes | None = None) -> Path:
+        """Download the model in another file format, such as "sog", to `path`, a file or an existing folder.
+
+        The first download in a format waits until the server has converted the model. Returns the path written.
+        """
+        return self._loop.run(self._async.download_as(format, path, on_bytes=on_bytes))
 
     def delete(self) -> None:
         """Delete the model with its job, its report and its files. The capture is kept."""
@@ -360,3 +404,27 @@ class ModelHandle:
         as long as the server does by default.
         """
         return self._loop.run(self._async.orbit(path, timeout=timeout, **options))
+
+    def edit(
+        self,
+        *,
+        box: Box | Mapping[str, Sequence[float]] | None = None,
+        min_opacity: float | None = None,
+        max_size: float | None = None,
+        name: str | None = None,
+        preview: bool = False,
+    ) -> Edited:
+        """Make a new model of a part of this one, which is kept, and return what that does to the held-out photos.
+
+        box: keep the Gaussians whose centre lies in it: `{"min": [x, y, z], "max": [x, y, z]}` in units of the model.
+        min_opacity: keep the Gaussians of at least this opacity, between 0 and 1.
+        max_size: keep the Gaussians whose standard deviation is at most this along every axis, in units of the model.
+        name: of the new model; left out, that of this one.
+        preview: only measure; no model is made.
+
+        At least one of box, min_opacity and max_size is needed. `model` of the returned record is the id of the new
+        model, None for a preview.
+        """
+        return self._loop.run(
+            self._async.edit(box=box, min_opacity=min_opacity, max_size=max_size, name=name, preview=preview)
+        )

@@ -16,11 +16,13 @@ from splatmill.schema import (
     JobState,
     LogLine,
     LogPage,
+    Placement,
     Problem,
     Progress,
     ProgressEvent,
     Report,
     StateEvent,
+    Watch,
 )
 from splatmill.sse import GIVE_UP_SECONDS, follow_events
 from splatmill.uploads import OnProgress
@@ -160,6 +162,27 @@ class AsyncJobHandle:
     async def preview(self) -> bytes:
         """Return the newest preview image (JPEG)."""
         response = await self.connection.request("GET", f"/v1/jobs/{self.id}/preview")
+        return response.content
+
+    async def cameras(self) -> Placement:
+        """Return the cameras and points as structure from motion places them, and the photos that are not used."""
+        response = await self.connection.request("GET", f"/v1/jobs/{self.id}/cameras")
+        return read_answer(Placement, response)
+
+    async def watch(self) -> float:
+        """Ask the job for snapshots of its scene, and return for how many seconds it makes them without being asked.
+
+        While it does, events announce the snapshots. Raises Conflict for a job that has ended.
+        """
+        response = await self.connection.request("POST", f"/v1/jobs/{self.id}/watch", repeatable=True)
+        return read_answer(Watch, response).seconds
+
+    async def snapshot(self) -> bytes:
+        """Return the newest snapshot of the scene in training: a compressed .ply without spherical harmonics.
+
+        Only a job that is watched makes snapshots. Raises NotFound while there is none.
+        """
+        response = await self.connection.request("GET", f"/v1/jobs/{self.id}/snapshot")
         return response.content
 
     async def _post(self, action: str) -> Job:

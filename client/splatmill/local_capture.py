@@ -1,5 +1,6 @@
 """The files of a capture at a local path: photos, masks, poses, a video or a zip archive."""
 
+import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,8 +53,8 @@ def find_files(path: str | os.PathLike[str]) -> Found:
 
     In a folder, the photos are those under `images/`, named relative to it. Without `images/`, they are all photos in
     the folder, named relative to the folder, so that `train/r_0.png` keeps its name in `transforms_train.json`. Masks
-    lie under `masks/` or `mask/`; poses are `transforms*.json` and a COLMAP model. Hidden files and folders are
-    ignored. Videos and zip archives are used only where there are no photos.
+    lie under `masks/` or `mask/`; poses are `transforms*.json`, the `.ply` files of points that they name, and a COLMAP
+    model. Hidden files and folders are ignored. Videos and zip archives are used only where there are no photos.
 
     Raises NothingToUpload where the path does not exist, cannot be read or holds none of these, and where the service
     does not accept the name of a file.
@@ -73,6 +74,7 @@ def find_files(path: str | os.PathLike[str]) -> Found:
         (f"{top}/" for top in MASK_FOLDERS if any(name.startswith(f"{top}/") for name in names)), None
     )
     poses = _poses(names)
+    poses |= _points_of([root / name for name in poses if name.endswith(".json")], names)
     files: list[LocalFile] = []
     ignored: list[str] = []
     for name in names:
@@ -106,7 +108,7 @@ def start_model(path: Path) -> LocalFile:
     if not path.is_file():
         raise NothingToUpload(
             f"The model {path} to start from does not exist.",
-            "Give the path of a .ply file, or the id of a model.",
+            "Give the path of a model file, or the id of a model.",
         )
     return _local(Role.poses, path.name, path)
 
@@ -157,6 +159,21 @@ def _poses(names: list[str]) -> dict[str, str]:
             ]
             # In a capture, a COLMAP model always lies in the same folder.
             return found | {name: f"sparse/0/{name.removeprefix(prefix)}" for name in model}
+    return found
+
+
+def _points_of(transforms: list[Path], names: list[str]) -> dict[str, str]:
+    """Return the .ply files with points that transforms files name, each with its name in the capture, which is the
+    same. A transforms file that cannot be read names none here; the worker says what is wrong with it."""
+    found = {}
+    for path in transforms:
+        try:
+            named = json.loads(path.read_bytes()).get("ply_file_path")
+        except (OSError, ValueError, AttributeError, RecursionError):
+            continue
+        name = str(named).removeprefix("./")
+        if name in names and _suffix(name) == ".ply":
+            found[name] = name
     return found
 
 

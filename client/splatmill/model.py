@@ -1,8 +1,9 @@
 """A finished model on the server: its files, its cameras, and images rendered from it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Unpack
+from urllib.parse import quote
 
 import httpx
 from pydantic import ValidationError
@@ -12,7 +13,20 @@ from splatmill.connection import Connection, read_answer
 from splatmill.downloads import AnyPath, OnBytes, download, target_of
 from splatmill.errors import invalid_request
 from splatmill.files import atomic_write
-from splatmill.schema import CameraSpec, Model, ModelCamera, ModelCameras, OrbitRequest, RenderRequest
+from splatmill.schema import (
+    Box,
+    CameraSpec,
+    Edited,
+    EditModel,
+    Model,
+    ModelCamera,
+    ModelCameras,
+    ModelDownload,
+    ModelDownloads,
+    OrbitRequest,
+    RenderRequest,
+)
+from splatmill.shares import AsyncShares
 
 # Longer than the server waits for its renderer, so that the server's problem arrives before this timeout.
 RENDER_TIMEOUT = httpx.Timeout(30.0, read=150.0)
@@ -26,6 +40,7 @@ class AsyncModelHandle:
     def __init__(self, connection: Connection, model: Model) -> None:
         self.connection = connection
         self.model = model
+        self.shares = AsyncShares(connection, model.id)
 
     @property
     def id(self) -> str:
@@ -47,6 +62,27 @@ class AsyncModelHandle:
             target_of(path, file),
             sha256=digest,
             on_bytes=on_bytes,
+        )
+
+    async def formats(self) -> list[ModelDownload]:
+        """Return the file formats in which the model can be downloaded, with bytes and quality where they are known."""
+        response = await self.connection.request("GET", f"/v1/models/{self.id}/formats")
+        return read_answer(ModelDownloads, response).formats
+
+    async def download_as(self, format: str, path: AnyPath, *, on_bytes: OnBytes | None = None) -> Path:
+        """Download the model in another file format, such as "sog", to `path`, a file or an existing folder.
+
+        The first download in a format waits until the server has converted the model. Returns the path written.
+        Raises NotFound for an unknown format, DownloadFailed, ConnectionFailed, a subclass of `Refused`, or OSError.
+        """
+        address = f"/v1/models/{self.id}/download/{quote(format, safe='')}"
+        # The conversion comes first: downloads are begun again when no byte has come for some seconds.
+        first = {"Range": "bytes=0-0"}
+        await self.connection.request(
+            "GET", address, headers=first, repeatable=True, costly=True, timeout=ORBIT_TIMEOUT
+        )
+        return await download(
+            self.connection, address, target_of(path, f"{self.id}.{format}"), on_bytes=on_bytes
         )
 
     async def delete(self) -> None:
@@ -104,6 +140,49 @@ class AsyncModelHandle:
         target = target_of(path, "orbit.mp4")
         atomic_write(target, response.content)
         return target
+
+    async def edit(
+        self,
+        *,
+        box: Box | Mapping[str, Sequence[float]] | None = None,
+        min_opacity: float | None = None,
+        max_size: float | None = None,
+        name: str | None = None,
+        preview: bool = False,
+    ) -> Edited:
+        """Make a new model of a part of this one, which is kept, and return what that does to the held-out photos.
+
+        box: keep the Gaussians whose centre lies in it: `{"min": [x, y, z], "max": [x, y, z]}` in units of the model.
+        min_opacity: keep the Gaussians of at least this opacity, between 0 and 1.
+        max_size: keep the Gaussians whose standard deviation is at most this along every axis, in units of the model.
+        name: of the new model; left out, that of this one.
+        preview: only measure; no model is made.
+
+        At least one of box, min_opacity and max_size is needed. `model` of the returned record is the id of the new
+        model, None for a preview. Raises InvalidRequest for values that are not valid, and for an edit that leaves
+        nothing.
+        """
+        given = {
+            "box": box,
+            "min_opacity": min_opacity,
+            "max_size": max_size,
+            "name": name,
+            "preview": preview,
+        }
+        try:
+            request = EditModel.model_validate(given)
+        except ValidationError as error:
+            raise invalid_request(error) from error
+        # Repeated after a lost answer, it would make a second model, so only a preview is.
+        response = await self.connection.request(
+            "POST",
+            f"/v1/models/{self.id}/edits",
+            json=request.model_dump(mode="json", exclude_none=True),
+            repeatable=preview,
+            costly=True,
+            timeout=ORBIT_TIMEOUT,
+        )
+        return read_answer(Edited, response)
 
 
 async def find_model(connection: Connection, model_id: str) -> AsyncModelHandle:

@@ -5,12 +5,13 @@ One module per page. Each has a function `page()` that returns the page as Markd
 
 from pathlib import Path
 
-from docs.generate import command_line, environment, errors, hostile, python_errors, rest, settings
+from docs.generate import command_line, environment, errors, formats, hostile, python_errors, rest, settings
 
 PAGES = {
     "command-line.md": command_line.page,
     "environment.md": environment.page,
     "errors.md": errors.page,
+    "formats.md": formats.page,
     "hostile.md": hostile.page,
     "python-errors.md": python_errors.page,
     "rest.md": rest.page,

@@ -26,6 +26,7 @@ HEADINGS = {
     "captures": "Captures",
     "jobs": "Jobs",
     "models": "Models",
+    "shares": "Links to models",
     "webhooks": "Webhooks",
     "keys": "Keys",
     "service": "The service itself",

@@ -6,13 +6,13 @@ from docs.generate.markdown import choices, code, table
 
 from splatmill.cli.schema_options import PANELS
 from splatmill.schema import (
+    PRESET_STEPS,
     FitImageOptions,
     OptionHelp,
     Preset,
     describe_options,
     format_bytes,
 )
-from splatmill_worker.splat.plan.capacity import PRESET_STEPS
 from splatmill_worker.splat.plan.photos import PRESET_SIZE
 
 INTRODUCTION = """# Settings

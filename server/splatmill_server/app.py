@@ -20,11 +20,16 @@ from splatmill_server.access.sessions import COOKIE
 from splatmill_server.middleware import RequestMiddleware
 from splatmill_server.routes import (
     captures,
+    edits,
+    estimate,
     imports,
+    job_live,
     job_outputs,
     jobs,
     models,
     session,
+    shared,
+    shares,
     status,
     storage,
     uploads,
@@ -33,6 +38,7 @@ from splatmill_server.routes import (
 from splatmill_server.routes import keys as key_routes
 from splatmill_server.service import Service
 from splatmill_server.settings import Settings
+from splatmill_server.web import pages
 
 log = structlog.get_logger()
 
@@ -86,8 +92,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         uploads,
         imports,
         jobs,
+        job_live,
         job_outputs,
+        estimate,
+        edits,
         models,
+        shares,
         webhooks,
         key_routes,
         session,
@@ -96,6 +106,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     for module in modules:
         app.include_router(module.router, dependencies=[PERMITTED])
+    app.include_router(shared.router)  # for people without a key
+    app.include_router(pages.router)
     _describe(app, keyless=settings.local and settings.api_key is None)
     return app
 

@@ -17,9 +17,14 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import Problem, format_bytes
 from splatmill_server.access.caller import NOBODY, Caller
-from splatmill_server.access.permission import OPEN_PATHS
-from splatmill_server.access.rate import Rate
-from splatmill_server.problems import ProblemError, ProblemResponse, problem_of_redis, problem_of_storage
+from splatmill_server.access.permission import is_open
+from splatmill_server.problems import (
+    ProblemError,
+    ProblemResponse,
+    problem_of_redis,
+    problem_of_storage,
+    shown_path,
+)
 from splatmill_server.service import Service
 
 log = structlog.get_logger()
@@ -34,7 +39,7 @@ class RequestMiddleware:
     def __init__(self, app: ASGIApp, service: Service) -> None:
         self.app = app
         self.authentication = service.authentication
-        self.rate = Rate(service.redis_async)
+        self.rate = service.rate
         self.max_body = service.settings.max_json_bytes
         self.metrics = service.metrics
         self.level = logging.INFO if service.settings.access_log else logging.DEBUG
@@ -84,7 +89,7 @@ class RequestMiddleware:
                 owner=caller.owner,
                 key=caller.key_name,
                 method=scope["method"],
-                path=scope["path"],
+                path=shown_path(scope["path"]),
                 status=status,
                 seconds=round(seconds, 4),
                 bytes=sent,
@@ -102,9 +107,9 @@ class RequestMiddleware:
         try:
             await self.app(scope, receive, send_noted)
         except ClientDisconnect:
-            log.debug("the client disconnected", path=scope["path"])
+            log.debug("the client disconnected", path=shown_path(scope["path"]))
         except Exception as error:
-            log.exception("unexpected error", method=scope["method"], path=scope["path"])
+            log.exception("unexpected error", method=scope["method"], path=shown_path(scope["path"]))
             if begun:
                 raise  # The status is already sent, so only a broken connection shows that the rest is missing.
             problem = Problem.of(
@@ -119,7 +124,7 @@ class RequestMiddleware:
 
     async def _admit(self, scope: Scope, headers: Headers) -> None:
         """Find the caller. Raises ProblemError for a request that is refused before its body is read."""
-        if scope["path"] not in OPEN_PATHS:
+        if not is_open(scope["path"]):
             try:
                 scope["state"]["caller"] = await self.authentication.caller(scope, headers)
             except StorageError as error:

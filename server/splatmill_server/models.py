@@ -72,8 +72,9 @@ class Models:
     def get(self, model_id: str) -> Model:
         """Return a model with its files. Raises 404 and 409 problems, and 500 if its files cannot be read."""
         self.check(model_id)
+        folder = layout.model(model_id) + "/"
         files = {
-            entry.path.rsplit("/", 1)[-1]: entry for entry in self.storage.entries(layout.model(model_id))
+            entry.path.removeprefix(folder): entry for entry in self.storage.entries(layout.model(model_id))
         }
         try:
             job = read_record(self.storage, model_id)
@@ -103,10 +104,10 @@ class Models:
                     name=name,
                     size=entry.size,
                     sha256=digests.get(name),
-                    media_type=layout.MODEL_FILES[name],
+                    media_type=media_type,
                 )
                 for name, entry in sorted(files.items())
-                if name in layout.MODEL_FILES
+                if (media_type := layout.model_media_type(name)) is not None
             ],
             links={
                 "self": base,
@@ -114,6 +115,8 @@ class Models:
                 "cameras": f"{base}/cameras",
                 "render": f"{base}/render",
                 "orbit": f"{base}/orbit",
+                "formats": f"{base}/formats",
+                "html": f"{base}/download/html",
                 "ply": f"{base}/files/model.ply",
                 "report": f"{base}/files/report.html",
             },
@@ -156,12 +159,14 @@ class Models:
     def file(self, model_id: str, name: str) -> Entry:
         """Return the entry of a file of a model. Raises 404 and 409 problems."""
         self.check(model_id)
-        entry = self.storage.head(layout.model_file(model_id, name)) if name in layout.MODEL_FILES else None
+        known = layout.model_media_type(name) is not None
+        entry = self.storage.head(layout.model_file(model_id, name)) if known else None
         if entry is None:
             raise ProblemError(
                 "file_not_found",
                 f"The model {model_id} has no file {name[:80]!r}.",
-                advice=f"The files of a model are: {', '.join(sorted(layout.MODEL_FILES))}.",
+                advice=f"The files of a model are: {', '.join(sorted(layout.MODEL_FILES))}, and those that "
+                f"GET /v1/models/{model_id} lists in the folders {' and '.join(layout.MODEL_FOLDERS)}.",
             )
         return entry
 
@@ -175,6 +180,17 @@ class Models:
             raise ProblemError(
                 "model_corrupt", f"The file cameras.json of the model {model_id} cannot be read: {error}."
             ) from error
+
+    def antialias(self, model_id: str) -> bool:
+        """Return whether the model was trained with antialiasing, as the plan in its report says."""
+        try:
+            plan = Report.model_validate_json(
+                self.storage.get(layout.model_file(model_id, "report.json"))
+            ).plan
+        except (FileNotFoundError, ValidationError):
+            return False
+        decided = plan.get("antialias")
+        return bool(decided.get("value") if isinstance(decided, dict) else decided)
 
     def _header(self, model_id: str, entry: Entry) -> tuple[int, int]:
         """Return the number of Gaussians and the degree of the spherical harmonics, from the header of the .ply."""

@@ -1,5 +1,6 @@
 """Converts every error into a problem document (RFC 9457) with a code from `splatmill.schema.PROBLEMS`."""
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,6 +17,8 @@ from splatmill.schema import PROBLEM_MEDIA_TYPE, PROBLEMS, Problem, UnsafeName, 
 from splatmill_server.validation import problem_of_validation
 
 log = structlog.get_logger()
+
+_SHARED = re.compile(r"^/s/[^/]+")
 
 
 class ProblemError(HTTPException):
@@ -90,19 +93,24 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(redis.RedisError)
     def on_redis(request: Request, error: redis.RedisError) -> Response:
-        log.warning("queue unavailable", error=str(error), path=request.url.path)
+        log.warning("queue unavailable", error=str(error), path=shown_path(request.url.path))
         problem = problem_of_redis(error)
         return ProblemResponse(problem, request.url.path, {"Retry-After": "5"})
 
     @app.exception_handler(StorageError)
     def on_storage(request: Request, error: StorageError) -> Response:
-        log.warning("storage error", error=str(error), path=request.url.path)
+        log.warning("storage error", error=str(error), path=shown_path(request.url.path))
         return ProblemResponse(problem_of_storage(error), request.url.path)
 
     @app.exception_handler(ClientDisconnect)
     def on_disconnect(request: Request, _: ClientDisconnect) -> Response:
         # The client is gone, but a proxy in between may read this response.
         return ProblemResponse(body_cut_off(), request.url.path)
+
+
+def shown_path(path: str) -> str:
+    """Return a path as logs may show it: without the token of a shared link."""
+    return _SHARED.sub("/s/...", path)
 
 
 def problem_of_redis(error: redis.RedisError) -> Problem:

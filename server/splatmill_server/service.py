@@ -16,16 +16,20 @@ from splatmill.backplane.connection import connect, connect_async
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill_server.access.authentication import Authentication
 from splatmill_server.access.keys import Keys
+from splatmill_server.access.rate import Rate
 from splatmill_server.access.sessions import Sessions
 from splatmill_server.captures.imports import Imports
 from splatmill_server.captures.partial_uploads import PartialUploads
 from splatmill_server.captures.records import Captures
+from splatmill_server.conversions import Conversions
+from splatmill_server.jobs.finished import Finished
 from splatmill_server.jobs.reaper import Reaper
 from splatmill_server.jobs.records import Jobs
 from splatmill_server.metrics import Metrics
 from splatmill_server.models import Models
 from splatmill_server.outgoing import Outgoing
 from splatmill_server.settings import Settings
+from splatmill_server.shares import Shares
 from splatmill_server.space.deletion import Deletion
 from splatmill_server.space.ledger import Ledger
 from splatmill_server.space.quota import Quota
@@ -79,10 +83,14 @@ class Service:
     webhooks: Webhooks
     deliveries: Deliveries
     jobs: Jobs
+    finished: Finished
     models: Models
+    shares: Shares
+    conversions: Conversions
     keys: Keys
     authentication: Authentication
     sessions: Sessions
+    rate: Rate
     reaper: Reaper
     usage: Usage
     quota: Quota
@@ -99,12 +107,14 @@ class Service:
         connection = connect(settings.redis_url, timeout=settings.redis_timeout, retries=1)
         metrics = Metrics()
         jobs = Jobs(connection, storage, metrics)
+        models = Models(storage, jobs)
         captures = Captures(storage, settings, metrics)
         usage = Usage(storage, Ledger(connection))
         quota = Quota(usage, captures, settings.quota)
         deletion = Deletion(connection, storage, captures, jobs, usage.ledger)
         outgoing = Outgoing(settings.outgoing_allow)
         webhooks = Webhooks(storage, jobs)
+        renderer = _renderer(settings)
         stored_keys = Keys(storage, bootstrap=settings.api_key is not None)
         sessions = Sessions(redis_async, settings.session_seconds, settings.redis_timeout)
         return cls(
@@ -113,7 +123,7 @@ class Service:
             redis_async=redis_async,
             storage=storage,
             storage_check=StorageCheck(storage),
-            renderer=_renderer(settings),
+            renderer=renderer,
             metrics=metrics,
             captures=captures,
             partial_uploads=PartialUploads(storage, captures),
@@ -122,10 +132,14 @@ class Service:
             webhooks=webhooks,
             deliveries=Deliveries(connection, webhooks, outgoing),
             jobs=jobs,
-            models=Models(storage, jobs),
+            finished=Finished(storage),
+            models=models,
+            shares=Shares(storage, models),
+            conversions=Conversions(storage, connection, models, renderer, settings.orbit_timeout),
             keys=stored_keys,
             authentication=Authentication(settings, stored_keys, sessions),
             sessions=sessions,
+            rate=Rate(redis_async),
             reaper=Reaper(connection, jobs, metrics, settings),
             usage=usage,
             quota=quota,

@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -68,7 +67,6 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> Any:
                 "scenes",
                 "spread",
                 "tables",
-                "unequal",
             )
         ),
     )
@@ -250,7 +248,7 @@ def test_switches_are_compared_seed_by_seed_on_the_same_code(parts: Any, place: 
     rows = [like(default, seed=seed, psnr=20.0 + 3 * seed, train=10.0) for seed in (0, 1, 2)]
     for seed, gain in enumerate((0.1, 0.3, 0.2)):
         rows.append(
-            like(row, config="exposure", plan=changed, seed=seed, psnr=20.0 + 3 * seed + gain, train=11.0)
+            like(row, config="even-light", plan=changed, seed=seed, psnr=20.0 + 3 * seed + gain, train=11.0)
         )
         rows.append(
             like(row, config="antialias", plan=changed, seed=seed, psnr=20.0 + 3 * seed - gain, train=9.0)
@@ -259,7 +257,7 @@ def test_switches_are_compared_seed_by_seed_on_the_same_code(parts: Any, place: 
     text = ablation(rows)
     assert "| 3 | +0.20 (+0.10 to +0.30) | +0.0000 (+0.0000 to +0.0000) | +10 (+10 to +10) | better |" in text
     assert "| 3 | -0.20 (-0.30 to -0.10) | +0.0000 (+0.0000 to +0.0000) | -10 (-10 to -10) | worse |" in text
-    assert "| `exposure` | 1 | tiny, 30steps | nowhere | +0.20 |" in text
+    assert "| `even-light` | 1 | tiny, 30steps | nowhere | +0.20 |" in text
     assert "1 rows of a switch have no default of the same code" in text
     assert "`older`" not in text
     busy = [each | {"others_cpu_seconds": 1e3} for each in rows if each["seed"] == 2]
@@ -268,20 +266,22 @@ def test_switches_are_compared_seed_by_seed_on_the_same_code(parts: Any, place: 
     assert "| +0.0000 (+0.0000 to +0.0000) | busy machine | better |" in ablation(
         [each | {"others_cpu_seconds": 1e3} for each in rows]
     )
-    unclear = like(row, config="exposure", plan=changed, seed=2, psnr=25.9, train=11.0)
+    unclear = like(row, config="even-light", plan=changed, seed=2, psnr=25.9, train=11.0)
     assert "| no clear difference |" in ablation([*rows, unclear])
-    alone = ablation([rows[0], like(row, config="exposure", plan=changed, seed=0, psnr=21.0)])
+    alone = ablation([rows[0], like(row, config="even-light", plan=changed, seed=0, psnr=21.0)])
     assert "one seed says nothing" in alone
     same = ablation([like(default, seed=0), like(row, config="antialias", seed=0)])
     assert "the default's plan is the same" in same
     elsewhere = [like(default, scene="flat", seed=seed) for seed in (0, 1)]
     elsewhere += [like(row, scene="flat", config="sh-3", plan=changed, seed=0)]
-    assert "Not measured, since the default's plan is that already: `exposure` on flat" not in ablation(
+    assert "Not measured, since the default's plan is that already: `even-light` on flat" not in ablation(
         [*rows, *elsewhere]
     )
     has_it = [like(default, scene="flat", seed=seed, plan=changed) for seed in (0, 1)]
     has_it += [like(row, scene="flat", config="sh-3", seed=0)]
-    assert "the default's plan is that already: `exposure` on flat at 30steps." in ablation([*rows, *has_it])
+    assert "the default's plan is that already: `even-light` on flat at 30steps." in ablation(
+        [*rows, *has_it]
+    )
 
 
 def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: Path) -> None:
@@ -297,8 +297,8 @@ def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: P
 
     assert "densify" not in default["plan"]
     assert idle("no-densification", default["plan"])
-    assert not idle("exposure", default["plan"])
-    assert idle("exposure", default["plan"] | {"exposure": True})
+    assert not idle("even-light", default["plan"])
+    assert idle("even-light", default["plan"] | {"exposure": True})
     assert idle("no-coarse-to-fine", default["plan"])
     assert idle("no-antialias", default["plan"])
     assert not idle("antialias", default["plan"])
@@ -306,14 +306,14 @@ def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: P
     assert not idle("sh-3", default["plan"])
     assert not idle("default", default["plan"])
     wanted = rows.runs_of(
-        [scene], ["exposure", "default", "no-random-background", "black-background"], [budget], [1, 0]
+        [scene], ["even-light", "default", "no-random-background", "black-background"], [budget], [1, 0]
     )
     assert [(run.seed, run.config) for run in wanted] == [
         (1, "default"),
-        (1, "exposure"),
+        (1, "even-light"),
         (1, "black-background"),
         (0, "default"),
-        (0, "exposure"),
+        (0, "even-light"),
         (0, "black-background"),
     ]
     bare = replace(scene, points=False)
@@ -335,20 +335,3 @@ def test_a_reworded_comment_leaves_measured_rows_as_they_are(parts: Any) -> None
     assert said == computing('def f(x):\n    return x + 1\n\n\nY = "text"\n')
     assert said != computing('def f(x):\n    return x + 2\n\n\nY = "text"\n')
     assert said != computing('def f(x):\n    return x + 1\n\n\nY = "other"\n')
-
-
-def test_exposures_differ_but_for_the_photos_that_are_held_out(parts: Any, tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[0x0110] = "Ray caster"
-    for number in range(10):
-        Image.fromarray(np.full((8, 8, 3), 100, np.uint8)).save(tmp_path / f"{number}.jpg", exif=exif)
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    parts["_train.unequal"].expose(tmp_path)
-    same = {name for name, data in before.items() if (tmp_path / name).read_bytes() == data}
-    assert same == {"0.jpg", "8.jpg"}
-    levels = []
-    for name in sorted(before.keys() - same):
-        with Image.open(tmp_path / name) as photo:
-            levels.append(float(np.asarray(photo).mean()))
-            assert photo.getexif()[0x0110] == "Ray caster"
-    assert 0.15 < float(np.log(levels).std()) < 0.6

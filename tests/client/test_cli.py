@@ -112,6 +112,8 @@ def test_the_options_of_train_are_those_of_the_schema():
         (["--max-memory", "1MB"], Exit.usage, "greater than or equal to 200000000"),
         (["--stepps", "3"], Exit.usage, "No such option"),
         (["--detach"], Exit.usage, "--detach needs --server"),
+        (["--priority", "5"], Exit.usage, "--priority orders the jobs of a server"),
+        (["--priority", "101"], Exit.usage, "less than or equal to 100"),
         (["--server", "nonsense"], Exit.usage, "address of a server"),
         (["--server", "http://127.0.0.1:9"], Exit.unreachable, "splatmill up"),
     ],
@@ -216,9 +218,10 @@ def test_an_interruption_cancels_the_job(service, photos: Path, tmp_path: Path, 
 def test_a_detached_job_and_what_is_asked_about_it(service, photos: Path, tmp_path: Path):
     at = ("--server", service.url)
     assert "no jobs yet" in invoke("jobs", *at).output
-    job_id = invoke("train", photos, "-o", tmp_path / "out", "--detach", "--name", "tea", *at).stdout.split()[
-        -1
-    ]
+    options = ("--detach", "--name", "tea", "--priority", "5")
+    job_id = invoke("train", photos, "-o", tmp_path / "out", *options, *at).stdout.split()[-1]
+    with Client(service.url) as client:
+        assert client.job(job_id).job.priority == 5
     listed = invoke("jobs", *at).stdout
     assert job_id in listed
     assert "queued" in listed

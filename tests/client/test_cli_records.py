@@ -269,3 +269,8 @@ def test_status_says_where_a_waiting_job_stands(service, at, photos):
     assert "1 job before it" in invoke("status", usual.id, *at).stdout
     service.begin(usual.id)
     assert "before it" not in invoke("status", usual.id, *at).stdout
+
+
+@pytest.mark.parametrize("group", ["keys", "webhooks", "shares"])
+def test_a_group_of_commands_offers_no_completion_of_its_own(group):
+    assert "--show-completion" not in invoke(group, "--help").stdout

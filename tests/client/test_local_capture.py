@@ -1,6 +1,6 @@
 """What a path contains: photos, masks and poses are found and named as the worker will look for them.
 
-Does not prove that the files hold what their names say; nothing is opened.
+Does not prove that the files hold what their names say; only transforms.json is opened.
 """
 
 from pathlib import Path
@@ -97,6 +97,25 @@ def test_links_are_followed_but_not_in_circles(tmp_path: Path):
     (tmp_path / "shared" / "again").symlink_to(tmp_path / "set")
     (tmp_path / "set" / "gone.jpg").symlink_to(tmp_path / "nowhere")
     assert roles(tmp_path / "set")[Role.images] == ["a.jpg"]
+
+
+@pytest.mark.parametrize(
+    "content", ['{"ply_file_path": "points3D.ply"}', '{"ply_file_path": "./points3D.ply"}']
+)
+def test_the_points_that_transforms_name_are_poses_and_other_files_are_not(tmp_path: Path, content: str):
+    tree(tmp_path, "images/a.jpg", "points3D.ply", "other.ply")
+    (tmp_path / "transforms.json").write_text(content)
+    assert roles(tmp_path)[Role.poses] == ["points3D.ply", "transforms.json"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["rubbish", "[]", "{}", '{"ply_file_path": 3}', '{"ply_file_path": "../points3D.ply"}', "[" * 9999],
+)
+def test_transforms_without_such_points_are_sent_alone(tmp_path: Path, content: str):
+    tree(tmp_path, "images/a.jpg", "points3D.ply")
+    (tmp_path / "transforms.json").write_text(content)
+    assert roles(tmp_path)[Role.poses] == ["transforms.json"]
 
 
 def test_paths_with_nothing_to_train(tmp_path: Path):

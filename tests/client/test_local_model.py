@@ -1,4 +1,4 @@
-"""Images and videos of a .ply without a server: the command line starts the worker's program, which renders the file.
+"""Images, videos and conversions of a file without a server: the command line starts the worker's programs.
 
 The model is a ball, red on the side of +x and blue on the other. That the kernels render correctly is proved in
 tests/kernels.
@@ -140,10 +140,10 @@ def test_a_file_that_is_no_model(tmp_path: Path):
         (["render", "ball.ply", "--camera", "2"], Exit.usage, "The model has 2 cameras, 0 to 1."),
         (["render", "ball.ply", "--camera", "c.json"], Exit.usage, "neither a file nor the number"),
         (["render", "ball.ply", "--view", "z.jpg"], Exit.usage, "no camera named 'z.jpg'; it has a.jpg"),
-        (["render", "ball.ply", "--up", "y"], Exit.usage, "--up is for a .ply without cameras"),
+        (["render", "ball.ply", "--up", "y"], Exit.usage, "--up is for a file without cameras"),
         (["render", "ball.ply", "-o", "v.webp", "--output", "depth"], Exit.refused, "Depth cannot be a webp"),
         (["orbit", "ball.ply", "--width", "33"], Exit.refused, "multiple of 2"),
-        (["orbit", "0123456789abcdef", "--up", "y"], Exit.usage, "--up is for a .ply without cameras"),
+        (["orbit", "0123456789abcdef", "--up", "y"], Exit.usage, "--up is for a file without cameras"),
     ],
 )
 def test_wrong_arguments(posed: Path, monkeypatch: pytest.MonkeyPatch, arguments, status, sentence):
@@ -158,6 +158,33 @@ def test_where_the_worker_is_not_installed(posed: Path, monkeypatch: pytest.Monk
     done = invoke("render", posed)
     assert done.exit_code == Exit.no_service
     assert done.stderr.startswith(
-        "Error: Rendering a .ply on this machine needs the package splatmill-worker, which is not installed.\n"
+        "Error: Rendering a file on this machine needs the package splatmill-worker, which is not installed.\n"
     )
     assert ALL_PARTS in done.stderr
+
+
+@pytest.mark.slow
+def test_a_conversion_prints_bytes_and_errors_and_its_file_renders(posed: Path, tmp_path: Path):
+    out = tmp_path / "ball.spz"
+    status, stdout, stderr = run("convert", posed, out)
+    assert (status, stderr) == (0, "")
+    heads, first, second, *said = stdout.splitlines()
+    assert heads.split() == ["file", "bytes", "smaller", "Gaussians", "photos", "views"]
+    assert first.split()[:2] == [str(posed), f"{posed.stat().st_size:,}"]
+    assert second.split()[:2] == [str(out), f"{out.stat().st_size:,}"]
+    assert float(second.split()[-2]) > 30
+    assert said[0].startswith("views: from the cameras of 1 held-out photos")
+    assert run("render", out, "-o", tmp_path / "view.png")[0] == 0
+    assert centre(tmp_path / "view.png") == BLUE
+
+
+def test_a_conversion_of_what_is_no_model_is_refused_before_it_starts(ball: Path, tmp_path: Path):
+    for arguments, says in (
+        ([tmp_path / "none.ply", "a.spz"], "There is no file"),
+        ([ball, "a.obj"], "must end in one of"),
+        ([ball, "a.ksplat"], "must end in one of"),
+        ([ball, "a.spz", "--photos", tmp_path / "none"], "There is no folder"),
+    ):
+        result = invoke("convert", *map(str, arguments))
+        assert result.exit_code == 2
+        assert says in " ".join(result.output.replace("│", "").split())

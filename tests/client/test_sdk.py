@@ -15,15 +15,18 @@ import pytest
 from pydantic import SecretStr
 
 from splatmill import AsyncClient, Client, JobCancelled, JobFailed, WaitTimeout
+from splatmill.backplane import keys, layout
 from splatmill.errors import Conflict, InvalidRequest, NotFound, NothingToUpload, Unauthorized
 from splatmill.schema import (
     JobState,
     LogEvent,
+    Placement,
     PlanEvent,
     Problem,
     Progress,
     ProgressEvent,
     StateEvent,
+    TrainOptions,
     describe_options,
 )
 from splatmill_server.app import create_app
@@ -61,6 +64,14 @@ def test_the_life_of_a_job(service, photos, tmp_path):
         service.begin(job.id)
         steps = [ProgressEvent(stage="training", done=n, total=3, step=n, loss=1 / n) for n in (1, 2, 3)]
         service.say(job.id, StateEvent(state=JobState.training), PlanEvent(plan={"sh_degree": 2}), *steps)
+        with pytest.raises(NotFound):
+            job.snapshot()
+        assert job.watch() > 5
+        service.connection.hset(keys.snapshot(job.id), mapping={"ply": PLY, "tag": "1-3"})
+        assert job.snapshot() == PLY
+        placed = Placement(final=True, cameras=[], points=[(0, 1, 2)], colors=[(9, 9, 9)], points_total=1)
+        service.storage.put(layout.job_cameras(job.id), placed.model_dump_json().encode())
+        assert job.cameras() == placed
         threading.Timer(0.2, service.finish, [job.id, PLY]).start()
         heard: list[tuple[Progress, threading.Thread]] = []
         model = job.wait(lambda progress: heard.append((progress, threading.current_thread())))
@@ -267,6 +278,14 @@ def test_what_the_server_says_of_itself(service):
         assert client.info().limits.max_render_pixels > 0
         ready = client.ready()
         assert set(ready.checks) >= {"storage"}
+
+
+def test_an_estimate_is_a_question(service):
+    with Client(service.url) as client:
+        found = client.estimate(24, TrainOptions(time_budget=90), posed=True)
+        assert [stage.seconds for stage in found.stages] == [None, 90.0, None]
+        assert found.seconds is None
+        assert list(client.jobs()) == []
 
 
 def test_a_key_is_asked_for_and_given(settings, monkeypatch):

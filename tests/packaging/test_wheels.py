@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import sys
 import tarfile
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,23 @@ def test_the_wheels_have_one_version_and_their_licence(wheels: dict[str, Path]) 
         assert found.version == client.version
         assert found.read_text("licenses/LICENSE") == text
         assert str(found.metadata["Description"]).startswith(f"# {name}\n")
+
+
+def test_the_server_contains_its_web_page_and_the_licences_of_others(wheels: dict[str, Path]) -> None:
+    with zipfile.ZipFile(wheels["server"]) as archive:
+        names = set(archive.namelist())
+    web = ROOT / "server" / "splatmill_server" / "web"
+    ours = {f"splatmill_server/web/{path.relative_to(web)}" for path in (web / "page").rglob("*.*")}
+    assert ours <= names
+    assert "splatmill_server/web/vendor/imports.json" in names, "`make install` has fetched it"
+    folders = {
+        name.split("/")[3]
+        for name in names
+        if name.startswith("splatmill_server/web/vendor/") and "." in name
+    }
+    for folder in folders - {"imports.json"}:
+        assert f"splatmill_server/web/vendor/{folder}/LICENSE" in names
+    assert "playcanvas" in folders
 
 
 def test_the_client_imports_without_the_other_parts_and_their_libraries(alone: Path) -> None:

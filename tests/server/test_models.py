@@ -25,7 +25,11 @@ def test_a_model_says_what_it_is(app: ServedApp, model_id: str) -> None:
     ply = app.http.get(f"/v1/models/{model_id}/files/model.ply")
     assert (model["id"], model["gaussians"], model["sh_degree"], model["psnr"]) == (model_id, 2, 1, 27.5)
     assert model["bytes"] == len(ply.content)
-    assert {f["name"] for f in model["files"]} == set(layout.MODEL_FILES) - {"report.png", "progress.mp4"}
+    assert {f["name"] for f in model["files"]} == set(layout.MODEL_FILES) - {
+        "cameras.zip",
+        "report.png",
+        "progress.mp4",
+    }
     assert ply.headers["content-disposition"].startswith("attachment")
     assert [m["id"] for m in app.http.get("/v1/models").json()["models"]] == [model_id]
     assert app.http.get(f"/v1/models/{model_id}/cameras").json() == {"cameras": []}
@@ -93,7 +97,30 @@ def test_only_a_models_own_files_are_served(app: ServedApp, model_id: str) -> No
     app.service.storage.put(f"models/{model_id}/secret.txt", b"x")
     for name in ("secret.txt", "nothing.ply", "report.png"):
         problem(app.http.get(f"/v1/models/{model_id}/files/{name}"), 404, "file_not_found")
-    problem(app.http.get(f"/v1/models/{model_id}/files/..%2fjob.json"), 404, "not_found")
+    problem(app.http.get(f"/v1/models/{model_id}/files/..%2fjob.json"), 404, "file_not_found")
+
+
+def test_files_in_folders_are_listed_and_served(app: ServedApp, model_id: str) -> None:
+    storage = app.service.storage
+    for name in ("held_out/000.webp", "time_lapse/012.ply", "held_out/x.webp", "other/000.webp"):
+        storage.put(f"models/{model_id}/{name}", name.encode())
+    model = app.http.get(f"/v1/models/{model_id}").json()
+    types = {f["name"]: f["media_type"] for f in model["files"] if "/" in f["name"]}
+    assert types == {"held_out/000.webp": "image/webp", "time_lapse/012.ply": "application/octet-stream"}
+    photo = app.http.get(f"/v1/models/{model_id}/files/held_out/000.webp")
+    assert (photo.content, photo.headers["content-type"]) == (b"held_out/000.webp", "image/webp")
+    for name in (
+        "held_out/x.webp",
+        "other/000.webp",
+        "held_out/../job.json",
+        "held_out/001.webp",
+        "held_out",
+    ):
+        problem(
+            app.http.get(f"/v1/models/{model_id}/files/{name.replace('..', '%2e%2e')}"), 404, "file_not_found"
+        )
+    app.http.delete(f"/v1/jobs/{model_id}")
+    assert not list(storage.entries(f"models/{model_id}"))
 
 
 def test_one_unreadable_model_does_not_hide_the_others(app: ServedApp, model_id: str) -> None:

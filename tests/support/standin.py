@@ -43,6 +43,8 @@ def run(
     options: TrainOptions,
     emit: Callable[[Event], None],
     cancelled: Callable[[], bool],
+    *,
+    onlookers: object = None,
 ) -> SimpleNamespace:
     """Follow the script and leave a ball of Gaussians as the model. The photos are not read."""
     own = capture / "images" / "script.json"

@@ -6,7 +6,7 @@ Not proved here: that the training goes on well from there (tests/worker/splat/t
 import json
 
 from splatmill.schema import Job, ModelCameras, Report
-from splatmill_worker.splat import ply
+from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.plan.plan_file import read_plan
 from splatmill_worker.splat.train import checkpoint
 from tests.support.formats import V1, job_ids
@@ -32,5 +32,5 @@ def test_the_files_of_a_model_are_readable() -> None:
     report = Report.model_validate_json((MODEL / "report.json").read_text())
     assert (report.curve[-1].step, report.curve[-1].gaussians) == (60, 400)
     assert len(ModelCameras.model_validate_json((MODEL / "cameras.json").read_text()).cameras) == 8
-    assert len(ply.read(MODEL / "model.ply").means) == 400
+    assert len(ply.read(MODEL / "model.ply").gaussians.means) == 400
     assert Job.model_validate_json((MODEL / "job.json").read_text()).options.steps == 60

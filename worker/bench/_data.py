@@ -10,6 +10,8 @@ FOLDERS = {
     "lego": "lego_400",
     "lund": "lund_1024x768_gps",
     "kermit": "kermit_640x480",
+    "beer": "beer_720",
+    "snowmiku": "snowmiku_1008",
     "unrelated": "failure_unrelated_640",
     "rotation": "failure_pure_rotation",
 }

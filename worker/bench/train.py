@@ -234,7 +234,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--scenes",
         **several,
-        help=f"of {', '.join(scenes.ALL)} (default: all but the last), or folders with a capture of your own",
+        help=f"of {', '.join(scenes.ALL)} (default: {', '.join(scenes.KNOWN)}), or folders with captures of your own",
     )
     switches = "; ".join(f"{name}: {each.what}" for name, each in configurations.CONFIGURATIONS.items())
     parser.add_argument(

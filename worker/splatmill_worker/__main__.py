@@ -1,4 +1,4 @@
-"""The worker's programs: `python -m splatmill_worker train | renderer | render-file | orbit-file | fit-image | ...`."""
+"""The worker's programs: `python -m splatmill_worker train | renderer | render-file | fit-image | ...`."""
 
 import argparse
 import ctypes
@@ -39,13 +39,19 @@ def main(argv: list[str] | None = None) -> int:
         "--backend", choices=["reference", "cpu", "gpu"], help="kernels to render with (default: cpu)"
     )
     for name, what in (("render-file", "an image"), ("orbit-file", "a video")):
-        file = programs.add_parser(name, help=f"render {what} of a .ply on this machine")
+        file = programs.add_parser(name, help=f"render {what} of a model file on this machine")
         file.add_argument("model", type=Path)
         file.add_argument("--out", type=Path, required=True)
         file.add_argument("--request", default="{}", help="the request of the REST API as JSON")
         file.add_argument("--cameras", type=Path, help="cameras.json of the model")
         file.add_argument("--width", type=int, help="width in pixels of an image without a camera")
         file.add_argument("--up", default="z", help="axis that points up, for a model without cameras")
+    convert = programs.add_parser("convert-file", help="convert a model file to other formats")
+    convert.add_argument("model", type=Path)
+    convert.add_argument("outs", type=Path, nargs="+")
+    convert.add_argument("--photos", type=Path, help="folder of the photos, to compare with")
+    text = programs.add_parser("model-text", help="turn the files of a COLMAP model from binary to text")
+    text.add_argument("folder", type=Path)
     fit_image = programs.add_parser("fit-image", help="fit one image by Gaussians in a plane")
     fit_image.add_argument("photo", type=Path)
     fit_image.add_argument("--out", type=Path, required=True, help="folder for the results")
@@ -71,6 +77,14 @@ def main(argv: list[str] | None = None) -> int:
         from splatmill_worker.render_service.local import main as local_main
 
         return local_main(chosen)
+    if chosen.program == "convert-file":
+        from splatmill_worker.render_service.convert import main as convert_main
+
+        return convert_main(chosen.model, chosen.outs, chosen.photos)
+    if chosen.program == "model-text":
+        from splatmill_worker.sfm.posed.text import main as text_main
+
+        return text_main(chosen.folder)
     if chosen.program == "fit-image":
         from splatmill_worker.fit_image.command import main as fit_image_main
 

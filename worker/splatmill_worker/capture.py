@@ -11,6 +11,7 @@ from splatmill_worker.errors import Refusal
 from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.scene import Scene, View, split
 from splatmill_worker.sfm import posed
+from splatmill_worker.sfm.placed import PlacingObserver
 from splatmill_worker.sfm.posed import zipped
 from splatmill_worker.splat.plan.plan import Kernels
 
@@ -24,15 +25,18 @@ def posed_scene(
     options: TrainOptions,
     on_progress: OnProgress,
     cancelled: Callable[[], bool],
+    observer: PlacingObserver | None = None,
 ) -> Scene:
     """Return the scene with the cameras that the capture brings, or else with cameras recovered from the photos.
 
     capture: folder with images/, and masks/ and poses/ where they were given; or the folder of a posed data set. The
         only file in images/ may be a zip of a whole data set.
-    workdir: folder where structure from motion and stereo store their results, and from which they read earlier ones.
+    workdir: folder where structure from motion, triangulation and stereo store their results, and from which they
+        read earlier ones.
     options: only those of structure from motion are read.
-    on_progress: called with the progress of structure from motion and stereo.
+    on_progress: called with the progress of structure from motion, triangulation and stereo.
     cancelled: polled; when it returns true, Cancelled is raised.
+    observer: looks at the cameras and points while structure from motion places them.
 
     Raises Refusal for poses that cannot be used, and SfmFailed.
     """
@@ -47,7 +51,9 @@ def posed_scene(
                 str(error),
                 advice="Correct the poses, or remove them to have the cameras recovered from the photos.",
             ) from error
-        return posed.with_stereo_points(scene, workdir, on_progress, cancelled)
+        return posed.with_points(
+            scene, workdir, seed=options.seed, on_progress=on_progress, cancelled=cancelled
+        )
     images = capture / "images"
     masks = capture / "masks"
     wanted = sfm.SfmOptions(
@@ -64,6 +70,7 @@ def posed_scene(
         wanted,
         on_progress,
         cancelled,
+        observer,
     )
 
 
@@ -105,7 +112,7 @@ def split_views(scene: Scene, options: TrainOptions) -> tuple[tuple[View, ...], 
 
 
 def start_model_path(capture: Path, workdir: Path, options: TrainOptions) -> Path | None:
-    """Return the path of the .ply file to start from, or None when the training starts from points.
+    """Return the path of the model file to start from, or None when the training starts from points.
 
     It is a file among the capture's poses if the option `start` names one, else the stored model that the service has
     copied to `workdir/start.ply`. Raises Refusal when the capture has no such file.
@@ -120,7 +127,7 @@ def start_model_path(capture: Path, workdir: Path, options: TrainOptions) -> Pat
     raise Refusal(
         "start_unusable",
         f"There is no file {options.start_file!r} among the poses of the capture.",
-        advice="Upload the .ply file to the poses of the capture, or leave out the option start.",
+        advice="Upload the model file to the poses of the capture, or leave out the option start.",
     )
 
 

@@ -11,7 +11,7 @@
     ├── SfmFailed            structure from motion ended without a usable scene
     ├── TrainingFailed       training ended with a numerical failure
     ├── ModelNotFound        there is no finished model with the requested id
-    ├── ModelUnreadable      a .ply file cannot be read as a 3D Gaussian model
+    ├── ModelUnreadable      a model file cannot be read as 3D Gaussians, or is of an unknown format
     ├── FolderInUse          another process works in the job's folder
     └── DiskReserveReached   the worker's disk is full but for the reserve
 
@@ -87,7 +87,7 @@ class StartUnusable(Refusal):
             "start_unusable",
             message,
             advice=(
-                "Start from a 3D Gaussian .ply file that was trained on the cameras of this capture, "
+                "Start from a 3D Gaussian model that was trained on the cameras of this capture, "
                 "or leave out the option start."
             ),
         )
@@ -205,7 +205,7 @@ class ModelNotFound(WorkerError):
 
 
 class ModelUnreadable(WorkerError):
-    """A .ply file is damaged, or is not a 3D Gaussian model."""
+    """A model file is damaged, of a format that is not read or written, or no 3D Gaussian model."""
 
     def __init__(self, message: str) -> None:
         super().__init__("model_corrupt", message)

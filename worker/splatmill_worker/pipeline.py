@@ -6,22 +6,35 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import av
 import torch
 
-from splatmill.schema import Backend, JobState, LogEvent, PlanEvent, StateEvent, TrainOptions
+from splatmill.schema import (
+    TIME_LAPSE,
+    Backend,
+    JobState,
+    LogEvent,
+    PlanEvent,
+    StateEvent,
+    Switch,
+    TrainOptions,
+)
 from splatmill_worker.capture import choose_kernels, posed_scene, split_views, start_model_path
 from splatmill_worker.errors import Cancelled, Refusal
 from splatmill_worker.events import Emit, TrainingEvents, progress_events
 from splatmill_worker.images.load import load_views
 from splatmill_worker.kernels.gpu.device import absence, describe
+from splatmill_worker.live import LiveCameras, LiveScene, Looks, Onlookers, placement_of, store_placement
 from splatmill_worker.scene import Normalization, Scene, View
+from splatmill_worker.sfm.posed.written import write_cameras
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.decide import decide
 from splatmill_worker.splat.plan.facts import Facts, measure
+from splatmill_worker.splat.plan.light import light_of
 from splatmill_worker.splat.plan.photos import loading_size
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.plan_file import read_plan, write_plan
@@ -39,6 +52,7 @@ from splatmill_worker.splat.train.loop import Hooks, Trained, train
 from splatmill_worker.splat.train.renderer import renderer
 from splatmill_worker.splat.train.snapshot import Snapshot
 from splatmill_worker.splat.views import TrainingView
+from splatmill_worker.time_lapse import TimeLapse
 
 EXTENT = 1.1
 """Scene extent, which scales the learning rate of the positions, in units of the training world: the farthest camera is
@@ -68,22 +82,25 @@ def run(
     emit: Emit,
     cancelled: Callable[[], bool],
     *,
+    onlookers: Onlookers | None = None,
     revise: Revise = lambda plan: plan,
 ) -> Outcome:
-    """Train a scene from `capture`, and leave model.ply, cameras.json and the reports in `workdir/out`.
+    """Train a scene from `capture`, and leave model.ply, cameras.json, cameras.zip and the reports in `workdir/out`.
 
     capture: folder with images/, and masks/ and poses/ where they were given.
     workdir: folder that is kept between attempts; what an earlier attempt stored there is used again.
     emit: called with each event as it happens. The states emitted are sfm, training and exporting; the caller emits
         the final one.
     cancelled: polled; when it returns true, the run ends with "cancelled". Training stores a checkpoint first.
+    onlookers: those who look at the job while it runs; None: nobody does.
     revise: returns the plan to use in place of the one that was made; an ablation changes one decision with it.
 
     Raises Refusal, SfmFailed and TrainingFailed (see `errors`).
     """
     stages = Stages(workdir / "stages.json")
     try:
-        task = Task(capture, workdir, options, choose_kernels(options), emit, cancelled)
+        looks = None if onlookers is None else Looks(onlookers)
+        task = Task(capture, workdir, options, choose_kernels(options), emit, cancelled, looks)
         task.out.mkdir(parents=True, exist_ok=True)
         _warn_of_idle_gpu(task)
         emit(StateEvent(state=JobState.sfm))
@@ -95,9 +112,10 @@ def run(
             facts = _measure_facts(task, cameras, probed, first, start)
             plan = _make_plan(task, facts, revise)
         emit(PlanEvent(plan=plan.as_dict()))
-        photos = _resize_photos(cameras, probed, plan, facts, stages)
+        photos = _relit(cameras, probed, plan, _resize_photos(cameras, probed, plan, facts, stages))
+        del probed  # memory: photos are kept once
         engine = open_engine(_seeded(first, cameras, photos, plan), plan.kernels)
-        training = _train(task, engine, photos, plan)
+        training = _train(task, cameras, engine, photos, plan)
     except Cancelled:
         return Outcome("cancelled", workdir / "out")
     emit(StateEvent(state=JobState.exporting))
@@ -110,6 +128,7 @@ class Task:
     """The arguments of `run`, which describes them, and the kernels chosen for them.
 
     kernels: the backend of the engine.
+    looks: those of the onlookers; None where there are none.
     """
 
     capture: Path
@@ -118,6 +137,13 @@ class Task:
     kernels: Kernels
     emit: Emit
     cancelled: Callable[[], bool]
+    looks: Looks | None
+
+    @property
+    def keeps_time_lapse(self) -> bool:
+        """Whether snapshots of the training are kept: of the jobs of a service, if nothing else is asked for."""
+        asked = self.options.time_lapse
+        return asked is Switch.on or (asked is Switch.auto and self.looks is not None)
 
     @property
     def out(self) -> Path:
@@ -133,6 +159,7 @@ class Cameras:
     normalization: the similarity from that world to the training world.
     world: the scene in the training world.
     training, held_out: the views to train on and to evaluate on, in the world of `scene`.
+    exported: the world of the exported files.
     """
 
     scene: Scene
@@ -140,6 +167,7 @@ class Cameras:
     world: Scene
     training: tuple[View, ...]
     held_out: tuple[View, ...]
+    exported: ExportWorld
 
 
 @dataclass(frozen=True)
@@ -162,11 +190,13 @@ class Training:
     trained: its result.
     events: emits its events and holds its warnings.
     film: the frames of the progress film; None where the options ask for no film.
+    lapse: the snapshots of the training; None where none are kept.
     """
 
     trained: Trained
     events: TrainingEvents
     film: ProgressFilm | None
+    lapse: TimeLapse | None
 
 
 def _warn_of_idle_gpu(task: Task) -> None:
@@ -176,17 +206,25 @@ def _warn_of_idle_gpu(task: Task) -> None:
 
 def _recover_cameras(task: Task, stages: Stages) -> Cameras:
     """The cameras that came with the photos or are recovered from them, and which photos are held out."""
+    live = None if task.looks is None else LiveCameras(task.looks, task.emit, task.workdir)
     with stages.measured("sfm"):
         scene = posed_scene(
-            task.capture, task.workdir, task.options, progress_events(task.emit), task.cancelled
+            task.capture, task.workdir, task.options, progress_events(task.emit), task.cancelled, live
         )
+    if task.looks is not None and task.looks.seconds:
+        stages.add("sfm", -task.looks.seconds)
     for note in scene.notes:
         task.emit(LogEvent(message=note))
+    for warning in scene.warnings:
+        task.emit(LogEvent(level="warning", message=warning))
     for name, reason in scene.left_out:
         task.emit(LogEvent(level="warning", message=f"{name} is left out: {reason}"))
     normalization = Normalization.of(scene)
     training, held_out = split_views(scene, task.options)
-    return Cameras(scene, normalization, normalization.apply(scene), training, held_out)
+    world = ExportWorld.of(normalization, scene)
+    placement = placement_of(scene, world, (view.name for view in held_out))
+    store_placement(placement, task.workdir, task.emit)
+    return Cameras(scene, normalization, normalization.apply(scene), training, held_out, world)
 
 
 def _load_photos(cameras: Cameras, size: int, stages: Stages) -> Photos:
@@ -200,10 +238,25 @@ def _load_photos(cameras: Cameras, size: int, stages: Stages) -> Photos:
 
 
 def _resize_photos(cameras: Cameras, loaded: Photos, plan: Plan, facts: Facts, stages: Stages) -> Photos:
-    """`loaded`, or the photos loaded again at the plan's image size where that is smaller."""
+    """`loaded`, or the photos loaded again at the plan's image size where that is smaller; `loaded` is then empty."""
     if plan.image_size >= max(facts.width, facts.height):
         return loaded
+    # Freed first: both sizes at once would be the most memory that photos ever take.
+    loaded.training.clear()
+    loaded.held_out.clear()
     return _load_photos(cameras, plan.image_size, stages)
+
+
+def _relit(cameras: Cameras, probed: Photos, plan: Plan, photos: Photos) -> Photos:
+    """`photos`, those to train on with the light that the photos around them have, where the plan says so.
+
+    Held-out photos stay as they are: to fit them to the model would flatter the score.
+    """
+    light = light_of(cameras.world, probed.training) if plan.exposure else None
+    if light is None:
+        return photos
+    relit = [view.relit(change) for view, change in zip(photos.training, light.departures, strict=True)]
+    return replace(photos, training=relit)
 
 
 def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaussians, GivenModel | None]:
@@ -276,13 +329,17 @@ def _seeded(first: Gaussians, cameras: Cameras, photos: Photos, plan: Plan) -> G
     )
 
 
-def _train(task: Task, engine: Engine, photos: Photos, plan: Plan) -> Training:
+def _train(task: Task, cameras: Cameras, engine: Engine, photos: Photos, plan: Plan) -> Training:
     """Train to the end of the budget, from the checkpoint of an earlier attempt where there is one."""
     checkpoints = task.workdir / "checkpoints"
     earlier = _resumable(checkpoints, photos)
     film = None
     if task.options.progress_video:
         film = ProgressFilm(task.workdir / "film", photos.shown, plan, anew=earlier is None)
+    lapse = None
+    if task.keeps_time_lapse:
+        lapse = TimeLapse(task.workdir / TIME_LAPSE, cameras.exported, anew=earlier is None)
+    live = None if task.looks is None else LiveScene(task.looks, cameras.exported)
     events = TrainingEvents(task.emit, task.workdir, plan, photos.shown)
     trained = train(
         engine,
@@ -296,11 +353,11 @@ def _train(task: Task, engine: Engine, photos: Photos, plan: Plan) -> Training:
             warn=events.warn,
             cancelled=task.cancelled,
             checkpoint=lambda snapshot: checkpoint.save(checkpoints, snapshot),
-            observer=film,
+            observers=[observer for observer in (film, lapse, live) if observer is not None],
         ),
         resume_from=earlier,
     )
-    return Training(trained, events, film)
+    return Training(trained, events, film, lapse)
 
 
 def _resumable(checkpoints: Path, photos: Photos) -> Snapshot | None:
@@ -322,9 +379,18 @@ def _write_files(
 ) -> None:
     """Write the model, its cameras, the last preview, the film and the report."""
     trained, events = training.trained, training.events
-    world = ExportWorld.of(cameras.normalization, cameras.scene)
     with stages.measured("export"):
-        exported = export(task.out, trained, plan, world, photos.held_out)
+        exported = export(task.out, trained, plan, cameras.exported, photos.held_out)
+        write_cameras(
+            task.out / "cameras.zip",
+            cameras.scene,
+            {
+                v.name: cameras.exported.camera(v.full.camera).viewmat
+                for v in (*trained.views, *photos.held_out)
+            },
+            cameras.exported.offset,
+            frozenset(view.name for view in photos.held_out),
+        )
         events.preview(engine, trained.steps)
     if training.film is not None:
         try:
@@ -333,9 +399,17 @@ def _write_files(
             # The model is complete: a film that cannot be encoded must not fail the job.
             events.warn(f"The film of the training could not be written: {error}.")
         stages.add("film", training.film.seconds)
+    lapse: list[dict[str, Any]] = []
+    if training.lapse is not None:
+        lapse = training.lapse.publish(task.out)
+        stages.add("time_lapse", training.lapse.seconds)
+    if task.looks is not None and task.looks.seconds:
+        stages.add("live", task.looks.seconds)
     write_report(
         task.out,
         PlannedScene(cameras.scene, facts, plan, photos.held_out),
-        FinishedTraining(trained, exported, stages.seconds, events.warnings),
+        FinishedTraining(
+            trained, exported, stages.seconds, [*cameras.scene.warnings, *events.warnings], lapse
+        ),
         renderer(engine, plan),
     )

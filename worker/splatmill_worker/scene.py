@@ -200,6 +200,7 @@ class Scene:
     facts: figures about photos, pairs and model, by name.
     left_out: (name, reason) of each photo or file that is not used.
     notes: sentences for the user.
+    warnings: sentences for the user about what is probably wrong.
     """
 
     views: tuple[View, ...]
@@ -212,6 +213,7 @@ class Scene:
     facts: dict[str, Any] = field(default_factory=dict)
     left_out: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def centers(self) -> Float:

@@ -20,6 +20,7 @@ from splatmill.backplane import keys
 from splatmill.backplane.records import FORMAT, check_format, reason, warn
 from splatmill.schema import (
     EVENT,
+    CamerasEvent,
     CurveRow,
     Event,
     EventRecord,
@@ -28,6 +29,7 @@ from splatmill.schema import (
     PlanEvent,
     PreviewEvent,
     ProgressEvent,
+    SnapshotEvent,
     StateEvent,
 )
 from splatmill.schema.tolerant import keep_readable
@@ -93,7 +95,7 @@ def stream_of(event: Event) -> Callable[[str], str]:
             return keys.warnings if event.level in ("warning", "error") else keys.log
         case MetricEvent():
             return keys.curve
-        case ProgressEvent() | PreviewEvent():
+        case ProgressEvent() | PreviewEvent() | CamerasEvent() | SnapshotEvent():
             return keys.progress
 
 

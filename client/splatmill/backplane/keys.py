@@ -1,6 +1,6 @@
 """The names of all keys of Splatmill in Redis. RQ keeps its own under `rq:`.
 
-The keys of a job are deleted with the job; only those of `idempotency` and `lease` expire.
+The keys of a job are deleted with the job; where keys expire, their functions say so.
 """
 
 PREFIX = "splatmill:"
@@ -50,7 +50,7 @@ def states(job_id: str) -> str:
 
 
 def progress(job_id: str) -> str:
-    """Return the key of the stream of progress and previews, which is trimmed. Only workers append.
+    """Return the key of the stream of progress, previews, cameras and snapshots, which is trimmed. Only workers append.
 
     Workers of earlier versions append metrics and log lines to it, too.
     """
@@ -80,6 +80,22 @@ def attempts(job_id: str) -> str:
 def lock(job_id: str) -> str:
     """Return the key of the lock, a hash with the process that works on the job. Only workers write it."""
     return f"{PREFIX}job:{job_id}:lock"
+
+
+def watched(job_id: str) -> str:
+    """Return the key of a string that exists while somebody looks at the scene in training. It expires.
+
+    Only the server writes it, and the worker makes snapshots while it is there.
+    """
+    return f"{PREFIX}job:{job_id}:watched"
+
+
+def snapshot(job_id: str) -> str:
+    """Return the key of a hash with the newest snapshot of the scene in training, `ply`, and its `tag`. It expires.
+
+    Only workers write it.
+    """
+    return f"{PREFIX}job:{job_id}:snapshot"
 
 
 def idempotency(key_digest: str) -> str:
@@ -161,7 +177,7 @@ def begun_jobs(owner: str) -> str:
 def of_job(job_id: str) -> tuple[str, ...]:
     """Return all keys of a job, for deletion."""
     streams = states(job_id), progress(job_id), log(job_id), warnings(job_id), curve(job_id)
-    return job(job_id), *streams, attempts(job_id), lock(job_id)
+    return job(job_id), *streams, attempts(job_id), lock(job_id), watched(job_id), snapshot(job_id)
 
 
 def lease(kind: str, name: str) -> str:

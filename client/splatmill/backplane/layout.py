@@ -16,15 +16,23 @@ due/{time}.{webhook}.{delivery}             mark of a delivery that is pending: 
 watched/{job}.json                          row of an unfinished job whose owner has webhooks
 jobs/{id}/work/...                          checkpoints and other files from which another machine can resume
 jobs/{id}/log.jsonl                         the job as it ended, then the lines of its log
+jobs/{id}/cameras.json                      cameras and points as structure from motion placed them
 models/{id}/{file}                          model.ply, report.json, report.png, report.html, cameras.json, ...
+models/{id}/held_out/{n}.webp               held-out photo, as the renderings were compared with it
+models/{id}/time_lapse/{n}.ply              snapshot of the training, a compressed .ply
+models/{id}/formats/{format}                the model in another file format
+models/{id}/formats/{format}.json           what the conversion cost and lost; written last
 models/{id}/job.json                        record of the ended job; written last: a model exists once it does
 keys/{id}.json                              a key of the API: its owner, scopes, limits, and the digests of its secrets
 keys/{id}.revoked                           the key was revoked; it counts more than the record beside it
+shares/{model}/{share}.json                 a link to a model: when it ends, and the digest of its token
 
 The id of a model is that of the job that made it.
 """
 
-from splatmill.schema import Role
+import re
+
+from splatmill.schema import HELD_OUT, TIME_LAPSE, Role
 from splatmill.schema.ids import ID
 
 MODEL_FILES = {
@@ -33,11 +41,28 @@ MODEL_FILES = {
     "report.png": "image/png",
     "report.html": "text/html; charset=utf-8",
     "cameras.json": "application/json",
+    "cameras.zip": "application/zip",
     "job.json": "application/json",
     "preview.jpg": "image/jpeg",
     "progress.mp4": "video/mp4",
 }
 """The files that a model may have, with their media types."""
+
+MODEL_FOLDERS = {
+    HELD_OUT: (re.compile(r"[0-9]{3,6}\.webp", re.ASCII), "image/webp"),
+    TIME_LAPSE: (re.compile(r"[0-9]{3,6}\.ply", re.ASCII), "application/octet-stream"),
+}
+"""The folders that a model may have: the names of the files in them, and their media type."""
+
+
+def model_media_type(name: str) -> str | None:
+    """Return the media type of a file that a model may have, as "model.ply" or "held_out/000.webp"; None for any other
+    name, which must not become part of a path."""
+    folder, slash, inside = name.rpartition("/")
+    if not slash:
+        return MODEL_FILES.get(name)
+    names, media_type = MODEL_FOLDERS.get(folder, (None, ""))
+    return media_type if names is not None and names.fullmatch(inside) else None
 
 
 def is_id(text: str) -> bool:
@@ -54,8 +79,9 @@ def folder_of(path: str) -> tuple[str, str, str] | None:
 
 
 def is_derived(kind: str, inside: str) -> bool:
-    """Return whether a path inside of a folder can be made again: a capture's reconstruction, or a job's work files."""
-    return (kind, inside.partition("/")[0]) in (("captures", "sfm"), ("jobs", "work"))
+    """Return whether a path inside of a folder can be made again: a capture's reconstruction, a job's work files, or a
+    model's conversions to other formats."""
+    return (kind, inside.partition("/")[0]) in (("captures", "sfm"), ("jobs", "work"), ("models", "formats"))
 
 
 def digest_of(path: str) -> tuple[str, str] | None:
@@ -156,6 +182,11 @@ def job_log(job_id: str) -> str:
     return f"jobs/{job_id}/log.jsonl"
 
 
+def job_cameras(job_id: str) -> str:
+    """Return the path of a job's cameras and points, a `Placement`. Only the worker writes it."""
+    return f"jobs/{job_id}/cameras.json"
+
+
 def models() -> str:
     return "models"
 
@@ -168,9 +199,28 @@ def model_file(model_id: str, name: str) -> str:
     return f"models/{model_id}/{name}"
 
 
+def conversion(model_id: str, key: str) -> str:
+    """Return the path of a model in the format with this key."""
+    return f"models/{model_id}/formats/{key}"
+
+
+def conversion_record(model_id: str, key: str) -> str:
+    """Return the path of the record of a conversion; the file is whole once it exists."""
+    return f"models/{model_id}/formats/{key}.json"
+
+
 def job_record(job_id: str) -> str:
     """Return the path of `job.json`, from which a finished job is read when Redis has lost it."""
     return f"models/{job_id}/job.json"
+
+
+def shares_of(model_id: str) -> str:
+    """Return the folder of the links to a model."""
+    return f"shares/{model_id}"
+
+
+def share_record(model_id: str, share_id: str) -> str:
+    return f"shares/{model_id}/{share_id}.json"
 
 
 def keys() -> str:

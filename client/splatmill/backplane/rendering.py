@@ -17,6 +17,19 @@ def orbit_path(model_id: str) -> str:
     return f"/v1/models/{model_id}/orbit"
 
 
+def convert_path(model_id: str) -> str:
+    """Return the path to which a `ConversionRequest` is posted; the response is the file, with CONVERSION_HEADER."""
+    return f"/v1/models/{model_id}/convert"
+
+
+def edits_path(model_id: str) -> str:
+    """Return the path to which an `EditModel` is posted; the response is the new model.ply, or for a preview empty.
+
+    Its header EDIT_HEADER holds the `Edited`, as JSON.
+    """
+    return f"/v1/models/{model_id}/edits"
+
+
 def address(url: str) -> tuple[str, str | None]:
     """Return the base URL of the renderer and, for `unix:/path/to.sock`, the path of the socket.
 

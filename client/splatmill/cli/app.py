@@ -24,8 +24,12 @@ COMMANDS = {
     "delete": ("splatmill.cli.delete", "delete"),
     "models": ("splatmill.cli.records", "models"),
     "download": ("splatmill.cli.models", "download"),
+    "shares": ("splatmill.cli.shares", "shares"),
     "render": ("splatmill.cli.pictures", "render"),
     "orbit": ("splatmill.cli.pictures", "orbit"),
+    "edit": ("splatmill.cli.edit", "edit"),
+    "convert": ("splatmill.cli.convert", "convert"),
+    "cameras": ("splatmill.cli.cameras", "cameras"),
     "captures": ("splatmill.cli.records", "captures"),
     "import": ("splatmill.cli.imports", "import_file"),
     "up": ("splatmill.cli.service", "up"),
@@ -40,7 +44,18 @@ COMMANDS = {
 HEADINGS = {
     "Make a model": ("train", "fit-image", "options"),
     "Jobs on a server": ("jobs", "status", "follow", "logs", "cancel", "restart", "delete"),
-    "Models and captures": ("models", "download", "render", "orbit", "captures", "import"),
+    "Models and captures": (
+        "models",
+        "download",
+        "shares",
+        "render",
+        "orbit",
+        "edit",
+        "convert",
+        "cameras",
+        "captures",
+        "import",
+    ),
     "The service and this machine": ("up", "keys", "webhooks", "storage", "doctor", "bench"),
 }
 

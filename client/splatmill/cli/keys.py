@@ -10,7 +10,10 @@ if TYPE_CHECKING:
     from splatmill.schema import KeyWithSecret
 
 keys = typer.Typer(
-    no_args_is_help=True, pretty_exceptions_enable=False, help="Create, list, revoke and rotate API keys."
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Create, list, revoke and rotate API keys.",
 )
 
 KeyId = Annotated[str, typer.Argument(metavar="KEY", help="Id of the key.", show_default=False)]

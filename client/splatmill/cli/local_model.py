@@ -1,4 +1,4 @@
-"""Images and videos of a .ply on this machine: the worker part renders them, as a process that replaces this one."""
+"""Images, videos and conversions of a model file on this machine: the worker part makes them."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,18 +8,20 @@ import typer
 
 from splatmill.cli.embedded import require
 from splatmill.cli.service import exec_module
+from splatmill.schema.formats import format_of
 
 if TYPE_CHECKING:
     from splatmill.schema import CameraSpec, ModelCamera
 
 
 def is_local(model: str) -> bool:
-    """Return whether a command is given the path of a .ply, and not the id of a model. Ids have no suffix."""
-    return model.lower().endswith(".ply")
+    """Return whether a command is given the path of a model file, and not the id of a model. Ids have no suffix."""
+    found = format_of(model)
+    return found is not None and found.readable
 
 
 def local_cameras(model: Path) -> "list[ModelCamera]":
-    """Return the cameras in the cameras.json beside a .ply; none, with a sentence, if it has none that can be read."""
+    """Return the cameras in the cameras.json beside a model; none, with a sentence, if it has none that can be read."""
     from pydantic import ValidationError
 
     from splatmill.schema import ModelCameras
@@ -45,7 +47,7 @@ def render_local(
     width: int | None,
     up: str,
 ) -> NoReturn:
-    """Render an image of a .ply and end. Without a camera, it shows the whole scene from the side.
+    """Render an image of a model file and end. Without a camera, it shows the whole scene from the side.
 
     options: output, format and background of `RenderRequest`.
     """
@@ -69,7 +71,7 @@ def render_local(
 def orbit_local(
     model: Path, out: Path, options: Mapping[str, Any], *, with_cameras: bool, up: str
 ) -> NoReturn:
-    """Render a video that circles the scene of a .ply and end. `options` are fields of `OrbitRequest`."""
+    """Render a video that circles the scene of a model file and end. `options` are fields of `OrbitRequest`."""
     from pydantic import ValidationError
 
     from splatmill.errors import invalid_request
@@ -90,6 +92,6 @@ def _cameras_path(model: Path) -> Path:
 
 
 def _run(program: str, model: Path, out: Path, request: str, up: str, *more: str) -> NoReturn:
-    require("splatmill_worker", "Rendering a .ply on this machine")
+    require("splatmill_worker", "Rendering a file on this machine")
     options = ("--out", str(out), "--request", request, f"--up={up}", *more)
     exec_module("splatmill_worker", program, *options, "--", str(model))

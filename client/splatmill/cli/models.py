@@ -18,7 +18,7 @@ ModelId = Annotated[
     typer.Argument(metavar="MODEL", help="Id of the model, which is that of its job.", show_default=False),
 ]
 
-FILES = ("model.ply", "report.json", "report.png", "report.html", "cameras.json")
+FILES = ("model.ply", "report.json", "report.png", "report.html", "cameras.json", "cameras.zip")
 """The files that `train` and `download` write to the output folder."""
 
 OPTIONAL_FILES = ("preview.jpg", "progress.mp4")
@@ -39,6 +39,23 @@ def download_files(model: "ModelHandle", folder: Path, names: Sequence[str] = ()
     with make_transfer_display() as show:
         return [
             model.download(folder / name, file=name, on_bytes=partial(show, name)) for name in names or wanted
+        ]
+
+
+def complete_format() -> list[str]:
+    """Return the keys that complete `--format` in a shell."""
+    from splatmill.schema import DOWNLOADS
+
+    return [*DOWNLOADS]
+
+
+def download_formats(model: "ModelHandle", folder: Path, formats: Sequence[str]) -> list[Path]:
+    """Download the model in these file formats to `folder` as `model.sog` and so on, and return their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with make_transfer_display() as show:
+        names = {key: f"model.{key}" for key in formats}
+        return [
+            model.download_as(key, folder / name, on_bytes=partial(show, name)) for key, name in names.items()
         ]
 
 
@@ -90,9 +107,23 @@ def download(
             autocompletion=complete_file,
         ),
     ] = None,
+    formats: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--format",
+            metavar="FORMAT",
+            help="Download the model in this file format only, such as sog, spz or glb. May be repeated.",
+            show_default=False,
+            autocompletion=complete_format,
+        ),
+    ] = None,
     server: ServerOption = None,
 ) -> None:
     """Download a finished model with its report. A download that was interrupted continues where it stopped."""
     with open_client(server) as client:
-        for path in download_files(client.model(model_id), out, file or ()):
+        model = client.model(model_id)
+        written = download_formats(model, out, formats) if formats else []
+        if file or not formats:
+            written += download_files(model, out, file or ())
+        for path in written:
             typer.echo(path)

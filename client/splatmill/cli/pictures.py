@@ -1,4 +1,4 @@
-"""`splatmill render` and `orbit`: images and videos of a model on a server, or of a .ply on this machine."""
+"""`splatmill render` and `orbit`: images and videos of a model on a server, or in a file on this machine."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -15,7 +15,7 @@ ModelOrFile = Annotated[
     str,
     typer.Argument(
         metavar="MODEL",
-        help="Id of a model on the server, or path of a .ply, which is rendered on this machine.",
+        help="Id of a model on the server, or path of a file (.ply, .spz, ...), which is rendered on this machine.",
         show_default=False,
     ),
 ]
@@ -23,7 +23,7 @@ Up = Annotated[
     Literal["x", "y", "z", "-x", "-y", "-z"] | None,
     typer.Option(
         "--up",
-        help="Axis that points up in a .ply without a cameras.json beside it. Left out, z.",
+        help="Axis that points up in a file without a cameras.json beside it. Left out, z.",
         show_default=False,
     ),
 ]
@@ -66,7 +66,7 @@ def render(
     up: Up = None,
     server: ServerOption = None,
 ) -> None:
-    """Render an image of a model on a server, or of a .ply on this machine."""
+    """Render an image of a model on a server, or in a file on this machine."""
     from splatmill.files import atomic_write
     from splatmill.schema import Format
 
@@ -109,7 +109,7 @@ def orbit(
     up: Up = None,
     server: ServerOption = None,
 ) -> None:
-    """Render a video that circles the scene of a model on a server, or of a .ply on this machine."""
+    """Render a video that circles the scene of a model on a server, or in a file on this machine."""
     options: dict[str, Any] = {"seconds": seconds, "fps": fps, "width": width, "height": height}
     if is_local(model_id):
         cameras = local_cameras(Path(model_id))
@@ -123,7 +123,7 @@ def orbit(
 def _check_up(up: str | None, *, used: bool) -> None:
     if up is not None and not used:
         raise typer.BadParameter(
-            "--up is for a .ply without cameras; the cameras of this model say where up is.",
+            "--up is for a file without cameras; the cameras of this model say where up is.",
             param_hint="--up",
         )
 

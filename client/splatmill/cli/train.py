@@ -58,6 +58,15 @@ def train(
         bool,
         typer.Option("--detach", help="Start the job on --server, print its id, and do not wait for it."),
     ] = False,
+    priority: Annotated[
+        int | None,
+        typer.Option(
+            min=-100,
+            max=100,
+            help="On a server, of the jobs of one owner those with a higher priority are run first; 0 if left out.",
+            show_default=False,
+        ),
+    ] = None,
     orbit: Annotated[
         bool, typer.Option("--orbit", help="Also write orbit.mp4, a video that circles the scene.")
     ] = False,
@@ -87,6 +96,9 @@ def train(
     from splatmill.aio import train_options, with_start_model
 
     given = {key: value for key, value in options.items() if value is not None and value != []}
+    if server is None:
+        # The embedded service takes this training for a job like any other, but its results have no page.
+        given.setdefault("time_lapse", "off")
     given, start = with_start_model(given, path)
     checked = train_options(given)
     found = find_files(path)
@@ -99,6 +111,11 @@ def train(
         raise typer.BadParameter(
             "--fresh discards a training on this machine; with --server, every command starts a new job.",
             param_hint="--fresh",
+        )
+    if priority is not None and server is None:
+        raise typer.BadParameter(
+            "--priority orders the jobs of a server; without --server, nothing else waits.",
+            param_hint="--priority",
         )
     out.mkdir(parents=True, exist_ok=True)
     _announce(found)
@@ -120,10 +137,14 @@ def train(
             return
         with open_client(server) as client:
             capture = _upload(client, path, title, start)
+
+            def submit() -> JobHandle:
+                return client.submit(capture.id, checked, name=title, priority=priority or 0)
+
             if detach:
-                typer.echo(client.submit(capture.id, checked, name=title).id)
+                typer.echo(submit().id)
                 return
-            outputs(_follow(lambda: client.submit(capture.id, checked, name=title), verbose))
+            outputs(_follow(submit, verbose))
 
 
 def _announce(found: Found) -> None:

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from splatmill.schema import WebhookWithSecret
 
 webhooks = typer.Typer(
+    add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Let the server tell an address when jobs end.",

@@ -111,6 +111,30 @@ class PreviewEvent(Response):
     step: int | None = Field(default=None, ge=0, description="Training steps done.")
 
 
+class CamerasEvent(Response):
+    """Cameras were placed: some of them while structure from motion runs, or all of them when it has ended."""
+
+    type: Literal["cameras"] = "cameras"
+    path: str = Field(
+        description="Path of the `Placement`, relative to the storage root or to the job's work folder. Clients get "
+        "it from `/v1/jobs/{id}/cameras`."
+    )
+    cameras: int = Field(ge=0, description="Number of photos that have a camera.")
+    points: int = Field(ge=0, description="Number of points of the whole scene.")
+    final: bool = Field(default=False, description="Whether training uses these cameras.")
+
+
+class SnapshotEvent(Response):
+    """A new snapshot of the scene in training can be fetched from `/v1/jobs/{id}/snapshot`, for some time."""
+
+    type: Literal["snapshot"] = "snapshot"
+    step: int = Field(ge=0, description="Training steps done.")
+    seconds: float = Field(ge=0, description="Training time in seconds.")
+    gaussians: int = Field(ge=0, description="Number of Gaussians of the scene.")
+    shown: int = Field(ge=0, description="Number of Gaussians in the snapshot.")
+    bytes: int = Field(ge=0, description="Size of the snapshot in bytes.")
+
+
 class PlanEvent(Response):
     """The plan of the training: what is done and what is left out, each with the fact that decided it."""
 
@@ -119,7 +143,14 @@ class PlanEvent(Response):
 
 
 Event = Annotated[
-    StateEvent | ProgressEvent | MetricEvent | LogEvent | PreviewEvent | PlanEvent,
+    StateEvent
+    | ProgressEvent
+    | MetricEvent
+    | LogEvent
+    | PreviewEvent
+    | PlanEvent
+    | CamerasEvent
+    | SnapshotEvent,
     Field(discriminator="type"),
 ]
 

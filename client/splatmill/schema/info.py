@@ -38,6 +38,21 @@ class Limits(Response):
     max_render_pixels: int = Field(description="Pixels of a rendered image.")
 
 
+class Accepted(Response):
+    """Which files count as what, by the suffix of their name in lower case, and the least size of a photo."""
+
+    photos: list[str]
+    videos: list[str]
+    archives: list[str]
+    masks: list[str]
+    mask_folders: list[str] = Field(
+        description="Folders of a data set that hold masks; the first that exists is used."
+    )
+    min_photo_side: int = Field(
+        description="Pixels; photos with a shorter side are left out of the training."
+    )
+
+
 class Info(Response):
     """The response of `/v1/info`."""
 
@@ -52,6 +67,14 @@ class Info(Response):
         description="The queues: any (backend auto), cpu (backends cpu and reference) and gpu (backend gpu).",
     )
     limits: Limits
+    accepted: Accepted | None = Field(
+        default=None, description="Files that a capture may hold; null on servers before this was told."
+    )
+    local: bool | None = Field(
+        default=None,
+        description="Whether the server listens where only its own machine reaches it; a proxy may lead to it all the "
+        "same. Null on servers before this was told.",
+    )
     details: dict[str, Any] = Field(default_factory=dict)
 
 

@@ -35,8 +35,12 @@ class CreateJob(Request):
         A field that was added after the first version is left out where it has its default, so that a request is known
         again after an upgrade.
         """
-        later = {"priority"} if self.priority == 0 else set()
-        return self.model_dump_json(exclude=later if with_capture else later | {"capture"})
+        later: dict[str, Any] = {"options": self.options.later_defaults()}
+        if self.priority == 0:
+            later["priority"] = True
+        if not with_capture:
+            later["capture"] = True
+        return self.model_dump_json(exclude=later)
 
 
 def _readable_options(value: Any) -> Any:

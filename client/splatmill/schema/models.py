@@ -9,9 +9,16 @@ from splatmill.schema.base import Measured, Response, Time
 from splatmill.schema.cameras import CameraSpec
 from splatmill.schema.events import CurveRow
 
+HELD_OUT = "held_out"
+"""Folder of a model's held-out photos as they were compared, `000.webp` and so on."""
+
+TIME_LAPSE = "time_lapse"
+"""Folder of a model's snapshots of its training, `000.ply` and so on."""
+
 
 class ModelFile(Response):
-    """A file of a model: model.ply, report.json, report.png, report.html, cameras.json, preview.jpg, progress.mp4."""
+    """A file of a model: model.ply, report.json, report.png, report.html, cameras.json, cameras.zip, preview.jpg,
+    progress.mp4, the held-out photos in held_out/, and the snapshots of the training in time_lapse/."""
 
     name: str
     size: int = Field(ge=0, description="Size in bytes.")
@@ -54,6 +61,15 @@ class ModelCamera(Response):
     split: str = Field(default="train", description="train, or test for a held-out photo.")
     camera: CameraSpec
     psnr: Measured = Field(default=None, description="PSNR of this photo, in dB.")
+    psnr_color_fitted: Measured = Field(
+        default=None, description="PSNR after the affine fit of the rendered colours to this photo, in dB."
+    )
+    ssim: Measured = Field(default=None, description="SSIM of this photo.")
+    photo: str | None = Field(
+        default=None,
+        description="File of the model with this photo as it was compared: at the camera's size, undistorted, "
+        "transparent at pixels that do not count. Only held-out photos have one, and not all where they are many.",
+    )
 
 
 class ModelCameras(Response):

@@ -13,6 +13,7 @@ from pydantic.fields import FieldInfo
 
 from splatmill.schema.base import Request, Response
 from splatmill.schema.captures import safe_name
+from splatmill.schema.formats import is_model_file, readable_suffixes
 from splatmill.schema.ids import ID
 from splatmill.schema.quantities import ByteSize, Duration
 
@@ -21,6 +22,10 @@ class Preset(StrEnum):
     draft = "draft"
     balanced = "balanced"
     quality = "quality"
+
+
+PRESET_STEPS = {Preset.draft: 1000, Preset.balanced: 3000, Preset.quality: 10_000}
+"""Number of training steps where no budget is given."""
 
 
 class Switch(StrEnum):
@@ -69,6 +74,10 @@ def _group(name: str) -> dict[str, Any]:
 
 
 _BUDGET, _PHOTOS, _CAMERAS, _ENGINE = map(_group, ("budget", "photos", "cameras", "engine"))
+
+
+_ADDED_LATER = ("time_lapse",)
+"""Options that requests to the first version did not have."""
 
 
 class TrainOptions(Request):
@@ -174,14 +183,22 @@ class TrainOptions(Request):
         max_length=512,
         description=(
             "Model to start from, in place of the points of the reconstruction: the id of a model on the "
-            "server, or a .ply file, given by its path or by its name among the capture's poses. Its "
-            "coordinates must be those of the capture's cameras."
+            "server, or a model file (.ply, .spz, ...), given by its path or by its name among the capture's "
+            "poses. Its coordinates must be those of the capture's cameras."
         ),
         json_schema_extra=_PHOTOS,
     )
     progress_video: bool = Field(
         default=False,
         description="Also write progress.mp4, a video of one view in the course of the training.",
+        json_schema_extra=_PHOTOS,
+    )
+    time_lapse: Switch = Field(
+        default=Switch.auto,
+        description=(
+            "Keep snapshots of the training with the model, at most 24 and 64 MB, to watch it form on the page of the "
+            "model. With auto, jobs of a server do; trainings on this machine do not."
+        ),
         json_schema_extra=_PHOTOS,
     )
     background: Background = Field(
@@ -197,8 +214,8 @@ class TrainOptions(Request):
     exposure: Switch = Field(
         default=Switch.auto,
         description=(
-            "Fit an affine colour transform per photo, for photos that differ in exposure or white balance. "
-            "With auto, this is done where the same points differ in brightness or tint between photos."
+            "Bring the training photos to the exposure and white balance of the photos taken around them. "
+            "With auto, this is done where the points they share show that one photo in ten departs from these."
         ),
         json_schema_extra=_PHOTOS,
     )
@@ -308,14 +325,21 @@ class TrainOptions(Request):
     def _model_or_file(cls, start: str | None) -> str | None:
         if start is None or ID.fullmatch(start):
             return start
-        if not start.lower().endswith(".ply"):
-            raise ValueError(f"{start[:80]!r} is neither the id of a model nor the name of a .ply file")
+        if not is_model_file(start):
+            raise ValueError(
+                f"{start[:80]!r} is neither the id of a model nor the name of a {readable_suffixes()} file"
+            )
         return safe_name(start)
+
+    def later_defaults(self) -> set[str]:
+        """Return the options that were added after the first version and have their defaults."""
+        fields = type(self).model_fields
+        return {name for name in _ADDED_LATER if getattr(self, name) == fields[name].default}
 
     @property
     def start_file(self) -> str | None:
         """The name of a file among the capture's poses, if `start` is one."""
-        return self.start if self.start is not None and self.start.lower().endswith(".ply") else None
+        return self.start if self.start is not None and is_model_file(self.start) else None
 
     @property
     def start_model(self) -> str | None:

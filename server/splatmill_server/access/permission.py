@@ -1,5 +1,6 @@
 """What a caller may request. Requests that change something need the scope `train`, if the endpoint names no other."""
 
+import re
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -9,12 +10,20 @@ from splatmill.schema import Scope
 from splatmill_server.access.caller import Caller, Who
 from splatmill_server.problems import ProblemError
 
-OPEN_PATHS = frozenset({"/healthz", "/readyz", "/openapi.json", "/docs"})
-"""Paths that need no API key, for probes and browsers. They contain no data of users."""
+_OPEN = re.compile(
+    r"/|/(healthz|readyz|openapi\.json|docs)|/(jobs|models)(/[^/]*)?|/sign-in|/(page|vendor|s)/.*", re.ASCII
+)
 
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+
+def is_open(path: str) -> bool:
+    """Return whether a path needs no API key: those for probes, the files of the web page, and shared
+    links, whose endpoints ask for the token in the path instead. The others hold no data.
+    """
+    return _OPEN.fullmatch(path) is not None
 
 
 def needs(scope: Scope) -> Callable[[F], F]:
@@ -41,7 +50,7 @@ def check_scope(who: Caller, needed: Scope) -> None:
 
 
 def _permitted(request: Request, who: Who) -> None:
-    if request.scope["path"] in OPEN_PATHS:
+    if is_open(request.scope["path"]):
         return
     endpoint = getattr(request.scope.get("route"), "endpoint", None)
     by_method = Scope.read if request.method in SAFE_METHODS else Scope.train

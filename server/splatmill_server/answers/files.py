@@ -42,7 +42,7 @@ async def file_response(
     if media_type.startswith("text/html"):
         # A report contains file names chosen by users, so its page gets no access to this origin.
         headers["Content-Security-Policy"] = "sandbox allow-scripts"
-    if _matches(request.headers.get("if-none-match"), etag):
+    if matches(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     wanted = None
     if request.headers.get("if-range", etag) == etag:
@@ -63,7 +63,7 @@ async def _read(storage: Storage, entry: Entry, start: int, end: int) -> AsyncIt
         yield chunk
 
 
-def _matches(header: str | None, etag: str) -> bool:
+def matches(header: str | None, etag: str) -> bool:
     if header is None:
         return False
     tags = [tag.strip().removeprefix("W/") for tag in header.split(",")]

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
-from splatmill_server.problems import ProblemError
+from splatmill_server.renderer import post
 
 _PASSED_BACK = (
     "content-type",
@@ -37,36 +37,11 @@ async def forward(
 
     Raises a 503 problem if there is no renderer, and a 504 problem if it does not answer within `seconds`.
     """
-    if renderer is None:
-        raise ProblemError(
-            "renderer_unavailable",
-            "This server has no renderer, so it cannot render images.",
-            advice="Start `python -m splatmill_worker renderer` and set SPLATMILL_RENDERER_URL. "
-            "Models can be downloaded without it.",
-        )
-    headers = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
+    headers = {"Content-Type": "application/json"}
     if (known := request.headers.get("if-none-match")) is not None:
         headers["If-None-Match"] = known
     content = body.model_dump_json(exclude_none=True)
-    try:
-        sent = renderer.build_request(
-            "POST", path, content=content, headers=headers, timeout=httpx.Timeout(seconds, connect=5.0)
-        )
-        answer = await _while_connected(request, renderer.send(sent, stream=True))
-    except httpx.TimeoutException as error:
-        raise ProblemError(
-            "render_timeout",
-            f"The renderer did not answer within {seconds:g} seconds.",
-            advice="Request a smaller image or a shorter video, or try again when the machine is less busy.",
-        ) from error
-    except httpx.TransportError as error:
-        raise ProblemError(
-            "renderer_unavailable",
-            f"The renderer cannot be reached ({type(error).__name__}).",
-            advice="Try again in a few seconds. If the problem persists, read the log of "
-            "`python -m splatmill_worker renderer`. Models can be downloaded without it.",
-            headers={"Retry-After": "5"},
-        ) from error
+    answer = await while_connected(request, post(renderer, path, content, headers, seconds))
     if answer is None:
         return Response(status_code=CLIENT_GONE)
     passed = {
@@ -80,7 +55,7 @@ async def forward(
     return StreamingResponse(_pass(answer), answer.status_code, passed)
 
 
-async def _while_connected(request: Request, pending: Coroutine[Any, Any, T]) -> T | None:
+async def while_connected(request: Request, pending: Coroutine[Any, Any, T]) -> T | None:
     """Return the result of `pending`, or cancel it and return None if the client closes its connection before."""
     work = asyncio.create_task(pending)
     gone = asyncio.create_task(_disconnect(request))

@@ -26,6 +26,7 @@ from splatmill.schema import (
     may_be_empty,
     safe_name,
 )
+from splatmill.schema.formats import is_model_file
 from splatmill.schema.tolerant import keep_readable
 from splatmill_server.filters import Filter
 from splatmill_server.metrics import Metrics
@@ -169,9 +170,7 @@ class Captures:
             )
         photos = all(entry.path.lower().endswith(PHOTO_SUFFIXES) for entry in images)
         poses = self.storage.entries(layout.capture_files(capture_id, Role.poses))
-        posed = any(
-            not entry.path.lower().endswith(".ply") for entry in poses
-        )  # a .ply is a model to start from, not a pose
+        posed = any(not is_model_file(entry.path) for entry in poses)  # a model to start from is no pose
         if len(images) == 1 and photos and not posed:
             raise ProblemError(
                 "too_few_images",

@@ -2,17 +2,28 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Request
+from fastapi import APIRouter, Body, Path, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from splatmill.backplane import layout, rendering
-from splatmill.schema import Model, ModelCameras, ModelPage, OrbitRequest, RenderRequest, Scope
+from splatmill.schema import (
+    DOWNLOADS,
+    Model,
+    ModelCameras,
+    ModelDownloads,
+    ModelPage,
+    OrbitRequest,
+    RenderRequest,
+    Scope,
+)
 from splatmill_server.access.permission import needs
 from splatmill_server.answers.files import file_response
-from splatmill_server.answers.forward import forward
+from splatmill_server.answers.forward import CLIENT_GONE, forward, while_connected
+from splatmill_server.answers.single_file import single_file
+from splatmill_server.conversions import format_of_key
 from splatmill_server.filters import Filter
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.routes.openapi import CAMERA, RENDER_REQUESTS, answer, binary, problems
@@ -22,10 +33,10 @@ from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
 
-_RENDERED = binary("The image", "image/png", "image/jpeg", "image/webp", "application/x-npy") | {
+RENDERED = binary("The image", "image/png", "image/jpeg", "image/webp", "application/x-npy") | {
     304: {"description": "The image with the ETag in `If-None-Match` is unchanged."}
 }
-_RENDER_PROBLEMS = problems(
+RENDER_PROBLEMS = problems(
     "model_not_found",
     "model_not_ready",
     "camera_invalid",
@@ -34,7 +45,7 @@ _RENDER_PROBLEMS = problems(
     "renderer_unavailable",
     "render_timeout",
 )
-_CAMERA_QUERY = [
+CAMERA_QUERY = [
     {
         "name": "camera_to_world",
         "in": "query",
@@ -81,21 +92,99 @@ def get_model(service: Shared, model_id: ModelId) -> Model:
     return service.models.get(model_id)
 
 
-@router.head("/{model_id}/files/{name}", include_in_schema=False)
+@router.head("/{model_id}/files/{name:path}", include_in_schema=False)
 @router.get(
-    "/{model_id}/files/{name}",
+    "/{model_id}/files/{name:path}",
     response_class=Response,
-    responses=binary("The file", *sorted(set(layout.MODEL_FILES.values())))
+    responses=binary("The file", *sorted({*layout.MODEL_FILES.values(), "image/webp"}))
     | answer(206, "The requested range of the file")
     | answer(304, "The file is unchanged")
     | problems("model_not_found", "file_not_found", "model_not_ready", "range_not_satisfiable"),
 )
 async def get_file(service: Shared, model_id: ModelId, name: str, request: Request) -> Response:
-    """Download a file of a model: `model.ply`, `report.json`, `report.png`, `report.html`, `cameras.json`, ..."""
+    """Download a file of a model: `model.ply`, `report.json`, `cameras.json`, `held_out/000.webp`, ..."""
     entry = await run_in_threadpool(service.models.file, model_id, name)
     download = f"{model_id}.ply" if name == "model.ply" else None
     return await file_response(
-        request, service.storage, entry.path, layout.MODEL_FILES[name], download_name=download
+        request,
+        service.storage,
+        entry.path,
+        layout.model_media_type(name) or "application/octet-stream",
+        download_name=download,
+    )
+
+
+@router.get("/{model_id}/formats", responses=problems("model_not_found", "model_not_ready", "model_corrupt"))
+def get_formats(service: Shared, model_id: ModelId) -> ModelDownloads:
+    """List the file formats in which a model can be downloaded, with bytes and quality where it has been converted."""
+    return service.conversions.list(model_id)
+
+
+@router.get(
+    "/{model_id}/download/html",
+    response_class=Response,
+    responses=binary("The model with its viewer in one HTML file", "text/html; charset=utf-8")
+    | problems(
+        "model_not_found",
+        "file_not_found",
+        "model_not_ready",
+        "model_corrupt",
+        "conversion_failed",
+        "renderer_unavailable",
+        "render_timeout",
+    ),
+)
+async def download_html(service: Shared, model_id: ModelId, request: Request) -> Response:
+    """Download a model with its viewer in one HTML file, which needs no server and sends no request."""
+    path = await while_connected(request, service.conversions.path(model_id, DOWNLOADS["sog"]))
+    if path is None:
+        return Response(status_code=CLIENT_GONE)
+
+    def made() -> bytes:
+        model = service.models.get(model_id)
+        cameras = service.models.cameras(model_id)
+        antialias = service.models.antialias(model_id)
+        return single_file(model.name or model_id, service.storage.get(path), cameras, antialias)
+
+    headers = {
+        "Content-Disposition": f"attachment; filename*=UTF-8''{model_id}.html",
+        "Content-Security-Policy": "sandbox allow-scripts",
+        "Cache-Control": "private, no-cache",
+    }
+    return Response(await run_in_threadpool(made), headers=headers, media_type="text/html; charset=utf-8")
+
+
+@router.head("/{model_id}/download/{format}", include_in_schema=False)
+@router.get(
+    "/{model_id}/download/{format}",
+    response_class=Response,
+    responses=binary("The model in this format", *sorted({form.media_type for form in DOWNLOADS.values()}))
+    | answer(206, "The requested range of the file")
+    | answer(304, "The file is unchanged")
+    | problems(
+        "model_not_found",
+        "format_unknown",
+        "model_not_ready",
+        "range_not_satisfiable",
+        "model_corrupt",
+        "conversion_failed",
+        "renderer_unavailable",
+        "render_timeout",
+    ),
+)
+async def download(
+    service: Shared,
+    model_id: ModelId,
+    format: Annotated[str, Path(description=f"One of {', '.join(DOWNLOADS)}.")],
+    request: Request,
+) -> Response:
+    """Download a model in a file format, such as `sog`. The first request converts it, which takes seconds."""
+    form = format_of_key(format)
+    path = await while_connected(request, service.conversions.path(model_id, form))
+    if path is None:
+        return Response(status_code=CLIENT_GONE)
+    return await file_response(
+        request, service.storage, path, form.media_type, download_name=f"{model_id}{form.suffix}"
     )
 
 
@@ -111,7 +200,7 @@ def get_cameras(service: Shared, model_id: ModelId) -> ModelCameras:
 @router.post(
     "/{model_id}/render",
     response_class=Response,
-    responses=_RENDERED | _RENDER_PROBLEMS | problems("unsupported_media_type", "body_too_large"),
+    responses=RENDERED | RENDER_PROBLEMS | problems("unsupported_media_type", "body_too_large"),
     dependencies=[JSON_ONLY],
 )
 @needs(Scope.read)
@@ -131,8 +220,8 @@ async def render(
 @router.get(
     "/{model_id}/render",
     response_class=Response,
-    responses=_RENDERED | _RENDER_PROBLEMS,
-    openapi_extra={"parameters": _CAMERA_QUERY},
+    responses=RENDERED | RENDER_PROBLEMS,
+    openapi_extra={"parameters": CAMERA_QUERY},
 )
 async def render_cacheable(service: Shared, model_id: ModelId, request: Request) -> Response:
     """Render an image of a model at an address that browsers and proxies can cache."""
@@ -152,7 +241,7 @@ async def render_cacheable(service: Shared, model_id: ModelId, request: Request)
     response_class=Response,
     responses=binary("The video", "video/mp4")
     | answer(304, "The video is unchanged")
-    | _RENDER_PROBLEMS
+    | RENDER_PROBLEMS
     | problems("unsupported_media_type", "body_too_large", "size_out_of_range"),
     dependencies=[JSON_ONLY],
 )

@@ -12,8 +12,15 @@ from splatmill.backplane import entries, lines, rendering, workers
 from splatmill.backplane.lines import Waiting
 from splatmill.backplane.workers import WorkerRecord
 from splatmill.schema import (
+    ARCHIVE_SUFFIXES,
+    MASK_FOLDERS,
+    MASK_SUFFIXES,
     MAX_PHOTO_PIXELS,
     MAX_RENDER_PIXELS,
+    MIN_PHOTO_SIDE,
+    PHOTO_SUFFIXES,
+    VIDEO_SUFFIXES,
+    Accepted,
     Health,
     Info,
     Limits,
@@ -55,6 +62,15 @@ def get_info(service: Shared, who: Who) -> Info:
             max_image_pixels=MAX_PHOTO_PIXELS,
             max_render_pixels=MAX_RENDER_PIXELS,
         ),
+        accepted=Accepted(
+            photos=list(PHOTO_SUFFIXES),
+            videos=list(VIDEO_SUFFIXES),
+            archives=list(ARCHIVE_SUFFIXES),
+            masks=list(MASK_SUFFIXES),
+            mask_folders=list(MASK_FOLDERS),
+            min_photo_side=MIN_PHOTO_SIDE,
+        ),
+        local=service.settings.local,
         details={"renderer": service.renderer is not None},
     )
 

@@ -81,7 +81,10 @@ class Deletion:
             if still is not None and not still():
                 return False
             mark.begin()
-            self.jobs.delete(job_id)
+            self.jobs.delete(
+                job_id
+            )  # refuses a job that has not ended; its links open nothing without the model
+            self.storage.delete_prefix(layout.shares_of(job_id))
             for kind in (StoredKind.job, StoredKind.model):
                 self.ledger.deleted(kind, job_id, owner)
         return True
@@ -101,6 +104,8 @@ class Deletion:
             if self._user(held.key) is not None or not still():
                 return False
             mark.begin()
+            if held.kind is StoredKind.model:
+                self.storage.delete_prefix(layout.shares_of(held.id))
             self.storage.delete_prefix(held.folder)
             self.ledger.deleted(held.kind, held.id, held.owner)
         return True
@@ -127,7 +132,7 @@ class Deletion:
                     for path in (
                         (layout.capture(record_id),)
                         if is_capture
-                        else (layout.model(record_id), layout.job(record_id))
+                        else (layout.shares_of(record_id), layout.model(record_id), layout.job(record_id))
                     ):
                         self.storage.delete_prefix(path)
                     finished.append(record)

@@ -23,9 +23,9 @@ class Holding(BaseModel):
     """One folder of storage: a capture, the files of a job, or a model.
 
     bytes: size of all files but `derived`.
-    derived: size of what can be made again: a capture's reconstruction, or a job's checkpoints.
+    derived: size of what can be made again: a capture's reconstruction, a job's checkpoints, or a model's conversions.
     files: number of files.
-    modified: time of the last write of any file, in seconds since 1970.
+    modified: time of the last write of any file, in seconds since 1970; conversions make a model no younger.
     whole: whether the record is there: `capture.json`, which is written first; `job.json` of a model, which is written
         last; the log of a job that has ended.
     owner: None if nothing says whose it is.
@@ -70,12 +70,14 @@ class _Sums:
     whole: bool = False
 
     def add(self, entry: Entry, kind: StoredKind, inside: str) -> None:
-        if layout.is_derived(_FOLDERS[kind], inside):
+        derived = layout.is_derived(_FOLDERS[kind], inside)
+        if derived:
             self.derived += entry.size
         else:
             self.bytes += entry.size
         self.files += 1
-        self.modified = max(self.modified, entry.modified.timestamp())
+        if not (derived and kind is StoredKind.model):
+            self.modified = max(self.modified, entry.modified.timestamp())
         self.whole = self.whole or inside == _RECORDS[kind]
 
 

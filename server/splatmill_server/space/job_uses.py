@@ -12,6 +12,7 @@ from splatmill.backplane import events, keys, row
 from splatmill.backplane.fold import fold
 from splatmill.backplane.records import UnreadableRecord
 from splatmill.schema import DEFAULT_OWNER, StoredKind
+from splatmill.schema.formats import is_model_file
 from splatmill_server.space.holdings import Holding
 
 _BATCH = 500
@@ -104,7 +105,7 @@ def _use(job_id: str, fields: Mapping[str, bytes | None], states: Any, unfinishe
         owner=texts.get("owner", DEFAULT_OWNER),
         name=texts.get("name"),
         capture=capture,
-        start_model=start if isinstance(start, str) and not start.lower().endswith(".ply") else None,
+        start_model=start if isinstance(start, str) and not is_model_file(start) else None,
         last_heard=max(moments),
         unfinished=unfinished,
         readable=capture is not None and options is not None,

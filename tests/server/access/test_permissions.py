@@ -19,8 +19,16 @@ from splatmill_server.settings import Settings
 from tests.support.served_app import Serve, ServedApp, problem
 
 OPEN = {"/healthz", "/readyz", "/openapi.json", "/docs"}
+LINKS = "/s/{token}/"
+"""What is below it asks for the token in the address and for nothing else (test_shares.py)."""
 SAFE = {"get", "head", "options"}
-READS = {"/v1/models/{model_id}/render", "/v1/models/{model_id}/orbit", "/v1/session"}
+READS = {
+    "/v1/jobs/{job_id}/watch",
+    "/v1/models/{model_id}/render",
+    "/v1/models/{model_id}/orbit",
+    "/v1/session",
+    "/v1/estimate",
+}
 """Addresses whose POST and DELETE change no record."""
 
 OWN = {"capture_id", "job_id", "model_id", "webhook_id"}
@@ -38,7 +46,7 @@ class World:
     secrets: dict[str, str]
 
     def ask(self, who: str, method: str, template: str) -> Any:
-        path = template.replace("{name}", "a.jpg").replace("{role}", "images")
+        path = template.replace("{name}", "a.jpg").replace("{role}", "images").replace("{format}", "ply")
         for name, value in self.ids.items():
             path = path.replace(f"{{{name}}}", value)
         assert "{" not in path, f"tell this test what fills the parameter of {template}"
@@ -60,7 +68,8 @@ def operations() -> list[tuple[str, str, dict[str, Any]]]:
         for method, operation in methods.items()
     ]
     assert len(found) > 25
-    return found
+    assert [path for _, path, _ in found if path.startswith(LINKS)]
+    return [(method, path, operation) for method, path, operation in found if not path.startswith(LINKS)]
 
 
 @pytest.fixture
@@ -89,6 +98,7 @@ def world(serve: Serve) -> World:
         f"/v1/captures/{capture}/images/c.jpg", content=b"c", headers={"Upload-Complete": "?0"}
     )
     ids = {"capture_id": capture, "job_id": waiting, "model_id": done, "key_id": ann["id"]}
+    ids["share_id"] = "fedcba98"  # guarded by its model
     ids["import_id"] = "0" * 16  # guarded by its capture
     ids["webhook_id"] = app.http.post("/v1/webhooks", json={"url": "http://8.8.8.8/"}).json()["id"]
     ids["delivery_id"] = "0" * 16  # guarded by its webhook

@@ -174,7 +174,7 @@ def test_folders_without_a_record_are_deleted_after_a_grace(people: ServedApp) -
         f"models/{broken}/preview.jpg",
         f"jobs/{unfinished}/work/x",
         f"jobs/{model}/work/x",
-        "keys/x.json",
+        "of-another-program/x",
     ]
     for path in (*orphans, *kept):
         storage.put(path, b"x")

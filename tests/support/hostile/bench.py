@@ -139,9 +139,9 @@ class Bench:
         notes = [note for note in scene.notes if "Stereo" not in note]
         return Answer(f"used: {len(scene.views)} cameras", " ".join([*notes, *said]))
 
-    def start(self, data: bytes) -> Answer:
-        """What the worker makes of a .ply file to start from."""
-        path = write(self._fresh() / "start.ply", data)
+    def start(self, data: bytes, suffix: str = ".ply") -> Answer:
+        """What the worker makes of a file to start from, whose suffix tells its format."""
+        path = write(self._fresh() / f"start{suffix}", data)
         try:
             gaussians = read_given_model(path, Normalization(1.0, np.zeros(3)))
         except WorkerError as error:

@@ -6,6 +6,8 @@ import json
 import struct
 from typing import Any
 
+import zstandard
+
 
 def text(count: int = 3) -> dict[str, str]:
     """The files of a COLMAP model of cameras in a row, without points."""
@@ -60,6 +62,34 @@ def ply(
     head += [f"property float {name}" for name in SPLAT] + ["end_header", ""]
     row = struct.pack(f"<{len(SPLAT)}f", *[value] * len(SPLAT))
     return "\n".join(head).encode() + row * (count if rows is None else rows)
+
+
+def compressed_ply(*, chunks: int, count: int) -> bytes:
+    """A compressed .ply of zeros."""
+    axes = [f"{end}_{what}{axis}" for what in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
+    head = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
+    head += [*(f"property float {name}" for name in axes), f"element vertex {count}"]
+    head += [f"property uint packed_{what}" for what in ("position", "rotation", "scale", "color")]
+    return "\n".join([*head, "end_header", ""]).encode() + bytes(48 * chunks + 16 * count)
+
+
+def spz_header(count: int, version: int = 3) -> bytes:
+    """The header of an .spz without harmonics."""
+    return b"NGSP" + struct.pack("<IIBBBB", version, count, 0, 12, 0, 0)
+
+
+def spz_of_zstd(*, count: int, held: int) -> bytes:
+    """An .spz of version 4 that announces `count` Gaussians and holds the bytes of `held`."""
+    widths = (9, 1, 3, 3, 4)
+    frames = [zstandard.compress(bytes(width * held)) for width in widths]
+    sizes = [struct.pack("<QQ", len(f), w * count) for f, w in zip(frames, widths, strict=True)]
+    head = spz_header(count, 4)[:15] + b"\5" + struct.pack("<I12x", 32)
+    return head + b"".join([*sizes, *frames])
+
+
+def ksplat_header(sections: int) -> bytes:
+    """The first header of a .ksplat."""
+    return struct.pack("<BBxxI", 0, 1, sections) + bytes(4088)
 
 
 def _image(number: int, points: int = 0) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import struct
 
@@ -53,8 +54,8 @@ def _document(**values: object) -> bytes:
     return json.dumps(json.loads(models.transforms()) | values).encode()
 
 
-def _start(what: str, data: bytes, kind: str = UNUSABLE, said: str = "") -> Hostile:
-    return Hostile("Models to start from", what, lambda bench: bench.start(data), kind, said)
+def _start(what: str, data: bytes, kind: str = UNUSABLE, said: str = "", *, suffix: str = ".ply") -> Hostile:
+    return Hostile("Models to start from", what, lambda bench: bench.start(data, suffix), kind, said)
 
 
 def _scaled(factors: tuple[float, float, float]) -> list[list[float]]:
@@ -159,5 +160,48 @@ POSES = (
         "a mesh",
         b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
         said="missing",
+    ),
+    _start(
+        "chunks of a compressed .ply for fewer Gaussians than it has",
+        models.compressed_ply(chunks=1, count=300),
+        said="300 Gaussians and 1 chunks",
+    ),
+    _start(
+        "an .spz of 90 bytes that announces 4 thousand million Gaussians",
+        gzip.compress(models.spz_header(2**32 - 1) + bytes(900)),
+        said="announces 85899345900 bytes",
+        suffix=".spz",
+    ),
+    _start(
+        "an .spz of 200 kB that expands to 200 MB",
+        gzip.compress(models.spz_header(10**7) + bytes(2 * 10**8)),
+        said="more than 100 times",
+        suffix=".spz",
+    ),
+    _start(
+        "an .spz that is cut off",
+        gzip.compress(models.spz_header(9) + bytes(180))[:-12],
+        said="gzip data end",
+        suffix=".spz",
+    ),
+    _start(
+        "an .spz whose zstd frames hold more than they announce",
+        models.spz_of_zstd(count=4, held=400),
+        said="more than 36 bytes",
+        suffix=".spz",
+    ),
+    _start("a .splat of half a row", bytes(48), said="no whole number of rows", suffix=".splat"),
+    _start("a .splat of NaN", b"\xff" * 64, said="no Gaussian with finite values", suffix=".splat"),
+    _start(
+        "a .ksplat that announces 4 thousand million sections",
+        models.ksplat_header(sections=2**32 - 1),
+        said="4294967295 sections",
+        suffix=".ksplat",
+    ),
+    _start(
+        "a .ksplat with 4 thousand million Gaussians in a section",
+        models.ksplat_header(sections=1) + bytes.fromhex("ffffffff" * 2) + bytes(1016),
+        said="ends at byte",
+        suffix=".ksplat",
     ),
 )

@@ -154,7 +154,7 @@ REQUESTS = (
         "Names",
         "a file of a model that leads elsewhere",
         lambda b: b.request(f"GET /v1/models/{_model(b)}/files/..%2Fjob.json"),
-        "404 `not_found`",
+        "404 `file_not_found`",
     ),
     Hostile("Bodies", "cut off; nothing is stored", _cut_off, "no answer"),
     Hostile(

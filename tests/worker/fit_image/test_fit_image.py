@@ -24,7 +24,7 @@ from splatmill_worker.fit_image import command as program
 from splatmill_worker.fit_image import plane
 from splatmill_worker.fit_image.command import fit_image
 from splatmill_worker.fit_image.photo import load
-from splatmill_worker.splat import ply
+from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.plan.budget import Budget
 
 WIDTH, HEIGHT = 80, 56
@@ -79,7 +79,7 @@ def test_a_picture_becomes_a_scene_that_shows_it(tmp_path: Path) -> None:
 
 def test_the_scene_is_a_thin_slab_in_an_order_of_its_own(tmp_path: Path) -> None:
     fit_image(saved(tmp_path / "p.png"), tmp_path, options(steps=60))
-    scene = ply.read(tmp_path / "model.ply")
+    scene = ply.read(tmp_path / "model.ply").gaussians
     assert scene.degree == 3
     assert torch.equal(scene.sh[:, 1:], torch.zeros_like(scene.sh[:, 1:]))
     depth = scene.means[:, 2]

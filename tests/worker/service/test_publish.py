@@ -3,6 +3,7 @@
 Does not prove that readers ignore a model without a record: tests/server does.
 """
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -42,6 +43,30 @@ def test_a_model_is_published_for_its_generation(
     assert stored == {"model.ply", "report.json", "job.json"}, (
         "other files of the folder are no part of a model"
     )
+
+
+def test_files_in_folders_are_those_of_the_last_generation(
+    local: Storage, connection: redis.Redis, tmp_path: Path
+) -> None:
+    (tmp_path / "model.ply").write_text("splats")
+    for name in ("held_out/000.webp", "held_out/001.webp", "time_lapse/000.ply", "film/000.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name)
+    row = write_row(connection, JOB)
+
+    def stored() -> set[str]:
+        folder = layout.model(JOB) + "/"
+        return {entry.path.removeprefix(folder) for entry in local.entries(layout.model(JOB))}
+
+    publish(local, attempt(connection, 1), row, tmp_path)
+    common = {"model.ply", "job.json", "held_out/000.webp"}
+    assert stored() == common | {"held_out/001.webp", "time_lapse/000.ply"}
+    digests = json.loads(local.get(layout.job_record(JOB)))["sha256"]
+    assert digests["held_out/000.webp"] == hashlib.sha256(b"held_out/000.webp").hexdigest()
+    for name in ("held_out/001.webp", "time_lapse/000.ply"):
+        (tmp_path / name).unlink()
+    publish(local, attempt(connection, 2), row, tmp_path)
+    assert stored() == common
 
 
 def test_without_a_model_nothing_is_published(

@@ -47,6 +47,37 @@ def test_only_masked_pixels_are_judged() -> None:
     assert compare("x", torch.where(mask[..., None], dimmed, 1.0), photo, mask) == score
 
 
+def test_a_fit_of_the_colours_takes_light_out_and_leaves_shape_in() -> None:
+    photo = image().float() / 255
+    turn = torch.tensor([[0.7, 0.1, 0.0], [0.05, 0.8, 0.1], [0.0, 0.0, 0.6]])
+    lit = photo @ turn.T + torch.tensor([0.05, 0.0, 0.1])
+    score = compare("x", lit, image())
+    assert score.psnr < 20.0
+    # Float32 images in 0 to 1: rounding leaves a mean squared error of (6e-8)^2, far below the 1e-10 that counts as 0.
+    assert score.psnr_color_fitted == 100.0
+    noise = 0.05 * torch.randn(photo.shape, generator=torch.Generator().manual_seed(2))
+    shaped = compare("x", 0.5 + 0.3 * (photo - 0.5) + noise, image())
+    # The variance of the noise (0.05^2) in units of the photo: (0.05 / 0.3)^2, less what regression shrinks.
+    assert 15.0 < shaped.psnr_color_fitted < 19.0
+    assert shaped.psnr_color_fitted > shaped.psnr
+
+
+def test_a_fit_of_the_colours_never_makes_worse_and_is_that_of_the_mask() -> None:
+    photo = image()
+    for color in (image(1).float() / 255, torch.full((40, 56, 3), 0.2), torch.zeros(40, 56, 3)):
+        score = compare("x", color, photo)
+        assert score.psnr_color_fitted >= score.psnr - 1e-6
+    flat = compare("x", torch.full((40, 56, 3), 0.2), photo)
+    constant = photo.float().div(255).flatten(0, 1)
+    assert flat.psnr_color_fitted == pytest.approx(
+        psnr(float((constant - constant.mean(dim=0)).square().mean())), abs=1e-4
+    )
+    mask = torch.zeros(40, 56, dtype=torch.bool)
+    mask[5:20, 5:20] = True
+    halved = torch.where(mask[..., None], 0.5 * photo.float() / 255, 1.0)
+    assert compare("x", halved, photo, mask).psnr_color_fitted == 100.0
+
+
 def ssim_by_definition(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
     """SSIM per pixel and channel [H, W, 3] as Wang et al. (2004) define it: a Gaussian window of 11 taps and sigma 1.5,
     zeros outside the image. In float64, as products with the matrices that apply the window along either axis.

@@ -70,8 +70,10 @@ CONFIGURATIONS = {
     ),
     "antialias": _option("opacities compensated for the 0.3 px dilation", "antialias", "on", True),
     "no-antialias": _option("no such compensation", "antialias", "off", False),
-    "exposure": _option("an affine colour for each photo", "exposure", "on", True),
-    "no-exposure": _option("no such colour", "exposure", "off", False),
+    "even-light": _option(
+        "photos are brought to the light of those around", "exposure", "on", True, points=True
+    ),
+    "uneven-light": _option("photos keep their exposures", "exposure", "off", False),
     "no-random-background": Configuration(
         "white behind transparent photos",
         {"background": "white"},
@@ -91,6 +93,8 @@ CONFIGURATIONS = {
 """The switches by name. A name never changes its meaning, since measured rows refer to it."""
 
 TAKEN_OUT = {
+    "exposure": "an affine colour fitted for each photo",
+    "no-exposure": "no such colour",
     "absolute": "densification by absolute gradients (Ye et al. 2024)",
     "sky": "a far shell of Gaussians where photos show sky, and only there",
     "no-sky": "no such shell where photos show sky",

@@ -16,10 +16,10 @@ import torch
 from _rows import Row, origin, worked
 from torch import Tensor
 
-from _train import unequal
+from _train import bare
 from _train.configurations import revised
 from _train.rows import code_version
-from _train.scenes import UNEQUAL
+from _train.scenes import MADE
 from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline, sfm, synthetic
 from splatmill_worker.__main__ import return_freed_memory
@@ -28,8 +28,8 @@ from splatmill_worker.errors import ModelUnreadable, Refusal, TrainingFailed
 from splatmill_worker.images.load import load_views
 from splatmill_worker.scene import Normalization, Scene
 from splatmill_worker.sfm import posed
-from splatmill_worker.splat import ply
 from splatmill_worker.splat.evaluate import benchmark_background, evaluate
+from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.render import render
 from splatmill_worker.splat.report.report import plain
@@ -38,7 +38,17 @@ from splatmill_worker.splat.views import Target, TrainingView
 NAMED = (Refusal, TrainingFailed, sfm.SfmFailed)
 """Failures that are results of a benchmark. Any other exception is a fault of the program."""
 
-RESULT = ("psnr", "ssim", "mse", "train_psnr", "steps", "gaussians", "recoveries", "stopped")
+RESULT = (
+    "psnr",
+    "psnr_color_fitted",
+    "ssim",
+    "mse",
+    "train_psnr",
+    "steps",
+    "gaussians",
+    "recoveries",
+    "stopped",
+)
 
 PHOTOS = 40
 """Photos of the still life, as `make demo` takes them (640 x 480 pixels)."""
@@ -84,7 +94,7 @@ def measure(job: Row) -> Row:
         others = max(0.0, worked() - machine - cpu)
         report = json.loads((outcome.out / "report.json").read_text())
     result, seconds = report["result"], report["seconds"]
-    recovered = report["sfm"].get("seconds", {}) if report["facts"]["source"] == "sfm" else {}
+    recovered = report["sfm"].get("seconds", {})
     values = {
         "outcome": "trained" if result["failure"] is None else f"failed: {result['failure']}",
         **{name: result[name] for name in RESULT},
@@ -109,7 +119,7 @@ def judge(job: Row) -> Row:
     path = Path(job["model"])
     options = TrainOptions.model_validate(job["options"])
     try:
-        gaussians = ply.read(path)
+        gaussians = ply.read(path).gaussians
         scene = _posed(job, options)
         _, test = split_views(scene, options)
     except (ModelUnreadable, *NAMED) as failure:
@@ -163,11 +173,12 @@ def main(text: str) -> int:
 def _posed(job: Row, options: TrainOptions) -> Scene:
     """The posed scene of a capture. The still life is photographed first; recovered cameras are kept."""
     capture = Path(job["capture"])
-    if job["made"] and not (capture / "images").is_dir():
+    if job["made"] in bare.SCENES:
+        if not capture.is_dir():
+            bare.make(job["made"], capture, PHOTOS)
+    elif job["made"] and not (capture / "images").is_dir():
         part = capture / "images.part"
-        synthetic.capture(part, PHOTOS)
-        if job["made"] == UNEQUAL:
-            unequal.expose(part)
+        synthetic.capture(part, PHOTOS, light=MADE[job["made"]])
         part.rename(capture / "images")
     with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
         return posed_scene(capture, _with_cameras(Path(folder), job), options, _quiet, lambda: False)

@@ -8,6 +8,9 @@ from typing import Any
 
 from _data import FOLDERS, SHARED
 
+from _train import bare
+from splatmill_worker.synthetic import Light
+
 SIDE = 480
 """Longest side of the photos in pixels, small enough for a run of one minute to converge."""
 
@@ -24,15 +27,21 @@ class Scene:
     made: str | None = None
 
 
-KNOWN = ("fox", "lego", "lund", "kermit", "synthetic")
-"""Trained by default. fox and lego bring their cameras; those of lund, kermit and the still life are recovered once,
-then kept."""
+KNOWN = ("fox", "lego", "lund", "kermit", "synthetic", "beer", "snowmiku")
+"""Trained by default. fox, lego and beer bring their cameras; the others' are recovered once, then kept."""
 
-UNEQUAL = "unequal"
-MADE = ("synthetic", UNEQUAL)
-"""The built-in still life, and the same with a random exposure for each photo."""
+PLANTED = {
+    "unequal": Light(exposures=0.3),
+    "vignetted": Light(vignetting=0.4),
+    "tone-mapped": Light(exposures=0.1, tone=0.5),
+}
+"""The built-in still life as cameras show it that change its light: with a random exposure for each training photo,
+with darker corners, and with local tone mapping."""
 
-ALL = (*KNOWN, UNEQUAL)
+MADE = {"synthetic": None, **PLANTED}
+"""What the camera of each built-in scene makes of its light."""
+
+ALL = (*KNOWN, *PLANTED, *bare.SCENES)
 
 
 def named(text: str, work: Path) -> Scene:
@@ -41,6 +50,12 @@ def named(text: str, work: Path) -> Scene:
     Raises, with a sentence, ValueError for what is neither, and FileNotFoundError for shared data that is not there.
     """
     if text in MADE:
+        return Scene(text, work / text / "capture", made=text)
+    if text in bare.SCENES:
+        if not bare.available(text):
+            raise FileNotFoundError(
+                f"{text} is left out: fox is not in ../shared/data, and no part of the project."
+            )
         return Scene(text, work / text / "capture", made=text)
     if text in KNOWN:
         folder = SHARED / FOLDERS[text]

@@ -16,8 +16,8 @@ from torch import Tensor
 from splatmill.files import atomic_write, replacing
 from splatmill.schema import FitImageOptions, ModelCamera, ModelCameras
 from splatmill_worker.fit_image.plane import FitPoint
-from splatmill_worker.splat import ply
 from splatmill_worker.splat.evaluate import ViewScore, compare
+from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.machine import machine, peak_memory, versions
 from splatmill_worker.splat.picture import as_image
@@ -58,7 +58,7 @@ def write_results(
         f"one picture, seen from the origin along z, {_angle(camera.width, camera.fx)}",
     )
     ply.write(files[0], fitted, degree=DEGREE, comments=comments)
-    stored = ply.read(files[0])
+    stored = ply.read(files[0]).gaussians
     shown = render(stored, camera, background=torch.ones(3))
     score = compare(view.name, shown.color, view.full.over(torch.ones(3)))
     with replacing(files[1]) as part:

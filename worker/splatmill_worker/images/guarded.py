@@ -10,6 +10,7 @@ image list can name other files or addresses.
 from __future__ import annotations
 
 import fcntl
+import io
 import os
 import struct
 import threading
@@ -82,13 +83,25 @@ def opened(path: Path, name: str | None = None) -> Iterator[Image.Image]:
     with damage(name, "its header cannot be read"):
         image = _opened(path, name)
     with image:
-        if image.width * image.height > MAX_PHOTO_PIXELS:
+        _check_pixels(image, name)
+        yield image
+
+
+@contextmanager
+def opened_bytes(data: bytes, name: str, formats: tuple[str, ...]) -> Iterator[Image.Image]:
+    """Open a picture of one of Pillow's `formats` that is a part of another file; errors call it `name`.
+
+    Raises UnusablePicture when it is of another format, too large, or has a damaged header.
+    """
+    with damage(name, "its header cannot be read"):
+        try:
+            image = Image.open(io.BytesIO(data), formats=formats)
+        except UnidentifiedImageError as error:
             raise UnusablePicture(
-                "image_too_large",
-                name,
-                f"it has {image.width} x {image.height} pixels; at most {MAX_PHOTO_PIXELS // 10**6} million are "
-                "decoded",
-            )
+                "not_an_image", name, f"it is not a picture of the format {' or '.join(formats)}"
+            ) from error
+    with image:
+        _check_pixels(image, name)
         yield image
 
 
@@ -217,6 +230,15 @@ def _opened(path: Path, name: str) -> Image.Image:
             name,
             "it is not an image, or its format is not supported",
         ) from error
+
+
+def _check_pixels(image: Image.Image, name: str) -> None:
+    if image.width * image.height > MAX_PHOTO_PIXELS:
+        raise UnusablePicture(
+            "image_too_large",
+            name,
+            f"it has {image.width} x {image.height} pixels; at most {MAX_PHOTO_PIXELS // 10**6} million are decoded",
+        )
 
 
 def _check_frame(name: str, width: int, height: int) -> None:

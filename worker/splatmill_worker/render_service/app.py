@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import tempfile
 import traceback
 from collections.abc import Awaitable, Callable
@@ -24,7 +25,18 @@ from starlette.routing import Route
 
 from splatmill.backplane import layout, rendering
 from splatmill.backplane.storage import Storage, StorageError
-from splatmill.schema import PROBLEM_MEDIA_TYPE, ModelCameras, OrbitRequest, Problem, RenderRequest
+from splatmill.schema import (
+    CONVERSION_HEADER,
+    DOWNLOADS,
+    EDIT_HEADER,
+    PROBLEM_MEDIA_TYPE,
+    ConversionRequest,
+    EditModel,
+    ModelCameras,
+    OrbitRequest,
+    Problem,
+    RenderRequest,
+)
 from splatmill_worker.errors import ModelNotFound, ModelUnreadable
 from splatmill_worker.render_service.model_cache import LoadedModel, ModelCache
 from splatmill_worker.render_service.render_queue import ClientGone, QueueFull, RenderQueue
@@ -46,6 +58,13 @@ _ENCODING_VERSION = b"1"
 Body = TypeVar("Body", bound=BaseModel)
 
 
+class FormatUnknown(Exception):
+    """The model was to be converted to a format that is not written."""
+
+    def __init__(self, key: str) -> None:
+        super().__init__(f"There is no format {key[:40]!r}. Those that are: {', '.join(DOWNLOADS)}.")
+
+
 class RenderApp:
     """The endpoints for the models of one storage.
 
@@ -56,6 +75,7 @@ class RenderApp:
 
     def __init__(self, storage: Storage, cache_bytes: int, backend: str | None = None) -> None:
         self._storage = storage
+        self._backend = backend
         self._cache = ModelCache(storage, cache_bytes, backend)
         self._queue = RenderQueue(MAX_WAITING)
 
@@ -66,6 +86,8 @@ class RenderApp:
                 Route(rendering.HEALTH, self.health),
                 Route(rendering.render_path("{model_id}"), self.render, methods=["POST"]),
                 Route(rendering.orbit_path("{model_id}"), self.orbit, methods=["POST"]),
+                Route(rendering.convert_path("{model_id}"), self.convert, methods=["POST"]),
+                Route(rendering.edits_path("{model_id}"), self.edit, methods=["POST"]),
             ]
         )
 
@@ -80,6 +102,14 @@ class RenderApp:
     async def orbit(self, request: Request) -> Response:
         """Respond with a video."""
         return await self._respond(request, OrbitRequest, self._video)
+
+    async def convert(self, request: Request) -> Response:
+        """Respond with the model in another file format."""
+        return await self._respond(request, ConversionRequest, self._converted)
+
+    async def edit(self, request: Request) -> Response:
+        """Respond with an edited model."""
+        return await self._respond(request, EditModel, self._edited)
 
     async def _respond(
         self,
@@ -103,9 +133,11 @@ class RenderApp:
             return _problem_response(error.problem())
         except ModelUnreadable as error:
             advice = f"Restart the job {model_id}."
-            return _problem_response(Problem.of(error.code, error.message, advice=advice))
+            return _problem_response(Problem.of(error.code, error.message.rstrip(".") + ".", advice=advice))
         except ClientGone:
             return Response(status_code=CLIENT_GONE)
+        except FormatUnknown as error:
+            return _problem_response(Problem.of("format_unknown", str(error)))
         except QueueFull:
             problem = Problem.of(
                 "renderer_unavailable",
@@ -167,6 +199,64 @@ class RenderApp:
             raise
         remove = BackgroundTask(path.unlink, missing_ok=True)
         return FileResponse(path, media_type="video/mp4", headers=headers, background=remove)
+
+    async def _converted(
+        self, request: Request, model_id: str, body: ConversionRequest, headers: dict[str, str]
+    ) -> Response:
+        """Convert, then compare picture by picture, so that images can be rendered in between."""
+        from splatmill_worker.render_service import conversion
+
+        form = DOWNLOADS.get(body.format)
+        if form is None:
+            raise FormatUnknown(body.format)
+        model = await self._queue.run(lambda: self._cache.get(model_id), request.is_disconnected)
+        folder = Path(await run_in_threadpool(tempfile.mkdtemp, prefix="splatmill-convert-"))
+        try:
+            path, back, record = await self._queue.run(
+                partial(conversion.convert, model, form, folder), request.is_disconnected
+            )
+            views, what = await run_in_threadpool(conversion.pictures_of, self._storage, model_id)
+            behind = await run_in_threadpool(conversion.background_of, self._storage, model_id)
+            scores = [
+                await self._queue.run(
+                    partial(conversion.score, self._storage, model, back, view, behind),
+                    request.is_disconnected,
+                )
+                for view in (views if form.readable else [])
+            ]
+            record = conversion.with_scores(record, scores, what)
+        except BaseException:
+            await run_in_threadpool(shutil.rmtree, folder, ignore_errors=True)
+            raise
+        remove = BackgroundTask(shutil.rmtree, folder, ignore_errors=True)
+        return FileResponse(
+            path,
+            media_type=form.media_type,
+            headers={CONVERSION_HEADER: record.model_dump_json()},
+            background=remove,
+        )
+
+    async def _edited(
+        self, request: Request, model_id: str, body: EditModel, headers: dict[str, str]
+    ) -> Response:
+        from splatmill_worker.render_service.edit import NothingLeft, edit
+
+        try:
+            edited, path = await self._queue.run(
+                lambda: edit(self._storage, model_id, body, self._backend), request.is_disconnected
+            )
+        except NothingLeft:
+            problem = Problem.of(
+                "invalid_request",
+                "The edit leaves no Gaussian of the model.",
+                advice="Choose a larger box, a lower opacity or a larger size.",
+            )
+            return _problem_response(problem)
+        headers = {EDIT_HEADER: edited.model_dump_json()}
+        if path is None:
+            return Response(headers=headers)
+        remove = BackgroundTask(path.unlink, missing_ok=True)
+        return FileResponse(path, media_type="application/octet-stream", headers=headers, background=remove)
 
     def _orbit_cameras(self, model: LoadedModel, body: OrbitRequest) -> list[Camera]:
         from splatmill_worker.render_service.orbit import orbit_cameras

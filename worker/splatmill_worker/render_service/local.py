@@ -1,4 +1,4 @@
-"""Pictures and videos of a `.ply` on this machine, without a server: the programs `render-file` and `orbit-file`."""
+"""Pictures and videos of a model file, without a server: the programs `render-file` and `orbit-file`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from splatmill_worker.film import Film
 from splatmill_worker.render_service.encoding import render_frame, render_image
 from splatmill_worker.render_service.model_cache import LoadedModel, antialias_of
 from splatmill_worker.render_service.orbit import DEFAULT_FOV, Float, orbit_cameras, path_around
-from splatmill_worker.splat import ply
+from splatmill_worker.splat.formats import registry
+from splatmill_worker.splat.formats.contents import Contents
 
 UNWRITABLE, REFUSED, STOPPED = 1, 5, 130
 """Exit statuses, those of the command line: a file cannot be read or written; the model cannot be used; Ctrl-C."""
@@ -59,7 +61,7 @@ def main(chosen: argparse.Namespace) -> int:
 
 
 def render_file(model: Path, out: Path, request: dict[str, Any], width: int | None, up: str) -> None:
-    """Render an image of the `.ply` at `model` and write it to `out`.
+    """Render an image of the model file `model` and write it to `out`.
 
     request: the fields of RenderRequest. Without a camera, the image shows the whole model from the side.
     width: width in pixels of an image without a camera.
@@ -74,7 +76,7 @@ def render_file(model: Path, out: Path, request: dict[str, Any], width: int | No
 
 
 def orbit_file(model: Path, out: Path, request: OrbitRequest, cameras: Path | None, up: str) -> None:
-    """Render a video that circles the `.ply` at `model` and write it to `out`.
+    """Render a video that circles the model file `model` and write it to `out`.
 
     cameras: the cameras.json of the model, whose positions the path is fitted to; None gives a circle with `up`.
 
@@ -93,13 +95,23 @@ def orbit_file(model: Path, out: Path, request: OrbitRequest, cameras: Path | No
 
 
 def load(model: Path) -> LoadedModel:
-    """Return the model in a `.ply`. A report.json beside it says whether it is to be rendered with antialiasing."""
-    gaussians = ply.read(model)
-    if not gaussians.count:
+    """Return the model in a file of any readable format. Raises ModelUnreadable, and FileNotFoundError."""
+    contents = read(model)
+    return LoadedModel(str(model), "", contents.gaussians, bool(contents.antialiased), 0)
+
+
+def read(model: Path) -> Contents:
+    """Return what a file of any readable format holds, at least one Gaussian, and whether it was antialiased.
+
+    Where its format does not say so, a report.json beside it does. Raises ModelUnreadable, and FileNotFoundError.
+    """
+    contents = registry.read(model)
+    if not contents.gaussians.count:
         raise ModelUnreadable(f"{model.name} has no Gaussians with finite values.")
+    if contents.antialiased is not None:
+        return contents
     report = model.with_name("report.json")
-    antialias = antialias_of(report.read_bytes()) if report.is_file() else False
-    return LoadedModel(str(model), "", gaussians, antialias, 0)
+    return replace(contents, antialiased=antialias_of(report.read_bytes()) if report.is_file() else False)
 
 
 def overview(model: LoadedModel, width: int, up: Float) -> CameraSpec:

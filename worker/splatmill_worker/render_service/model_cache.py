@@ -28,6 +28,7 @@ class LoadedModel:
     antialias: whether it was trained with compensation for the pixel filter, and must be rendered with it.
     bytes: memory of its parameters.
     backend: the kernels that render it; None means those of the parameters' device.
+    offset: world = model + offset, as in splat.formats.contents.
     """
 
     id: str
@@ -36,6 +37,7 @@ class LoadedModel:
     antialias: bool
     bytes: int
     backend: str | None = None
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class ModelCache:
@@ -82,20 +84,22 @@ class ModelCache:
             return model
 
     def _load(self, model_id: str, etag: str) -> LoadedModel:
-        from splatmill_worker.splat import ply
+        from splatmill_worker.splat.formats import ply
 
         path = layout.model_file(model_id, "model.ply")
         local = self._storage.local_path(path)
         if local is not None:
-            gaussians = ply.read(local)
+            contents = ply.read(local)
         else:
             with tempfile.TemporaryDirectory(prefix="splatmill-model-") as folder:
                 self._storage.download(path, Path(folder) / "model.ply")
-                gaussians = ply.read(Path(folder) / "model.ply")
+                contents = ply.read(Path(folder) / "model.ply")
+        gaussians = contents.gaussians
         if self._backend == "gpu":
             gaussians = gaussians.map(lambda tensor: tensor.cuda())
         size = sum(t.numel() * t.element_size() for t in gaussians)
-        return LoadedModel(model_id, etag, gaussians, self._antialias(model_id), size, self._backend)
+        antialias = self._antialias(model_id)
+        return LoadedModel(model_id, etag, gaussians, antialias, size, self._backend, contents.offset)
 
     def _antialias(self, model_id: str) -> bool:
         """Return what the plan in the model's report says of antialiasing; False without a report or a plan."""

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Entry, Storage
+from splatmill.schema import TIME_LAPSE
 from splatmill_worker.errors import CaptureIncomplete, FolderInUse, StartNotStored
 from splatmill_worker.service.disk_reserve import shortage
 from splatmill_worker.service.own_copy import link_or_copy
@@ -26,8 +27,9 @@ from splatmill_worker.settings import work_folder
 LOCK_SECONDS = 10.0
 """Seconds to wait for the folder's lock, which a process that is being killed still holds for a moment."""
 
-START, FILM, CHECKPOINTS = "start.ply", "film", "checkpoints"
-"""Names in the run folder: the model to start from, the frames of the progress film, and the checkpoints."""
+START, FILM, CHECKPOINTS, SNAPSHOTS = "start.ply", "film", "checkpoints", TIME_LAPSE
+"""Names in the run folder: the model to start from, the frames of the progress film, the checkpoints, and the snapshots
+of the time-lapse."""
 
 _CAMERAS = "sfm"
 
@@ -109,8 +111,8 @@ class JobFolder:
     def restore(self) -> list[str]:
         """Download the files that an attempt on another machine stored, if this machine has none. Return their names.
 
-        Without a checkpoint the training starts anew, so film frames of the earlier training are first deleted from
-        storage.
+        Without a checkpoint the training starts anew, so film frames and snapshots of the earlier training are first
+        deleted from storage.
         """
         if self.storage.root is not None:
             return []
@@ -121,7 +123,8 @@ class JobFolder:
         else:
             resumes = any(True for _ in self.storage.entries(f"{stored}/{CHECKPOINTS}"))
         if not resumes:
-            self.storage.delete_prefix(f"{stored}/{FILM}")
+            for name in (FILM, SNAPSHOTS):
+                self.storage.delete_prefix(f"{stored}/{name}")
         return [] if own else self.storage.download_prefix(stored, self.run)
 
     def close(self) -> None:

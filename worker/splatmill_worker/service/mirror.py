@@ -6,12 +6,12 @@ from pathlib import Path
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import StorageError
-from splatmill_worker.service.job_folder import CHECKPOINTS, FILM, START, JobFolder
+from splatmill_worker.service.job_folder import CHECKPOINTS, FILM, SNAPSHOTS, START, JobFolder
 
 INTERVAL = 15.0
 """Seconds between two copies. A checkpoint written less than this before the machine fails may be lost."""
 
-MIRRORED = (START, CHECKPOINTS, "plan.json", "stages.json", FILM)
+MIRRORED = (START, CHECKPOINTS, "plan.json", "stages.json", FILM, SNAPSHOTS)
 """Files and folders of `run` that are copied. The recovered cameras are not among them: `sfm_cache` stores those."""
 
 

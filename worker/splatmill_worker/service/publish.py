@@ -25,6 +25,12 @@ def is_published(storage: Storage, attempt: Attempt) -> bool:
     return isinstance(record, dict) and record.get("generation") == attempt.generation
 
 
+def _in_folders(out: Path) -> list[str]:
+    """Return the names of the files in the folders of a model."""
+    found = (path.relative_to(out).as_posix() for path in sorted(out.glob("*/*")))
+    return [name for name in found if layout.model_media_type(name) is not None]
+
+
 def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path) -> None:
     """Store the files of the pipeline's `out` folder as the job's model.
 
@@ -36,7 +42,12 @@ def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path) -> None:
         raise FileNotFoundError(f"The pipeline ended without writing {out / 'model.ply'}.")
     storage.delete(layout.job_record(attempt.job_id))
     digests: dict[str, str] = {}
-    for name in layout.MODEL_FILES:
+    names = [*layout.MODEL_FILES, *_in_folders(out)]
+    for entry in storage.entries(layout.model(attempt.job_id)):
+        name = entry.path.removeprefix(layout.model(attempt.job_id) + "/")
+        if "/" in name and name not in names:
+            storage.delete(entry.path)  # of an earlier generation that had more of them
+    for name in names:
         path = out / name
         if name != _RECORD and path.is_file():
             storage.put(layout.model_file(attempt.job_id, name), path)

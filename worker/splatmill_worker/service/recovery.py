@@ -13,7 +13,7 @@ from typing import Any, cast
 import redis
 from rq import Worker
 from rq.executions import Execution
-from rq.worker_registration import get_keys
+from rq.worker_registration import REDIS_WORKER_KEYS, get_keys
 
 from splatmill.backplane import keys, leases, lines, workers
 from splatmill.backplane.entries import split_rq_id
@@ -32,8 +32,14 @@ def process_fields() -> dict[str, str]:
 
 
 def is_recorded(worker: Worker) -> bool:
-    """Return whether the worker's record is still there. It expires while Redis cannot be reached."""
-    return bool(worker.connection.hexists(worker.key, _PROCESS_FIELD))
+    """Return whether the worker's record is there and listed.
+
+    The record expires while Redis cannot be reached; another worker that cleans the list then takes it off.
+    """
+    with worker.connection.pipeline(transaction=False) as pipe:
+        pipe.hexists(worker.key, _PROCESS_FIELD)
+        pipe.sismember(REDIS_WORKER_KEYS, worker.key)
+        return all(pipe.execute())
 
 
 def hand_back(worker: Worker, lease: Lease) -> None:

@@ -20,13 +20,14 @@ from splatmill.backplane import row as rows
 from splatmill.backplane.fold import fold
 from splatmill.backplane.row import JobRow
 from splatmill.backplane.storage import Storage, StorageError
-from splatmill.schema import Event, JobState, LogEvent, PreviewEvent, StateEvent, TrainOptions
+from splatmill.schema import CamerasEvent, Event, JobState, LogEvent, PreviewEvent, StateEvent, TrainOptions
 from splatmill_worker.errors import EmptyCapture
 from splatmill_worker.service import hand_back, publish, sfm_cache
 from splatmill_worker.service.attempt import LONGEST_MESSAGE, Attempt
 from splatmill_worker.service.disk_reserve import DiskWatch
 from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.job_folder import JobFolder
+from splatmill_worker.service.live_view import LiveView
 from splatmill_worker.service.lock import LockState
 from splatmill_worker.service.mirror import Mirror
 from splatmill_worker.service.outbox import Outbox
@@ -52,9 +53,26 @@ class PipelineResult(Protocol):
     def ended(self) -> str: ...
 
 
-Pipeline = Callable[[Path, Path, TrainOptions, Callable[[Event], None], Callable[[], bool]], PipelineResult]
-"""Arguments: the capture folder, the run folder, the options, a function that takes each event, and a function that
-returns whether to stop."""
+class Pipeline(Protocol):
+    """What does the work of an attempt.
+
+    capture, workdir: the capture folder and the run folder.
+    emit: takes each event.
+    cancelled: returns whether to stop.
+    onlookers: those who look at the job through the API.
+    """
+
+    def __call__(
+        self,
+        capture: Path,
+        workdir: Path,
+        options: TrainOptions,
+        emit: Callable[[Event], None],
+        cancelled: Callable[[], bool],
+        *,
+        onlookers: LiveView,
+    ) -> PipelineResult: ...
+
 
 log = logging.getLogger("splatmill_worker")
 
@@ -118,7 +136,7 @@ def _train_and_publish(attempt: Attempt, row: JobRow, storage: Storage, outbox: 
     folder = JobFolder(storage, attempt.job_id, row.capture)
     disk = DiskWatch()
     try:
-        _train(row, folder, disk, outbox)
+        _train(attempt, row, folder, disk, outbox)
     except Exception as error:
         # Native code reports a full disk in many ways; the watch knows better.
         if disk.error is not None and not hand_back.requested():
@@ -132,7 +150,7 @@ def _train_and_publish(attempt: Attempt, row: JobRow, storage: Storage, outbox: 
     folder.remove()
 
 
-def _train(row: JobRow, folder: JobFolder, disk: DiskWatch, outbox: Outbox) -> None:
+def _train(attempt: Attempt, row: JobRow, folder: JobFolder, disk: DiskWatch, outbox: Outbox) -> None:
     """Stage the capture and run the pipeline to its end. Raises HandedBack, DiskReserveReached and its errors."""
     if disk.error is not None:
         raise disk.error
@@ -147,6 +165,7 @@ def _train(row: JobRow, folder: JobFolder, disk: DiskWatch, outbox: Outbox) -> N
     if row.options.start_model is not None:
         folder.stage_start(row.options.start_model)
     mirror = Mirror(folder, log.warning)
+    live = LiveView(attempt, outbox.put)
     try:
         # Not imported by the worker that forks this process: numpy and the decoders start threads.
         from splatmill_worker.images import decoders
@@ -160,6 +179,7 @@ def _train(row: JobRow, folder: JobFolder, disk: DiskWatch, outbox: Outbox) -> N
                 row.options,
                 lambda event: _forward(event, folder, outbox),
                 lambda: hand_back.requested() or disk.error is not None,
+                onlookers=live,
             )
     except BaseException as error:
         mirror.close(copy=hand_back.requested())
@@ -167,6 +187,8 @@ def _train(row: JobRow, folder: JobFolder, disk: DiskWatch, outbox: Outbox) -> N
         if isinstance(error, Exception) and not stopped and not keeps_progress(error):
             folder.reset()
         raise
+    finally:
+        live.close()
     ended_early = result.ended == "cancelled"
     mirror.close(copy=ended_early)
     if ended_early:
@@ -176,7 +198,8 @@ def _train(row: JobRow, folder: JobFolder, disk: DiskWatch, outbox: Outbox) -> N
 def _forward(event: Event, folder: JobFolder, outbox: Outbox) -> None:
     """Send an event of the pipeline, and store the files that belong to it.
 
-    A preview is stored before it is announced. When training begins, the recovered cameras are stored for other jobs.
+    A preview and a placement of cameras are stored before they are announced. When training begins, the recovered
+    cameras are stored for other jobs.
     Final states are dropped: the service reports them once the model is stored.
     """
     if isinstance(event, StateEvent) and event.state.final:
@@ -189,6 +212,14 @@ def _forward(event: Event, folder: JobFolder, outbox: Outbox) -> None:
             outbox.put(LogEvent(level="warning", message=f"A preview could not be stored: {error}"))
             return
         event = PreviewEvent(path=target, step=event.step)
+    if isinstance(event, CamerasEvent):
+        target = layout.job_cameras(folder.job_id)
+        try:
+            folder.storage.put(target, (folder.run / event.path).read_bytes())
+        except (StorageError, OSError) as error:
+            outbox.put(LogEvent(level="warning", message=f"The cameras to show could not be stored: {error}"))
+            return
+        event = event.model_copy(update={"path": target})
     outbox.put(event)
     if isinstance(event, StateEvent) and event.state is JobState.training:
         try:

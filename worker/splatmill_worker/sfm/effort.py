@@ -238,6 +238,7 @@ def _map(run: SfmRun, result: EffortResult) -> mapper.Mapped:
                 run.options.seed,
                 relaxed=relaxed,
                 on_progress=lambda done, total: run.on_progress("mapping", done, total, "photos registered"),
+                on_model=run.show,
                 cancelled=run.cancelled,
             )
             rank = registered_counts(mapped)

@@ -77,6 +77,7 @@ def _with_plausible_intrinsics(
             run.options.seed,
             fixed_intrinsics=True,
             on_progress=lambda done, total: run.on_progress("mapping", done, total, "photos registered"),
+            on_model=run.show,
             cancelled=run.cancelled,
         )
     least = checks.min_registered(run.count)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import torch
 
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.prepare import Prepared
 from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.sfm.cameras import CameraGroup
@@ -20,6 +21,7 @@ from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching.pairs import Pair
 from splatmill_worker.sfm.matching.two_view import TwoView
 from splatmill_worker.sfm.options import Effort, SfmOptions
+from splatmill_worker.sfm.placed import PlacingObserver, placed
 
 VERSION = 4
 """Version of everything that is cached; a cache with another version is not read."""
@@ -57,6 +59,7 @@ class SfmRun:
     threads: number of CPU threads.
     pool: with that many threads.
     on_progress, cancelled: the caller's callbacks.
+    observer: looks at the mapping; None: nobody does.
     scores: number of preemptive matches of each candidate pair; empty until some effort needs them.
     seconds: time spent so far, by stage.
     notes: sentences for the user.
@@ -76,11 +79,17 @@ class SfmRun:
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     best_mapper: mapper.Mapper | None = None
+    observer: PlacingObserver | None = None
 
     @property
     def count(self) -> int:
         """Number of photos."""
         return len(self.prepared.photos)
+
+    def show(self, model: pycolmap.Reconstruction) -> None:
+        """Let the observer look at the model that a mapper works on, where it wants to."""
+        if self.observer is not None and self.observer.is_due():
+            self.observer.observe(lambda: placed(model, [photo.name for photo in self.prepared.photos]))
 
     @contextmanager
     def clock(self, stage: str) -> Iterator[None]:

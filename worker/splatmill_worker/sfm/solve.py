@@ -22,6 +22,7 @@ from splatmill_worker.sfm.effort import ENOUGH_REGISTERED, registered_counts, so
 from splatmill_worker.sfm.final_model import final_model
 from splatmill_worker.sfm.model_store import is_stored, load_model, store_model
 from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions, fitted
+from splatmill_worker.sfm.placed import PlacingObserver
 from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest, torch_threads
 
 log = logging.getLogger("splatmill_worker")
@@ -34,6 +35,7 @@ def reconstruct(
     options: SfmOptions,
     on_progress: OnProgress,
     cancelled: Callable[[], bool],
+    observer: PlacingObserver | None = None,
 ) -> Scene:
     """Recover the cameras of the photos under `images`, and of those in its videos and zips.
 
@@ -43,13 +45,14 @@ def reconstruct(
     on_progress: called with the stages images, features, pairs, matching, mapping and, where points are few, stereo.
     cancelled: polled; Cancelled is raised within a fraction of a second of it turning true, except that the global
         mapper and a bundle adjustment that are running finish first.
+    observer: looks at the cameras and points while the incremental mapper places them.
 
     Raises SfmFailed with facts and advice when no usable model is found, and Cancelled.
     """
     prepared = prepare(
         images, masks, workdir, frames=options.frames, on_progress=on_progress, cancelled=cancelled
     )
-    return reconstruct_photos(prepared, workdir, options, on_progress, cancelled)
+    return reconstruct_photos(prepared, workdir, options, on_progress, cancelled, observer)
 
 
 def reconstruct_photos(
@@ -58,6 +61,7 @@ def reconstruct_photos(
     options: SfmOptions,
     on_progress: OnProgress = lambda stage, done, total, note: None,
     cancelled: Callable[[], bool] = lambda: False,
+    observer: PlacingObserver | None = None,
 ) -> Scene:
     """`reconstruct` for photos that `images.prepare` has examined."""
     _require_photos(prepared)
@@ -78,6 +82,7 @@ def reconstruct_photos(
     # Several pairs are matched at the same time, so that each torch call gets one thread.
     with ThreadPoolExecutor(threads) as pool, torch_threads(1):
         run = SfmRun(prepared, groups, model, options, folder, threads, pool, on_progress, cancelled)
+        run.observer = observer
         store_model(run, final_model(run, _solve(run)), stored)
     return load_model(prepared, stored)
 

@@ -1,18 +1,22 @@
-"""How close rendered views are to photos: PSNR and SSIM."""
+"""How close rendered views are to photos: PSNR, PSNR after a fit of the colours, and SSIM."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.splat.views import Target, TrainingView
+from splatmill_worker.splat.color_fit import color_fitted
 
-Renderer = Callable[[Target, Tensor], Tensor]
+if TYPE_CHECKING:  # the renderer compares pictures without what reads photos
+    from splatmill_worker.splat.views import Target, TrainingView
+
+Renderer = Callable[["Target", Tensor], Tensor]
 """Renders colour [H, W, 3] of a target's camera over a background [3]."""
 
 
@@ -24,12 +28,15 @@ class ViewScore:
     mse: mean squared error of colours in 0 to 1.
     psnr: dB.
     ssim: structural similarity (Wang et al. 2004), 1 for identical images.
+    psnr_color_fitted: dB, after the affine map of the rendered colours that fits the photo best. How far it lies above
+        `psnr` is what exposure and white balance cost; it uses the photo, and is no score to compare methods by.
     """
 
     name: str
     mse: float
     psnr: float
     ssim: float
+    psnr_color_fitted: float
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,11 @@ class Score:
     def psnr(self) -> float:
         """Mean over the views, dB."""
         return sum(view.psnr for view in self.views) / len(self.views)
+
+    @property
+    def psnr_color_fitted(self) -> float:
+        """Mean over the views of the PSNR after the fit of each view's colours, dB."""
+        return sum(view.psnr_color_fitted for view in self.views) / len(self.views)
 
     @property
     def ssim(self) -> float:
@@ -75,16 +87,20 @@ def compare(name: str, color: Tensor, photo: Tensor, mask: Tensor | None = None)
     """
     image = color.detach().float().clamp(0.0, 1.0)
     truth = photo.to(image.device).float() / 255.0
-    squares = (image - truth).square().mean(dim=2)
     counted = mask.to(image.device) if mask is not None and bool(mask.any()) else None
-    if counted is not None:
-        squares = squares[counted]
+    shown = image.reshape(-1, 3) if counted is None else image[counted]
+    wanted = truth.reshape(-1, 3) if counted is None else truth[counted]
     # The kernels' SSIM, which the loss is made of: a curve is evaluated every few seconds, and plain torch is too slow.
     similarity = 1.0 - float(
         ops.loss(image, photo.to(image.device).contiguous(), mask=counted, dssim_weight=1.0)
     )
-    mse = float(squares.double().mean())
-    return ViewScore(name, mse, psnr(mse), similarity)
+    mse = _mse(shown, wanted)
+    fitted = _mse(color_fitted(shown, wanted), wanted)
+    return ViewScore(name, mse, psnr(mse), similarity, psnr(fitted))
+
+
+def _mse(image: Tensor, truth: Tensor) -> float:
+    return float((image - truth).square().mean(dim=1).double().mean())
 
 
 def psnr(mse: float) -> float:

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from splatmill_worker.images.load import Photo
 from splatmill_worker.scene import Camera, Normalization
+
+Float = npt.NDArray[np.float64]
+
+CLIPPED = 254
+"""Grey levels of 255 from which a value may have been clipped."""
+
+NEGLIGIBLE = 0.02
+"""Share by which a clipped value may become darker and still count."""
 
 
 class Target(NamedTuple):
@@ -62,11 +72,30 @@ class TrainingView:
         """The photo at full training resolution."""
         return self.levels[1]
 
+    def relit(self, exposure: Float) -> TrainingView:
+        """The view as it would be with an exposure of 1: values over exp(`exposure`) [3], of red, green and blue.
+
+        Pixels that the photo clips, and whose values are known from below alone, count no longer where they would
+        become darker.
+        """
+        factors = torch.exp(-torch.from_numpy(np.asarray(exposure, dtype=np.float32)))
+        target = self.full
+        rgb = (target.rgb.float() * factors + 0.5).clamp(0.0, 255.0).to(torch.uint8)
+        known = ((target.rgb < CLIPPED) | (factors >= 1.0 - NEGLIGIBLE)).all(dim=2)
+        mask = known if target.mask is None else known & target.mask
+        return replace(self, levels={1: target._replace(rgb=rgb, mask=None if bool(mask.all()) else mask)})
+
     def reduced(self, factor: int) -> Target:
         """The photo with both sides divided by `factor`, averaged over area, but no side under one pixel."""
         if factor not in self.levels:
             self.levels[factor] = _reduced(self.full, factor)
         return self.levels[factor]
+
+    def forget_reduced(self) -> None:
+        """Free the reduced photos; `reduced` makes them again where they are asked for."""
+        full = self.full
+        self.levels.clear()
+        self.levels[1] = full
 
 
 def _target(camera: Camera, rgb: Tensor, alpha: Tensor | None, mask: Tensor | None) -> Target:

@@ -1,5 +1,6 @@
 """A built-in still life with exact cameras: the demo's capture, and ground truth for tests and benchmarks."""
 
+from splatmill_worker.synthetic.light import Light
 from splatmill_worker.synthetic.ray_caster import StillLife, capture, look_at, orbit, photograph, still_life
 
-__all__ = ["StillLife", "capture", "look_at", "orbit", "photograph", "still_life"]
+__all__ = ["Light", "StillLife", "capture", "look_at", "orbit", "photograph", "still_life"]

@@ -61,33 +61,40 @@ from pathlib import Path
 from splatmill_worker.sfm.posed import model_files
 used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + 2**28, used + 2**28))
-try:
-    model_files.read(Path(sys.argv[1]))
-except ValueError as error:
-    print(error)
+for folder in sys.argv[1:]:
+    try:
+        model_files.read(Path(folder))
+    except ValueError as error:
+        print(error)
 """
 
 HUGE = struct.pack("<Q", 1 << 50)
 
+BEYOND = [
+    ("cameras", HUGE),
+    ("images", HUGE),
+    ("points3D", HUGE),
+    ("points3D", models.point_with_track(1 << 40)),
+    ("images", models.image_with_points(1 << 40)),
+    ("images", b"\x01"),
+    ("cameras", models.binary()["cameras"][:-4]),
+]
+"""A file of a model, and bytes whose counts announce more than follows."""
 
-@pytest.mark.parametrize(
-    ("file", "content"),
-    [
-        ("cameras", HUGE),
-        ("images", HUGE),
-        ("points3D", HUGE),
-        ("points3D", models.point_with_track(1 << 40)),
-        ("images", models.image_with_points(1 << 40)),
-        ("images", b"\x01"),
-        ("cameras", models.binary()["cameras"][:-4]),
-    ],
-)
-def test_counts_beyond_the_file_cost_no_memory(tmp_path: Path, file: str, content: bytes) -> None:
-    binary(tmp_path, **{file: content})
+
+def test_counts_beyond_the_file_cost_no_memory(tmp_path: Path) -> None:
+    """One process reads them all, with 256 MiB to spare."""
+    folders = [tmp_path / str(index) for index in range(len(BEYOND))]
+    for folder, (file, content) in zip(folders, BEYOND, strict=True):
+        folder.mkdir()
+        binary(folder, **{file: content})
     done = subprocess.run(
-        [sys.executable, "-c", LOAD, str(tmp_path)], capture_output=True, text=True, timeout=120, check=True
+        [sys.executable, "-c", LOAD, *folders], capture_output=True, text=True, timeout=120, check=True
     )
-    assert done.stdout.startswith(f"{file}.bin could not be read: it announces"), done.stdout
+    said = done.stdout.splitlines()
+    assert len(said) == len(BEYOND), done.stdout
+    for line, (file, _) in zip(said, BEYOND, strict=True):
+        assert line.startswith(f"{file}.bin could not be read: it announces")
 
 
 @pytest.mark.parametrize(

@@ -45,15 +45,24 @@ def test_the_background_is_random_unless_few_photos_are_opaque(
     assert ("alpha" in plan.left_out) == (transparent == 0)
 
 
-def test_exposures_are_fitted_where_brightness_or_white_balance_differ() -> None:
-    assert planned(changed(exposure_spread=0.3)).exposure
-    assert "30 % in brightness" in planned(changed(exposure_spread=0.3)).reasons["exposure"]
-    assert planned(changed(tint_spread=0.2)).exposure
-    assert "20 % in white balance" in planned(changed(tint_spread=0.2)).reasons["exposure"]
-    assert not planned().exposure
-    assert "2.0 %" in planned().left_out["exposure"]
-    # The tint alone says nothing where exposures could not be compared.
-    assert not planned(changed(exposure_spread=None, tint_spread=0.2)).exposure
+def test_light_is_evened_where_one_photo_in_ten_departs_from_those_around_it() -> None:
+    departing = planned(changed(light_tail=0.3))
+    assert departing.exposure
+    assert "30.0 % or more" in departing.reasons["exposure"]
+    # A spread that the photos around predict is left to the colours of the scene.
+    assert not planned(changed(exposure_spread=0.4)).exposure
+    assert "1.0 %" in planned().left_out["exposure"]
+    uncertain = planned(changed(light_tail=0.3, light_error=0.11))
+    assert not uncertain.exposure
+    assert "error of 11.0 %" in uncertain.left_out["exposure"]
+    assert not planned(changed(light_tail=float("nan"))).exposure
+
+
+def test_light_that_cannot_be_compared_is_not_evened_on_demand() -> None:
+    assert "cannot be compared" in planned(changed(light_tail=None)).left_out["exposure"]
+    with pytest.raises(ValueError, match="points that several photos show"):
+        planned(changed(light_tail=None), exposure="on")
+    assert not planned(changed(light_tail=None), exposure="off").exposure
 
 
 def test_gaussians_are_antialiased_where_distances_differ() -> None:

@@ -29,7 +29,9 @@ from tests.support.training import plan
 def trained(psnrs: list[float], held_out: bool) -> Trained:
     """A result whose training views have these PSNRs."""
     views = still_life.training_views()[: len(psnrs)]
-    scores = tuple(ViewScore(view.name, 0.01, psnr, 0.9) for view, psnr in zip(views, psnrs, strict=True))
+    scores = tuple(
+        ViewScore(view.name, 0.01, psnr, 0.9, psnr + 2.0) for view, psnr in zip(views, psnrs, strict=True)
+    )
     nothing = torch.zeros(0, 3)
     return Trained(
         gaussians=Gaussians(nothing, nothing, torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, 1, 3)),
@@ -90,6 +92,16 @@ def test_the_stages_the_offset_and_the_headline_are_those_of_the_run(tmp_path: P
     assert "25.00 dB on training photos, none were held out; 5 Gaussians after 20 steps" in page
     assert "Training ended because the budget is spent." in page
     assert (tmp_path / "report.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_light_is_told_apart_from_shape(tmp_path: Path) -> None:
+    report = report_of(tmp_path, trained([30.0, 20.0], held_out=True))
+    assert (report["result"]["psnr"], report["result"]["psnr_color_fitted"]) == (30.0, 32.0)
+    assert report["result"]["train_psnr_color_fitted"] == 27.0
+    assert [row["psnr_color_fitted"] for row in report["views"]] == [32.0, 32.0, 22.0]
+    page = (tmp_path / "report.html").read_text()
+    assert "30.00 dB on held-out photos (32.00 dB with colours fitted, SSIM 0.900)" in page
+    assert "<td class=n>30.00</td><td class=n>32.00</td>" in page
 
 
 def test_json_gets_plain_values() -> None:

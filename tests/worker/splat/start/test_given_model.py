@@ -19,7 +19,7 @@ import torch
 from splatmill.schema import Event, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.errors import Refusal
-from splatmill_worker.splat import ply
+from splatmill_worker.splat.formats import ply, registry
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.start.points import from_points
 from tests.support import still_life
@@ -56,12 +56,12 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def changed(trained: Path, tmp_path: Path, change: Callable[[Gaussians], Gaussians]) -> Path:
     """The capture with `change` applied to its model."""
     capture = still_life.posed_capture(tmp_path / "capture")
-    ply.write(capture / "poses" / "m.ply", change(ply.read(trained / "poses" / "m.ply")))
+    ply.write(capture / "poses" / "m.ply", change(ply.read(trained / "poses" / "m.ply").gaussians))
     return capture
 
 
 def test_training_starts_from_the_model_and_improves_it(trained: Path, tmp_path: Path) -> None:
-    before = ply.read(trained / "poses" / "m.ply")
+    before = ply.read(trained / "poses" / "m.ply").gaussians
     outcome, events = run(trained, tmp_path, start="m.ply", steps=250)
     report = report_of(outcome)
     assert report["plan"]["initial"] == "model"
@@ -79,18 +79,30 @@ def test_training_starts_from_the_model_and_improves_it(trained: Path, tmp_path:
 def test_a_model_of_a_lower_degree_is_padded(trained: Path, tmp_path: Path) -> None:
     capture = changed(trained, tmp_path, lambda model: model.padded(0))
     outcome, _ = run(capture, tmp_path / "work", start="m.ply", sh_degree=2, steps=20)
-    assert ply.read(outcome.out / "model.ply").degree == 2
+    assert ply.read(outcome.out / "model.ply").gaussians.degree == 2
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".compressed.ply"])
+def test_a_model_of_another_format_starts_as_well(trained: Path, tmp_path: Path, suffix: str) -> None:
+    capture = still_life.posed_capture(tmp_path / "capture")
+    model = registry.read(trained / "poses" / "m.ply").gaussians
+    registry.write(capture / "poses" / f"m{suffix}", model)
+    known = {}
+    for folder, name in ((trained, "m.ply"), (capture, f"m{suffix}")):
+        outcome, _ = run(folder, tmp_path / name, start=name, steps=1)
+        known[name] = report_of(outcome)["facts"]["start"]["psnr"]
+    assert known[f"m{suffix}"] == pytest.approx(known["m.ply"], abs=0.5)
 
 
 def test_the_degree_of_the_model_is_kept(trained: Path, tmp_path: Path) -> None:
-    assert ply.read(trained / "poses" / "m.ply").degree == 3
+    assert ply.read(trained / "poses" / "m.ply").gaussians.degree == 3
     outcome, _ = run(trained, tmp_path, start="m.ply", steps=20)
     assert report_of(outcome)["plan"]["schedule"]["degree"] == 3
 
 
 def test_a_model_larger_than_allowed_keeps_its_most_opaque_part(trained: Path, tmp_path: Path) -> None:
     outcome, _ = run(trained, tmp_path, start="m.ply", max_gaussians=500, steps=20)
-    assert ply.read(outcome.out / "model.ply").count <= 500
+    assert ply.read(outcome.out / "model.ply").gaussians.count <= 500
 
 
 def test_the_offset_of_a_model_far_from_the_origin_is_added_again(tmp_path: Path) -> None:
@@ -101,7 +113,7 @@ def test_the_offset_of_a_model_far_from_the_origin_is_added_again(tmp_path: Path
         frame["transform_matrix"][0][3] += 450_000.0
     path.write_text(json.dumps(document))
     first, _ = run(capture, tmp_path / "a", steps=100)
-    assert ply.offset(first.out / "model.ply")[0] == pytest.approx(450_000.0, abs=3.0)
+    assert ply.read(first.out / "model.ply").offset[0] == pytest.approx(450_000.0, abs=3.0)
     (capture / "poses" / "m.ply").write_bytes((first.out / "model.ply").read_bytes())
     second, _ = run(capture, tmp_path / "b", start="m.ply", steps=20)
     known = report_of(second)["facts"]["start"]
@@ -144,13 +156,13 @@ def test_a_file_that_is_not_a_model_is_refused(
 
 def test_infinite_logits_of_other_tools_are_read_as_opaque(trained: Path, tmp_path: Path) -> None:
     path = tmp_path / "m.ply"
-    model = ply.read(trained / "poses" / "m.ply")
+    model = ply.read(trained / "poses" / "m.ply").gaussians
     ply.write(path, model)
     raw = path.read_bytes()
     head, body = raw.split(b"end_header\n", 1)
     table = np.frombuffer(body, "<f4").reshape(model.count, -1).copy()
     table[0, -8] = np.inf  # opacity, before three scales and four of the quaternion
     path.write_bytes(head + b"end_header\n" + table.tobytes())
-    read = ply.read(path)
+    read = ply.read(path).gaussians
     assert read.count == model.count
     assert 0.999 < float(torch.sigmoid(read.logit_opacities[0])) <= 1.0

@@ -17,7 +17,6 @@ import torch
 from splatmill_worker.errors import FailureName, TrainingFailed
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train import checkpoint
-from splatmill_worker.splat.train.exposure import Exposure
 from splatmill_worker.splat.train.poses import Poses
 from splatmill_worker.splat.train.run import TrainingRun
 from splatmill_worker.splat.train.snapshot import Snapshot
@@ -25,20 +24,20 @@ from tests.support.training import first_engine, plan, split
 
 FILE_KEYS = {
     "format", "parameters", "exp_avg", "exp_avg_sq", "step", "seconds", "rows", "recoveries", "rate_scale", "order",
-    "random", "views", "exposure", "poses", "budget", "shortened", "most", "ever_saw",
+    "random", "views", "poses", "budget", "shortened", "most", "ever_saw",
 }  # fmt: skip
 
 
 def a_run(course: Plan) -> TrainingRun:
-    """A run with everything that a snapshot can hold: refined cameras and fitted exposures."""
+    """A run with everything that a snapshot can hold: refined cameras too."""
     views, _ = split()
     engine = first_engine()
     engine.keep_pose_gradient = True
-    return TrainingRun(engine, course, views, 1.1, exposure=Exposure(len(views)), poses=Poses(views, 1.0))
+    return TrainingRun(engine, course, views, 1.1, poses=Poses(views, 1.0))
 
 
 def course() -> Plan:
-    return plan(200, background="random", pose_refinement=True, exposure=True)
+    return plan(200, background="random", pose_refinement=True)
 
 
 def advanced(run: TrainingRun, steps: int) -> TrainingRun:
@@ -75,7 +74,6 @@ def same(first: Snapshot, second: Snapshot, *, but: set[str]) -> None:
 def old_checkpoint(run: TrainingRun) -> dict[str, Any]:
     """What the code before snapshots stored, key by key."""
     exp_avg, exp_avg_sq = run.engine.moments()
-    assert run.exposure is not None
     assert run.poses is not None
     return {
         "format": 1,
@@ -96,7 +94,7 @@ def old_checkpoint(run: TrainingRun) -> dict[str, Any]:
         "order": [4, 7, 1],
         "random": torch.Generator().manual_seed(11).get_state(),
         "views": [view.name for view in run.views],
-        "exposure": run.exposure.state(),
+        "exposure": {"affine": torch.eye(3, 4).repeat(len(run.views), 1, 1)},  # fitted then, and read no more
         "poses": run.poses.state(),
         "budget": {"steps": 180, "seconds": None},
         "shortened": True,
@@ -122,7 +120,7 @@ def test_a_checkpoint_of_the_code_before_snapshots_is_resumed(tmp_path: Path) ->
     assert run.curve[1].memory is None
     held = run.snapshot()
     assert torch.equal(held.random, stored["random"])
-    for name in ("parameters", "exp_avg", "exp_avg_sq", "exposure", "poses"):
+    for name in ("parameters", "exp_avg", "exp_avg_sq", "poses"):
         pairs = zip(flat(getattr(held, name)), flat(stored[name]), strict=True)
         assert all(torch.equal(a, b) for a, b in pairs), name
     advanced(run, 60)
@@ -165,7 +163,7 @@ def test_a_roll_back_restores_what_is_optimised_and_nothing_else() -> None:
     assert good.step < 60
     run.roll_back(TrainingFailed(FailureName.divergence, "the loss rose.", step=60))
     after = run.snapshot()
-    optimised = {"parameters", "exp_avg", "exp_avg_sq", "poses", "exposure"}
+    optimised = {"parameters", "exp_avg", "exp_avg_sq", "poses"}
     others = {field.name for field in fields(Snapshot)} - optimised
     same(after, good, but=others)
     same(after, before, but=optimised | {"seconds", "recoveries", "rate_scale", "lowest_loss"})

@@ -50,6 +50,7 @@ def run(
     relaxed: bool = False,
     fixed_intrinsics: bool = False,
     on_progress: Callable[[int, int], None],
+    on_model: Callable[[pycolmap.Reconstruction], None] = lambda _: None,
     cancelled: Callable[[], bool],
 ) -> Mapped:
     """Map the `count` photos in COLMAP's database.
@@ -57,6 +58,8 @@ def run(
     relaxed: accept smaller triangulation angles and fewer inliers (incremental mapper only).
     fixed_intrinsics: keep focal lengths and distortion as they are in the database.
     on_progress: called as (photos registered, count), by the incremental mapper only.
+    on_model: called with the model that grows, after each registered photo, by the incremental mapper only. The mapper
+        waits meanwhile.
 
     Raises Cancelled: between two photos in the incremental mapper, at the end in the global one.
     """
@@ -73,6 +76,7 @@ def run(
                 nonlocal registered
                 registered = min(registered + 1, count)
                 on_progress(registered, count)
+                on_model(manager.get(manager.size() - 1))
                 stop_if(cancelled)
 
             callback = pycolmap.IncrementalPipelineCallback

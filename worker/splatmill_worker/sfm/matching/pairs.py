@@ -143,6 +143,17 @@ def preemptive_matches(
         candidates = set(exhaustive(count))
     else:
         candidates = _most_similar(features, PREEMPTIVE_PARTNERS) | likely
+    return matches_of_largest(candidates, features, pool, on_progress, cancelled)
+
+
+def matches_of_largest(
+    candidates: Iterable[Pair],
+    features: Sequence[Features],
+    pool: ThreadPoolExecutor,
+    on_progress: Callable[[int, int], None],
+    cancelled: Callable[[], bool],
+) -> dict[Pair, int]:
+    """Number of matches among the PREEMPTIVE_FEATURES features with the largest scale, for each candidate pair."""
     matcher = Matcher(features, max_features=PREEMPTIVE_FEATURES)
     ordered = sorted(candidates)
     scores: dict[Pair, int] = {}

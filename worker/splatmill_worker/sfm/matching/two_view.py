@@ -49,6 +49,11 @@ class TwoView:
     configuration: int
 
 
+def max_error(longest: int) -> float:
+    """Largest epipolar error of an inlier, in pixels of photos whose longest side has `longest` pixels."""
+    return max(MIN_MAX_ERROR, MAX_ERROR_SHARE * longest)
+
+
 def match_pairs(
     chosen: Iterable[Pair],
     features: Sequence[Features],
@@ -74,7 +79,7 @@ def match_pairs(
     options.ransac.max_num_trials = MAX_RANSAC_TRIALS
     options.ransac.random_seed = seed
     longest = max((max(camera.width, camera.height) for camera in cameras.values()), default=1000)
-    options.ransac.max_error = max(MIN_MAX_ERROR, MAX_ERROR_SHARE * longest)
+    options.ransac.max_error = max_error(longest)
     matcher = Matcher(features, max_features)
     ordered = sorted(chosen)
     found: dict[Pair, TwoView] = {}

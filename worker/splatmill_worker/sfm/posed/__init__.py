@@ -1,5 +1,6 @@
-"""Captures that bring their cameras: a COLMAP model, transforms.json, or a Blender data set."""
+"""Captures that bring their cameras: a COLMAP model, transforms.json, or a Blender data set; and their points."""
 
-from splatmill_worker.sfm.posed.capture import PosedInput, find, with_stereo_points
+from splatmill_worker.sfm.posed.capture import PosedInput, find
+from splatmill_worker.sfm.posed.points import with_points
 
-__all__ = ["PosedInput", "find", "with_stereo_points"]
+__all__ = ["PosedInput", "find", "with_points"]

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatmill_worker.images.decoders import mask_fault
 from splatmill_worker.scene import Scene, Source
-from splatmill_worker.sfm import stereo
-from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.sfm.posed import colmap_model, transforms
 from splatmill_worker.sfm.posed.files import ImageFiles
 
@@ -75,23 +71,6 @@ def find(directory: Path) -> PosedInput | None:
     return None
 
 
-def with_stereo_points(
-    scene: Scene,
-    workdir: Path,
-    on_progress: OnProgress = lambda stage, done, total, note: None,
-    cancelled: Callable[[], bool] = lambda: False,
-) -> Scene:
-    """The scene with stereo points where it has few or none; they are kept in `workdir`.
-
-    Blender data sets are returned as they are: training starts them from the visual hull of their transparent photos.
-    Raises what `stereo.find_points` raises.
-    """
-    if scene.source == "blender" or not stereo.has_few_points(scene):
-        return scene
-    stored = workdir / "sfm" / f"posed-{_digest(scene)}.npz"
-    return stereo.with_stereo_points(scene, stored, on_progress, cancelled)
-
-
 def _without_unfit_masks(scene: Scene) -> Scene:
     """The scene without masks that are unreadable or of another shape than their photo, each named in a note."""
     views, notes = [], []
@@ -103,19 +82,6 @@ def _without_unfit_masks(scene: Scene) -> Scene:
                 view = replace(view, mask=None)
         views.append(view)
     return replace(scene, views=tuple(views), notes=(*scene.notes, *notes))
-
-
-def _digest(scene: Scene) -> str:
-    """A name for everything that the stereo points depend on: the method, cameras, known points and masks."""
-    digest = hashlib.sha256(repr((stereo.VERSION, scene.points.shape)).encode())
-    digest.update(scene.points.tobytes())
-    for view in scene.views:
-        camera = view.camera
-        digest.update(repr((view.name, view.lens, view.split, camera.width, camera.height)).encode())
-        digest.update(camera.viewmat.tobytes() + camera.K.tobytes())
-        if view.mask is not None:
-            digest.update(hashlib.sha256(view.mask.read_bytes()).digest())
-    return digest.hexdigest()[:24]
 
 
 def _model_under(base: Path) -> Path | None:

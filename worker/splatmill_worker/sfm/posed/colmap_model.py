@@ -108,7 +108,27 @@ def scene_of(
     left_out: tuple[tuple[str, str], ...] = (),
     notes: tuple[str, ...] = (),
 ) -> Scene:
-    """The scene of `views`, by COLMAP's image id, with the model's points that at least one of them observes."""
+    """The scene of `views`, by COLMAP's image id, with the model's points that at least one of them observes.
+
+    Where most points have no track at all, the scene has these points instead, and no tracks: `points.with_points`
+    judges them by the photos.
+    """
+    loose = [point for point in model.points3D.values() if not point.track.elements]
+    if 2 * len(loose) > len(model.points3D):
+        finite = [point for point in loose if np.isfinite(point.xyz).all()]
+        return Scene(
+            tuple(views.values()),
+            np.array([point.xyz for point in finite], np.float64).reshape(-1, 3),
+            np.array([point.color for point in finite], np.uint8).reshape(-1, 3),
+            source,
+            left_out=left_out,
+            notes=notes,
+        )
+    if loose:
+        notes = (
+            *notes,
+            f"{len(loose)} points without tracks are not used: {len(model.points3D) - len(loose)} have.",
+        )
     order = {image_id: index for index, image_id in enumerate(views)}
     points, colors, errors, rows = [], [], [], []
     for point in model.points3D.values():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from splatmill.schema.formats import is_model_file
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, MASK_FOLDERS
 from splatmill_worker.images import prepare
 from splatmill_worker.images.archive import Allowance
@@ -17,9 +18,9 @@ MAX_DEPTH = 4
 def data_set(capture: Path, workdir: Path, cancelled: Callable[[], bool] = lambda: False) -> Path:
     """The folder to read a capture from: that of the unpacked data set if the capture is a zip of one, else `capture`.
 
-    A capture is a zip of a data set if a single zip is its only file besides .ply models, and the zip holds cameras
-    (transforms*.json or a COLMAP model), or the folders images/ and masks/. Other zips hold photos, which `prepare`
-    finds. It unpacks to the same folder in `workdir`, so nothing is unpacked twice.
+    A capture is a zip of a data set if a single zip is its only file besides models to start from, and the zip holds
+    cameras (transforms*.json or a COLMAP model), or the folders images/ and masks/. Other zips hold photos, which
+    `prepare` finds. It unpacks to the same folder in `workdir`, so nothing is unpacked twice.
 
     Raises Refusal for an archive that unpacks to too much, and Cancelled.
     """
@@ -27,7 +28,7 @@ def data_set(capture: Path, workdir: Path, cancelled: Callable[[], bool] = lambd
     others = [path for folder in ("masks", "poses") for path in prepare.given_files(capture / folder)]
     if len(images) != 1 or images[0].suffix.lower() not in ARCHIVE_SUFFIXES or images[0].is_symlink():
         return capture
-    if any(path.suffix.lower() != ".ply" for path in others):
+    if any(not is_model_file(path.name) for path in others):
         return capture
     try:
         folder = prepare.unpacked(images[0].name, images[0], workdir, Allowance(), cancelled)

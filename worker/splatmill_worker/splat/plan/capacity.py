@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from splatmill.schema import Preset, TrainOptions
+from splatmill.schema import PRESET_STEPS, Preset, TrainOptions
 from splatmill_worker.kernels.gpu.device import largest_budget
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.facts import Facts, Speed
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.reasons import Reasons
-
-PRESET_STEPS = {Preset.draft: 1000, Preset.balanced: 3000, Preset.quality: 10_000}
-"""Number of steps where no budget is given."""
 
 GAUSSIANS_PER_ROOT_STEP = 1550.0
 """Gaussians that a run can train, per square root of its number of steps (decisions: GAUSSIANS_PER_ROOT_STEP)."""

@@ -86,9 +86,10 @@ def _start(facts: Facts, reasons: Reasons) -> _Start:
     if facts.points >= ENOUGH_POINTS:
         reasons.chosen["initial"] = f"The reconstruction has {facts.points} points; each becomes a Gaussian."
         return _Start("points", facts.points)
+    because = "" if facts.no_points is None else f"{facts.no_points} "
     reasons.chosen["initial"] = (
-        f"The scene has {facts.points} points, fewer than {ENOUGH_POINTS}, so {RANDOM_GAUSSIANS} Gaussians start at "
-        "random where the cameras look."
+        f"{because}The scene has {facts.points} points, fewer than {ENOUGH_POINTS}, so "
+        f"{RANDOM_GAUSSIANS} Gaussians start at random where the cameras look."
     )
     return _Start("random", RANDOM_GAUSSIANS)
 

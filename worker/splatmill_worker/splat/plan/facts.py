@@ -14,6 +14,8 @@ import torch
 from splatmill_worker import memory
 from splatmill_worker.images.lens import distortion
 from splatmill_worker.scene import Scene
+from splatmill_worker.splat.plan.light import compared
+from splatmill_worker.splat.plan.observations import Observations
 from splatmill_worker.splat.start.cells import cells_of
 from splatmill_worker.splat.start.far_shell import shell_points
 from splatmill_worker.splat.start.gaps import gap_points, gap_share
@@ -23,27 +25,6 @@ from splatmill_worker.splat.start.sky import sky_share
 from splatmill_worker.splat.views import TrainingView
 
 Float = npt.NDArray[np.float64]
-
-MAX_POINTS = 4000
-"""Points whose observations are compared, evenly chosen and fewer than twice this number: enough for a median."""
-
-DARK = 4.0
-"""Grey levels of 255: darker values count as this one, since their ratios are noise."""
-
-RESIDUAL_FLOOR = 0.02
-"""Natural logarithm of brightness: residuals below this floor have the same weight."""
-
-ITERATIONS = 30
-"""Iterations of the reweighted least squares that separates exposures from the brightness of points."""
-
-ENOUGH_OBSERVATIONS = 40
-"""Number of observations below which exposures, angles and distances are not measured."""
-
-ENOUGH_OF_A_PHOTO = 10
-"""Number of observations of a photo from which its exposure counts."""
-
-ENOUGH_PHOTOS = 3
-"""Number of such photos from which the spread of exposures is measured."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +68,9 @@ class Facts:
     speed: training time of this machine; None where it was not probed.
     start: the model that training starts from; None without one.
     tint_spread: as exposure_spread, of red over green or blue over green, whichever spreads more.
+    light_tail: departure of a photo's exposure or white balance from what the photos around it predict, natural
+        logarithm; nine photos in ten depart less.
+    light_error: median standard error of the photos' exposures, natural logarithm.
     lens_residual: largest displacement of a pixel by lens distortion, pixels.
     sightings: median number of points that a photo shows.
     sky_share: share of the photos' area that looks like sky and shows no point, 0 to 1.
@@ -94,6 +78,7 @@ class Facts:
     gap_points: number of Gaussians that would fill the gaps.
     shell_points: number of Gaussians of the far shell.
     shell_distance: distance from the origin to the nearest Gaussian of the far shell, in units of the world.
+    no_points: why a posed scene has no points, a sentence; None where it has some.
     extent: radius around the cameras that holds nine points in ten, over the radius of the cameras.
     """
 
@@ -116,6 +101,8 @@ class Facts:
     speed: Speed | None = None
     start: GivenModel | None = None
     tint_spread: float | None = None
+    light_tail: float | None = None
+    light_error: float | None = None
     lens_residual: float | None = None
     sightings: float | None = None
     sky_share: float | None = None
@@ -124,6 +111,7 @@ class Facts:
     shell_points: int = 0
     shell_distance: float | None = None
     extent: float | None = None
+    no_points: str | None = None
 
     @property
     def pixels(self) -> int:
@@ -139,7 +127,8 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
     """Facts of `scene`, whose training photos are `views` in the same world, of any origin and unit."""
     sizes = np.array([[view.full.camera.width, view.full.camera.height] for view in views])
     width, height = (int(value) for value in np.median(sizes, axis=0))
-    seen = _Observations.of(scene, views)
+    seen = Observations.of(scene, views)
+    light = None if seen is None else compared(seen, views)
     return Facts(
         views=len(views),
         held_out=held_out,
@@ -152,14 +141,17 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
         masked=sum(view.full.mask is not None for view in views),
         distorted=sum(view.lens is not None for view in scene.views),
         halving_loss=float(np.median([halving_loss(view.full.rgb) for view in views])),
-        exposure_spread=None if seen is None else exposure_spread(seen),
-        tint_spread=None if seen is None else tint_spread(seen),
+        exposure_spread=None if light is None else light.spread,
+        tint_spread=None if light is None else light.tint_spread,
+        light_tail=None if light is None else light.tail,
+        light_error=None if light is None else light.error,
         view_angle=None if seen is None else seen.view_angle(_own_points(scene)),
         distance_ratio=None if seen is None else seen.distance_ratio(),
         reprojection=_reprojection(scene, max(width, height)),
         lens_residual=_lens_residual(scene, max(width, height)),
         memory_available=memory.available(),
         speed=speed,
+        no_points=scene.facts.get("no_points"),
         **_coverage(scene, views),
     )
 
@@ -225,117 +217,3 @@ def _lens_residual(scene: Scene, longest: int) -> float | None:
     lenses = {view.lens for view in scene.views if view.lens is not None}
     moves = [distortion(lens) * longest / max(lens.width, lens.height) for lens in lenses]
     return max(moves, default=None)
-
-
-def exposure_spread(seen: _Observations) -> float | None:
-    """Spread of the photos' exposures, natural logarithm; None with too few observations."""
-    return _spread(seen, np.log(np.maximum(seen.color.mean(axis=1), DARK)))
-
-
-def tint_spread(seen: _Observations) -> float | None:
-    """Spread of the photos' white balance: of red over green or blue over green, the larger, natural logarithm."""
-    red, green, blue = np.log(np.maximum(seen.color.astype(np.float64), DARK)).T
-    spreads = [_spread(seen, red - green), _spread(seen, blue - green)]
-    return max((spread for spread in spreads if spread is not None), default=None)
-
-
-def _spread(seen: _Observations, log: Float) -> float | None:
-    """Robust standard deviation of the photos' offsets in `log`, which has one value per observation.
-
-    Each value is modelled as the sum of an offset of its point and an offset of its photo. Both are solved for in
-    alternation, by reweighted least squares: weights fall with the residual, so that outliers (highlights, occlusions)
-    have little influence. None where fewer than ENOUGH_PHOTOS photos have ENOUGH_OF_A_PHOTO observations.
-    """
-    of_photo = np.zeros(seen.photos)
-    weight = np.ones(len(log))
-    for _ in range(ITERATIONS):
-        of_point = _group_mean(log - of_photo[seen.photo], weight, seen.point, seen.points)
-        of_photo = _group_mean(log - of_point[seen.point], weight, seen.photo, seen.photos)
-        of_photo -= np.median(of_photo)
-        residual = log - of_point[seen.point] - of_photo[seen.photo]
-        weight = 1.0 / np.maximum(np.abs(residual), RESIDUAL_FLOOR)
-    enough = np.bincount(seen.photo, minlength=seen.photos) >= ENOUGH_OF_A_PHOTO
-    if enough.sum() < ENOUGH_PHOTOS:
-        return None
-    # 1.4826 times the median absolute deviation is the standard deviation of a normal distribution.
-    return float(1.4826 * np.median(np.abs(of_photo[enough] - np.median(of_photo[enough]))))
-
-
-@dataclass(frozen=True)
-class _Observations:
-    """Which photo shows which point: n observations, without those of held-out photos.
-
-    points, photos: number of points of the scene and of photos.
-    point, photo: indices of the observation's point and photo [n].
-    color: colour of the photo there, uint8 [n, 3].
-    footprint: width of a pixel at the point's depth [n], in units of the world.
-    direction: unit vector from the camera to the point [n, 3].
-    """
-
-    points: int
-    photos: int
-    point: npt.NDArray[np.int64]
-    photo: npt.NDArray[np.int64]
-    color: npt.NDArray[np.uint8]
-    footprint: Float
-    direction: Float
-
-    @staticmethod
-    def of(scene: Scene, views: Sequence[TrainingView]) -> _Observations | None:
-        """The observations of the scene's tracks in `views`; None without tracks, or with too few of them."""
-        if scene.point_views is None or len(scene.points) < ENOUGH_POINTS:
-            return None
-        number = {view.name: i for i, view in enumerate(views)}
-        of_scene = np.array([number.get(view.name, -1) for view in scene.views], dtype=np.int64)
-        offsets, track = scene.point_views
-        point = np.repeat(np.arange(len(scene.points)), np.diff(offsets))
-        photo = of_scene[track]
-        stride = max(1, len(scene.points) // MAX_POINTS)
-        keep = (photo >= 0) & (point % stride == 0)
-        point, photo = point[keep], photo[keep]
-        columns: list[tuple[Any, ...]] = []
-        for i, view in enumerate(views):
-            rows = point[photo == i]
-            camera, rgb = view.full.camera, view.full.rgb.numpy()
-            seen = camera.project(scene.points[rows])
-            rows, z = rows[seen.inside], seen.depths[seen.inside]
-            color = rgb[seen.rows[seen.inside].astype(np.int64), seen.columns[seen.inside].astype(np.int64)]
-            away = scene.points[rows] - camera.center
-            direction = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-            columns.append((rows, np.full(len(rows), i), color, z / camera.fx, direction))
-        joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
-        if len(joined[0]) < ENOUGH_OBSERVATIONS:
-            return None
-        return _Observations(len(scene.points), len(views), *joined)
-
-    def view_angle(self, first: int) -> float | None:
-        """Median over the `first` points of the largest angle between two views, degrees; None without any."""
-        own = self.point < first
-        if not own.any():
-            return None
-        return float(np.median([_widest(rows) for rows in _by_point(self.point[own], self.direction[own])]))
-
-    def distance_ratio(self) -> float:
-        """Largest over smallest footprint of a pixel on the same point, 90th percentile over points."""
-        ratios = [rows.max() / rows.min() for rows in _by_point(self.point, self.footprint)]
-        return float(np.percentile(ratios, 90))
-
-
-def _by_point(point: npt.NDArray[np.int64], values: Float) -> list[Float]:
-    """The values of each point's observations: of points with at least two, or of all where no point has two."""
-    order = np.argsort(point, kind="stable")
-    starts = np.flatnonzero(np.diff(point[order], prepend=-1))
-    groups = np.split(values[order], starts[1:])
-    return [group for group in groups if len(group) >= 2] or groups
-
-
-def _widest(directions: Float) -> float:
-    """Largest angle between two of the unit vectors [n, 3], degrees."""
-    return float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0))))
-
-
-def _group_mean(values: Float, weights: Float, group: npt.NDArray[np.int64], groups: int) -> Float:
-    """Weighted mean of `values` per group; 0 where a group is empty."""
-    total = np.bincount(group, weights, minlength=groups)
-    mean: Float = np.bincount(group, weights * values, minlength=groups) / np.maximum(total, 1e-12)
-    return mean

@@ -1,10 +1,10 @@
-"""Decisions on the photos: their size, what lies behind them, exposure compensation, anti-aliasing."""
+"""Decisions on the photos: their size, what lies behind them, exposures, anti-aliasing."""
 
 from __future__ import annotations
 
 from typing import Literal
 
-from splatmill.schema import Background, Preset, TrainOptions
+from splatmill.schema import Background, Preset, Switch, TrainOptions
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.needs import FEW_VIEWS
 from splatmill_worker.splat.plan.plan import Kernels
@@ -23,11 +23,12 @@ BLURRED = 1.5
 HALVED_FROM = 256
 """Pixels: photos whose longest side is shorter are not halved."""
 
-EXPOSURES_DIFFER = 0.2
-"""Natural logarithm of brightness: exposures that spread more are compensated (decisions: EXPOSURES_DIFFER)."""
+LIGHT_DEPARTS = 0.075
+"""Natural logarithm: where one photo in ten departs more from the light of the photos around it, departures are taken
+out (decisions: LIGHT_DEPARTS)."""
 
-TINTS_DIFFER = 0.1
-"""Natural logarithm of red over green, or of blue over green: white balances that spread more are compensated."""
+CERTAIN = 3.0
+"""Standard errors of an exposure that a departure exceeds at least, to be one."""
 
 DISTANCES_DIFFER = 4.0
 """Ratio of the distances from which the same point is seen, above which Gaussians are anti-aliased."""
@@ -97,31 +98,31 @@ def decide_background(
 
 
 def decide_exposure(facts: Facts, options: TrainOptions, reasons: Reasons) -> bool:
-    """Whether an affine colour transform is fitted for each photo."""
+    """Whether training photos are brought to the exposure and white balance that the photos around them predict.
+
+    Raises ValueError where an option asks for it and the light of the photos cannot be compared.
+    """
+    if options.exposure is Switch.on and facts.light_tail is None:
+        raise ValueError(
+            "exposure=on needs points that several photos show, since their colours tell how the light differs, and "
+            "this scene has too few. Set exposure to auto."
+        )
     return reasons.switch("exposure", options.exposure, *_exposure(facts))
 
 
 def _exposure(facts: Facts) -> tuple[bool, str]:
-    spread, tint = facts.exposure_spread, facts.tint_spread
-    if spread is None:
+    tail, error = facts.light_tail, facts.light_error
+    if tail is None or error is None:
         return (
             False,
             "The photos' exposures cannot be compared: it is not known which photos show the same points.",
         )
-    if spread > EXPOSURES_DIFFER:
-        return (
-            True,
-            f"The same points differ by {100 * spread:.0f} % in brightness between photos, so exposures are fitted.",
-        )
-    if tint is not None and tint > TINTS_DIFFER:
-        return (
-            True,
-            f"The same points differ by {100 * tint:.0f} % in white balance between photos, so exposures are fitted.",
-        )
-    return False, (
-        f"The same points differ by {100 * spread:.1f} % in brightness between photos; exposures are fitted above "
-        f"{100 * EXPOSURES_DIFFER:.0f} %."
-    )
+    seen = f"One photo in ten departs by {100 * tail:.1f} % or more from the light of the photos around it"
+    if not tail >= LIGHT_DEPARTS:
+        return False, f"{seen}; exposures are corrected from {100 * LIGHT_DEPARTS:.0f} %."
+    if not tail >= CERTAIN * error:
+        return False, f"{seen}, which an error of {100 * error:.1f} % of their exposures may explain."
+    return True, f"{seen}, so exposure and white balance of the training photos are corrected."
 
 
 def decide_antialias(facts: Facts, options: TrainOptions, reasons: Reasons) -> bool:

@@ -30,7 +30,7 @@ class Plan:
     initial: what the first Gaussians are made from: points, random places, or a given model.
     kernels: the backend of the engine.
     background: colour behind Gaussians and transparent photos in training.
-    exposure: an affine colour transform is fitted for each photo.
+    exposure: training photos are brought to the light that the photos around them have.
     antialias: opacities are compensated for the 0.3 pixels by which projection widens every Gaussian.
     target_psnr: PSNR of the held-out photos at which training ends, dB; None: none.
     max_memory: limit of the memory in use, bytes; None: none.

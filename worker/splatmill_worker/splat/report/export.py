@@ -14,9 +14,11 @@ import torch
 from splatmill.files import atomic_write
 from splatmill.schema import CameraSpec, ModelCamera, ModelCameras
 from splatmill_worker.scene import Camera, Normalization, Scene
-from splatmill_worker.splat import ply
+from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.report.held_out import write_held_out
 from splatmill_worker.splat.train.loop import Trained
+from splatmill_worker.splat.train.renderer import evaluation_background
 from splatmill_worker.splat.views import TrainingView
 
 FAR = 1e4
@@ -56,38 +58,49 @@ class Exported:
     """The files that `export` wrote.
 
     gaussians: how many model.ply holds.
-    world: the world of both files.
+    world: the world of model.ply and cameras.json.
+    left_out: held-out photos that were not written, each with the reason.
     """
 
     gaussians: int
     world: ExportWorld
+    left_out: Sequence[tuple[str, str]] = ()
 
 
 def export(
     out: Path, trained: Trained, plan: Plan, world: ExportWorld, held_out: Sequence[TrainingView]
 ) -> Exported:
-    """Write model.ply and cameras.json into the folder `out`."""
+    """Write model.ply, cameras.json and the held-out photos into the folder `out`."""
     scale = 1.0 / world.normalization.scale
     shift = -scale * world.normalization.translation - world.offset
     gaussians = trained.gaussians.moved(scale, torch.from_numpy(shift))
-    comments = ["Made by Splatmill"]
-    if world.offset.any():
-        comments.append("offset " + " ".join(f"{value:.0f}" for value in world.offset))
-    written = ply.write(out / "model.ply", gaussians, degree=plan.schedule.degree, comments=tuple(comments))
-    errors = {} if trained.held_out is None else {view.name: view.psnr for view in trained.held_out.views}
+    x, y, z = world.offset
+    written = ply.write(
+        out / "model.ply",
+        gaussians,
+        offset=(float(x), float(y), float(z)),
+        degree=plan.schedule.degree,
+        comments=("Made by Splatmill",),
+    )
+    photos, left_out = write_held_out(out, held_out, evaluation_background(plan, trained.views))
+    scores = {} if trained.held_out is None else {view.name: view for view in trained.held_out.views}
     cameras = [
         ModelCamera(
             name=view.name,
             split=split,
             camera=spec_of(world.camera(view.full.camera)),
-            psnr=errors.get(view.name),
+            psnr=None if score is None else score.psnr,
+            psnr_color_fitted=None if score is None else score.psnr_color_fitted,
+            ssim=None if score is None else score.ssim,
+            photo=photos.get(view.name),
         )
         for split, views in (("train", trained.views), ("test", held_out))
         for view in views
+        for score in [scores.get(view.name)]
     ]
     document = ModelCameras(cameras=cameras).model_dump(mode="json", exclude_none=True)
     atomic_write(out / "cameras.json", json.dumps(document, indent=1))
-    return Exported(written, world)
+    return Exported(written, world, left_out)
 
 
 def spec_of(camera: Camera) -> CameraSpec:

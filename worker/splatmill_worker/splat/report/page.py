@@ -26,6 +26,11 @@ img { max-width: 100%; height: auto; } .pairs { display: flex; flex-wrap: wrap; 
 .warn { background: #fff4e0; padding: .5rem .8rem; border-left: 3px solid #d08a20; margin: .3rem 0; }
 """
 
+COLOR_FITTED = (
+    "Colours fitted: after the affine change of the rendered colours that is closest to the photo. Where this is far "
+    "above the PSNR, the photo's exposure or white balance differs, and the shape is right."
+)
+
 
 @dataclass(frozen=True)
 class ViewComparison:
@@ -70,13 +75,17 @@ def render(report: dict[str, Any], figure: Path, comparisons: Sequence[ViewCompa
         "</div>",
         "<h2>All evaluated views</h2>",
         _table(
-            ["photo", "split", "PSNR (dB)", "SSIM"],
+            ["photo", "split", "PSNR (dB)", "PSNR, colours fitted (dB)", "SSIM"],
             [
-                [row["name"], row["split"], f"{row['psnr']:.2f}", f"{row['ssim']:.4f}"]
+                [
+                    *(row["name"], row["split"]),
+                    *(f"{row['psnr']:.2f}", f"{row['psnr_color_fitted']:.2f}", f"{row['ssim']:.4f}"),
+                ]
                 for row in report["views"]
             ],
             2,
         ),
+        f"<p class=dim>{COLOR_FITTED}</p>",
         f"<p class=dim>{html.escape(_footer(report))}</p></html>",
     ]
     return "\n".join(parts)
@@ -86,7 +95,8 @@ def _headline(result: dict[str, Any]) -> str:
     counted = f"{result['gaussians']:,} Gaussians after {result['steps']:,} steps"
     if result["psnr"] is None:
         return f"{result['train_psnr']:.2f} dB on training photos, none were held out; {counted}"
-    return f"{result['psnr']:.2f} dB on held-out photos (SSIM {result['ssim']:.3f}); {counted}"
+    fitted = f"{result['psnr_color_fitted']:.2f} dB with colours fitted"
+    return f"{result['psnr']:.2f} dB on held-out photos ({fitted}, SSIM {result['ssim']:.3f}); {counted}"
 
 
 def _plan(plan: dict[str, Any]) -> str:
@@ -104,7 +114,8 @@ def _comparison(view: ViewComparison) -> str:
     return (
         "<div class=pair>"
         f"<figure><img alt='rendered' src='{data_uri(view.rendered, 480)}'>"
-        f"<figcaption>{name}: {view.score.psnr:.2f} dB, SSIM {view.score.ssim:.3f}</figcaption></figure>"
+        f"<figcaption>{name}: {view.score.psnr:.2f} dB ({view.score.psnr_color_fitted:.2f} dB with colours fitted), "
+        f"SSIM {view.score.ssim:.3f}</figcaption></figure>"
         f"<figure><img alt='photo' src='{data_uri(view.photo, 480)}'><figcaption>photo</figcaption></figure></div>"
     )
 

@@ -56,7 +56,7 @@ class ProgressFilm:
         """Whether a frame is to be taken at this share of the budget."""
         return self._next < len(TAKEN_AT) and TAKEN_AT[self._next] <= progress
 
-    def observe(self, engine: Engine, progress: float, seconds: float) -> None:
+    def observe(self, engine: Engine, progress: float, seconds: float, step: int) -> None:
         """Take the frame that is due, `seconds` into the training."""
         started = time.perf_counter()
         color = render_view(engine, self._plan, self._view)

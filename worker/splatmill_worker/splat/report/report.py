@@ -58,12 +58,14 @@ class FinishedTraining:
     exported: the files of the model.
     seconds: wall time by stage, over all attempts; "train" and "evaluate" are added from `trained`.
     warnings: what was warned of on the way, one sentence each.
+    time_lapse: the snapshots that the model keeps, in order: file, step, seconds and Gaussians of each.
     """
 
     trained: Trained
     exported: Exported
     seconds: Mapping[str, float]
     warnings: Sequence[str]
+    time_lapse: Sequence[Mapping[str, Any]] = ()
 
 
 FORMAT = 1
@@ -94,11 +96,16 @@ def write_report(
             "left_out": [
                 *({"what": name, "why": reason} for name, reason in plan.left_out.items()),
                 *({"photo": name, "why": reason} for name, reason in planned.scene.left_out),
+                *(
+                    {"what": f"the held-out photo {name} beside the model", "why": reason}
+                    for name, reason in finished.exported.left_out
+                ),
                 {"what": "lpips", "why": NO_LPIPS},
             ],
             "warnings": [*finished.warnings, *_unplaced(planned.scene), *_misfits(trained)],
             "facts": planned.facts.as_dict(),
             "sfm": planned.scene.facts,
+            "time_lapse": finished.time_lapse,
             "offset": offset.tolist() if offset.any() else None,
             "peak_memory": peak_memory(),
             "versions": versions(plan.kernels),
@@ -154,9 +161,11 @@ def _result(trained: Trained, written: int) -> dict[str, Any]:
         "cameras_moved_pixels": trained.cameras_moved,
         "failure": None if trained.failure is None else trained.failure.name.value,
         "psnr": None if held is None else held.psnr,
+        "psnr_color_fitted": None if held is None else held.psnr_color_fitted,
         "ssim": None if held is None else held.ssim,
         "mse": None if held is None else held.mse,
         "train_psnr": trained.on_training.psnr,
+        "train_psnr_color_fitted": trained.on_training.psnr_color_fitted,
         "train_ssim": trained.on_training.ssim,
     }
 

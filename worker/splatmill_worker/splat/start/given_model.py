@@ -12,8 +12,8 @@ from torch import Tensor
 
 from splatmill_worker.errors import ModelUnreadable, StartUnusable
 from splatmill_worker.scene import Normalization
-from splatmill_worker.splat import ply
 from splatmill_worker.splat.evaluate import benchmark_background, compare
+from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.render import render
 from splatmill_worker.splat.views import TrainingView
@@ -59,21 +59,21 @@ class GivenModel:
 
 
 def read_given_model(path: Path, normalization: Normalization) -> Gaussians:
-    """The Gaussians of the .ply file `path`, moved into the training world by `normalization`.
+    """The Gaussians of the file `path`, of any readable format, moved into the training world by `normalization`.
 
     Far from the origin, export subtracts an offset and stores it in the file; it is added again.
     Raises StartUnusable where the file cannot be read or holds no Gaussian.
     """
     try:
-        offset = ply.offset(path)
-        gaussians = ply.read(path)
+        contents = registry.read(path)
     except ModelUnreadable as error:
         raise StartUnusable(str(error)) from error
     except OSError as error:
         raise StartUnusable(f"{path.name} cannot be opened: {error.strerror or error}.") from error
+    gaussians = contents.gaussians
     if gaussians.count == 0:
         raise StartUnusable(f"{path.name} holds no Gaussian with finite values.")
-    shift = normalization.scale * np.array(offset) + normalization.translation
+    shift = normalization.scale * np.array(contents.offset) + normalization.translation
     return gaussians.moved(normalization.scale, torch.from_numpy(shift))
 
 

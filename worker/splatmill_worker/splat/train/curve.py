@@ -32,6 +32,7 @@ class CurvePoint:
     memory: resident size of the process, bytes.
     train_psnr: dB, mean over a few training views.
     train_ssim: mean over the same training views, 0 to 1.
+    views: number of held-out views that were evaluated; None where there are none. The last point shows all of them.
     """
 
     seconds: float
@@ -43,6 +44,7 @@ class CurvePoint:
     memory: int | None = None
     train_psnr: float | None = None
     train_ssim: float | None = None
+    views: int | None = None
 
 
 def is_flat(curve: Sequence[CurvePoint]) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,14 +10,13 @@ from typing import Protocol
 from splatmill_worker.errors import Cancelled, FailureName, TrainingFailed
 from splatmill_worker.splat.engine.open import gaussians_of
 from splatmill_worker.splat.engine.protocol import Engine
-from splatmill_worker.splat.evaluate import Score, evaluate
+from splatmill_worker.splat.evaluate import Score
 from splatmill_worker.splat.gaussians import Gaussians
-from splatmill_worker.splat.machine import resident_memory
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.curve import CurvePoint, is_flat
-from splatmill_worker.splat.train.exposure import Exposure
+from splatmill_worker.splat.train.evaluations import Evaluations, corrected
 from splatmill_worker.splat.train.poses import Poses, mean_depth
-from splatmill_worker.splat.train.renderer import evaluation_background, render_view, renderer
+from splatmill_worker.splat.train.renderer import render_view
 from splatmill_worker.splat.train.run import TrainingRun
 from splatmill_worker.splat.train.snapshot import Snapshot
 from splatmill_worker.splat.views import TrainingView
@@ -31,15 +29,6 @@ PROGRESS_SECONDS = 0.5
 
 CHECKPOINT_SECONDS = 20.0
 """Seconds between two checkpoints."""
-
-EVALUATED_AT = (0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-"""Shares of the budget at which the held-out views are evaluated: close together where the curve is steep."""
-
-ALSO_EVALUATED = 4
-"""Training views, evenly chosen, that are evaluated at each point of the curve beside the held-out ones."""
-
-FINALLY_EVALUATED = 16
-"""Training views, evenly chosen, that are evaluated at the end: this many, and less than twice as many."""
 
 FLAT_TAIL = 0.1
 """Share of the time spent so far in which the rates fall to their ends once the curve is flat."""
@@ -71,8 +60,8 @@ class Observer(Protocol):
     def is_due(self, progress: float) -> bool:
         """Whether to look at the scene now, at this share of the budget."""
 
-    def observe(self, engine: Engine, progress: float, seconds: float) -> None:
-        """Look at what `engine` holds, `seconds` into the training."""
+    def observe(self, engine: Engine, progress: float, seconds: float, step: int) -> None:
+        """Look at what `engine` holds after `step` steps, `seconds` into the training."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +74,7 @@ class Hooks:
     cancelled: before every step; training ends when it returns True.
     checkpoint: with a snapshot to store, every `checkpoint_seconds` and on a cancellation; None: never.
     checkpoint_seconds: seconds between two checkpoints.
-    observer: looks at the scene at moments of its own; None: nobody does.
+    observers: look at the scene, each at moments of its own.
     """
 
     progress: Callable[[TrainingProgress], None] = lambda _: None
@@ -94,7 +83,7 @@ class Hooks:
     cancelled: Callable[[], bool] = lambda: False
     checkpoint: Callable[[Snapshot], None] | None = None
     checkpoint_seconds: float = CHECKPOINT_SECONDS
-    observer: Observer | None = None
+    observers: Sequence[Observer] = ()
 
 
 @dataclass(frozen=True)
@@ -149,16 +138,15 @@ def train(
     and Cancelled when `hooks.cancelled` returns True.
     """
     hooks = hooks or Hooks()
-    exposure = Exposure(len(views)) if plan.exposure else None
     render_view(engine, plan, views[0])  # code is loaded and memory allocated before the clock starts
     poses = None
     if plan.pose_refinement:
         poses = Poses(views, _scene_depth(engine, views, plan))
         engine.keep_pose_gradient = True
-    run = TrainingRun(engine, plan, views, extent, exposure=exposure, poses=poses, warn=hooks.warn)
+    run = TrainingRun(engine, plan, views, extent, poses=poses, warn=hooks.warn)
     if resume_from is not None:
         run.resume(resume_from)
-    evaluations = _Evaluations(run, held_out)
+    evaluations = Evaluations(run, held_out)
     stopped, failure = "", None
     last_progress = last_checkpoint = time.monotonic()
     while not stopped:
@@ -179,9 +167,10 @@ def train(
             with run.clock.stopped():
                 hooks.evaluated(evaluations.evaluate(), engine)
             stopped = _reason_to_stop(run)
-        if hooks.observer is not None and hooks.observer.is_due(run.progress):
-            with run.clock.stopped():
-                hooks.observer.observe(engine, run.progress, run.clock.seconds)
+        for observer in hooks.observers:
+            if observer.is_due(run.progress):
+                with run.clock.stopped():
+                    observer.observe(engine, run.progress, run.clock.seconds, run.step)
         now = time.monotonic()
         if now - last_progress >= PROGRESS_SECONDS:
             last_progress = now
@@ -190,84 +179,35 @@ def train(
             with run.clock.stopped():
                 hooks.checkpoint(run.snapshot())
             last_checkpoint = time.monotonic()
-    return _result(run, held_out, evaluations, stopped, failure)
-
-
-class _Evaluations:
-    """Evaluates a run at the shares of its budget that EVALUATED_AT lists, and counts the seconds that this takes."""
-
-    def __init__(self, run: TrainingRun, held_out: Sequence[TrainingView]) -> None:
-        self._run, self._held_out = run, held_out
-        self.seconds = 0.0
-        # A resumed run is evaluated at the end again: an attempt may die after its last step and before its export.
-        passed = sum(share <= run.progress for share in EVALUATED_AT)
-        self._next = min(passed, len(EVALUATED_AT) - 1)
-
-    @property
-    def due(self) -> bool:
-        """Whether the next share of the budget is reached."""
-        return self._run.progress >= EVALUATED_AT[self._next]
-
-    def evaluate(self) -> CurvePoint:
-        """Evaluate now; the point is added to the curve of the run."""
-        started = time.perf_counter()
-        run, plan = self._run, self._run.plan
-        while self._next < len(EVALUATED_AT) and run.progress >= EVALUATED_AT[self._next]:
-            self._next += 1
-        render, background = renderer(run.engine, plan), evaluation_background(plan, run.views)
-        score = evaluate(render, self._held_out, background) if self._held_out else None
-        views = _corrected(run)
-        on_training = evaluate(render, views[:: math.ceil(len(views) / ALSO_EVALUATED)], background)
-        point = CurvePoint(
-            seconds=run.clock.seconds,
-            step=run.step,
-            loss=run.loss,
-            psnr=None if score is None else score.psnr,
-            ssim=None if score is None else score.ssim,
-            gaussians=run.engine.count,
-            memory=resident_memory(),
-            train_psnr=on_training.psnr,
-            train_ssim=on_training.ssim,
-        )
-        run.curve.append(point)
-        self.seconds += time.perf_counter() - started
-        return point
+    return _result(run, evaluations, stopped, failure)
 
 
 def _result(
     run: TrainingRun,
-    held_out: Sequence[TrainingView],
-    evaluations: _Evaluations,
+    evaluations: Evaluations,
     stopped: str,
     failure: TrainingFailed | None,
 ) -> Trained:
-    """What the run ends with, evaluated once more: after a failure, the scene is not that of the last point."""
+    """What the run ends with. After a failure, the scene is not that of the last point, and is evaluated anew."""
     seconds = run.clock.seconds
-    started = time.perf_counter()
-    render, background = renderer(run.engine, run.plan), evaluation_background(run.plan, run.views)
-    final = evaluate(render, held_out, background) if held_out else None
     run.engine.keep_pose_gradient = False
-    views = _corrected(run)
-    on_training = evaluate(render, views[:: max(1, len(views) // FINALLY_EVALUATED)], background)
+    if failure is not None:
+        evaluations.final = None
+    final = evaluations.finish()
     return Trained(
         gaussians=gaussians_of(run.engine).padded(run.plan.schedule.degree),
         curve=tuple(run.curve),
-        held_out=final,
-        on_training=on_training,
+        held_out=final.held_out,
+        on_training=final.on_training,
         steps=run.step,
         seconds=seconds,
-        evaluate_seconds=evaluations.seconds + time.perf_counter() - started,
+        evaluate_seconds=evaluations.seconds,
         stopped=stopped,
         failure=failure,
         recoveries=run.recoveries,
-        views=views,
+        views=corrected(run),
         cameras_moved=None if run.poses is None else run.poses.pixels_moved(),
     )
-
-
-def _corrected(run: TrainingRun) -> tuple[TrainingView, ...]:
-    """The training views with their cameras as they are now."""
-    return tuple(run.views if run.poses is None else run.poses.corrected(run.views))
 
 
 def _scene_depth(engine: Engine, views: Sequence[TrainingView], plan: Plan) -> float:
@@ -294,7 +234,7 @@ def _reason_to_stop(run: TrainingRun) -> str:
         return "the held-out curve became flat" if run.shortened else "the budget is spent"
     reached = run.curve[-1].psnr
     if plan.target_psnr is not None and reached is not None and reached >= plan.target_psnr:
-        return f"the held-out views reached {reached:.2f} dB"
+        return f"{run.curve[-1].views} held-out views reached {reached:.2f} dB"
     if plan.stops_when_flat and not run.shortened and is_flat(run.curve):
         run.shorten(FLAT_TAIL)
     return ""

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.errors import FailureName, TrainingFailed
-from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.engine.protocol import Engine, StepResult
 from splatmill_worker.splat.plan.budget import Clock
@@ -18,13 +17,12 @@ from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
 from splatmill_worker.splat.train.curve import CurvePoint
 from splatmill_worker.splat.train.density import clone_split
-from splatmill_worker.splat.train.exposure import Exposure
 from splatmill_worker.splat.train.health import LossHealth
 from splatmill_worker.splat.train.pace import Pace
 from splatmill_worker.splat.train.poses import Poses
 from splatmill_worker.splat.train.renderer import fixed_background
 from splatmill_worker.splat.train.snapshot import Snapshot
-from splatmill_worker.splat.views import Target, TrainingView
+from splatmill_worker.splat.views import TrainingView
 
 SNAPSHOT_SHARE = 0.04
 """Share of the budget between two snapshots to roll back to: copying costs at most 2 % of the time."""
@@ -38,9 +36,8 @@ class TrainingRun:
 
     engine: the scene, its optimiser and the kernels.
     plan: what was decided before training.
-    views: the training views; `poses`, `exposure` and `upcoming` hold their indices.
+    views: the training views; `poses` and `upcoming` hold their indices.
     extent: radius of the cameras in the training world, the unit of the position rate.
-    exposure: fitted colours of the photos; None where none are.
     poses: corrections of the cameras; None where they are taken as given.
     warn: gets a sentence at each roll-back.
     budget: what the run may spend; cut where the curve becomes flat.
@@ -67,12 +64,11 @@ class TrainingRun:
         views: Sequence[TrainingView],
         extent: float,
         *,
-        exposure: Exposure | None = None,
         poses: Poses | None = None,
         warn: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.engine, self.plan, self.views, self.extent = engine, plan, views, extent
-        self.exposure, self.poses, self.warn = exposure, poses, warn
+        self.poses, self.warn = poses, warn
         self.budget = plan.schedule.budget
         self.clock = Clock()
         self.step = 0
@@ -107,6 +103,8 @@ class TrainingRun:
         reduction = schedule.reduction(self.step)
         if reduction != self.reduction:
             self.reduction = reduction
+            for view in self.views:
+                view.forget_reduced()  # coarse photos do not come again
             self.health.expect_rise(self.step)
         index = self._next_view()
         rates = self.rates(progress)
@@ -170,7 +168,6 @@ class TrainingRun:
             exp_avg=exp_avg,
             exp_avg_sq=exp_avg_sq,
             poses=None if self.poses is None else self.poses.state(),
-            exposure=None if self.exposure is None else self.exposure.state(),
             step=self.step,
             seconds=self.clock.seconds,
             budget=self.budget,
@@ -203,12 +200,10 @@ class TrainingRun:
         self.health.expect_rise(self.step)
 
     def _restore(self, snapshot: Snapshot) -> None:
-        """Put back what was optimised: Gaussians, moments, cameras and exposures."""
+        """Put back what was optimised: Gaussians, moments and cameras."""
         self.engine.replace(snapshot.parameters, snapshot.exp_avg, snapshot.exp_avg_sq)
         if self.poses is not None and snapshot.poses is not None:
             self.poses.restore(snapshot.poses)
-        if self.exposure is not None and snapshot.exposure is not None:
-            self.exposure.restore(snapshot.exposure)
 
     def _checked_snapshot(self) -> Snapshot:
         """A snapshot to roll back to. Raises TrainingFailed where parameters are not finite."""
@@ -221,56 +216,22 @@ class TrainingRun:
     def _step(self, index: int, rates: Rates) -> StepResult:
         """One optimisation step on photo number `index`, at the reduction of this step."""
         target = self.views[index].reduced(self.reduction)
+        background = self._background()
         try:
-            if self.poses is not None:
-                target = target._replace(viewmat=self.poses.viewmat(index))
-            if self.exposure is None:
-                return self._plain_step(index, target, rates)
-            return self._exposed_step(self.exposure, index, target, rates)
+            return self.engine.train_photo(
+                target.viewmat if self.poses is None else self.poses.viewmat(index),
+                target.K,
+                target.over(background),
+                degree=self.plan.schedule.degree,
+                rates=rates,
+                step=self.step,
+                background=background,
+                mask=target.mask,
+                antialias=self.plan.antialias,
+                key=(index, self.reduction) if target.alpha is None else None,
+            )
         except MemoryError as short:
             raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
-
-    def _plain_step(self, index: int, target: Target, rates: Rates) -> StepResult:
-        background = self._background()
-        return self.engine.train_photo(
-            target.viewmat,
-            target.K,
-            target.over(background),
-            degree=self.plan.schedule.degree,
-            rates=rates,
-            step=self.step,
-            background=background,
-            mask=target.mask,
-            antialias=self.plan.antialias,
-            key=(index, self.reduction) if target.alpha is None else None,
-        )
-
-    def _exposed_step(self, exposure: Exposure, index: int, target: Target, rates: Rates) -> StepResult:
-        """A step whose loss compares the photo with the rendered colour under the photo's fitted exposure."""
-        background = self._background()
-        color, alpha, _ = self.engine.forward(
-            target.viewmat,
-            target.K,
-            target.camera.width,
-            target.camera.height,
-            degree=self.plan.schedule.degree,
-            background=background,
-            antialias=self.plan.antialias,
-        )
-        color = color.detach().clone().requires_grad_()
-        seen = exposure.applied(index, color)
-        photo = target.over(background).to(seen.device)
-        mask = None if target.mask is None else target.mask.to(seen.device)
-        loss = ops.loss(seen, photo, mask=mask, backend=self.plan.kernels)
-        (loss + exposure.penalty(index).to(loss.device)).backward()  # type: ignore[no-untyped-call]  # torch's own gap
-        if bool(torch.isfinite(loss)):  # otherwise this step is about to be rolled back
-            exposure.update(self.rate_scale)
-        assert color.grad is not None
-        self.engine.backward_update(color.grad, rates=rates, step=self.step)
-        any_visible = bool(
-            (alpha > 0).any()
-        )  # this path does not count them, and only zero or not is looked at
-        return StepResult(float(loss.detach()), int(any_visible))
 
     def _background(self) -> Tensor:
         """RGB [3] behind this step's photo. A random one keeps training from hiding holes in the surface."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +20,6 @@ class Snapshot:
     exp_avg: Adam's first moments [N, 59].
     exp_avg_sq: Adam's second moments [N, 59].
     poses: `Poses.state()`; None where cameras are not refined.
-    exposure: `Exposure.state()`; None where no exposures are fitted.
     step: training steps done.
     seconds: training time, without evaluations and checkpoints.
     budget: what the run may spend, as it was cut where the curve became flat.
@@ -41,7 +39,6 @@ class Snapshot:
     exp_avg: Tensor
     exp_avg_sq: Tensor
     poses: dict[str, Tensor] | None
-    exposure: dict[str, Any] | None
     step: int
     seconds: float
     budget: Budget

@@ -14,7 +14,7 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from splatmill_worker.errors import ModelUnreadable
-from splatmill_worker.splat import ply
+from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.gaussians import Gaussians
 
 
@@ -31,7 +31,7 @@ def some_gaussians(n: int, degree: int, seed: int = 0) -> Gaussians:
 def test_a_scene_survives_the_file(tmp_path: Path, degree: int) -> None:
     before = some_gaussians(17, degree)
     assert ply.write(tmp_path / "m.ply", before) == 17
-    after = ply.read(tmp_path / "m.ply")
+    after = ply.read(tmp_path / "m.ply").gaussians
     assert after.degree == degree
     for name, value in before.parameters().items():
         if name != "quats":
@@ -64,7 +64,7 @@ def test_the_layout_is_the_one_viewers_read(tmp_path: Path) -> None:
 
 def test_degrees_are_padded_on_request(tmp_path: Path) -> None:
     ply.write(tmp_path / "m.ply", some_gaussians(5, 1), degree=3)
-    after = ply.read(tmp_path / "m.ply")
+    after = ply.read(tmp_path / "m.ply").gaussians
     assert after.degree == 3
     assert torch.equal(after.sh[:, 4:], torch.zeros(5, 12, 3))
 
@@ -78,7 +78,7 @@ def test_what_is_unfit_is_left_out(tmp_path: Path) -> None:
     scene.quats[3] = 0.0
     scene.logit_opacities[4] = math.log(1 / 256) - math.log(1 - 1 / 256)
     assert ply.write(tmp_path / "m.ply", scene) == 3
-    after = ply.read(tmp_path / "m.ply")
+    after = ply.read(tmp_path / "m.ply").gaussians
     assert torch.equal(after.means, scene.means[5:])
     assert bool(after.finite().all())
 
@@ -92,7 +92,7 @@ def test_any_order_of_properties_and_extra_ones_are_read(tmp_path: Path) -> None
     for name in names:
         table[name] = vertex[name]
     PlyData([PlyElement.describe(table, "vertex")], text=True).write(str(tmp_path / "theirs.ply"))
-    after = ply.read(tmp_path / "theirs.ply")
+    after = ply.read(tmp_path / "theirs.ply").gaussians
     assert torch.allclose(after.sh, scene.sh, atol=1e-6)
     assert torch.allclose(after.means, scene.means, atol=1e-6)
 

@@ -11,14 +11,10 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from splatmill.files import replacing
 from splatmill_worker import ply_header
 from splatmill_worker.errors import ModelUnreadable
+from splatmill_worker.splat.formats.contents import NO_OFFSET, OPAQUE, Contents, Offset, finite, unit, visible
 from splatmill_worker.splat.gaussians import Gaussians
 
-MIN_OPACITY = 1.0 / 255.0
-"""Gaussians of less opacity are not written: they cannot change an 8-bit image."""
-
 _DEGREE_OF_REST = {0: 0, 9: 1, 24: 2, 45: 3}
-_HEAD_BYTES = 65536
-_OPAQUE = 16.0  # logit: 1 - 1e-7, the last opacity under 1 in float32
 
 
 def property_names(degree: int) -> list[str]:
@@ -35,23 +31,25 @@ def property_names(degree: int) -> list[str]:
 
 
 def write(
-    path: Path, gaussians: Gaussians, *, degree: int | None = None, comments: tuple[str, ...] = ()
+    path: Path,
+    gaussians: Gaussians,
+    *,
+    offset: Offset = NO_OFFSET,
+    antialiased: bool = False,
+    degree: int | None = None,
+    comments: tuple[str, ...] = (),
 ) -> int:
     """Write `gaussians` as binary little-endian float32; returns how many were written.
 
     Rows with a non-finite parameter and rows with an opacity under MIN_OPACITY are left out. Quaternions are
-    normalised. degree: SH degree of the file (some viewers read degree 3 only); that of the Gaussians where None.
-    comments: lines of the header.
+    normalised. offset: of `Contents`. antialiased: not stored, the format has no place for it. degree: SH degree of the
+    file (some viewers read degree 3 only); that of the Gaussians where None. comments: lines of the header.
     The file is replaced atomically and synced.
     """
     if degree is not None:
         gaussians = gaussians.padded(degree)
-    gaussians = gaussians.map(lambda value: value.detach().to("cpu", torch.float32))
-    gaussians = gaussians.select(
-        gaussians.finite() & (torch.sigmoid(gaussians.logit_opacities) >= MIN_OPACITY)
-    )
+    gaussians = visible(gaussians)
     n = gaussians.count
-    quats = torch.nn.functional.normalize(gaussians.quats.double(), dim=1, eps=0.0).float()
     columns = torch.cat(
         [
             gaussians.means,
@@ -60,7 +58,7 @@ def write(
             gaussians.sh[:, 1:].transpose(1, 2).flatten(1),  # channel-major: all R, then all G, then all B
             gaussians.logit_opacities[:, None],
             gaussians.log_scales,
-            quats,
+            unit(gaussians.quats),
         ],
         dim=1,
     )
@@ -68,51 +66,32 @@ def write(
     table = (
         np.ascontiguousarray(columns.numpy(), dtype="<f4").view([(name, "<f4") for name in names]).reshape(n)
     )
-    document = PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=list(comments))
+    document = PlyData(
+        [PlyElement.describe(table, "vertex")], byte_order="<", comments=[*comments, *offset_comment(offset)]
+    )
 
     with replacing(path, sync=True) as part, part.open("wb") as stream:
         document.write(stream)
     return n
 
 
-def offset(path: Path) -> tuple[float, float, float]:
-    """The offset that `export` subtracted to keep float32 exact: world = file + offset. Zeros where there is none.
-
-    It is a comment of the header. Raises ModelUnreadable where that comment does not hold three numbers.
-    """
-    with path.open("rb") as file:
-        head = file.read(_HEAD_BYTES).partition(b"end_header")[0]
-    for line in head.decode("ascii", "replace").splitlines():
-        words = line.split()
-        if words[:2] == ["comment", "offset"]:
-            try:
-                x, y, z = (float(word) for word in words[2:])
-            except ValueError as error:
-                raise ModelUnreadable(
-                    f"{path.name} has an offset without three numbers in its header: {line!r}."
-                ) from error
-            return x, y, z
-    return 0.0, 0.0, 0.0
+def offset_comment(offset: Offset) -> list[str]:
+    """The comment of the header that holds the offset of `Contents`; none where it is zero."""
+    return ["offset " + " ".join(f"{value:.0f}" for value in offset)] if any(offset) else []
 
 
-def read(path: Path) -> Gaussians:
+def read(path: Path) -> Contents:
     """Read any tool's 3D Gaussian `.ply` (binary of either byte order, or text) as float32 tensors.
 
     Properties are found by name; normals and unknown properties are ignored. Rows with a non-finite value are left
     out. Raises ModelUnreadable for any other file, and FileNotFoundError where there is none.
     """
-    try:
-        ply_header.check(path)
-        document = PlyData.read(str(path))
-    except FileNotFoundError:
-        raise
-    except (PlyParseError, ValueError, OSError, IndexError, KeyError) as error:
-        raise ModelUnreadable(f"{path.name} could not be read as a .ply file: {error}") from error
+    return decode(path, parsed(path))
+
+
+def decode(path: Path, document: PlyData) -> Contents:
+    """What `read` returns, of a file that was parsed already."""
     elements = {element.name: element for element in document.elements}
-    if "chunk" in elements:
-        raise ModelUnreadable(
-            f"{path.name} is a packed (quantised) splat .ply. Convert it to the standard float layout first."
-        )
     if "vertex" not in elements:
         raise ModelUnreadable(
             f"{path.name} has no vertex element; its elements are: {', '.join(elements) or 'none'}."
@@ -145,8 +124,34 @@ def read(path: Path) -> Gaussians:
         log_scales=columns("scale_0", "scale_1", "scale_2"),
         quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
         # Some tools write an opacity of exactly 1 or 0 as its infinite logit.
-        logit_opacities=columns("opacity")[:, 0].contiguous().clamp(-_OPAQUE, _OPAQUE),
+        logit_opacities=columns("opacity")[:, 0].contiguous().clamp(-OPAQUE, OPAQUE),
         sh=torch.cat([columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest_columns.transpose(1, 2)], dim=1),
     )
-    keep = gaussians.finite()
-    return gaussians if bool(keep.all()) else gaussians.select(keep)
+    return Contents(finite(gaussians), offset_of(path, document))
+
+
+def parsed(path: Path) -> PlyData:
+    """A .ply file whose header was checked against its size. Raises ModelUnreadable, and FileNotFoundError."""
+    try:
+        ply_header.check(path)
+        document: PlyData = PlyData.read(str(path))
+    except FileNotFoundError:
+        raise
+    except (PlyParseError, ValueError, OSError, IndexError, KeyError) as error:
+        raise ModelUnreadable(f"{path.name} could not be read as a .ply file: {error}") from error
+    return document
+
+
+def offset_of(path: Path, document: PlyData) -> Offset:
+    """The offset in the comments of a header. Raises ModelUnreadable where one does not hold three numbers."""
+    for comment in document.comments:
+        words = comment.split()
+        if words[:1] == ["offset"]:
+            try:
+                x, y, z = (float(word) for word in words[1:])
+            except ValueError as error:
+                raise ModelUnreadable(
+                    f"{path.name} has an offset without three numbers in its header: {comment!r}."
+                ) from error
+            return x, y, z
+    return NO_OFFSET

@@ -1,0 +1,64 @@
+"""`splatmill shares`: creates, lists and revokes links to a model."""
+
+from typing import Annotated
+
+import typer
+
+from splatmill.cli.models import ModelId
+from splatmill.cli.servers import ServerOption, open_client
+
+shares = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Show a model to people without a key, by a link that ends.",
+)
+
+
+@shares.command()
+def create(
+    model_id: ModelId,
+    expires_in: Annotated[
+        str, typer.Option(metavar="TIME", help="For how long the link is valid, such as 12h or 30d.")
+    ] = "30d",
+    name: Annotated[str | None, typer.Option(help="What people call the link.")] = None,
+    server: ServerOption = None,
+) -> None:
+    """Create a link to a model, and print its address, which the server cannot show again."""
+    with open_client(server) as client:
+        made = client.model(model_id).shares.create(expires_in=expires_in, name=name)
+        typer.echo(f"link {made.id}, valid until {made.expires_at:%Y-%m-%d %H:%M} UTC")
+        typer.echo(f"{client.server.rstrip('/')}{made.path}")
+
+
+@shares.command("list")
+def list_shares(
+    model_id: ModelId,
+    server: ServerOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")] = False,
+) -> None:
+    """List the links to a model, newest first, without their addresses."""
+    with open_client(server) as client:
+        found = client.model(model_id).shares.list()
+    if as_json:
+        for share in found:
+            typer.echo(share.model_dump_json(exclude_none=True))
+        return
+    if not found:
+        typer.echo(f"There are no links to this model. Create one with: splatmill shares create {model_id}")
+    for share in found:
+        state = "revoked" if share.revoked_at else "valid until" if share.active else "expired"
+        until = share.revoked_at or share.expires_at
+        typer.echo(f"{share.id}  {state} {until:%Y-%m-%d %H:%M}" + (f"  {share.name}" if share.name else ""))
+
+
+@shares.command()
+def revoke(
+    model_id: ModelId,
+    share_id: Annotated[str, typer.Argument(metavar="LINK", help="Id of the link.", show_default=False)],
+    server: ServerOption = None,
+) -> None:
+    """Revoke a link to a model, at once and for good."""
+    with open_client(server) as client:
+        client.model(model_id).shares.revoke(share_id)
+    typer.echo(f"The link {share_id} is revoked.")

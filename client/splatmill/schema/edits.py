@@ -1,0 +1,74 @@
+"""Edits of a model: which Gaussians a new model leaves out."""
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from splatmill.schema.base import Measured, Request, Response
+
+EDIT_HEADER = "Splatmill-Edit"
+"""Response header of the renderer with an edited model: the `Edited` of it, as JSON."""
+
+Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+
+
+class Box(Request):
+    """A box along the axes, in the coordinates of the model."""
+
+    min: Point
+    max: Point
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> Self:
+        if any(low >= high for low, high in zip(self.min, self.max, strict=True)):
+            raise ValueError("The box is empty: each coordinate of min must be less than that of max.")
+        return self
+
+
+class EditModel(Request):
+    """What a new model leaves out of a model, which itself is kept. At least one thing must be asked for."""
+
+    box: Box | None = Field(default=None, description="Gaussians whose centre is outside are left out.")
+    min_opacity: float | None = Field(
+        default=None, gt=0, lt=1, description="Gaussians of less opacity are left out."
+    )
+    max_size: float | None = Field(
+        default=None,
+        gt=0,
+        le=1e9,
+        description="Gaussians with a larger standard deviation along any axis are left out. In units of the model.",
+    )
+    name: str | None = Field(
+        default=None, max_length=200, description="Name of the new model. Left out, that of the model."
+    )
+    preview: bool = Field(default=False, description="Only measure what the edit does; no model is made.")
+
+    @model_validator(mode="after")
+    def _does_something(self) -> Self:
+        if self.box is None and self.min_opacity is None and self.max_size is None:
+            raise ValueError("The edit leaves nothing out: give box, min_opacity or max_size.")
+        return self
+
+
+class EditedView(Response):
+    """The error of an edited model on one held-out photo."""
+
+    name: str = Field(description="The photo's name.")
+    psnr: Measured = Field(default=None, description="PSNR, in dB.")
+    ssim: Measured = Field(default=None, description="SSIM.")
+
+
+class Edited(Response):
+    """What an edit did, or would do."""
+
+    model: str | None = Field(default=None, description="Id of the new model; null for a preview.")
+    gaussians_before: int = Field(ge=0, description="Number of Gaussians of the model.")
+    gaussians: int = Field(ge=0, description="Number of Gaussians that are left.")
+    psnr_before: Measured = Field(
+        default=None, description="PSNR in dB of the model, a mean over held-out photos; null without any."
+    )
+    psnr: Measured = Field(default=None, description="PSNR in dB of what is left, over the same photos.")
+    views: list[EditedView] = Field(
+        default_factory=list, description="The held-out photos that were measured: at most 16, evenly chosen."
+    )

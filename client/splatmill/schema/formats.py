@@ -1,0 +1,133 @@
+"""The file formats of models: which are read, which are written, and what each of them loses."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ModelFormat:
+    """A file format of models.
+
+    suffix: in lower case, with its dot.
+    name: what the format is called.
+    media_type: with which it is served.
+    readable: whether a model can be read from it.
+    writable: whether a model can be written to it.
+    loses: what a model loses in it, as a sentence.
+    readers: programs that read it, of others.
+    """
+
+    suffix: str
+    name: str
+    media_type: str
+    readable: bool
+    writable: bool
+    loses: str
+    readers: tuple[str, ...] = ()
+
+    @property
+    def key(self) -> str:
+        """The suffix without its dot, as it is written in addresses: "sog"."""
+        return self.suffix.removeprefix(".")
+
+
+MODEL_FORMATS: dict[str, ModelFormat] = {
+    form.suffix: form
+    for form in (
+        ModelFormat(
+            ".ply",
+            "3D Gaussian .ply",
+            "application/octet-stream",
+            readable=True,
+            writable=True,
+            loses="Nothing, as every parameter is stored as float32.",
+            readers=("SuperSplat", "PlayCanvas", "Spark", "Babylon.js"),
+        ),
+        ModelFormat(
+            ".compressed.ply",
+            "compressed .ply (SuperSplat, PlayCanvas)",
+            "application/octet-stream",
+            readable=True,
+            writable=True,
+            loses="Positions and scales keep 10 to 11 bits within a chunk of 256 Gaussians, colours and opacities 8; "
+            "harmonics are clamped to 4 and keep steps of 1/32.",
+            readers=("SuperSplat", "PlayCanvas", "Spark"),
+        ),
+        ModelFormat(
+            ".spz",
+            ".spz of Niantic and Scaniverse",
+            "application/octet-stream",
+            readable=True,
+            writable=True,
+            loses="Scales keep steps of 6 % and lie between 0.00005 and 380 units, opacities and colours keep 8 bits, "
+            "harmonics are clamped to 1 and keep 6 bits. The offset of far scenes is lost.",
+            readers=("Scaniverse", "Spark", "Babylon.js", "splat-transform"),
+        ),
+        ModelFormat(
+            ".splat",
+            ".splat of antimatter15",
+            "application/octet-stream",
+            readable=True,
+            writable=False,
+            loses="All harmonics above the colour; colours, opacities and quaternions keep 8 bits.",
+        ),
+        ModelFormat(
+            ".ksplat",
+            ".ksplat of GaussianSplats3D",
+            "application/octet-stream",
+            readable=True,
+            writable=False,
+            loses="Harmonics of degree 3; at levels 1 and 2 positions keep 16 bits within a bucket, the rest 8 to 16.",
+        ),
+        ModelFormat(
+            ".sog",
+            "SOG, version 2 (PlayCanvas)",
+            "application/octet-stream",
+            readable=True,
+            writable=True,
+            loses="Positions keep 16 bits of their logarithm; scales and colours are of 256 values, chosen for the "
+            "scene; rotations and opacities keep 8 bits; the harmonics of similar Gaussians become the same.",
+            readers=("SuperSplat", "PlayCanvas", "Spark", "Babylon.js"),
+        ),
+        ModelFormat(
+            "meta.json",
+            "SOG, version 2, unpacked: the meta.json beside its images",
+            "application/json",
+            readable=True,
+            writable=False,
+            loses="What .sog loses.",
+        ),
+        ModelFormat(
+            ".glb",
+            "binary glTF with KHR_gaussian_splatting",
+            "model/gltf-binary",
+            readable=True,
+            writable=True,
+            loses="Nothing, as every parameter is stored as float32.",
+            readers=("PlayCanvas", "CesiumJS", "Babylon.js"),
+        ),
+    )
+}
+"""All formats by their suffix."""
+
+
+def is_model_file(name: str) -> bool:
+    """Whether a name is that of a file from which a model can be read: of one that a training may start from."""
+    found = format_of(name)
+    return found is not None and found.readable and found.suffix.startswith(".")
+
+
+def readable_suffixes() -> str:
+    """The suffixes of the files from which a model can be read, for a sentence."""
+    suffixes = [suffix for suffix in MODEL_FORMATS if is_model_file(suffix)]
+    return f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
+
+
+def format_of(name: str) -> ModelFormat | None:
+    """The format of a file by its name: that of the longest suffix that fits, or None."""
+    lower = name.lower()
+    found = [form for suffix, form in MODEL_FORMATS.items() if lower.endswith(suffix)]
+    return max(found, key=lambda form: len(form.suffix), default=None)
+
+
+DOWNLOADS: dict[str, ModelFormat] = {form.key: form for form in MODEL_FORMATS.values() if form.writable}
+"""The formats in which a model can be downloaded, by their keys."""

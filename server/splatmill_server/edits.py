@@ -1,0 +1,90 @@
+"""Models made from models: what the renderer leaves of one becomes another, with its photos and its report."""
+
+import json
+import secrets
+from collections.abc import AsyncIterator
+from typing import Any
+
+from starlette.concurrency import run_in_threadpool
+
+from splatmill.backplane import layout
+from splatmill.backplane.row import now
+from splatmill.backplane.storage import Storage
+from splatmill.schema import HELD_OUT, Edited, EditModel
+
+
+async def store_edited(
+    storage: Storage, model_id: str, request: EditModel, edited: Edited, ply: AsyncIterator[bytes]
+) -> str:
+    """Store an edited model and return its id. Its record is written last; if anything fails, nothing is left.
+
+    model_id: the model that was edited, which is not changed.
+    ply: its new model.ply.
+    """
+    new_id = secrets.token_hex(8)
+    try:
+        await storage.stream_put(layout.model_file(new_id, "model.ply"), ply)
+        await run_in_threadpool(_store_others, storage, model_id, new_id, request, edited)
+    except BaseException:
+        await run_in_threadpool(storage.delete_prefix, layout.model(new_id))
+        raise
+    return new_id
+
+
+def _store_others(storage: Storage, model_id: str, new_id: str, request: EditModel, edited: Edited) -> None:
+    """Store what an edited model has beside model.ply, its record last."""
+    for entry in storage.entries(layout.model_file(model_id, HELD_OUT)):
+        name = entry.path.removeprefix(layout.model(model_id) + "/")
+        storage.put(layout.model_file(new_id, name), storage.get(entry.path))
+    scores = {view.name: view for view in edited.views}
+    cameras = _read(storage, model_id, "cameras.json")
+    if cameras:
+        for row in cameras.get("cameras", []):
+            for stale in ("psnr", "psnr_color_fitted", "ssim"):
+                row.pop(stale, None)
+            if (score := scores.get(row.get("name"))) is not None:
+                row |= score.model_dump(mode="json", include={"psnr", "ssim"})
+        storage.put(layout.model_file(new_id, "cameras.json"), json.dumps(cameras, indent=1).encode())
+    report = _edited_report(_read(storage, model_id, "report.json"), model_id, request, edited)
+    storage.put(layout.model_file(new_id, "report.json"), json.dumps(report, indent=1).encode())
+    moment = now().isoformat()
+    record = json.loads(storage.get(layout.job_record(model_id)))
+    record |= {
+        "id": new_id,
+        "model": new_id,
+        "name": request.name or record.get("name"),
+        "created_at": moment,
+        "finished_at": moment,
+        "sha256": {},
+    }
+    storage.put(layout.job_record(new_id), json.dumps(record, indent=1).encode())
+
+
+def _edited_report(
+    report: dict[str, Any], model_id: str, request: EditModel, edited: Edited
+) -> dict[str, Any]:
+    """The report of the training, with the last point of its curve and the result as they are after the edit."""
+    ssims = [view.ssim for view in edited.views if view.ssim is not None]
+    measured = {
+        "gaussians": edited.gaussians,
+        "psnr": edited.psnr,
+        "ssim": sum(ssims) / len(ssims) if ssims else None,
+    }
+    last = (report.get("curve") or [{"seconds": 0.0, "step": 0}])[-1]
+    done = request.model_dump(mode="json", exclude_none=True, exclude={"name", "preview"})
+    return {
+        **{name: value for name, value in report.items() if name not in ("time_lapse", "views", "warnings")},
+        "seconds": report.get("seconds") or {},
+        "curve": [last | measured],
+        "result": (report.get("result") or {}) | measured,
+        "edit": {"model": model_id, **done, "psnr_before": edited.psnr_before},
+    }
+
+
+def _read(storage: Storage, model_id: str, name: str) -> dict[str, Any]:
+    """A JSON file of a model; {} where it has none that can be read."""
+    try:
+        found = json.loads(storage.get(layout.model_file(model_id, name)))
+    except (FileNotFoundError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,154 @@
+"""How long a job will probably take: a pure function of the request and of what the finished jobs took.
+
+Each stage is scaled from the finished jobs that are most alike; the median is the estimate, the extremes its range.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from statistics import median
+
+from splatmill.schema import PRESET_STEPS, Backend, Estimate, EstimateJob, Preset, StageEstimate, TrainOptions
+from splatmill_server.jobs.finished import Figures
+
+ALIKE = 5
+"""Number of finished jobs that a stage is scaled from: enough for a median, few enough to be alike."""
+
+OTHER_PRESET = 1.0
+"""Distance between jobs of which one has another preset, or a size of its own: as much as a factor e of photos."""
+
+
+def estimate(request: EstimateJob, finished: Sequence[Figures]) -> Estimate:
+    """Return how long a job would take.
+
+    finished: the figures of finished jobs, newest first. Those of other machines than that of the newest one which
+        fits the option `backend` are not used, nor those of other kernels.
+    """
+    backend = request.options.backend
+    fitting = [found for found in finished if backend is Backend.auto or found.kernels == backend.value]
+    here = [
+        found
+        for found in fitting
+        if (found.machine, found.kernels) == (fitting[0].machine, fitting[0].kernels)
+    ]
+    stages = [_cameras(request, here), _training(request, here), _rest(request, here)]
+    return Estimate(
+        seconds=_sum([stage.seconds for stage in stages]),
+        lowest=_sum([stage.lowest for stage in stages]),
+        highest=_sum([stage.highest for stage in stages]),
+        stages=stages,
+        jobs=len(here),
+        machine=here[0].machine if here else None,
+    )
+
+
+def _cameras(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
+    alike = _nearest(
+        [found for found in here if found.posed == request.posed],
+        lambda found: _ratio(found.photos, request.photos),
+    )
+    kind = "with cameras that came with the photos" if request.posed else "with recovered cameras"
+    if not alike:
+        return StageEstimate(stage="cameras", because=f"No job {kind} has finished on this server yet.")
+    each = [found.cameras / found.photos for found in alike]
+    return _stage(
+        "cameras",
+        [seconds * request.photos for seconds in each],
+        f"{_jobs(alike)} {kind} took {_digits(median(each))} s per photo.",
+    )
+
+
+def _training(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
+    options = request.options
+    steps, limit = steps_of(options), math.inf if options.time_budget is None else options.time_budget
+    if steps is None:
+        return _stage("training", [limit], f"The time budget is {limit:g} s.")
+    alike = _nearest(
+        here,
+        lambda found: (
+            _ratio(found.photos, request.photos)
+            + 0.5 * _ratio(found.steps, steps)
+            + _size_distance(found, options)
+        ),
+    )
+    if not alike and limit < math.inf:
+        return _stage(
+            "training", [limit], f"The time budget is {limit:g} s, and the steps may end it earlier."
+        )
+    if not alike:
+        return StageEstimate(stage="training", because="No such job has finished on this server yet.")
+    each = [found.train / found.steps * _size_factor(found, options) for found in alike]
+    at_most = ", at most, since the target may be reached earlier" if options.target_psnr is not None else ""
+    return _stage(
+        "training",
+        [min(limit, seconds * steps) for seconds in each],
+        f"{steps} steps{at_most}; {_jobs(alike)} took {_digits(1000 * median(each))} ms per step.",
+    )
+
+
+def _rest(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
+    alike = _nearest(here, lambda found: _ratio(found.photos, request.photos))
+    if not alike:
+        return StageEstimate(stage="rest", because="No job has finished on this server yet.")
+    return _stage(
+        "rest",
+        [found.fixed + found.by_photo / found.photos * request.photos for found in alike],
+        f"{_jobs(alike)} took {_digits(median([found.fixed for found in alike]))} s to start, plan and store, "
+        f"and {_digits(median([found.by_photo / found.photos for found in alike]))} s per photo to load and measure.",
+    )
+
+
+def steps_of(options: TrainOptions) -> int | None:
+    """Return the largest number of steps that the options allow, or None where a time budget alone limits them."""
+    if options.steps is not None:
+        return options.steps
+    if options.time_budget is not None:
+        return None
+    return PRESET_STEPS[Preset.quality if options.target_psnr is not None else options.preset]
+
+
+def _size_distance(found: Figures, options: TrainOptions) -> float:
+    if options.image_size is not None:
+        return _ratio(found.image_size, options.image_size)
+    return OTHER_PRESET if found.sized or found.preset != options.preset.value else 0.0
+
+
+def _size_factor(found: Figures, options: TrainOptions) -> float:
+    """How much longer a step takes at another size of the photos: the share that is spent on pixels grows with them."""
+    if options.image_size is None:
+        return 1.0
+    return 1.0 + found.pixel_share * ((options.image_size / found.image_size) ** 2 - 1.0)
+
+
+def _nearest(figures: Sequence[Figures], distance: Callable[[Figures], float]) -> list[Figures]:
+    """Return the ALIKE figures with the least distance; of equal ones, the newest."""
+    return sorted(figures, key=distance)[:ALIKE]
+
+
+def _ratio(one: float, other: float) -> float:
+    return abs(math.log(one / other))
+
+
+def _stage(name: str, seconds: Sequence[float], because: str) -> StageEstimate:
+    return StageEstimate.model_validate(
+        {
+            "stage": name,
+            "seconds": round(median(seconds), 1),
+            "lowest": round(min(seconds), 1),
+            "highest": round(max(seconds), 1),
+            "because": because,
+        }
+    )
+
+
+def _sum(numbers: Sequence[float | None]) -> float | None:
+    known = [number for number in numbers if number is not None]
+    return round(sum(known), 1) if len(known) == len(numbers) else None
+
+
+def _jobs(alike: Sequence[Figures]) -> str:
+    return "One finished job" if len(alike) == 1 else f"The {len(alike)} finished jobs that are most alike"
+
+
+def _digits(number: float) -> str:
+    """Return a number with two significant digits."""
+    return f"{number:.2g}" if number < 100 else f"{number:.0f}"

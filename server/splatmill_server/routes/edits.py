@@ -1,0 +1,78 @@
+"""The endpoint of edits: a new model that leaves out a part of another."""
+
+from typing import Annotated
+
+import httpx
+from fastapi import APIRouter, Body, Request
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import JSONResponse, Response
+
+from splatmill.backplane import rendering
+from splatmill.schema import EDIT_HEADER, Edited, EditModel
+from splatmill_server.access.caller import Who
+from splatmill_server.answers.forward import CLIENT_GONE, while_connected
+from splatmill_server.edits import store_edited
+from splatmill_server.problems import ProblemError
+from splatmill_server.renderer import post
+from splatmill_server.routes.models import RENDER_PROBLEMS
+from splatmill_server.routes.openapi import answer, problems
+from splatmill_server.routes.ownership import ModelId
+from splatmill_server.routes.requests import JSON_ONLY
+from splatmill_server.service import Shared
+
+router = APIRouter(prefix="/v1/models", tags=["models"])
+
+_EXAMPLE = {"box": {"min": [-1, -1, -1], "max": [1, 1, 1]}, "min_opacity": 0.05, "preview": True}
+
+
+@router.post(
+    "/{model_id}/edits",
+    status_code=201,
+    response_model=Edited,
+    responses=answer(200, "What the edit would do; no model was made")
+    | RENDER_PROBLEMS
+    | problems("unsupported_media_type", "body_too_large", "storage_full", "quota_exceeded"),
+    dependencies=[JSON_ONLY],
+)
+async def edit_model(
+    service: Shared,
+    who: Who,
+    model_id: ModelId,
+    request: Request,
+    body: Annotated[EditModel, Body(examples=[_EXAMPLE])],
+) -> Response:
+    """Make a new model of the Gaussians in a box, of some opacity, or up to some size; the model itself is kept.
+
+    The answer has the PSNR before and after, on the held-out photos. With `preview`, no model is made.
+    """
+    model = await run_in_threadpool(service.models.get, model_id)
+    if not body.preview:
+        await run_in_threadpool(service.quota.check_new, who, size=model.bytes)
+    asked = post(
+        service.renderer,
+        rendering.edits_path(model_id),
+        body.model_dump_json(exclude_none=True),
+        {"Content-Type": "application/json"},
+        service.settings.orbit_timeout,
+    )
+    found = await while_connected(request, asked)
+    if found is None:
+        return Response(status_code=CLIENT_GONE)
+    try:
+        if found.status_code != 200:
+            problem = await found.aread()
+            return Response(problem, found.status_code, media_type=found.headers.get("content-type"))
+        edited = Edited.model_validate_json(found.headers[EDIT_HEADER])
+        if not body.preview:
+            new_id = await store_edited(service.storage, model_id, body, edited, found.aiter_raw())
+            edited = edited.model_copy(update={"model": new_id})
+    except httpx.TransportError as error:
+        raise ProblemError(
+            "renderer_unavailable",
+            f"The renderer ended while it sent the edited model ({type(error).__name__}).",
+            advice="Nothing was stored. Try again in a few seconds.",
+        ) from error
+    finally:
+        await found.aclose()
+    headers = {} if body.preview else {"Location": f"/v1/models/{edited.model}"}
+    return JSONResponse(edited.model_dump(mode="json"), 200 if body.preview else 201, headers)

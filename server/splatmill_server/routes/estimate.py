@@ -1,0 +1,37 @@
+"""The endpoint of `/v1/estimate`: how long a job would take on this server."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Body
+
+from splatmill.schema import Estimate, EstimateJob, Scope
+from splatmill_server.access.permission import needs
+from splatmill_server.jobs.estimate import estimate
+from splatmill_server.routes.openapi import problems
+from splatmill_server.routes.requests import JSON_ONLY
+from splatmill_server.service import Shared
+
+router = APIRouter(tags=["jobs"])
+
+_EXAMPLE = {"photos": 24, "options": {"preset": "draft"}}
+
+
+@router.post(
+    "/v1/estimate",
+    responses=problems(
+        "malformed_body",
+        "unsupported_media_type",
+        "body_too_large",
+        "unknown_option",
+        "option_out_of_range",
+        "storage_unavailable",
+    ),
+    dependencies=[JSON_ONLY],
+)
+@needs(Scope.read)
+def estimate_job(service: Shared, request: Annotated[EstimateJob, Body(examples=[_EXAMPLE])]) -> Estimate:
+    """Check the options of a job and estimate its time from the jobs that have finished here. Nothing is created.
+
+    The jobs of all owners count, because they tell of the machine. No name or id of them is shown.
+    """
+    return estimate(request, service.finished.newest())

@@ -1,0 +1,156 @@
+"""The endpoints of `/s/{token}/model`: what a link to a model gives to people without a key. They only read, and only
+this model. Their addresses are those of `/v1/models/{model_id}`, below another one."""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Path, Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import ValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import Response
+
+from splatmill.backplane import layout, rendering
+from splatmill.schema import DOWNLOADS, KeyLimits, ModelCameras, ModelDownloads, RenderRequest, SharedModel
+from splatmill_server.access.caller import Caller
+from splatmill_server.answers.files import file_response
+from splatmill_server.answers.forward import CLIENT_GONE, forward, while_connected
+from splatmill_server.conversions import format_of_key
+from splatmill_server.problems import ProblemError
+from splatmill_server.routes.models import CAMERA_QUERY, RENDER_PROBLEMS, RENDERED
+from splatmill_server.routes.openapi import answer, binary, problems
+from splatmill_server.service import Shared
+from splatmill_server.shares import HIDDEN_FILES, StoredShare
+
+router = APIRouter(prefix="/s/{token}/model", tags=["shares"])
+
+LIMITS = KeyLimits(requests_per_minute=600)
+"""Requests a minute through one link, whoever sends them: dragging without WebGL asks for some pictures a second."""
+
+_OPEN: dict[str, Any] = {"security": []}
+"""The token in the address is all that these endpoints ask for."""
+
+
+async def _share(
+    service: Shared, request: Request, token: Annotated[str, Path(description="Token of the link.")]
+) -> StoredShare:
+    share = await run_in_threadpool(service.shares.open, token)
+    visitor = Caller("", f"share-{share.model}-{share.id}", f"link {share.id}", frozenset(), LIMITS)
+    request.state.caller = visitor  # for the access log, which does not show the token
+    await service.rate.admit(visitor)
+    return share
+
+
+OpenShare = Annotated[StoredShare, Depends(_share)]
+"""The link of the token in the address; an endpoint that takes one answers 404 and 410 where it opens nothing."""
+
+
+@router.get(
+    "",
+    responses=problems("share_not_found", "share_ended", "model_not_found", "model_corrupt"),
+    openapi_extra=_OPEN,
+)
+def get_shared_model(service: Shared, share: OpenShare) -> SharedModel:
+    """Get the model that a link shows."""
+    return service.shares.model(share)
+
+
+@router.head("/files/{name:path}", include_in_schema=False)
+@router.get(
+    "/files/{name:path}",
+    response_class=Response,
+    responses=binary("The file", *sorted({*layout.MODEL_FILES.values(), "image/webp"}))
+    | answer(206, "The requested range of the file")
+    | answer(304, "The file is unchanged")
+    | problems(
+        "share_not_found", "share_ended", "model_not_found", "file_not_found", "range_not_satisfiable"
+    ),
+    openapi_extra=_OPEN,
+)
+async def get_shared_file(service: Shared, share: OpenShare, name: str, request: Request) -> Response:
+    """Download a file of the model that a link shows."""
+    if name in HIDDEN_FILES:
+        raise ProblemError("file_not_found", f"The link gives out no file {name!r}.")
+    entry = await run_in_threadpool(service.models.file, share.model, name)
+    download = f"{share.model}.ply" if name == "model.ply" else None
+    media_type = layout.model_media_type(name) or "application/octet-stream"
+    return await file_response(request, service.storage, entry.path, media_type, download_name=download)
+
+
+@router.get(
+    "/formats",
+    responses=problems("share_not_found", "share_ended", "model_not_found", "model_corrupt"),
+    openapi_extra=_OPEN,
+)
+def get_shared_formats(
+    service: Shared, share: OpenShare, token: Annotated[str, Path(description="Token of the link.")]
+) -> ModelDownloads:
+    """List the file formats in which the model that a link shows can be downloaded."""
+    found = service.conversions.list(share.model)
+    base = f"/s/{token}/model/download"
+    formats = [form.model_copy(update={"address": f"{base}/{form.format}"}) for form in found.formats]
+    return found.model_copy(update={"formats": formats})
+
+
+@router.head("/download/{format}", include_in_schema=False)
+@router.get(
+    "/download/{format}",
+    response_class=Response,
+    responses=binary("The model in this format", *sorted({form.media_type for form in DOWNLOADS.values()}))
+    | answer(206, "The requested range of the file")
+    | answer(304, "The file is unchanged")
+    | problems(
+        "share_not_found",
+        "share_ended",
+        "model_not_found",
+        "format_unknown",
+        "range_not_satisfiable",
+        "model_corrupt",
+        "conversion_failed",
+        "renderer_unavailable",
+        "render_timeout",
+    ),
+    openapi_extra=_OPEN,
+)
+async def download_shared(
+    service: Shared,
+    share: OpenShare,
+    format: Annotated[str, Path(description=f"One of {', '.join(DOWNLOADS)}.")],
+    request: Request,
+) -> Response:
+    """Download the model that a link shows in a file format. The first request of anybody converts it."""
+    form = format_of_key(format)
+    path = await while_connected(request, service.conversions.path(share.model, form))
+    if path is None:
+        return Response(status_code=CLIENT_GONE)
+    return await file_response(
+        request, service.storage, path, form.media_type, download_name=f"{share.model}{form.suffix}"
+    )
+
+
+@router.get(
+    "/cameras",
+    responses=problems(
+        "share_not_found", "share_ended", "model_not_found", "file_not_found", "model_corrupt"
+    ),
+    openapi_extra=_OPEN,
+)
+def get_shared_cameras(service: Shared, share: OpenShare) -> ModelCameras:
+    """Get the cameras of the photos in the coordinates of the model that a link shows."""
+    return service.models.cameras(share.model)
+
+
+@router.get(
+    "/render",
+    response_class=Response,
+    responses=RENDERED | RENDER_PROBLEMS | problems("share_not_found", "share_ended"),
+    openapi_extra={"parameters": CAMERA_QUERY, **_OPEN},
+)
+async def render_shared(service: Shared, share: OpenShare, request: Request) -> Response:
+    """Render an image of the model that a link shows."""
+    try:
+        body = RenderRequest.from_query(request.query_params)
+    except ValidationError as error:
+        located = [{**found, "loc": ("query", *found["loc"])} for found in error.errors()]
+        raise RequestValidationError(located) from error
+    path, seconds = rendering.render_path(share.model), service.settings.render_timeout
+    return await forward(service.renderer, request, path, body, seconds)

@@ -1,0 +1,48 @@
+// Elements as function calls. Text is set as text, never as HTML, so names chosen by users cannot become markup.
+
+/** @typedef {Node | string | number | false | null | undefined} Child */
+
+/**
+ * Return a new element.
+ *
+ * Properties whose name begins with `on` are listeners; `class`, `data-...`, `aria-...` and others are attributes; false,
+ * null and undefined leave an attribute out, true gives it no value.
+ * @template {keyof HTMLElementTagNameMap} T
+ * @param {T} tag
+ * @param {Record<string, any>} [attributes]
+ * @param {...(Child | Child[])} children
+ * @returns {HTMLElementTagNameMap[T]}
+ */
+export function h(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) element.addEventListener(name.slice(2).toLowerCase(), value);
+    else if (value === true) element.setAttribute(name, "");
+    else if (value !== false && value !== null && value !== undefined) element.setAttribute(name, String(value));
+  }
+  append(element, children);
+  return element;
+}
+
+/**
+ * Append children, leaving out those that are false or null.
+ * @param {Element} element
+ * @param {(Child | Child[])[]} children
+ */
+export function append(element, children) {
+  for (const child of children.flat()) {
+    if (child !== false && child !== null && child !== undefined) element.append(child instanceof Node ? child : String(child));
+  }
+}
+
+/**
+ * Return the element with this id. Throws if the page has none, which is a mistake of the page.
+ * @template {HTMLElement} [T=HTMLElement]
+ * @param {string} id
+ * @returns {T}
+ */
+export function byId(id) {
+  const found = document.getElementById(id);
+  if (!found) throw new Error(`The page has no element #${id}.`);
+  return /** @type {T} */ (found);
+}

@@ -1,0 +1,151 @@
+// The course of a job, from its events: a reader of the same events gets the same course, from whichever event it begins.
+
+/** The states in order, and what happens in each, for people. */
+export const STATES = /** @type {const} */ ({
+  queued: "Waiting in the queue",
+  preparing: "Preparing",
+  sfm: "Finding the cameras",
+  training: "Training",
+  exporting: "Writing the model",
+});
+export const FINAL = ["succeeded", "failed", "cancelled"];
+
+/** Names of the stages that progress is reported of. */
+export const STAGES = new Map(Object.entries({
+  images: "Examining the photos",
+  features: "Finding features",
+  pairs: "Choosing pairs of photos",
+  matching: "Matching pairs of photos",
+  mapping: "Placing cameras",
+  stereo: "Adding points by stereo",
+  training: "Training",
+}));
+
+const MOST_LINES = 1000;
+
+/**
+ * @typedef {object} Span a time in one state
+ * @property {string} state
+ * @property {number} from milliseconds since 1970
+ * @property {number | null} to null while it lasts
+ *
+ * @typedef {object} Stage
+ * @property {string} name
+ * @property {number} done
+ * @property {number | null} total
+ * @property {string} note
+ * @property {number} began
+ * @property {number} last time of the last report
+ * @property {number | null} eta seconds until the stage ends
+ */
+
+export class Course {
+  constructor() {
+    this.state = "queued";
+    this.attempt = 0;
+    /** When the newest event was reported, milliseconds since 1970 by the server's clock. */
+    this.time = 0;
+    /** @type {any} the problem document of a job that failed */
+    this.problem = null;
+    /** @type {Span[]} */
+    this.spans = [];
+    /** @type {Map<string, Stage>} */
+    this.stages = new Map();
+    /** @type {any} the last progress event */
+    this.progress = null;
+    /** @type {any} */
+    this.plan = null;
+    /** @type {import("../chart.js").CurveRow[]} */
+    this.rows = [];
+    /** @type {{at: string, level: string, message: string}[]} */
+    this.lines = [];
+    /** Number of lines so far, those that are no longer kept included. */
+    this.logged = 0;
+    /** @type {any} the last event of cameras that were placed */
+    this.cameras = null;
+    /** @type {any} the last event of a snapshot */
+    this.snapshot = null;
+    /** Number of previews so far: it names the picture anew. */
+    this.previews = 0;
+  }
+
+  get final() {
+    return FINAL.includes(this.state);
+  }
+
+  /** Add what an event says. @param {any} record */
+  apply({ event, at, attempt }) {
+    const time = Date.parse(at);
+    this.time = Math.max(this.time, time);
+    switch (event.type) {
+      case "state":
+        this.enter(event, time, attempt);
+        break;
+      case "progress":
+        this.progress = event;
+        this.advance(event, time);
+        break;
+      case "metric":
+        // A run that resumed from a checkpoint measures again what came after it.
+        this.rows = [...this.rows.filter((row) => row.step < event.step), event];
+        break;
+      case "plan":
+        this.plan = event.plan;
+        break;
+      case "log":
+        this.lines.push({ at, level: event.level ?? "info", message: event.message });
+        this.logged += 1;
+        if (this.lines.length > MOST_LINES) this.lines.shift();
+        break;
+      case "cameras":
+        this.cameras = event;
+        break;
+      case "snapshot":
+        this.snapshot = { ...event, time };
+        break;
+      case "preview":
+        this.previews += 1;
+        break;
+    }
+  }
+
+  /** @param {any} event @param {number} time @param {number} attempt */
+  enter(event, time, attempt) {
+    const again = event.state === "queued" && this.spans.length > 0;
+    if (again && attempt === 0) {
+      // It was restarted: what happened before belongs to another run. What was measured may be gone on with.
+      const { rows, lines, logged } = this;
+      Object.assign(this, new Course(), { rows, lines, logged });
+    }
+    const open = this.spans.at(-1);
+    if (open) open.to ??= time;
+    this.state = event.state;
+    this.attempt = attempt;
+    this.problem = event.problem ?? null;
+    this.progress = null;
+    if (!this.final) this.spans.push({ state: event.state, from: time, to: null });
+  }
+
+  /** @param {any} event @param {number} time */
+  advance(event, time) {
+    const known = this.stages.get(event.stage);
+    const anew = !known || event.done < known.done;
+    const began = anew ? time : known.began;
+    const passed = (time - began) / 1000;
+    const share = event.total ? event.done / event.total : 0;
+    const eta = event.eta ?? (share > 0.02 && passed > 1 ? (passed * (1 - share)) / share : null);
+    this.stages.set(event.stage, {
+      name: event.stage, done: event.done, total: event.total ?? null, note: event.note ?? "", began, last: time, eta,
+    });
+  }
+
+  /** Seconds in each state so far, and at which of them it is now. @param {number} now milliseconds since 1970 */
+  seconds(now) {
+    /** @type {Map<string, number>} */
+    const sums = new Map();
+    for (const { state, from, to } of this.spans) {
+      sums.set(state, (sums.get(state) ?? 0) + Math.max(0, (to ?? now) - from) / 1000);
+    }
+    return sums;
+  }
+}

@@ -1,0 +1,30 @@
+// The log of a job: its last lines, warnings first to be seen, and the whole as a file.
+
+import { h } from "../dom.js";
+
+/** @typedef {{at: string, level: string, message: string}} Line */
+
+/** @type {WeakMap<object, HTMLLIElement>} */
+const items = new WeakMap();
+
+/** Show lines in a list; it stays at its end if it is there. @param {HTMLElement} list @param {Line[]} lines */
+export function showLog(list, lines) {
+  const atEnd = list.scrollHeight - list.scrollTop - list.clientHeight < 30;
+  for (const line of lines) if (!items.has(line)) items.set(line, itemOf(line));
+  const wanted = lines.map((line) => /** @type {HTMLLIElement} */ (items.get(line)));
+  while (list.firstChild && list.firstChild !== wanted[0]) list.firstChild.remove();
+  list.append(...wanted.slice(list.children.length));
+  if (atEnd) list.scrollTop = list.scrollHeight;
+}
+
+/** @param {Line} line */
+function itemOf({ at, level, message }) {
+  return h("li", { "data-level": level },
+    h("time", { datetime: at, class: "muted number" }, new Date(at).toLocaleTimeString()), " ",
+    level !== "info" && level !== "debug" && h("strong", {}, `${level}: `), message);
+}
+
+/** The warnings among log lines, each once, newest last. @param {{level: string, message: string}[]} lines */
+export function warningsOf(lines) {
+  return [...new Set(lines.filter(({ level }) => level === "warning").map(({ message }) => message))];
+}

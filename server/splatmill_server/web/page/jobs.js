@@ -1,0 +1,108 @@
+// The list of jobs: state and progress of each, cancel, delete.
+
+import { get, send } from "./api.js";
+import { h } from "./dom.js";
+import { ago, moment, seconds } from "./format.js";
+import { listing } from "./listing.js";
+import { confirmAction, notify, startShell } from "./shell.js";
+
+const RUNNING = ["preparing", "sfm", "training", "exporting"];
+const FINAL = ["succeeded", "failed", "cancelled"];
+const NAMES = /** @type {Record<string, string>} */ ({
+  queued: "Waiting", preparing: "Reading photos", sfm: "Finding cameras", training: "Training",
+  exporting: "Writing files", succeeded: "Finished", failed: "Failed", cancelled: "Cancelled",
+});
+const REFRESH_MS = 4000; // between two looks at the jobs that are not finished, while the page is seen
+
+/** @param {any} job */
+function entry(job) {
+  const name = job.name || `Job ${job.id.slice(0, 8)}`;
+  const kind = RUNNING.includes(job.state) ? "running" : job.state;
+  const done = FINAL.includes(job.state);
+  const { progress } = job;
+  return h("li", {},
+    poster(job),
+    h("div", {},
+      h("div", { class: "title" },
+        h("a", { class: "whole", href: `/jobs/${job.id}`, "data-focus": "open" }, name),
+        h("span", { class: "badge", "data-state": kind }, job.cancel_requested && !done ? "Stopping" : NAMES[job.state] ?? job.state)),
+      !done && progress?.total
+        ? h("progress", { value: progress.done, max: progress.total, "aria-label": `${name}: ${progress.stage}` }) : null,
+      h("p", { class: "meta", title: `Created ${moment(job.created_at)}` }, facts(job).join(" · "))),
+    h("div", { class: "actions" },
+      done ? null : h("button", { class: "quiet small", type: "button", "data-focus": "cancel", disabled: job.cancel_requested, onclick: () => cancel(job) }, "Cancel", hidden(name)),
+      done ? h("button", { class: "quiet small", type: "button", "data-focus": "delete", onclick: () => remove(job) }, "Delete", hidden(name)) : null));
+}
+
+/** @param {string} name */
+function hidden(name) {
+  return h("span", { class: "visually-hidden" }, ` ${name}`);
+}
+
+/** @param {any} job */
+function poster(job) {
+  if (job.state === "succeeded" && job.model) return h("img", { class: "poster", src: `/v1/models/${job.model}/files/preview.jpg`, alt: "", loading: "lazy" });
+  return h("div", { class: "poster none", "aria-hidden": "true" }, job.state === "failed" ? "no model" : job.state === "cancelled" ? "cancelled" : "…");
+}
+
+/** @param {any} job @returns {string[]} */
+function facts(job) {
+  const found = [];
+  const { progress } = job;
+  if (job.state === "failed" && job.problem) found.push(job.problem.title);
+  if (job.state === "queued") {
+    if (job.waiting_for) found.push(`waits for a worker of the queue ${job.waiting_for}`);
+    else if (job.queue_position !== null && job.queue_position !== undefined) found.push(job.queue_position === 0 ? "next in the queue" : `${job.queue_position} before it`);
+  }
+  if (RUNNING.includes(job.state) && progress) {
+    if (progress.psnr) found.push(`${progress.psnr.toFixed(1)} dB`);
+    if (progress.eta) found.push(`about ${seconds(progress.eta)} left`);
+  }
+  if (job.finished_at && job.started_at) found.push(`took ${seconds((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)}`);
+  found.push(ago(job.created_at));
+  return found;
+}
+
+/** @param {any} job */
+async function cancel(job) {
+  const yes = await confirmAction({
+    title: "Cancel this job?", text: "It ends without a model. What it has done is kept, so a restart goes on from there.", action: "Cancel the job",
+  });
+  if (!yes) return;
+  list.update(await send("POST", `/v1/jobs/${job.id}/cancel`));
+}
+
+/** @param {any} job */
+async function remove(job) {
+  const yes = await confirmAction({
+    title: "Delete this job?",
+    text: job.model ? "Its model, the report and all links to it are deleted too. The photos are kept." : "Its log is deleted too. The photos are kept.",
+    action: "Delete",
+  });
+  if (!yes) return;
+  await send("DELETE", `/v1/jobs/${job.id}`);
+  list.remove(job.id);
+  notify("The job is deleted.", "good");
+}
+
+async function refresh() {
+  if (document.hidden) return;
+  const open = list.records().filter((job) => !FINAL.includes(job.state));
+  for (const { id } of open) {
+    try {
+      list.update(await get(`/v1/jobs/${id}`));
+    } catch {
+      // Deleted by somebody else, or the server is away for a moment; the next look tells.
+    }
+  }
+}
+
+await startShell();
+const list = await listing({
+  noun: "jobs",
+  limit: 30,
+  query: ({ name, state }) => ({ name, state: state === "running" ? RUNNING : state }),
+  entry,
+  empty: () => h("span", {}, "There are no jobs yet. ", h("a", { href: "/" }, "Start with some photos"), "."),
+});
+setInterval(refresh, REFRESH_MS);

@@ -1,0 +1,122 @@
+// A list that is filtered, loaded page by page, and keeps its filters in the page's address.
+
+import { get } from "./api.js";
+import { byId } from "./dom.js";
+
+const TYPING_MS = 250; // a pause in typing after which the list is asked for again
+
+/**
+ * Show the records of a list in `#list`, filtered by the form `#filters`, with `#more` for the next page.
+ * @param {object} list
+ * @param {"jobs" | "models"} list.noun
+ * @param {number} list.limit records of a page
+ * @param {(filters: Record<string, string>) => import("./api.js").Query} list.query what the server is asked for
+ * @param {(record: any) => HTMLElement} list.entry returns the entry of a record, an `<li>`
+ * @param {() => (Node | string)} list.empty what to say where there is nothing at all
+ * @returns {Promise<{reload: () => Promise<void>, remove: (id: string) => void, update: (record: any) => void, records: () => any[]}>}
+ */
+export async function listing({ noun, limit, query, entry, empty }) {
+  const form = /** @type {HTMLFormElement} */ (byId("filters"));
+  const box = byId("list");
+  const more = /** @type {HTMLButtonElement} */ (byId("more"));
+  const count = byId("count");
+  /** @type {Map<string, {record: any, element: HTMLElement}>} */
+  const shown = new Map();
+  /** @type {string | null} */
+  let cursor = null;
+  let asked = new AbortController();
+  let timer = 0;
+
+  const filters = () => Object.fromEntries([...new FormData(form)].map(([name, value]) => [name, String(value)]));
+
+  for (const [name, value] of new URLSearchParams(location.search)) {
+    const control = form.elements.namedItem(name);
+    if (control instanceof HTMLInputElement || control instanceof HTMLSelectElement) control.value = value;
+  }
+
+  /** @param {any} record */
+  function show(record) {
+    const element = entry(record);
+    const known = shown.get(record.id);
+    if (known) known.element.replaceWith(element);
+    else box.append(element);
+    shown.set(record.id, { record, element });
+  }
+
+  function say() {
+    const filtered = Object.values(filters()).some(Boolean);
+    more.hidden = cursor === null;
+    box.hidden = shown.size === 0;
+    if (shown.size > 0) count.textContent = `${shown.size}${cursor ? " or more" : ""} ${shown.size === 1 ? noun.slice(0, -1) : noun}`;
+    else if (filtered) count.textContent = `No ${noun} match. Change the filter to see others.`;
+    else count.replaceChildren(empty());
+  }
+
+  async function load() {
+    asked.abort();
+    asked = new AbortController();
+    const { signal } = asked;
+    more.disabled = true;
+    try {
+      // A page of a filtered list may hold none although others follow.
+      for (let before = shown.size; shown.size === before; ) {
+        const page = await get(`/v1/${noun}`, { ...query(filters()), limit, cursor }, signal);
+        page[noun].forEach(show);
+        cursor = page.cursor;
+        if (!cursor) break;
+      }
+      say();
+    } catch (error) {
+      if (!signal.aborted) throw error;
+    } finally {
+      more.disabled = false;
+    }
+  }
+
+  async function reload() {
+    const chosen = new URLSearchParams(Object.entries(filters()).filter(([, value]) => value));
+    history.replaceState(null, "", chosen.size ? `?${chosen}` : location.pathname);
+    shown.clear();
+    box.replaceChildren();
+    cursor = null;
+    await load();
+  }
+
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    reload();
+  });
+  form.addEventListener("input", (event) => {
+    clearTimeout(timer);
+    timer = setTimeout(reload, event.target instanceof HTMLSelectElement ? 0 : TYPING_MS);
+  });
+  more.addEventListener("click", async () => {
+    const last = shown.size;
+    await load();
+    /** @type {HTMLElement | null | undefined} */ ([...shown.values()][last]?.element.querySelector("a"))?.focus();
+  });
+  await reload();
+
+  return {
+    reload,
+    records: () => [...shown.values()].map(({ record }) => record),
+    update(record) {
+      const known = shown.get(record.id);
+      // An entry that somebody is in keeps its focus: it is left alone unless something has changed.
+      if (!known || JSON.stringify(known.record) === JSON.stringify(record)) return;
+      const focused = known.element.contains(document.activeElement)
+        ? document.activeElement?.getAttribute("data-focus") : undefined;
+      show(record);
+      if (focused) /** @type {HTMLElement | null} */ (shown.get(record.id)?.element.querySelector(`[data-focus="${focused}"]`))?.focus();
+    },
+    remove(id) {
+      const known = shown.get(id);
+      if (!known) return;
+      const beside = known.element.nextElementSibling ?? known.element.previousElementSibling;
+      known.element.remove();
+      shown.delete(id);
+      say();
+      (/** @type {HTMLElement | null} */ (beside?.querySelector("a")) ?? byId("main")).focus();
+    },
+  };
+}

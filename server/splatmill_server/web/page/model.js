@@ -1,0 +1,88 @@
+// The page of one model: the viewer with its tools, the comparison with held-out photos, downloads, orbit video, cameras.
+
+import { get, idOfPage, modelAddress, request } from "./api.js";
+import { byId, h } from "./dom.js";
+import { ago, bytes, decibels, number } from "./format.js";
+import { showCompare } from "./model/compare.js";
+import { showCameras } from "./model/cameras.js";
+import { showDownloads } from "./model/downloads.js";
+import { showOrbit } from "./model/orbit.js";
+import { Stage } from "./model/stage.js";
+import { openSharing } from "./sharing.js";
+import { confirmAction, noticeOf, startShell } from "./shell.js";
+
+/**
+ * What the parts of the page know of the model.
+ * @typedef {object} Shown
+ * @property {any} model the answer of `/v1/models/{id}`
+ * @property {string} address that of the model, as `/v1/models/{id}`
+ * @property {any[]} cameras those of the photos, with `name`, `split`, `camera`, `psnr`, `ssim` and `photo`; none if it has none
+ * @property {any} report the contents of report.json; `{}` if it has none
+ * @property {"black" | "white"} background the colour behind the model when it was measured
+ */
+
+await startShell({ viewer: true });
+const id = idOfPage();
+try {
+  await show(await load(modelAddress(id)));
+} catch (error) {
+  byId("problem").append(noticeOf(/** @type {Error} */ (error)));
+}
+
+/** @param {string} address @returns {Promise<Shown>} */
+async function load(address) {
+  const model = await get(address);
+  const has = new Set(model.files.map((/** @type {any} */ file) => file.name));
+  const [cameras, report] = await Promise.all([
+    has.has("cameras.json") ? get(`${address}/cameras`).then((found) => found.cameras) : [],
+    has.has("report.json") ? get(`${address}/files/report.json`).catch(() => ({})) : /** @type {any} */ ({}),
+  ]);
+  const chosen = report.plan?.background ?? "random";
+  const white = chosen === "white" || (chosen === "random" && report.facts?.transparent > 0);
+  return { model, address, cameras, report, background: white ? "white" : "black" };
+}
+
+/** @param {Shown} shown */
+async function show(shown) {
+  const { model } = shown;
+  const name = model.name || `Model ${model.id}`;
+  document.title = `${name} - Splatmill`;
+  byId("title").textContent = name;
+  byId("lead").textContent = [
+    `${number(model.gaussians)} Gaussians`,
+    bytes(model.bytes),
+    model.psnr === null || model.psnr === undefined ? "no held-out photos" : `${decibels(model.psnr)} on held-out photos`,
+    `made ${ago(model.created_at)}`,
+  ].join(" · ");
+  byId("actions").append(...actions(shown));
+  byId("whole").hidden = false;
+  showCompare(byId("compare"), shown);
+  void showDownloads(byId("downloads"), shown);
+  showOrbit(byId("orbit"), shown);
+  const stage = new Stage(shown);
+  showCameras(byId("cameras"), shown, stage);
+  await stage.open();
+}
+
+/** @param {Shown} shown */
+function actions({ model, address }) {
+  const has = model.files.some((/** @type {any} */ file) => file.name === "report.html");
+  return [
+    h("button", { type: "button", onclick: () => openSharing(address, model.name || `Model ${model.id}`) }, "Share"),
+    has && h("a", { class: "button", href: `${address}/files/report.html`, target: "_blank", rel: "noopener" }, "Report"),
+    h("a", { class: "button", href: `/jobs/${encodeURIComponent(model.job)}` }, "Job"),
+    h("button", { class: "danger", type: "button", onclick: () => remove(model) }, "Delete"),
+  ].filter((element) => element instanceof Node);
+}
+
+/** @param {any} model */
+async function remove(model) {
+  const yes = await confirmAction({
+    title: "Delete this model?",
+    text: "The model, its report, its files and its job are deleted. The photos are kept. This cannot be undone.",
+    action: "Delete the model",
+  });
+  if (!yes) return;
+  await request("DELETE", `/v1/jobs/${encodeURIComponent(model.job)}`);
+  location.assign("/models");
+}

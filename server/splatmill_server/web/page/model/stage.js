@@ -1,0 +1,156 @@
+// The viewer of the model's page with its tools: kinds of view, cameras, far background, time-lapse, measuring.
+
+import { byId, h } from "../dom.js";
+import { bytes } from "../format.js";
+import { noticeOf } from "../shell.js";
+import { open } from "../viewer.js";
+import { GRADIENT } from "../viewer/depth.js";
+import { HELP } from "../viewer/controls.js";
+import { Edit } from "./edit.js";
+import { Measure } from "./measure.js";
+import { timeLapse } from "./time_lapse.js";
+
+/**
+ * @import {Shown} from "../model.js"
+ * @import {View} from "../viewer.js"
+ */
+
+/** Share of the far shell's distance that the camera may go to, and radius around the cameras that hiding it leaves. */
+const ROAM = 0.7;
+const INSIDE = 0.4;
+/** How far the camera may go where there is no shell, over the farthest camera's distance from the middle. */
+const ROAM_FREELY = 20;
+
+export class Stage {
+  /** @param {Shown} shown */
+  constructor(shown) {
+    this.shown = shown;
+    /** @type {View | null} */
+    this.view = null;
+    const { plan, facts } = shown.report;
+    /** Distance of the far shell over that of the farthest camera; 0 where there is none. */
+    this.shell = plan?.far_shell ? Number(facts?.shell_distance) || 0 : 0;
+    this.showing = { cameras: false, hidden: false };
+    this.note = byId("viewer-note");
+    this.kind = h("select", { "aria-label": "Kind of view", onchange: () => this.switchTo(this.kind.value) },
+      h("option", { value: "webgl" }, "3D"), h("option", { value: "pictures" }, "Pictures by the server"), h("option", { value: "depth" }, "Depth"));
+    this.camerasButton = toggle("Cameras", (on) => this.toggleCameras(on));
+    this.farButton = toggle("Hide far background", (on) => this.hideFar(on));
+    this.measure = new Measure(this);
+    this.edit = new Edit(this);
+    this.scale = h("div", { class: "depth-scale number", hidden: true });
+    byId("toolbar").append(this.kind,
+      h("button", { type: "button", onclick: () => this.view?.goHome() }, "Start view"),
+      shown.cameras.length ? this.camerasButton : "",
+      this.shell ? this.farButton : "",
+      this.measure.button,
+      this.edit.button,
+      document.fullscreenEnabled ? h("button", { type: "button", class: "push", onclick: () => void byId("viewer").requestFullscreen() }, "Full screen") : "");
+    byId("panels").append(this.scale, this.measure.panel, this.edit.panel);
+  }
+
+  /** Open the view of a kind, with the camera of the one before. @param {"webgl" | "pictures" | "depth"} kind */
+  async open(kind = "webgl") {
+    const { shown } = this;
+    const camera = this.view?.getCamera();
+    this.view?.dispose();
+    this.view = null;
+    const loading = byId("loading");
+    loading.textContent = "Loading the model";
+    try {
+      this.view = await open(byId("viewer"), {
+        url: `${shown.address}/files/model.ply`,
+        model: shown.address,
+        cameras: shown.cameras.map((entry) => entry.camera),
+        kind,
+        antialias: antialias(shown.report),
+        background: shown.background,
+        roam: this.shell ? ROAM * this.shell : ROAM_FREELY,
+        label: shown.model.name || "The model",
+        progress: (done, total) => {
+          loading.textContent = `Loading the model: ${bytes(done)}${total ? ` of ${bytes(total)}` : ""}`;
+        },
+      });
+    } catch (error) {
+      loading.textContent = "";
+      byId("viewer").append(noticeOf(/** @type {Error} */ (error)));
+      return;
+    }
+    loading.textContent = "";
+    const { view } = this;
+    this.kind.value = view.kind;
+    this.note.textContent = view.whyNot || HELP;
+    if (camera) view.setCamera(camera);
+    view.addEventListener("trouble", (event) => (loading.textContent = /** @type {CustomEvent} */ (event).detail));
+    view.addEventListener("range", (event) => this.showScale(/** @type {CustomEvent} */ (event).detail));
+    view.addEventListener("pick-camera", (event) => {
+      const { name } = /** @type {CustomEvent} */ (event).detail;
+      this.lookFrom(shown.cameras.find((entry) => entry.name === name));
+    });
+    this.scale.hidden = view.kind !== "depth";
+    this.measure.attach(view);
+    this.edit.attach(view);
+    this.toggleCameras(this.showing.cameras);
+    this.hideFar(this.showing.hidden);
+    if (!this.lapse) {
+      this.lapse = timeLapse(shown, this);
+      if (this.lapse) byId("panels").prepend(this.lapse.element);
+    }
+    this.lapse?.available(view.kind === "webgl");
+    byId("viewer").dataset.ready = view.kind;
+  }
+
+  /** @param {string} kind */
+  async switchTo(kind) {
+    await this.open(/** @type {"webgl" | "pictures" | "depth"} */ (kind));
+    this.view?.element.focus({ preventScroll: true });
+  }
+
+  /** @param {any} entry of the cameras */
+  lookFrom(entry) {
+    this.view?.setCamera(entry.camera);
+    this.selected = entry.name;
+    this.toggleCameras(this.showing.cameras);
+    byId("viewer").scrollIntoView({ block: "nearest" });
+    this.note.textContent = `The view of ${entry.name}.`;
+  }
+
+  /** @param {boolean} on */
+  toggleCameras(on) {
+    this.showing.cameras = on;
+    this.view?.showCameras(on ? this.shown.cameras.map((entry) => ({
+      name: entry.name, camera: entry.camera, selected: entry.name === this.selected,
+      color: entry.split === "test" ? "#f0a061" : "#8fb2ff",
+    })) : []);
+    if (on) this.note.textContent = "Blue: trained on. Orange: held out. Click the tip of a camera to look from there.";
+  }
+
+  /** @param {boolean} on */
+  hideFar(on) {
+    this.showing.hidden = on;
+    this.view?.hideBeyond(on ? INSIDE * this.shell : null);
+  }
+
+  /** @param {{near: number, far: number}} range */
+  showScale({ near, far }) {
+    const bar = h("i");
+    bar.style.background = GRADIENT;
+    this.scale.replaceChildren(h("span", {}, this.measure.distance(near)), bar, h("span", {}, this.measure.distance(far)));
+  }
+}
+
+/** @param {string} text @param {(on: boolean) => void} change */
+export function toggle(text, change) {
+  const button = h("button", { type: "button", "aria-pressed": "false", onclick: () => {
+    const on = button.getAttribute("aria-pressed") !== "true";
+    button.setAttribute("aria-pressed", String(on));
+    change(on);
+  } }, text);
+  return button;
+}
+
+/** Whether the plan of a report says that the model was trained with antialiasing. @param {any} report */
+function antialias(report) {
+  const decision = report.plan?.antialias;
+  return Boolean(decision?.value ?? decision);
+}

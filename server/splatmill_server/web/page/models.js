@@ -1,0 +1,106 @@
+// The list of models with their pictures, and what they occupy in storage.
+
+import { get, modelAddress, send } from "./api.js";
+import { append, byId, h } from "./dom.js";
+import { ago, bytes, decibels, moment, number } from "./format.js";
+import { listing } from "./listing.js";
+import { openSharing } from "./sharing.js";
+import { confirmAction, notify, startShell } from "./shell.js";
+
+/** @param {any} model */
+function entry(model) {
+  const name = model.name || `Model ${model.id.slice(0, 8)}`;
+  const hasPicture = model.files.some((/** @type {any} */ file) => file.name === "preview.jpg");
+  return h("li", { class: "tile" },
+    hasPicture
+      ? h("img", { class: "poster", src: `/v1/models/${model.id}/files/preview.jpg`, alt: "", loading: "lazy" })
+      : h("div", { class: "poster none", "aria-hidden": "true" }, "no picture"),
+    h("div", { class: "body" },
+      h("a", { class: "whole", href: `/models/${model.id}` }, name),
+      h("p", { class: "figures" }, `${decibels(model.psnr)} · ${number(model.gaussians)} Gaussians · ${bytes(model.bytes)}`),
+      h("div", { class: "foot" },
+        h("span", { title: moment(model.created_at) }, ago(model.created_at)),
+        h("span", { class: "actions push" },
+          h("button", { class: "quiet small", type: "button", onclick: () => openSharing(modelAddress(model.id), name) }, "Share", h("span", { class: "visually-hidden" }, ` ${name}`)),
+          h("button", { class: "quiet small", type: "button", onclick: () => remove(model, name) }, "Delete", h("span", { class: "visually-hidden" }, ` ${name}`))))));
+}
+
+/** @param {any} model @param {string} name */
+async function remove(model, name) {
+  const yes = await confirmAction({
+    title: `Delete ${name}?`, text: "Its job, the report and all links to it are deleted too. The photos are kept.", action: "Delete",
+  });
+  if (!yes) return;
+  await send("DELETE", `/v1/jobs/${model.job}`);
+  list.remove(model.id);
+  notify("The model is deleted.", "good");
+  await storage();
+}
+
+const KINDS = /** @type {const} */ ([
+  ["captures", "Photos", "s1"], ["models", "Models", "s2"], ["sfm", "Cameras", "s3"], ["jobs", "Checkpoints", "s4"],
+]);
+
+/** Show what the caller's records occupy: a bar, its key with the figures, and the largest records. */
+async function storage() {
+  const use = await get("/v1/storage", { largest: 6 });
+  const body = byId("storage-body");
+  body.replaceChildren();
+  for (const owner of use.owners) {
+    const kinds = KINDS.map(([kind, text, swatch]) => ({ text, swatch, size: owner.by_kind[kind] + (kind === "captures" ? owner.by_kind.uploads : 0) }));
+    const whole = Math.max(owner.limit ?? owner.bytes, 1);
+    const label = `${bytes(owner.bytes)}${owner.limit ? ` of ${bytes(owner.limit)}` : ""}`;
+    append(body, [
+      h("p", {}, use.owners.length > 1 ? h("strong", {}, `${owner.owner ?? "nobody"}: `) : null, label, owner.limit ? " used" : " in storage"),
+      h("div", { class: "meter", "aria-hidden": "true" }, meter(kinds, whole)),
+      h("ul", { class: "key" }, kinds.map(({ text, swatch, size }) => h("li", { class: swatch }, `${text} ${bytes(size)}`))),
+    ]);
+  }
+  if (use.largest.length) {
+    const expire = use.largest.some((/** @type {any} */ record) => record.expires_at);
+    append(body, [h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Largest records" }, h("table", { class: "table" },
+      h("caption", {}, "The largest records"),
+      h("thead", {}, h("tr", {}, ["What", "Name", "Last used", ...(expire ? ["Deleted"] : [])].map((text) => h("th", { scope: "col" }, text)), h("th", { scope: "col", class: "number" }, "Size"))),
+      h("tbody", {}, use.largest.map((/** @type {any} */ record) => h("tr", {},
+        h("td", {}, { capture: "Photos", job: "Checkpoints", model: "Model" }[/** @type {string} */ (record.kind)] ?? record.kind),
+        h("td", {}, place(record)),
+        h("td", {}, ago(record.last_used)),
+        expire ? h("td", {}, record.expires_at ? ago(record.expires_at) : "not by itself") : null,
+        h("td", { class: "number" }, bytes(record.bytes)))))))]);
+  }
+  byId("storage").hidden = use.owners.length === 0;
+}
+
+/** @param {any} record */
+function place(record) {
+  const name = record.name || record.id.slice(0, 8);
+  if (record.kind === "capture") return name;
+  return h("a", { href: `/${record.kind === "model" ? "models" : "jobs"}/${record.id}` }, name);
+}
+
+/** @param {{swatch: string, size: number}[]} kinds @param {number} whole */
+function meter(kinds, whole) {
+  const space = "http://www.w3.org/2000/svg";
+  const svg = document.createElementNS(space, "svg");
+  svg.setAttribute("viewBox", "0 0 100 1");
+  svg.setAttribute("preserveAspectRatio", "none");
+  let from = 0;
+  for (const { swatch, size } of kinds) {
+    const bar = document.createElementNS(space, "rect");
+    const width = (100 * size) / whole;
+    for (const [name, value] of Object.entries({ x: from, y: 0, width, height: 1, class: swatch })) bar.setAttribute(name, String(value));
+    svg.append(bar);
+    from += width;
+  }
+  return svg;
+}
+
+await startShell();
+const list = await listing({
+  noun: "models",
+  limit: 24,
+  query: ({ name }) => ({ name }),
+  entry,
+  empty: () => h("span", {}, "There are no models yet. ", h("a", { href: "/" }, "Start with some photos"), "."),
+});
+await storage();

@@ -1,0 +1,298 @@
+// The page at `/`: photos in, a job out.
+
+import { Problem, each, get, send } from "./api.js";
+import { byId, h } from "./dom.js";
+import { ago, bytes, number } from "./format.js";
+import { estimateOf } from "./new/estimate.js";
+import { Gallery } from "./new/gallery.js";
+import { chosen, dropped } from "./new/given.js";
+import { Items } from "./new/items.js";
+import { suffix } from "./new/kinds.js";
+import { Looking } from "./new/looking.js";
+import { OptionsForm } from "./new/options.js";
+import { Start } from "./new/start.js";
+import { forget, recall } from "./new/remembered.js";
+import { noticeOf, notify, startShell } from "./shell.js";
+
+/** Captures that are listed. */
+const LISTED = 9;
+
+/** Milliseconds after the last change before the server is asked for an estimate. */
+const ESTIMATE_AFTER = 400;
+
+/** Milliseconds between two redraws while photos are being checked. */
+const REDRAW = 150;
+
+/** Timer of the next redraw. @type {number | undefined} */
+let redrawing;
+
+/** Timer of the next estimate. @type {number | undefined} */
+let estimating;
+
+/** What the last estimate was asked for. */
+let asked = "";
+
+const caller = await startShell();
+const [info, { options }] = await Promise.all([get("/v1/info"), get("/v1/options")]);
+const items = new Items(info.accepted, info.limits.max_image_pixels);
+const form = new OptionsForm(options, estimateSoon);
+const gallery = new Gallery(byId("photos"), byId("others"), byId("more"), toggle);
+const looking = new Looking(onLooked);
+const start = new Start(items, form, { redraw: () => redraw(), problem: showProblem });
+
+byId("settings-first").append(form.first);
+byId("settings-all").append(form.all);
+byId("drop-title").tabIndex = -1;
+byId("camera").hidden = !matchMedia("(any-pointer: coarse)").matches;
+byId("phone").hidden = matchMedia("(pointer: coarse)").matches; // it is one
+
+wireGiving();
+wireTools();
+byId("form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  void start.go();
+});
+byId("pause").addEventListener("click", () => start.pause());
+addEventListener("beforeunload", (event) => {
+  if (start.sending) event.preventDefault();
+});
+byId("phone").addEventListener("toggle", showPhone, { once: true });
+
+const query = new URLSearchParams(location.search);
+const [wanted, earlier] = [query.get("capture"), query.get("options_of")];
+if (wanted) await useCapture(wanted, earlier);
+else await Promise.all([offerToGoOn(), listCaptures()]);
+document.documentElement.dataset.ready = "";
+
+function wireGiving() {
+  /** @type {[string, string][]} */
+  const pairs = [["choose", "files"], ["choose-folder", "folder"], ["camera", "shot"]];
+  for (const [button, input] of pairs) {
+    const field = /** @type {HTMLInputElement} */ (byId(input));
+    byId(button).addEventListener("click", () => field.click());
+    field.addEventListener("change", () => {
+      take(chosen(field.files));
+      field.value = "";
+    });
+  }
+  const zone = byId("drop");
+  // Files that miss the zone would replace the page.
+  addEventListener("dragover", (event) => {
+    event.preventDefault();
+    zone.classList.add("over");
+  });
+  addEventListener("dragleave", (event) => event.relatedTarget === null && zone.classList.remove("over"));
+  addEventListener("drop", async (event) => {
+    event.preventDefault();
+    zone.classList.remove("over");
+    if (!event.dataTransfer) return;
+    try {
+      take(await dropped(event.dataTransfer));
+    } catch (error) {
+      notify(/** @type {Error} */ (error));
+    }
+  });
+}
+
+function wireTools() {
+  byId("clear").addEventListener("click", () => {
+    items.clear();
+    start.reset();
+    redraw();
+    byId("drop-title").focus();
+  });
+  byId("leave-all").addEventListener("click", () => {
+    for (const item of advised()) item.left = true;
+    redraw();
+  });
+  const only = /** @type {HTMLInputElement} */ (byId("only-bad"));
+  only.addEventListener("change", () => {
+    gallery.onlyBad = only.checked;
+    redraw();
+  });
+  byId("more").addEventListener("click", () => {
+    gallery.whole = true;
+    redraw();
+  });
+}
+
+/** @param {import("./new/given.js").Given[]} given */
+function take(given) {
+  if (!given.length) return notify("Nothing was found in what you dropped.", "warning");
+  if (start.busy) return notify("Files are being sent. Pause first to give more.", "warning");
+  const added = items.add(given);
+  for (const item of added) {
+    if (item.kind === "archive") void items.open(item).then(redraw);
+    looking.add(item.id, item.file, item.kind === "photo", suffix(item.path));
+  }
+  if (!items.used.length && !start.held.length) {
+    const kinds = info.accepted.photos.map((/** @type {string} */ ending) => ending.slice(1)).join(", ");
+    notify(`None of these files can be used. Photos are ${kinds} files.`, "warning");
+  }
+  start.adopt();
+  redraw();
+}
+
+/** @param {import("./new/look.js").Looked} looked */
+function onLooked(looked) {
+  const item = items.all.find(({ id }) => id === looked.id);
+  if (!item) return; // removed meanwhile
+  const { thumbnail, error, ...seen } = looked;
+  Object.assign(item, seen);
+  if (thumbnail) item.thumbnail = URL.createObjectURL(thumbnail);
+  if (error) item.lost = "The file cannot be read. It may have been moved or changed; give it again.";
+  start.compare(item);
+  redrawSoon();
+}
+
+/** @param {import("./new/items.js").Item} item */
+function toggle(item) {
+  item.left = !item.left;
+  redraw();
+}
+
+function advised() {
+  return items.photos.filter((item) => !item.left && !item.stored && item.verdict.kind === "bad");
+}
+
+function redrawSoon() {
+  redrawing ??= setTimeout(redraw, REDRAW);
+}
+
+function redraw() {
+  clearTimeout(redrawing);
+  redrawing = undefined;
+  items.judge();
+  gallery.show(items);
+  const any = items.all.length > 0;
+  const usable = items.used.length > 0 || start.held.length > 0;
+  byId("given").hidden = !any;
+  byId("settings").hidden = byId("go").hidden = !usable;
+  byId("drop").classList.toggle("small-drop", any);
+  byId("summary").textContent = summary();
+  if (items.photos.every((item) => item.state !== "waiting" || item.lost)) byId("checked").textContent = summary();
+  const bad = advised().length;
+  const leave = byId("leave-all");
+  leave.hidden = bad === 0;
+  leave.textContent = bad === 1 ? "Leave out the one that is advised against" : `Leave out all ${number(bad)} that are advised against`;
+  byId("tools").hidden = items.photos.length === 0 && items.all.length === 0;
+  start.show();
+  estimateSoon();
+}
+
+function summary() {
+  const photos = items.photos.filter((item) => !item.left);
+  const checking = photos.filter((item) => item.state === "waiting" && !item.lost).length;
+  const masks = items.used.filter((item) => item.kind === "mask").length;
+  const left = items.photos.length - photos.length;
+  const size = items.used.reduce((sum, item) => sum + item.file.size, 0);
+  return [
+    photos.length === 1 ? "one photo" : `${number(photos.length)} photos`, masks > 0 && `${number(masks)} masks`, bytes(size),
+    checking > 0 && `${number(checking)} being checked`, checking === 0 && advised().length > 0 && `${number(advised().length)} to look at`,
+    left > 0 && `${number(left)} left out`,
+  ].filter(Boolean).join(", ");
+}
+
+function estimateSoon() {
+  clearTimeout(estimating);
+  estimating = setTimeout(() => void estimate(), ESTIMATE_AFTER);
+}
+
+async function estimate() {
+  if (byId("go").hidden || start.busy) return;
+  const values = form.values();
+  const { photos, posed } = items.size(start.held, Number(values.max_video_frames) || options.find((/** @type {any} */ one) => one.name === "max_video_frames").default);
+  const body = { photos: Math.max(1, photos ?? 1), posed, options: values };
+  const question = JSON.stringify([body, photos]);
+  if (question === asked) return;
+  asked = question;
+  try {
+    const found = await send("POST", "/v1/estimate", body);
+    if (asked !== question) return;
+    form.show(null);
+    showProblem(null);
+    byId("estimate").replaceChildren(photos === null
+      ? h("p", {}, "How long it will take is not known: the server has yet to count the photos in the archive.")
+      : estimateOf(found, photos, info.queued));
+  } catch (error) {
+    if (!(error instanceof Problem) || asked !== question) return;
+    asked = "";
+    byId("estimate").replaceChildren();
+    showProblem(error);
+  }
+}
+
+/** Show a problem beside the field that it concerns, or else above the button. @param {Error | null} problem */
+function showProblem(problem) {
+  const placed = form.show(problem instanceof Problem ? problem : null);
+  byId("problem").replaceChildren(...(problem && !(problem instanceof Problem && placed) ? [noticeOf(problem)] : []));
+}
+
+async function showPhone() {
+  const place = byId("phone-help");
+  try {
+    const { phoneHelp } = await import("./new/phone.js");
+    place.replaceChildren(await phoneHelp(new URL(location.pathname + location.search, location.origin), info.local ?? null, caller?.key_name !== "no key"));
+  } catch (error) {
+    place.replaceChildren(h("p", {}, `Open ${location.href} on the phone. The code cannot be drawn: ${error instanceof Error ? error.message : error}`));
+  }
+}
+
+/**
+ * Offer a further job on a capture.
+ * @param {string} id
+ * @param {string | null} earlier  id of a job whose options the new one begins with
+ */
+async function useCapture(id, earlier) {
+  try {
+    const capture = await get(`/v1/captures/${encodeURIComponent(id)}`);
+    start.use(capture);
+    if (earlier) form.fill((await get(`/v1/jobs/${encodeURIComponent(earlier)}`)).options);
+    const size = capture.files.reduce((/** @type {number} */ sum, /** @type {any} */ file) => sum + file.size, 0);
+    byId("place").replaceChildren(h("div", { class: "notice" },
+      h("p", {}, `${capture.name || "A capture without a name"}: ${capture.files.length === 1 ? "one file" : `${number(capture.files.length)} files`} (${bytes(size)}) are already on the server.`),
+      h("p", {}, "Choose the settings of another job, or give more photos first. ", h("a", { href: "/" }, "Begin with new photos"))));
+    byId("drop-title").textContent = "Drop more photos here";
+    redraw();
+  } catch (error) {
+    notify(/** @type {Error} */ (error));
+    await listCaptures();
+  }
+}
+
+/** Offer to continue an upload that another visit of this browser began. */
+async function offerToGoOn() {
+  const upload = recall();
+  if (!upload) return;
+  /** @type {any} */
+  let capture = null;
+  if (upload.capture) {
+    try {
+      capture = await get(`/v1/captures/${encodeURIComponent(upload.capture)}`);
+    } catch (error) {
+      if (error instanceof Problem && error.status === 404) return forget(); // deleted meanwhile
+      throw error;
+    }
+  }
+  start.offer(upload, capture);
+  form.restore(upload.options);
+  const there = upload.files.filter(([role, name, size]) => capture?.files.some((/** @type {any} */ file) => file.role === role && file.name === name && file.size === size)).length;
+  const box = h("div", { class: "notice", "data-kind": "warning", id: "go-on" },
+    h("p", {}, `An upload was interrupted ${ago(upload.at)}: ${upload.name || "without a name"}, ${number(there)} of ${number(upload.files.length)} files have arrived.`),
+    h("p", {}, "Give the same files again, and it goes on with those that are missing. Browsers do not keep files for a page."),
+    h("button", { type: "button", class: "small", onclick: () => {
+      start.withdraw();
+      forget();
+      box.remove();
+    } }, "Forget this upload"));
+  byId("place").replaceChildren(box);
+}
+
+async function listCaptures() {
+  const list = byId("capture-list");
+  for await (const capture of each("captures", { limit: LISTED })) {
+    if (list.children.length === LISTED) break;
+    list.append(h("li", {}, h("a", { href: `/?capture=${encodeURIComponent(capture.id)}` }, capture.name || "Without a name", h("span", {}, ago(capture.created_at)))));
+  }
+  byId("captures").hidden = list.children.length === 0;
+}

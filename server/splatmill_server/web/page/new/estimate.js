@@ -1,0 +1,43 @@
+// The time that a job will take, as the server derives it from the jobs that it has finished.
+
+import { seconds } from "../format.js";
+import { h } from "../dom.js";
+
+const STAGES = { cameras: "Cameras", training: "Training", rest: "Start, loading, measuring, storing" };
+
+/** @typedef {{stage: keyof typeof STAGES, seconds: number | null, lowest: number | null, highest: number | null, because: string}} Stage */
+/** @typedef {{seconds: number | null, lowest: number | null, highest: number | null, stages: Stage[], jobs: number, machine: string | null}} Estimate */
+
+/**
+ * Return an estimate as an element.
+ * @param {Estimate} estimate
+ * @param {number} photos
+ * @param {number} waiting jobs that wait before it
+ */
+export function estimateOf(estimate, photos, waiting) {
+  const { jobs, machine } = estimate;
+  const queue = waiting > 0 ? ` ${waiting === 1 ? "One job waits" : `${waiting} jobs wait`} before it.` : "";
+  if (jobs === 0 && estimate.stages.every((stage) => stage.seconds === null)) {
+    return h("p", {}, `How long it will take is not known: no job has finished on this server yet.${queue}`);
+  }
+  const head = estimate.seconds === null
+    ? h("p", {}, `How long all of it will take is not known yet.${queue}`)
+    : h("p", {}, "About ", h("strong", {}, rough(estimate.seconds)), spread(estimate), ` for ${photos === 1 ? "one photo" : `${photos} photos`}, once a worker has taken the job.${queue}`);
+  return h("div", {}, head, h("details", {}, h("summary", {}, "How this was derived"),
+    h("dl", { class: "facts" }, estimate.stages.flatMap((stage) => [
+      h("dt", {}, STAGES[stage.stage] ?? stage.stage),
+      h("dd", {}, stage.seconds === null ? "not known. " : `${rough(stage.seconds)}${spread(stage)}. `, stage.because),
+    ])),
+    machine && h("p", { class: "hint" }, `Figures of ${jobs === 1 ? "one job" : `${jobs} jobs`} on ${machine}. The cameras of a capture are recovered once; a further job on it does without that time.`)));
+}
+
+/** @param {{lowest: number | null, highest: number | null}} range */
+function spread({ lowest, highest }) {
+  return lowest === null || highest === null || rough(lowest) === rough(highest) ? "" : ` (${rough(lowest)} to ${rough(highest)})`;
+}
+
+/** A duration without a precision that an estimate does not have. @param {number} given */
+function rough(given) {
+  if (given < 10) return seconds(Math.max(1, Math.round(given))).replace(".0", "");
+  return seconds(given < 120 ? 5 * Math.round(given / 5) : given < 1800 ? 30 * Math.round(given / 30) : 300 * Math.round(given / 300));
+}

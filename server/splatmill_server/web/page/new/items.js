@@ -1,0 +1,170 @@
+// The files that were given: which of them belong to the capture, under which names, and what is known of each.
+
+import { namesIn } from "./zip.js";
+import { sort, suffix, withoutTop } from "./kinds.js";
+import { verdicts } from "./verdicts.js";
+
+/**
+ * @typedef {object} Item
+ * @property {number} id
+ * @property {string} path as it was given, and unique
+ * @property {File} file
+ * @property {import("./kinds.js").Role | null} role null for a file that is not used
+ * @property {string} name in the capture
+ * @property {"photo" | "video" | "archive" | "mask" | "pose" | "ignored"} kind
+ * @property {boolean} left whether a person has left it out
+ * @property {string | null} digest
+ * @property {"waiting" | "read" | "unreadable" | "unchecked"} state
+ * @property {number} width
+ * @property {number} height
+ * @property {import("./measure.js").Measures | null} measures
+ * @property {string | null} thumbnail address
+ * @property {string | null} lost why its bytes cannot be read
+ * @property {string[] | null} inside names of the files in an archive; null where they are not known
+ * @property {import("./verdicts.js").Verdict} verdict
+ * @property {boolean} stored whether the capture holds it
+ * @property {import("../api.js").Problem | null} problem why the server refused it
+ */
+
+/** @typedef {{role: string, name: string, size: number, sha256: string}} Held a file of a capture */
+
+export class Items {
+  /**
+   * @param {import("./kinds.js").Accepted} accepted
+   * @param {number} maxPixels
+   */
+  constructor(accepted, maxPixels) {
+    this.accepted = accepted;
+    this.limits = { minSide: accepted.min_photo_side, maxPixels };
+    /** @type {Map<string, Item>} */
+    this.byPath = new Map();
+    this.count = 0;
+  }
+
+  /** All items in order of their paths. */
+  get all() {
+    return [...this.byPath.values()];
+  }
+
+  /** The items that are to be sent. */
+  get used() {
+    return this.all.filter((item) => item.role !== null && !item.left);
+  }
+
+  /** The photos, left out or not, in order of name. */
+  get photos() {
+    return this.all.filter((item) => item.kind === "photo");
+  }
+
+  /**
+   * Add files; returns the new ones. A file that was given before is not added again; another one under the same path gets
+   * a path of its own, because phones call each photo image.jpg.
+   * @param {import("./given.js").Given[]} given
+   */
+  add(given) {
+    const added = [];
+    for (const { path, file } of given) {
+      const free = this.free(path, file);
+      if (free === null) continue;
+      /** @type {Item} */
+      const item = {
+        id: ++this.count, path: free, file, role: null, name: free, kind: "ignored", left: false, digest: null, state: "waiting", width: 0, height: 0,
+        measures: null, thumbnail: null, lost: null, inside: null, verdict: { kind: "waiting", text: "" }, stored: false, problem: null,
+      };
+      this.byPath.set(free, item);
+      added.push(item);
+    }
+    this.sort();
+    return added;
+  }
+
+  /** @param {string} path @param {File} file @returns {string | null} null if the file is there already */
+  free(path, file) {
+    const ending = suffix(path);
+    const stem = path.slice(0, path.length - ending.length);
+    for (let number = 1; ; number++) {
+      const wanted = number === 1 ? path : `${stem}-${number}${path.slice(stem.length)}`;
+      const known = this.byPath.get(wanted);
+      if (!known) return wanted;
+      if (known.file.size === file.size && known.file.lastModified === file.lastModified) return null;
+    }
+  }
+
+  clear() {
+    for (const item of this.all) if (item.thumbnail) URL.revokeObjectURL(item.thumbnail);
+    this.byPath.clear();
+  }
+
+  /** Decide again what each file is; more files may change that. */
+  sort() {
+    const sorted = sort(this.byPath.keys(), this.accepted);
+    const order = new Map(sorted.files.map(({ path, role, name }) => [path, { role, name }]));
+    const before = this.byPath;
+    this.byPath = new Map();
+    for (const path of [...order.keys(), ...[...before.keys()].filter((path) => !order.has(path))]) {
+      const item = /** @type {Item} */ (before.get(path));
+      const place = order.get(path);
+      item.role = place?.role ?? null;
+      item.name = place?.name ?? path;
+      item.kind = this.kindOf(item);
+      this.byPath.set(path, item);
+    }
+  }
+
+  /** @param {Item} item @returns {Item["kind"]} */
+  kindOf(item) {
+    if (item.role === null) return "ignored";
+    if (item.role !== "images") return item.role === "masks" ? "mask" : "pose";
+    const ending = suffix(item.path);
+    return this.accepted.photos.includes(ending) ? "photo" : this.accepted.videos.includes(ending) ? "video" : "archive";
+  }
+
+  /** Give each photo that is not left out its verdict. */
+  judge() {
+    const photos = this.photos.filter((item) => !item.left);
+    verdicts(photos, this.limits).forEach((verdict, index) => {
+      const item = photos[index];
+      item.verdict = item.lost ? { kind: "bad", text: item.lost } : verdict;
+    });
+  }
+
+  /** Read the list of an archive. @param {Item} item */
+  async open(item) {
+    try {
+      item.inside = await namesIn(item.file);
+    } catch {
+      item.inside = null; // the server says what is wrong with it
+    }
+  }
+
+  /**
+   * How many photos a job will have, and whether cameras come with them.
+   * @param {Held[]} held files that the capture holds
+   * @param {number} frames photos that are taken from a video
+   * @returns {{photos: number | null, posed: boolean}} null where an archive does not tell
+   */
+  size(held, frames) {
+    const items = this.used;
+    const own = new Set(items.map((item) => `${item.role}/${item.name}`));
+    const others = held.filter((file) => !own.has(`${file.role}/${file.name}`));
+    let photos = 0;
+    let posed = others.some(isPose) || items.some((item) => item.kind === "pose" && suffix(item.name) !== ".ply");
+    let known = !others.some((file) => file.role === "images" && this.accepted.archives.includes(suffix(file.name)));
+    for (const name of [...items, ...others].filter((file) => file.role === "images").map((file) => suffix(file.name))) {
+      if (this.accepted.photos.includes(name)) photos++;
+      if (this.accepted.videos.includes(name)) photos += frames;
+    }
+    for (const { inside } of items.filter((item) => item.kind === "archive")) {
+      if (inside === null) known = false;
+      const sorted = sort(withoutTop(inside ?? []), this.accepted);
+      photos += sorted.files.filter((file) => file.role === "images").length;
+      posed ||= sorted.files.some(isPose);
+    }
+    return { photos: known ? photos : null, posed };
+  }
+}
+
+/** @param {{role: string | null, name: string}} file */
+function isPose(file) {
+  return file.role === "poses" && suffix(file.name) !== ".ply";
+}

@@ -1,0 +1,83 @@
+// The worker that looks at one file at a time: digest, size, thumbnail and measures.
+
+import { sha256 } from "./digest.js";
+import { MEASURED_SIDE, measure } from "./measure.js";
+
+/** Pixels of the longest side of a thumbnail. */
+const THUMBNAIL = 240;
+
+/** Bytes above which a photo is not decoded here: four bytes for each of its pixels would take too much memory. */
+const LARGEST = 60e6;
+
+/**
+ * @typedef {object} Looked
+ * @property {number} id
+ * @property {string | null} digest null if the file could not be read
+ * @property {"read" | "unreadable" | "unchecked"} state
+ * @property {number} width
+ * @property {number} height
+ * @property {import("./measure.js").Measures | null} measures
+ * @property {Blob | null} thumbnail
+ * @property {string} [error] why the file could not be read at all
+ */
+
+/** @param {MessageEvent<{id: number, file: File, photo: boolean, shown: boolean, library: string}>} message */
+async function onMessage({ data: { id, file, photo, shown, library } }) {
+  /** @type {Looked} */
+  const looked = { id, digest: null, state: "unchecked", width: 0, height: 0, measures: null, thumbnail: null };
+  try {
+    looked.digest = await sha256(file, library);
+    if (photo && file.size <= LARGEST && "OffscreenCanvas" in globalThis) await decode(file, shown, looked);
+  } catch (error) {
+    looked.error = String(error);
+  }
+  postMessage(looked);
+}
+
+/**
+ * @param {File} file
+ * @param {boolean} shown whether browsers decode this format
+ * @param {Looked} looked
+ */
+async function decode(file, shown, looked) {
+  /** @type {ImageBitmap} */
+  let picture;
+  try {
+    picture = await createImageBitmap(file);
+  } catch {
+    if (shown) looked.state = "unreadable";
+    return;
+  }
+  try {
+    looked.width = picture.width;
+    looked.height = picture.height;
+    const canvas = drawn(picture, MEASURED_SIDE);
+    const pixels = context(canvas).getImageData(0, 0, canvas.width, canvas.height);
+    looked.measures = measure(pixels.data, canvas.width, canvas.height);
+    looked.thumbnail = await drawn(canvas, THUMBNAIL).convertToBlob({ type: "image/webp", quality: 0.8 });
+    looked.state = "read";
+  } finally {
+    picture.close();
+  }
+}
+
+/**
+ * Return a picture drawn with at most `side` pixels on its longest side.
+ * @param {ImageBitmap | OffscreenCanvas} picture
+ * @param {number} side
+ */
+function drawn(picture, side) {
+  const factor = Math.min(1, side / Math.max(picture.width, picture.height));
+  const canvas = new OffscreenCanvas(Math.max(1, Math.round(picture.width * factor)), Math.max(1, Math.round(picture.height * factor)));
+  const drawing = context(canvas);
+  drawing.imageSmoothingQuality = "high";
+  drawing.drawImage(picture, 0, 0, canvas.width, canvas.height);
+  return canvas;
+}
+
+/** @param {OffscreenCanvas} canvas */
+function context(canvas) {
+  return /** @type {OffscreenCanvasRenderingContext2D} */ (canvas.getContext("2d", { willReadFrequently: true }));
+}
+
+addEventListener("message", onMessage);

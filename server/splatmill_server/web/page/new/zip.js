@@ -1,0 +1,45 @@
+// The names of the files in a zip, from the list at its end. Nothing is unpacked; the server does that.
+
+const END = 0x06054b50;
+const ENTRY = 0x02014b50;
+const END_BYTES = 22;
+const LONGEST_COMMENT = 65535;
+
+/** Bytes of the list that are read at most. */
+const LONGEST_LIST = 16 << 20;
+
+/**
+ * Return the names of the files in a zip, or null where the list cannot be read, as in a zip of more than 4 GB.
+ * @param {Blob} zip
+ * @returns {Promise<string[] | null>}
+ */
+export async function namesIn(zip) {
+  const tail = await view(zip, Math.max(0, zip.size - END_BYTES - LONGEST_COMMENT), zip.size);
+  for (let at = tail.byteLength - END_BYTES; at >= 0; at--) {
+    if (tail.getUint32(at, true) !== END) continue;
+    const [size, begin] = [tail.getUint32(at + 12, true), tail.getUint32(at + 16, true)];
+    if (begin + size > zip.size || size > LONGEST_LIST) return null;
+    return names(await view(zip, begin, begin + size));
+  }
+  return null;
+}
+
+/** @param {DataView} list @returns {string[] | null} */
+function names(list) {
+  const text = new TextDecoder();
+  const found = [];
+  for (let at = 0; at + 46 <= list.byteLength; ) {
+    if (list.getUint32(at, true) !== ENTRY) return null;
+    const length = list.getUint16(at + 28, true);
+    if (at + 46 + length > list.byteLength) return null;
+    const name = text.decode(new Uint8Array(list.buffer, list.byteOffset + at + 46, length));
+    if (!name.endsWith("/")) found.push(name);
+    at += 46 + length + list.getUint16(at + 30, true) + list.getUint16(at + 32, true);
+  }
+  return found;
+}
+
+/** @param {Blob} zip @param {number} begin @param {number} end */
+async function view(zip, begin, end) {
+  return new DataView(await zip.slice(begin, end).arrayBuffer());
+}

@@ -1,0 +1,33 @@
+// The page of a link: one model, for somebody without a key.
+
+import { get } from "./api.js";
+import { byId, h } from "./dom.js";
+import { bytes, decibels, moment, number } from "./format.js";
+import { copy } from "./sharing.js";
+import { address, showShared } from "./shared_model.js";
+import { startShell } from "./shell.js";
+
+const KINDS = /** @type {Record<string, string>} */ ({
+  "report.html": "Report", "report.json": "Report as JSON",
+  "report.png": "Error against time", "cameras.json": "Cameras of the photos", "preview.jpg": "Picture", "progress.mp4": "Film of the training",
+});
+
+await startShell({ open: true, visitor: true });
+const model = await showShared();
+if (model) {
+  byId("figures").textContent = `${number(model.gaussians)} Gaussians` + (model.psnr === null ? "" : ` · ${decibels(model.psnr)} on photos not trained on`);
+  const { formats } = await get(`${address}/formats`);
+  byId("downloads").append(...formats.map((/** @type {any} */ format) => h("li", {},
+    h("a", { href: format.address, download: "", title: format.loses }, format.name),
+    h("span", { class: "number" }, format.bytes === null ? "made on demand" : bytes(format.bytes)))));
+  byId("downloads").append(...model.files.filter((/** @type {any} */ file) => file.name in KINDS).map((/** @type {any} */ file) => h("li", {},
+    h("a", { href: `${address}/files/${file.name}`, download: file.name }, KINDS[file.name]),
+    h("span", { class: "number" }, `${file.name.split(".").pop()}, ${bytes(file.size)}`))));
+  const frame = /** @type {HTMLTextAreaElement} */ (byId("embed"));
+  const name = (model.name || "A scene in 3D").replace(/[&"<>]/g, (/** @type {string} */ sign) => `&#${sign.charCodeAt(0)};`);
+  frame.value = `<iframe src="${location.origin}${location.pathname.replace(/\/$/, "")}/embed" width="800" height="500" title="${name}" allow="fullscreen" loading="lazy"></iframe>`;
+  frame.addEventListener("focus", () => frame.select());
+  byId("copy").addEventListener("click", () => copy(frame, byId("copied")));
+  byId("until").textContent = `This link is valid until ${moment(model.expires_at)}.`;
+  byId("below").hidden = false;
+}

@@ -1,0 +1,101 @@
+// The dialog that makes, shows and revokes links to a model.
+
+import { isLoopback } from "./address.js";
+import { get, send } from "./api.js";
+import { h } from "./dom.js";
+import { moment } from "./format.js";
+import { noticeOf } from "./shell.js";
+
+const TERMS = [["1d", "1 day"], ["7d", "7 days"], ["30d", "30 days"], ["365d", "1 year"]];
+
+/**
+ * Open the dialog of a model's links.
+ * @param {string} address that of the model, as /v1/models/ID
+ * @param {string} name of the model
+ */
+export async function openSharing(address, name) {
+  const term = h("select", { id: "share-term" }, TERMS.map(([value, text]) => h("option", { value, selected: value === "30d" }, text)));
+  const label = h("input", { id: "share-name", maxlength: 200, autocomplete: "off" });
+  const made = h("div", { class: "stack", role: "status" });
+  const list = h("ul", { class: "links" });
+  const trouble = h("div");
+  const form = h("form", { class: "stack" },
+    h("div", { class: "row" },
+      h("div", { class: "field" }, h("label", { for: "share-term" }, "Valid for"), term),
+      h("div", { class: "field" }, h("label", { for: "share-name" }, "For whom (only you see it)"), label)),
+    h("p", {}, h("button", { class: "primary", type: "submit" }, "Make a link")));
+  const dialog = h("dialog", { class: "sharing", "aria-labelledby": "sharing-title" },
+    h("div", { class: "stack" },
+      h("div", { class: "row" }, h("h2", { id: "sharing-title" }, `Share ${name}`),
+        h("button", { class: "quiet small push", type: "button", "aria-label": "Close", onclick: () => dialog.close() }, "✕")),
+      h("p", { class: "muted" }, "Whoever has the link sees this model, its files and its cameras, without a key and without being listed anywhere, until the link ends."),
+      form, trouble, made, list));
+
+  /** Do what may fail, and say it in the dialog. @param {() => Promise<void>} work */
+  async function tried(work) {
+    trouble.replaceChildren();
+    try {
+      await work();
+    } catch (error) {
+      trouble.replaceChildren(noticeOf(/** @type {Error} */ (error)));
+    }
+  }
+
+  async function show() {
+    const { shares } = await get(`${address}/shares`);
+    list.replaceChildren(...shares.map((/** @type {any} */ share) => h("li", { class: "row" },
+      h("span", {}, share.name || `Link ${share.id}`),
+      h("span", { class: "hint" }, share.revoked_at ? `revoked ${moment(share.revoked_at)}` : `${share.active ? "valid until" : "expired"} ${moment(share.expires_at)}`),
+      share.active && h("button", { class: "small push", type: "button", onclick: () => revoke(share) }, "Revoke", h("span", { class: "visually-hidden" }, ` ${share.name || share.id}`)))));
+  }
+
+  /** @param {any} share */
+  const revoke = (share) => tried(async () => {
+    await send("DELETE", `${address}/shares/${share.id}`);
+    await show();
+    /** @type {HTMLElement} */ (form.querySelector("button")).focus();
+  });
+
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    void tried(async () => {
+      const share = await send("POST", `${address}/shares`, { expires_in: term.value, name: label.value.trim() || null });
+      made.replaceChildren(link(`${location.origin}${share.path}`));
+      label.value = "";
+      await show();
+    });
+  });
+  dialog.addEventListener("close", () => dialog.remove());
+  document.body.append(dialog);
+  dialog.showModal();
+  await tried(show);
+}
+
+/** The address of a new link, which the server cannot show again. @param {string} address */
+function link(address) {
+  const shown = h("input", { id: "share-link", readonly: true, value: address, onfocus: () => shown.select() });
+  const said = h("span", { class: "hint", role: "status" });
+  return h("div", { class: "field" },
+    h("label", { for: "share-link" }, "The link, which is shown only now"),
+    shown,
+    h("div", { class: "row" },
+      h("button", { class: "small", type: "button", onclick: () => copy(shown, said) }, "Copy"),
+      h("a", { class: "button small", href: address, target: "_blank", rel: "noopener" }, "Open"), said),
+    isLoopback(location.hostname)
+      && h("p", { class: "hint" }, `Only this machine reaches ${location.host}. For others, make the link where this page is open under the name or the network address of the server.`));
+}
+
+/**
+ * Copy a text; where the browser has no clipboard, select it.
+ * @param {HTMLInputElement | HTMLTextAreaElement} shown @param {HTMLElement} said where to say what was done
+ */
+export async function copy(shown, said) {
+  try {
+    await navigator.clipboard.writeText(shown.value);
+    said.textContent = "Copied.";
+  } catch {
+    shown.focus();
+    shown.select();
+    said.textContent = "Selected: copy it with Ctrl-C.";
+  }
+}

@@ -1,0 +1,297 @@
+/**
+ * The viewer of models: splats in WebGL, or pictures by the server where a browser has none, with one interface.
+ *
+ *     const view = await open(container, { url: "/v1/models/ID/files/model.ply", model: "/v1/models/ID", cameras });
+ *     view.frame(cameras[0]);
+ *     await view.replace({ bytes });        // the camera stays
+ *     view.showCameras([{ name, camera, color }]);
+ *     view.addEventListener("move", () => view.getCamera());
+ *     view.dispose();
+ *
+ * @import {Camera, Pose, Vec} from "./viewer/pose.js"
+ * @import {Source} from "./viewer/source.js"
+ * @import {Line, ShownCamera} from "./viewer/overlay.js"
+ */
+import { Pictures } from "./pictures_view.js";
+import { Controls, HELP } from "./viewer/controls.js";
+import { ViewerError } from "./viewer/errors.js";
+import { Overlay } from "./viewer/overlay.js";
+import { dot, length, lookingAt, matrixOf, poseOf, sub, surroundings, tangentsOf } from "./viewer/pose.js";
+import { Splats, hasWebGL } from "./viewer/splats.js";
+
+export { ViewerError };
+
+/** Most pixels of the canvas per CSS pixel, and most pixels of the canvas: both bound the work of the graphics card. */
+const MAX_RATIO = 2;
+const MAX_PIXELS = 2560 * 1600;
+/** Vertical field of view in degrees where no camera gives one. */
+const FOV = 50;
+/** Distances of the clipping planes, over the distance of the farthest camera from the cameras' mean. */
+const NEAR = 0.002;
+const FAR = 1e4;
+/** Depth of the drawn frusta, over the same distance. */
+const FRUSTUM = 0.07;
+
+/**
+ * @typedef {Object} Options
+ * @property {string} [url]  address of a file of splats: .ply, compressed .ply or .sog
+ * @property {ArrayBuffer | Uint8Array} [bytes]  its bytes, in place of an address
+ * @property {string} [model]  address of a stored model, as /v1/models/{id}: the server renders it where there is no WebGL
+ * @property {Camera[]} [cameras]  of the photos: they tell where up is, where to look, and how far away to be
+ * @property {Camera} [camera]  to start from; left out, one of `cameras` whose view is close to the middle of all
+ * @property {"webgl" | "pictures" | "depth"} [kind]  the kind of view; left out, webgl where the browser has it
+ * @property {"black" | "white"} [background]  colour behind the model; left out, black
+ * @property {boolean} [antialias]  whether the model was trained with antialiasing
+ * @property {number} [roam]  how far the camera may leave the cameras' mean, over the farthest camera's distance from it
+ * @property {string} [label]  what is seen, for people who do not see it
+ * @property {(done: number, total: number) => void} [progress]  bytes of the model that are loaded
+ */
+
+/**
+ * Show a model in an element, which needs a size of its own.
+ * @param {HTMLElement} container @param {Options} options
+ * @returns {Promise<View>}  rejects with a ViewerError, whose message is a sentence to show
+ */
+export async function open(container, options) {
+  const view = new View(container, options);
+  try {
+    await view.begin();
+  } catch (error) {
+    view.dispose();
+    throw error;
+  }
+  return view;
+}
+
+/** A view. Events: `move` (the camera moved), `frame` (one was drawn), `pick` (x, y), `pick-camera` (name), `trouble`. */
+export class View extends EventTarget {
+  /** @param {HTMLElement} container @param {Options} options */
+  constructor(container, options) {
+    super();
+    this.container = container;
+    this.options = options;
+    const around = options.cameras?.length ? surroundings(options.cameras) : null;
+    /** @type {Vec} */
+    this.up = around?.up ?? [0, -1, 0];
+    /** @type {Vec} */
+    this.focus = around?.focus ?? [0, 0, 0];
+    this.spread = around?.spread || (around && length(sub(around.focus, around.middle))) || 1;
+    this.limit = around && options.roam ? { center: around.middle, radius: options.roam * this.spread } : null;
+    /** @type {Pose} */
+    this.pose = lookingAt([0, 0, -3 * this.spread], this.focus, this.up);
+    this.distance = 3 * this.spread;
+    /** Half the width and height at distance 1 that have to be seen. */
+    this.tangents = { x: 0, y: Math.tan((FOV * Math.PI) / 360) };
+    this.middle = around?.middle ?? this.focus;
+    /** Radius around the cameras' mean outside of which the far side is not drawn; null draws everything. @type {number | null} */
+    this.visible = null;
+    /** @type {"webgl" | "pictures" | "depth"} */
+    this.kind = "webgl";
+    /** Why there is no WebGL view, a sentence; empty where there is one or none was asked for. */
+    this.whyNot = "";
+    this.frames = 0;
+    this.pending = 0;
+    this.resized = true;
+    this.ratio = 1;
+    this.home = this.pose;
+    this.homeDistance = this.distance;
+    this.homeTangents = this.tangents;
+    /** @type {Splats | Pictures | null} */
+    this.surface = null;
+
+    this.element = document.createElement("div");
+    this.element.className = "view";
+    this.element.tabIndex = 0;
+    this.element.setAttribute("role", "application");
+    this.element.setAttribute("aria-roledescription", "3D view");
+    this.element.setAttribute("aria-label", `${options.label ?? "The scene"}. ${HELP}`);
+    this.canvas = document.createElement("canvas");
+    const over = document.createElement("canvas");
+    this.overlay = new Overlay(over);
+    this.overlay.size = FRUSTUM * this.spread;
+    this.element.append(this.canvas, over);
+    container.append(this.element);
+    this.controls = new Controls(this.element, this, {
+      moved: () => this.moved(),
+      home: () => this.goHome(),
+      picked: (x, y) => this.picked(x, y),
+    });
+    this.watch = new ResizeObserver(() => {
+      this.resized = true;
+      this.again();
+    });
+    this.watch.observe(this.element);
+    const start = options.camera ?? (options.cameras?.length ? mostCentral(options.cameras, this.focus) : null);
+    if (start) this.frame(start);
+  }
+
+  async begin() {
+    const { options } = this;
+    const wanted = options.kind ?? "webgl";
+    if (wanted === "webgl") {
+      try {
+        if (!hasWebGL()) throw new ViewerError("no_webgl", "This browser has no WebGL, which drawing in 3D needs.");
+        this.surface = await Splats.open(this.canvas, {
+          antialias: options.antialias,
+          background: options.background === "white" ? [1, 1, 1] : [0, 0, 0],
+          again: () => this.again(),
+        });
+      } catch (error) {
+        if (!(error instanceof ViewerError) || !options.model) throw error;
+        this.whyNot = `${error.message} The server renders pictures instead.`;
+      }
+    }
+    if (!this.surface) {
+      if (!options.model) throw new ViewerError("no_webgl", "Only a stored model can be shown without WebGL.");
+      this.kind = wanted === "depth" ? "depth" : "pictures";
+      this.surface = new Pictures(this.canvas, {
+        model: options.model,
+        depth: this.kind === "depth",
+        background: options.background,
+        failed: (message) => this.dispatchEvent(new CustomEvent("trouble", { detail: message })),
+        range: (near, far) => this.dispatchEvent(new CustomEvent("range", { detail: { near, far } })),
+      });
+    }
+    this.element.dataset.kind = this.kind;
+    if (options.url || options.bytes || this.kind !== "webgl") await this.surface.load(options, options.progress);
+    this.again();
+  }
+
+  /**
+   * Show another model, or this one as it is now; the camera stays.
+   * @param {Source} source
+   */
+  async replace(source) {
+    await this.surface?.load(source, this.options.progress);
+    this.again();
+  }
+
+  /** How many Gaussians are drawn; 0 where the server draws them. */
+  get gaussians() {
+    return this.surface?.gaussians ?? 0;
+  }
+
+  /** The vertical field of view that shows what has to be seen, radians. */
+  get fovY() {
+    const aspect = this.canvas.clientWidth / Math.max(1, this.canvas.clientHeight) || 1;
+    return 2 * Math.atan(Math.max(this.tangents.y, this.tangents.x / aspect));
+  }
+
+  /** The camera as the API writes it, at the size of the view in CSS pixels. @returns {Camera} */
+  getCamera() {
+    return {
+      camera_to_world: matrixOf(this.pose),
+      width: Math.max(1, Math.round(this.canvas.clientWidth)),
+      height: Math.max(1, Math.round(this.canvas.clientHeight)),
+      fov_y_deg: (this.fovY * 180) / Math.PI,
+    };
+  }
+
+  /** Look exactly as a camera does. @param {Camera} camera */
+  setCamera(camera) {
+    this.pose = poseOf(camera);
+    this.tangents = typeof camera.fov_y_deg === "number" ? { x: 0, y: tangentsOf(camera).y } : tangentsOf(camera);
+    const ahead = dot(sub(this.focus, this.pose.position), this.pose.forward);
+    this.distance = ahead > 0.05 * this.spread ? ahead : Math.max(length(sub(this.focus, this.pose.position)), 1e-3);
+    this.moved();
+  }
+
+  /** Look from a camera's side: upright, towards the middle of the scene. It becomes the view of `goHome`. @param {Camera} camera */
+  frame(camera) {
+    this.pose = lookingAt(poseOf(camera).position, this.focus, this.up);
+    this.distance = Math.max(length(sub(this.focus, this.pose.position)), 1e-3);
+    this.tangents = tangentsOf(camera);
+    [this.home, this.homeDistance, this.homeTangents] = [this.pose, this.distance, this.tangents];
+    this.moved();
+  }
+
+  goHome() {
+    [this.pose, this.distance, this.tangents] = [this.home, this.homeDistance, this.homeTangents];
+    this.moved();
+  }
+
+  /**
+   * Leave out what lies behind a sphere around the cameras' mean, as the far shell does. Pictures by the server show it.
+   * @param {number | null} radius  over the farthest camera's distance from the mean; null shows everything
+   */
+  hideBeyond(radius) {
+    this.visible = radius === null ? null : radius * this.spread;
+    this.again();
+  }
+
+  /** Draw cameras as frusta. @param {ShownCamera[]} cameras */
+  showCameras(cameras) {
+    this.overlay.cameras = cameras;
+    this.again();
+  }
+
+  /** Draw lines, marked points and a box. @param {{lines?: Line[], points?: Vec[], box?: {min: Vec, max: Vec} | null}} marks */
+  mark(marks) {
+    Object.assign(this.overlay, marks);
+    this.again();
+  }
+
+  moved() {
+    this.dispatchEvent(new Event("move"));
+    this.again();
+  }
+
+  /** @param {number} x @param {number} y */
+  picked(x, y) {
+    const camera = this.overlay.cameraAt(x, y);
+    const detail = camera ? { name: camera.name } : { x, y };
+    this.dispatchEvent(new CustomEvent(camera ? "pick-camera" : "pick", { detail }));
+  }
+
+  /** Ask for a frame; several calls before it give one. */
+  again() {
+    if (!this.pending && this.surface) this.pending = requestAnimationFrame(() => this.draw());
+  }
+
+  draw() {
+    this.pending = 0;
+    const { surface, canvas, element } = this;
+    const [width, height] = [element.clientWidth, element.clientHeight];
+    if (!surface || !width || !height) return;
+    if (this.resized) {
+      this.resized = false;
+      const ratio = Math.min(devicePixelRatio || 1, MAX_RATIO, Math.sqrt(MAX_PIXELS / (width * height)));
+      this.ratio = ratio;
+      surface.resize(Math.max(1, Math.round(width * ratio)), Math.max(1, Math.round(height * ratio)));
+      [this.overlay.canvas.width, this.overlay.canvas.height] = [canvas.width, canvas.height];
+    }
+    const far =
+      this.visible === null ? FAR * this.spread : length(sub(this.pose.position, this.middle)) + this.visible;
+    surface.draw(this.pose, this.fovY, NEAR * this.spread, far);
+    this.overlay.draw(this.pose, height / 2 / Math.tan(this.fovY / 2), this.ratio);
+    this.frames += 1;
+    element.dataset.frames = `${this.frames}`;
+    this.dispatchEvent(new Event("frame"));
+  }
+
+  /** Release the graphics context, the listeners and the elements. */
+  dispose() {
+    cancelAnimationFrame(this.pending);
+    this.watch.disconnect();
+    this.controls.dispose();
+    this.surface?.dispose();
+    this.surface = null;
+    this.element.remove();
+  }
+}
+
+/**
+ * The camera whose axis passes nearest to a point, as an angle.
+ * @param {Camera[]} cameras @param {Vec} point
+ */
+function mostCentral(cameras, point) {
+  let best = cameras[0];
+  let most = -Infinity;
+  for (const camera of cameras) {
+    const pose = poseOf(camera);
+    const offset = sub(point, pose.position);
+    const cosine = dot(offset, pose.forward) / Math.max(length(offset), 1e-12);
+    if (cosine > most) [best, most] = [camera, cosine];
+  }
+  return best;
+}

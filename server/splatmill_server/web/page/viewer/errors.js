@@ -1,0 +1,12 @@
+/** Why a model cannot be shown. */
+export class ViewerError extends Error {
+  /**
+   * @param {"no_webgl" | "no_engine" | "unreadable" | "format" | "empty"} reason
+   * @param {string} message  a sentence for the person in front of the page
+   * @param {ErrorOptions} [options]
+   */
+  constructor(reason, message, options) {
+    super(message, options);
+    this.reason = reason;
+  }
+}

@@ -1,0 +1,204 @@
+/**
+ * Draws Gaussians with PlayCanvas on a WebGL canvas. A frame is drawn when one is asked for, and when the splats have
+ * been sorted anew, so that a view that nobody moves costs nothing.
+ *
+ * @import {Pose} from "./pose.js"
+ * @import {Source} from "./source.js"
+ */
+import { ViewerError } from "./errors.js";
+import { opened } from "./source.js";
+
+/** Whether this browser draws with WebGL 2. */
+export function hasWebGL() {
+  const canvas = document.createElement("canvas");
+  const gl = canvas.getContext("webgl2");
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return gl !== null;
+}
+
+export class Splats {
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {{antialias?: boolean, background?: [number, number, number], again: () => void}} options
+   *   antialias: whether the model was trained with antialiasing. again: called when another frame has to be drawn.
+   * @returns {Promise<Splats>}
+   */
+  static async open(canvas, options) {
+    let pc;
+    try {
+      pc = await import("playcanvas");
+    } catch (error) {
+      throw new ViewerError(
+        "no_engine",
+        "The 3D engine of this page could not be loaded. The server was installed without it: `make install` fetches it.",
+        { cause: error },
+      );
+    }
+    let device;
+    try {
+      device = await pc.createGraphicsDevice(canvas, { deviceTypes: [pc.DEVICETYPE_WEBGL2], antialias: false });
+    } catch (error) {
+      throw new ViewerError("no_webgl", "This browser has no WebGL, which drawing in 3D needs.", { cause: error });
+    }
+    return new Splats(pc, canvas, device, options);
+  }
+
+  /** @param {any} pc @param {HTMLCanvasElement} canvas @param {any} device @param {any} options */
+  constructor(pc, canvas, device, options) {
+    this.pc = pc;
+    this.canvas = canvas;
+    this.again = options.again;
+    const settings = new pc.AppOptions();
+    settings.graphicsDevice = device;
+    settings.componentSystems = [pc.CameraComponentSystem, pc.GSplatComponentSystem];
+    // A .sog is a bundle of images, which are read as textures.
+    settings.resourceHandlers = [pc.GSplatHandler, pc.TextureHandler];
+    this.app = new pc.AppBase(canvas);
+    this.app.init(settings);
+    this.app.autoRender = false;
+    const [r, g, b] = options.background ?? [0, 0, 0];
+    this.eye = new pc.Entity("camera");
+    this.eye.addComponent("camera", { clearColor: new pc.Color(r, g, b, 1), toneMapping: pc.TONEMAP_NONE });
+    this.app.root.addChild(this.eye);
+    // Exact pictures before fast ones: colours follow every movement, and small Gaussians are drawn too.
+    const gsplat = this.app.scene.gsplat;
+    gsplat.colorUpdateAngle = 0;
+    gsplat.minPixelSize = 0;
+    gsplat.useTonemap = false;
+    gsplat.useFog = false;
+    gsplat.antiAlias = options.antialias ?? false;
+    gsplat.dataFormat = pc.GSPLATDATA_LARGE;
+    drawWholeGaussians(pc, device);
+    gsplat.material.update();
+    this.app.start();
+    cancelAnimationFrame(this.app.frameRequestId);
+    this.app.scene.on("gsplat:sorted", () => this.again());
+    this.app.systems.gsplat.on("frame:request", () => this.again());
+    device.on("devicerestored", () => this.again());
+    /** @type {any} */
+    this.splats = null;
+    this.gaussians = 0;
+    this.loads = 0;
+  }
+
+  /**
+   * Show another model; the one before stays until it is there.
+   * @param {Source} source
+   * @param {(done: number, total: number) => void} [progress]  bytes loaded, and all bytes, 0 where they are not known
+   */
+  async load(source, progress) {
+    const { pc, app } = this;
+    const { format, contents } = await opened(source);
+    if (!this.app) return;
+    // PlayCanvas keeps what it loads by its address, so that each model needs another one.
+    const url = `model-${(this.loads += 1)}.${format}`;
+    const asset = new pc.Asset(url, "gsplat", { url, filename: url, contents });
+    if (progress) asset.on("progress", progress);
+    try {
+      await loaded(app.assets, asset);
+      if (!this.app) return;
+      if (!(asset.resource.gsplatData.numSplats > 0)) {
+        throw new ViewerError("empty", "The model has no Gaussians, so there is nothing to draw.");
+      }
+    } catch (error) {
+      app.assets?.remove(asset);
+      asset.unload();
+      throw error;
+    }
+    const before = this.splats;
+    this.splats = new pc.Entity("splats");
+    this.splats.addComponent("gsplat", { asset });
+    app.root.addChild(this.splats);
+    this.gaussians = asset.resource.gsplatData.numSplats;
+    if (before) {
+      const old = app.assets.get(before.gsplat.asset);
+      before.destroy();
+      app.assets.remove(old);
+      old.unload();
+    }
+    this.again();
+  }
+
+  /** @param {number} width @param {number} height  of the drawing buffer, in pixels */
+  resize(width, height) {
+    this.app.graphicsDevice.setResolution(width, height);
+  }
+
+  /**
+   * Draw a frame.
+   * @param {Pose} pose @param {number} fovY  vertical field of view, radians
+   * @param {number} near @param {number} far  distances of the clipping planes
+   */
+  draw(pose, fovY, near, far) {
+    const { pc, app, eye } = this;
+    const { right, down, forward, position } = pose;
+    const world = new pc.Mat4();
+    // PlayCanvas's cameras have OpenGL axes: y up, z backward.
+    world.set([
+      ...right, 0,
+      ...down.map((x) => -x), 0,
+      ...forward.map((x) => -x), 0,
+      ...position, 1,
+    ]); // prettier-ignore
+    eye.setPosition(...position);
+    eye.setRotation(new pc.Quat().setFromMat4(world));
+    eye.camera.fov = (fovY * 180) / Math.PI;
+    eye.camera.nearClip = near;
+    eye.camera.farClip = far;
+    app.renderNextFrame = true;
+    app.tick(performance.now());
+    cancelAnimationFrame(app.frameRequestId); // the viewer decides when the next frame is drawn
+  }
+
+  dispose() {
+    const { app } = this;
+    this.app = null;
+    app?.destroy();
+  }
+}
+
+/**
+ * Load an asset of PlayCanvas. Of a .sog, the images are assets too, and PlayCanvas goes on without those that fail.
+ * @param {any} assets @param {any} asset
+ */
+async function loaded(assets, asset) {
+  let problem = "";
+  const failed = (/** @type {unknown} */ error, /** @type {any} */ part) => {
+    if (part.type === "texture") problem ||= `${part.name}: ${error}`;
+    else if (part === asset) problem ||= `${error}`;
+  };
+  assets.on("error", failed);
+  try {
+    await new Promise((resolve) => {
+      asset.once("load", resolve);
+      asset.once("error", resolve);
+      assets.add(asset);
+      assets.load(asset);
+    });
+  } finally {
+    assets.off("error", failed);
+  }
+  if (!problem) return;
+  const why = `its file is damaged, incomplete or without Gaussians (${problem})`;
+  throw new ViewerError("unreadable", `The model could not be read: ${why}.`);
+}
+
+/**
+ * Let PlayCanvas draw Gaussians as they were trained: it lets them end at 2.8 standard deviations and lowers the whole
+ * curve, so that it is zero there, which costs two to three dB against our renderer (docs/web.md). Here they end where
+ * their opacity falls under 1/255.
+ * @param {any} pc @param {any} device
+ */
+function drawWholeGaussians(pc, device) {
+  const chunks = pc.ShaderChunks.get(device, pc.SHADERLANGUAGE_GLSL);
+  for (const [chunk, before, after] of [
+    ["gsplatPS", "(exp(x * -4.0) - EXP4) * INV_EXP4", "exp(x * -4.0)"],
+    ["gsplatPS", "A > 1.0", "A > 1.5"],
+    ["gsplatCommonVS", "min(1.0, sqrt(max(0.0, log(alpha / alphaClipValue))) * 0.5)", "sqrt(max(0.0, log(alpha / alphaClipValue))) * 0.5"],
+  ]) {
+    const source = chunks.get(chunk);
+    // The lock file fixes the version of PlayCanvas; a newer one with other shaders has to be looked at.
+    if (!source?.includes(before)) throw new Error(`PlayCanvas ${pc.version}: no ${before} in its shader ${chunk}.`);
+    chunks.set(chunk, source.replace(before, after));
+  }
+}

@@ -1,0 +1,181 @@
+"""The addresses of the web page. Pages and their files hold no data of users, so everybody may load them; what they
+show comes from `/v1`, with the session or the key of who looks."""
+
+import json
+from html import escape
+from pathlib import Path
+
+from fastapi import APIRouter, Request
+from starlette.responses import FileResponse, Response
+
+from splatmill.schema import SharedModel
+from splatmill_server.problems import ProblemError
+from splatmill_server.service import Service, Shared
+from splatmill_server.web import policy
+from splatmill_server.web.tree import StaticFile, Tree
+
+router = APIRouter(include_in_schema=False)
+
+PAGE = Tree(Path(__file__).parent / "page")
+"""The page's own files."""
+
+VENDOR = Tree(Path(__file__).parent / "vendor")
+"""JavaScript of others, which `server/web/packages.py` fetches."""
+
+IMPORT_MAP_HERE = "<!-- import map -->"
+"""Where a page's import map goes."""
+
+_FOREVER = "public, max-age=31536000, immutable"
+_METHODS = ["GET", "HEAD"]
+
+
+@router.api_route("/", methods=_METHODS)
+def new_page(request: Request) -> Response:
+    """The page that takes photos and starts a job."""
+    return page(request, "new.html")
+
+
+@router.api_route("/jobs", methods=_METHODS)
+def jobs_page(request: Request) -> Response:
+    """The list of jobs."""
+    return page(request, "jobs.html")
+
+
+@router.api_route("/jobs/{job_id}", methods=_METHODS)
+def job_page(request: Request, job_id: str) -> Response:
+    """One job, live."""
+    return page(request, "job.html")
+
+
+@router.api_route("/models", methods=_METHODS)
+def models_page(request: Request) -> Response:
+    """The list of models and what storage they use."""
+    return page(request, "models.html")
+
+
+@router.api_route("/models/{model_id}", methods=_METHODS)
+def model_page(request: Request, model_id: str) -> Response:
+    """One model in the viewer."""
+    return page(request, "model.html")
+
+
+@router.api_route("/sign-in", methods=_METHODS)
+def sign_in_page(request: Request) -> Response:
+    """The page that exchanges a key for a session."""
+    return page(request, "sign-in.html")
+
+
+@router.api_route("/s/{token}", methods=_METHODS)
+def share_page(service: Shared, request: Request, token: str) -> Response:
+    """A model that somebody has shared."""
+    return _shared(service, request, token, embedded=False)
+
+
+@router.api_route("/s/{token}/embed", methods=_METHODS)
+def embedded_page(service: Shared, request: Request, token: str) -> Response:
+    """The viewer of a shared model alone, for a frame in pages of others."""
+    return _shared(service, request, token, embedded=True)
+
+
+@router.api_route("/page/{digest}/{name:path}", methods=_METHODS)
+def page_file(request: Request, digest: str, name: str) -> Response:
+    """A file of the page."""
+    return _asset(request, PAGE, digest, name)
+
+
+@router.api_route("/vendor/{digest}/{name:path}", methods=_METHODS)
+def vendor_file(request: Request, digest: str, name: str) -> Response:
+    """A file of others' JavaScript."""
+    return _asset(request, VENDOR, digest, name)
+
+
+def page(request: Request, name: str, *, embedded: bool = False, head: str = "") -> Response:
+    """Return the page `name` with the addresses of the files that it loads.
+
+    embedded: whether pages of others may show it in a frame.
+    head: elements for the page's head.
+    """
+    file = PAGE.find(name)
+    if file is None:
+        raise ProblemError("not_found", f"There is nothing at {request.url.path}.")
+    imports = import_map()
+    text = file.path.read_text(encoding="utf-8").replace('"/page/', f'"/page/{PAGE.digest}/')
+    inserted = f'<script type="importmap">{imports}</script>{head}' if imports else head
+    text = text.replace(IMPORT_MAP_HERE, inserted, 1)
+    if not imports:
+        text = text.replace("<html ", '<html data-viewer="missing" ', 1)
+    security = policy.headers([imports] if imports else [], embedded=embedded)
+    return Response(text, media_type="text/html", headers={"Cache-Control": "no-cache", **security})
+
+
+def _shared(service: Service, request: Request, token: str, *, embedded: bool) -> Response:
+    """Return the page of a link, whose status says whether the link is valid; the page says it to people."""
+    status, head = 200, ""
+    try:
+        model = service.shares.model(service.shares.open(token))
+        head = _poster(str(request.base_url), token, model)
+    except ProblemError as error:
+        status = error.problem.status
+    shown = page(request, "embed.html" if embedded else "share.html", embedded=embedded, head=head)
+    shown.status_code = status
+    shown.headers["X-Robots-Tag"] = "noindex"
+    return shown
+
+
+def _poster(base: str, token: str, model: SharedModel) -> str:
+    """Return the elements by which messengers show a picture of the model beside a link to it."""
+    quality = f", {model.psnr:.1f} dB on photos not trained on" if model.psnr is not None else ""
+    found = {
+        "og:type": "website",
+        "og:title": model.name or "A scene in 3D",
+        "og:description": f"{model.gaussians:,} Gaussians{quality}. Look at it from any side.",
+        "og:image": f"{base}s/{token}/model/files/preview.jpg",
+        "og:url": f"{base}s/{token}",
+        "twitter:card": "summary_large_image",
+    }
+    if not any(file.name == "preview.jpg" for file in model.files):
+        del found["og:image"]
+    return "".join(f'\n<meta property="{name}" content="{escape(text)}">' for name, text in found.items())
+
+
+def import_map() -> str:
+    """Return the import map as JSON, or "" if the packages have not been fetched."""
+    known = VENDOR.folder / "imports.json"
+    if not known.is_file():
+        return ""
+    imports = json.loads(known.read_text(encoding="utf-8"))["imports"]
+    return json.dumps(
+        {"imports": {name: f"/vendor/{VENDOR.digest}/{path}" for name, path in imports.items()}}
+    )
+
+
+def _asset(request: Request, tree: Tree, digest: str, name: str) -> Response:
+    """Return a file of a tree: for ever under its digest; a page of another version gets it too, but for once."""
+    file = tree.find(name)
+    if file is None:
+        raise ProblemError("not_found", f"There is nothing at {request.url.path}.")
+    packed = file.packed if _accepts_gzip(request) else None
+    etag = f'"{file.etag}-gzip"' if packed is not None else f'"{file.etag}"'
+    headers = {
+        "ETag": etag,
+        "Cache-Control": _FOREVER if digest == tree.digest else "no-cache",
+        "Content-Type": file.media_type,
+        "Vary": "Accept-Encoding",
+        # A worker or a frame made of this file is held to the same rules.
+        "Content-Security-Policy": policy.headers()["Content-Security-Policy"],
+    }
+    if etag in (tag.strip() for tag in request.headers.get("if-none-match", "").split(",")):
+        return Response(status_code=304, headers=headers)
+    return _content(request, file, packed, headers)
+
+
+def _content(request: Request, file: StaticFile, packed: bytes | None, headers: dict[str, str]) -> Response:
+    if packed is None:
+        return FileResponse(file.path, headers=headers)
+    headers |= {"Content-Encoding": "gzip", "Content-Length": str(len(packed))}
+    return Response(b"" if request.method == "HEAD" else packed, headers=headers)
+
+
+def _accepts_gzip(request: Request) -> bool:
+    accepted = (part.strip().lower() for part in request.headers.get("accept-encoding", "").split(","))
+    return any(part == "gzip" or (part.startswith("gzip;") and not part.endswith("q=0")) for part in accepted)

@@ -1,0 +1,79 @@
+"""Axe finds nothing serious on the pages of lists, sign-in and shared links, in both themes; and they work by keyboard.
+
+The other pages have tests of their own. Axe finds what a program can find, and not whether a page makes sense.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.browser.conftest import Open, SmallModel
+from tests.support.paths import ROOT
+from tests.support.up import Up
+
+AXE = ROOT / "server" / "web" / "node_modules" / "axe-core" / "axe.min.js"
+
+
+COUNT = """[...document.querySelectorAll("a[href], button, input, select, [tabindex='0']")]
+  .filter((element) => element.checkVisibility()).length"""
+"""The number of elements that Tab reaches."""
+
+
+def violations(page: Page) -> list[str]:
+    """What axe-core calls serious or critical, with the elements."""
+    if not AXE.is_file():
+        pytest.skip("axe-core is not installed: `python server/web/packages.py fetch --dev`")
+    page.evaluate(AXE.read_text(encoding="utf-8"))
+    result: dict[str, Any] = page.evaluate("axe.run(document)")
+    assert len(result["passes"]) > 10, "it has looked at the page"
+    found = result["violations"]
+    return [
+        f"{rule['id']}: {[node['target'] for node in rule['nodes']]}"
+        for rule in found
+        if rule["impact"] in ("serious", "critical")
+    ]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing_serious(service: Up, model: SmallModel, open_window: Open, scheme: str) -> None:
+    page = open_window(service, color_scheme=scheme).page
+    link = service.http.post(f"/v1/models/{model.id}/shares", json={"expires_in": "1h"}).json()["path"]
+    for path, ready in (
+        ("/jobs", "#list li"),
+        ("/models", "#storage table"),
+        ("/sign-in", "#already"),
+        (link, "#view .view"),
+        (f"{link}/embed", "#view .view"),
+    ):
+        page.goto(path)
+        expect(page.locator(ready).first).to_be_visible()
+        assert not violations(page), path
+    page.goto("/models")
+    page.get_by_role("button", name="Share").first.click()
+    expect(page.get_by_role("dialog")).to_be_visible()
+    assert not violations(page)
+
+
+def test_every_control_of_the_list_is_reached_by_tab_and_is_seen_to_be(
+    service: Up, model: SmallModel, page: Page
+) -> None:
+    page.goto("/models?name=still")
+    expect(page.locator("#storage table")).to_be_visible()
+    wanted = page.evaluate(COUNT)
+    seen: list[str] = []
+    for _ in range(wanted + 2):
+        page.keyboard.press("Tab")
+        name, outlined = page.evaluate(
+            """() => {
+              const e = document.activeElement, style = getComputedStyle(e), after = getComputedStyle(e, "::after");
+              const drawn = (s) => s.outlineStyle !== "none" && parseFloat(s.outlineWidth) > 0;
+              return [e.outerHTML.slice(0, 80), e === document.body || drawn(style) || drawn(after)];
+            }"""
+        )
+        assert outlined, name
+        if name not in seen:
+            seen.append(name)
+    assert len([name for name in seen if not name.startswith("<body")]) >= wanted

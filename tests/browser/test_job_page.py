@@ -1,0 +1,325 @@
+"""The page of a job: a whole small job watched from its beginning to its model, cancelled, and resumed after a lost
+connection.
+
+The service, the worker and the browser are real. Not proved here: what a snapshot holds (tests/worker/test_live.py),
+how the viewer draws it (test_viewer.py), and what watching costs (`splatmill bench live`).
+"""
+
+from __future__ import annotations
+
+import io
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Page, expect
+
+from tests.browser.conftest import Open, SmallModel, Visit
+from tests.support import still_life
+from tests.support.up import Up
+
+NO_WEBGL = """
+const before = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+  return kind.startsWith("webgl") ? null : before.call(this, kind, ...more);
+};
+"""
+
+
+@pytest.fixture(scope="module")
+def capture(service: Up, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The still life with its cameras, and one photo without a camera."""
+    folder = still_life.posed_capture(tmp_path_factory.mktemp("job") / "capture")
+    Image.new("RGB", (still_life.WIDTH, still_life.HEIGHT)).save(folder / "images" / "stray.png")
+    capture = str(service.http.post("/v1/captures", json={"name": "still life"}).json()["id"])
+    for role in ("images", "poses"):
+        for path in sorted((folder / role).iterdir()):
+            answer = service.http.put(f"/v1/captures/{capture}/{role}/{path.name}", content=path.read_bytes())
+            assert answer.status_code == 201, answer.text
+    return capture
+
+
+def submit(service: Up, capture: str, **options: Any) -> str:
+    options = {"max_gaussians": 1500, "gaps": "off", "far_shell": "off"} | options
+    answer = service.http.post("/v1/jobs", json={"capture": capture, "options": options, "name": "watched"})
+    assert answer.status_code == 202, answer.text
+    return str(answer.json()["id"])
+
+
+def snapshots(page: Page, least: int) -> None:
+    """Wait until this many snapshots were shown."""
+    page.wait_for_function(
+        "n => Number(document.querySelector('#live .box[data-snapshots]')?.dataset.snapshots ?? 0) >= n",
+        arg=least,
+        timeout=60_000,
+        polling=100,
+    )
+
+
+def seen(page: Page) -> np.ndarray:
+    """What the live view shows, float [H, W, 3]."""
+    picture = Image.open(io.BytesIO(page.locator("#live .stage").screenshot(timeout=60_000)))
+    return np.asarray(picture.convert("RGB"), np.float64) / 255.0
+
+
+def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
+    service: Up, capture: str, open_window: Open
+) -> None:
+    page = open_window(service, viewport={"width": 800, "height": 500}).page
+    job_id = submit(service, capture, time_budget="8s")
+    page.goto(f"/jobs/{job_id}")
+    expect(page.get_by_role("heading", level=1)).to_have_text("watched")
+    snapshots(page, 1)
+    first = seen(page)
+    assert first.std() > 0.05
+    # Somebody turns the scene: the next snapshots are seen from the same side.
+    box = page.locator("#live .box[data-snapshots]")
+    before = box.get_attribute("data-pose")
+    page.locator("#live .view").first.press("ArrowLeft", delay=200)
+    page.wait_for_function(
+        "before => document.querySelector('[data-pose]').dataset.pose !== before", arg=before, polling=100
+    )
+    turned, shown = box.get_attribute("data-pose"), int(box.get_attribute("data-snapshots") or 0)
+    snapshots(page, shown + 1)
+    assert box.get_attribute("data-pose") == turned
+    assert seen(page).std() > 0.05
+
+    expect(page.locator("#state")).to_have_text("succeeded", timeout=60_000)
+    link = page.get_by_role("link", name="Open the model")
+    expect(link).to_have_attribute("href", f"/models/{job_id}")
+    job, report = service.job(job_id), service.http.get(f"/v1/jobs/{job_id}/report").json()
+    assert report["seconds"]["live"] > 0
+    for sentence in [*job["plan"]["reasons"].values(), *job["plan"]["left_out"].values()]:
+        assert page.get_by_text(sentence, exact=True).count() >= 1, sentence
+    rows = service.http.get(f"/v1/jobs/{job_id}/curve").json()["rows"]
+    expect(page.locator("#curve tbody tr")).to_have_count(len(rows))
+    expect(page.locator("#curve polyline")).to_have_count(2)
+    expect(page.locator("#curve tbody tr").last).to_contain_text(f"{rows[-1]['psnr']:.2f}")
+    photos = page.locator("#photos")
+    expect(photos).to_contain_text("2 held out")
+    expect(photos.get_by_role("row").filter(has_text="stray.png")).to_contain_text("no camera")
+    expect(page.locator("#seconds")).to_contain_text("Live view")
+    assert {item.get_attribute("data-status") for item in page.locator("#stages > li").all()} == {"done"}
+
+    page.reload()
+    expect(page.get_by_role("link", name="Open the model")).to_be_visible()
+    expect(page.locator("#curve tbody tr")).to_have_count(len(rows))
+    page.get_by_role("button", name="Cameras and points").click()
+    expect(page.locator("#live .placement")).to_have_attribute("data-cameras", str(still_life.COUNT))
+    assert seen(page).std() > 0.01
+
+
+def test_a_queued_job_says_its_place_and_a_job_is_cancelled_by_keyboard(
+    service: Up, capture: str, open_window: Open
+) -> None:
+    running, waiting = (submit(service, capture, time_budget="60s") for _ in range(2))
+    visit = open_window(service)
+    visit.context.add_init_script(NO_WEBGL)
+    page = visit.page
+    page.goto(f"/jobs/{waiting}")
+    expect(page.locator("#outcome")).to_contain_text("begin")
+    page.get_by_role("button", name="Cancel").press("Enter")
+    dialog = page.get_by_role("dialog")
+    expect(dialog).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(dialog).to_be_hidden()
+    assert not service.job(waiting)["cancel_requested"]
+
+    # Without WebGL, the newest preview is shown.
+    page.goto(f"/jobs/{running}")
+    picture = page.get_by_role("img", name="The scene in training")
+    expect(picture).to_be_visible(timeout=60_000)
+    expect(page.locator("#live .caption")).to_contain_text("WebGL", timeout=30_000)
+    for job_id in (waiting, running):
+        page.goto(f"/jobs/{job_id}")
+        page.get_by_role("button", name="Cancel").press("Enter")
+        page.get_by_role("button", name="Cancel the job").press("Enter")
+        expect(page.locator("#state")).to_have_text("cancelled", timeout=30_000)
+        expect(page.get_by_role("button", name="Restart")).to_be_visible()
+        assert service.job(job_id)["state"] == "cancelled"
+
+
+def test_a_failed_job_says_why_and_what_to_do(service: Up, visit: Visit) -> None:
+    visit.watched.allow(r"status of 409.*/watch")  # the repeated job may have failed before it is watched
+    page = visit.page
+    capture = service.http.post("/v1/captures", json={"name": "two photos"}).json()["id"]
+    body = io.BytesIO()
+    Image.new("RGB", (64, 48), "gray").save(body, "PNG")
+    for name in ("a.png", "b.png"):
+        service.http.put(f"/v1/captures/{capture}/images/{name}", content=body.getvalue())
+    options = {"preset": "draft", "time_budget": "90s", "gaps": "off", "test_views": ["a.png"]}
+    asked = {"capture": capture, "options": options}
+    job_id = service.http.post("/v1/jobs", json=asked).json()["id"]
+    page.goto(f"/jobs/{job_id}")
+    expect(page.locator("#state")).to_have_text("failed", timeout=60_000)
+    expect(page.get_by_role("heading", name="Log", exact=True)).to_be_visible()
+    for name in ("Live view", "Error against time"):
+        expect(page.get_by_role("heading", name=name)).to_be_hidden()
+    problem = service.job(job_id)["problem"]
+    alert = page.get_by_role("alert")
+    expect(alert).to_contain_text(problem["detail"])
+    expect(alert).to_contain_text(problem["advice"])
+
+    page.get_by_role("link", name="Train with other options").click()
+    page.wait_for_url(f"**/?capture={capture}&options_of={job_id}")
+    page.locator("html[data-ready]").wait_for()
+    page.get_by_role("button", name="Train", exact=True).click()
+    page.wait_for_url("**/jobs/*")
+    repeated = service.job(page.url.rpartition("/")[2])
+    assert repeated["id"] != job_id
+    assert repeated["options"] == service.job(job_id)["options"]
+
+
+class Relay:
+    """Passes connections on to a service, until they are cut."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.open: list[socket.socket] = []
+        self.refuses = False
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.listener.getsockname()[1]}"
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                near, _ = self.listener.accept()
+                if self.refuses:
+                    near.close()
+                    continue
+                far = socket.create_connection(("127.0.0.1", self.port))
+                self.open += [near, far]
+                for one, other in ((near, far), (far, near)):
+                    threading.Thread(target=self._pass, args=(one, other), daemon=True).start()
+
+    def _pass(self, one: socket.socket, other: socket.socket) -> None:
+        with suppress(OSError):
+            while data := one.recv(65536):
+                other.sendall(data)
+        one.close()
+        other.close()
+
+    def cut(self) -> None:
+        """End all connections, and refuse others until `mend`."""
+        self.refuses = True
+        for each in self.open:
+            with suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+        self.open.clear()
+
+    def mend(self) -> None:
+        self.refuses = False
+
+
+@pytest.fixture
+def relay(service: Up) -> Iterator[Relay]:
+    port = service.http.base_url.port
+    assert port is not None
+    relay = Relay(port)
+    yield relay
+    relay.cut()
+    relay.listener.close()
+
+
+def test_a_lost_connection_is_shown_and_the_page_goes_on_where_it_was(
+    service: Up, capture: str, relay: Relay, open_window: Open
+) -> None:
+    visit = open_window(relay.address)
+    visit.watched.allow("ERR_EMPTY_RESPONSE|ERR_CONNECTION|ERR_INCOMPLETE|Failed to load resource")
+    page = visit.page
+    asked: list[str | None] = []
+    page.on(
+        "request",
+        lambda request: (
+            asked.append(request.headers.get("last-event-id")) if request.url.endswith("/events") else None
+        ),
+    )
+    job_id = submit(service, capture, time_budget="6s")
+    page.goto(f"/jobs/{job_id}")
+    expect(page.locator("#stages [data-status=now]")).to_contain_text("Training", timeout=60_000)
+    relay.cut()
+    expect(page.locator("#lost")).to_be_visible()
+    service.ended(job_id)
+    relay.mend()
+    expect(page.locator("#state")).to_have_text("succeeded", timeout=30_000)
+    expect(page.locator("#lost")).to_have_count(0)
+    rows = service.http.get(f"/v1/jobs/{job_id}/curve").json()["rows"]
+    expect(page.locator("#curve tbody tr")).to_have_count(len(rows))
+    assert asked[0] is None
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_fits_a_phone(service: Up, model: SmallModel, open_window: Open, scheme: str) -> None:
+    page = open_window(service, viewport={"width": 360, "height": 740}, color_scheme=scheme).page
+    page.goto(f"/jobs/{model.id}")
+    expect(page.get_by_role("link", name="Open the model")).to_be_visible()
+    page.locator("#curve summary").click()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    assert page.evaluate("document.querySelector('#curve svg').getBoundingClientRect().width") <= 340
+
+
+def test_a_job_that_is_not_there_says_so(page: Page, visit: Any) -> None:
+    visit.watched.allow("404")
+    page.goto("/jobs/0123456789abcdef")
+    expect(page.get_by_role("alert")).to_contain_text("0123456789abcdef")
+
+
+COURSE = """async (records) => {
+  const script = document.querySelector('script[type=module]').src;
+  const { Course } = await import(new URL('job/course.js', script));
+  const course = new Course();
+  for (const [seconds, event, attempt = 1] of records) {
+    course.apply({ event, attempt, at: new Date(1e12 + 1000 * seconds).toISOString() });
+  }
+  const { state, plan, lines, rows, stages } = course;
+  return {
+    state, plan, lines: lines.length, steps: rows.map((row) => row.step),
+    eta: stages.get('matching')?.eta ?? null, seconds: Object.fromEntries(course.seconds(1e12 + 200_000)),
+  };
+}"""
+
+
+def test_the_course_of_a_job_follows_from_its_events(page: Page) -> None:
+    state = lambda name: {"type": "state", "state": name}  # noqa: E731
+    metric = lambda step: {"type": "metric", "step": step, "seconds": step / 10, "gaussians": 5}  # noqa: E731
+    matching = lambda done: {"type": "progress", "stage": "matching", "done": done, "total": 100}  # noqa: E731
+    begun: list[list[Any]] = [
+        [0, state("queued"), 0],
+        [10, state("preparing")],
+        [12, state("sfm")],
+        [20, matching(10)],
+        [30, matching(20)],
+    ]
+    page.goto("/jobs")
+    now = page.evaluate(COURSE, begun)
+    assert now["state"] == "sfm"
+    assert now["eta"] == pytest.approx(40.0), "ten seconds for a fifth"
+    assert now["seconds"] == {"queued": 10, "preparing": 2, "sfm": 188}
+
+    trained: list[list[Any]] = [
+        *begun,
+        [50, state("training")],
+        [51, {"type": "plan", "plan": {"densify": True}}],
+        *([52 + step / 10, metric(step)] for step in (10, 20, 30)),
+        [60, {"type": "log", "message": "x"}],
+    ]
+    # The worker was killed: the next attempt goes on from a checkpoint at step 15, and measures again what follows.
+    resumed = [*trained, [70, state("queued")], [80, state("training"), 2], [81, metric(20), 2]]
+    again = page.evaluate(COURSE, resumed)
+    assert again["steps"] == [10, 20]
+    assert again["plan"] == {"densify": True}
+    assert again["seconds"]["queued"] == 20
+    # A restart is another run: what it measures may go on with what was measured.
+    restarted = page.evaluate(COURSE, [*trained, [70, state("failed")], [100, state("queued"), 0]])
+    assert (restarted["state"], restarted["plan"], restarted["lines"]) == ("queued", None, 1)
+    assert restarted["seconds"] == {"queued": 100}
+    assert restarted["steps"] == [10, 20, 30]

@@ -1,0 +1,253 @@
+"""The page of a model in a real browser: the comparison with held-out photos, the tools of the viewer, downloads, orbit
+videos, deleting; on a phone, by keyboard, and for a screen reader.
+
+Does not prove what the viewer draws: tests/browser/test_viewer.py does.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Locator, Page, expect
+
+from tests.browser.conftest import Open, SmallModel, Visit
+from tests.support.paths import ROOT
+from tests.support.up import Up
+
+WAIT = 20_000
+"""Milliseconds to wait for what the renderer answers, which other tests may keep busy."""
+
+AXE = ROOT / "server" / "web" / "node_modules" / "axe-core" / "axe.min.js"
+
+
+def show(page: Page, model: SmallModel) -> None:
+    page.goto(f"/models/{model.id}")
+    expect(page.locator("#viewer[data-ready]")).to_be_visible(timeout=WAIT)
+
+
+@pytest.fixture
+def shown(page: Page, model: SmallModel) -> Page:
+    show(page, model)
+    return page
+
+
+def test_the_model_is_compared_with_its_held_out_photos(service: Up, model: SmallModel, shown: Page) -> None:
+    cameras = service.http.get(f"/v1/models/{model.id}/cameras").json()["cameras"]
+    held = {camera["name"]: camera for camera in cameras if camera["split"] == "test"}
+    section = shown.locator("#compare")
+    buttons = section.locator(".photos button")
+    assert buttons.count() == len(held) == 2
+    worst = min(held.values(), key=lambda camera: float(camera["psnr"]))
+    section.get_by_label("Order of the photos").select_option("worst")
+    expect(buttons.first).to_contain_text(worst["name"])
+    for name, camera in held.items():
+        section.get_by_role("button", name=name).click()
+        figures = f"{name}: PSNR {camera['psnr']:.1f} dB, SSIM {camera['ssim']:.3f}"
+        expect(section.locator("figcaption")).to_have_text(figures)
+        sizes = """() => [...document.querySelectorAll('.pair img')].map((i) => [i.naturalWidth, i.naturalHeight])"""
+        wanted = [camera["camera"]["width"], camera["camera"]["height"]]
+        shown.wait_for_function(
+            f"([w, h]) => ({sizes})().every(([x, y]) => x === w && y === h)", arg=wanted, polling=100
+        )
+    error = shown.evaluate(
+        """() => {
+          const [render, photo] = [...document.querySelectorAll(".pair img")].map((image) => {
+            const canvas = document.createElement("canvas");
+            [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+            canvas.getContext("2d").drawImage(image, 0, 0);
+            return canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+          });
+          let sum = 0;
+          for (let i = 0; i < render.length; i += 4)
+            for (let c = 0; c < 3; c++) sum += ((render[i + c] - photo[i + c]) / 255) ** 2;
+          return -10 * Math.log10(sum / (render.length / 4) / 3);
+        }"""
+    )
+    assert error == pytest.approx(camera["psnr"], abs=0.05), (
+        "the pictures have the error that is written under them"
+    )
+    slider = section.get_by_role("slider")
+    slider.focus()
+    shown.keyboard.press("Home")
+    assert shown.locator(".pair").evaluate("(pair) => pair.style.getPropertyValue('--cut')") == "0%"
+    box = shown.locator(".pair").bounding_box()
+    assert box is not None
+    shown.locator(".pair").click(position={"x": 0.75 * box["width"], "y": 0.5 * box["height"]})
+    assert int(slider.input_value()) == pytest.approx(75, abs=1)
+
+
+def test_distances_are_measured_in_a_unit_that_is_set(shown: Page) -> None:
+    shown.get_by_role("button", name="Measure").click()
+    panel = shown.locator("form.panel").first
+    panel.get_by_role("button", name="Mark the point in the middle").click()
+    expect(panel.get_by_role("status")).to_have_text("Click a second point in the view.", timeout=WAIT)
+    box = shown.locator(".view").bounding_box()
+    assert box is not None
+    shown.locator(".view").click(position={"x": 0.5 * box["width"], "y": 0.6 * box["height"]})
+    expect(panel.get_by_role("status")).to_contain_text("units apart", timeout=WAIT)
+    panel.get_by_label("Its true length").fill("12")
+    panel.get_by_role("button", name="Set the scale").click()
+    expect(panel.get_by_role("status")).to_have_text("The points are 12 cm apart.")
+    shown.reload()
+    shown.get_by_role("button", name="Measure").click()
+    assert (
+        shown.evaluate("Object.keys(localStorage).filter((key) => key.startsWith('splatmill.scale.')).length")
+        == 1
+    )
+
+
+def test_the_view_is_changed_by_its_tools(shown: Page) -> None:
+    shown.get_by_role("button", name="Cameras", exact=True).click()
+    expect(shown.locator("#viewer-note")).to_contain_text("Orange: held out")
+    shown.get_by_text(re.compile("Cameras: 14 photos, 2 of them held out")).click()
+    shown.get_by_role("button", name="Look from 03.png").click()
+    expect(shown.locator("#viewer-note")).to_have_text("The view of 03.png.")
+    shown.get_by_label("Kind of view").select_option("depth")
+    expect(shown.locator("#viewer[data-ready=depth] .depth-scale, .depth-scale")).to_contain_text(
+        "units", timeout=WAIT
+    )
+    shown.get_by_label("Kind of view").select_option("webgl")
+    expect(shown.locator(".view[data-kind=webgl]")).to_be_visible()
+    assert shown.locator(".view").count() == 1
+
+
+def test_files_and_the_orbit_video_are_there(
+    service: Up, model: SmallModel, shown: Page, tmp_path: Path
+) -> None:
+    with shown.expect_download() as downloading:
+        shown.locator("#downloads").get_by_role("link", name="model.ply").click()
+    size = service.http.get(f"/v1/models/{model.id}").json()["bytes"]
+    downloading.value.save_as(tmp_path / "model.ply")
+    assert (tmp_path / "model.ply").stat().st_size == size
+    shown.get_by_label("Length", exact=True).select_option("4")
+    shown.get_by_role("button", name="Make the video").click()
+    shown.get_by_role("button", name="Stop").click()
+    expect(shown.locator("#orbit .hint")).to_have_text("Stopped.")
+
+
+def test_a_format_is_made_when_it_is_asked_for_and_its_row_is_told_anew(
+    service: Up, model: SmallModel, shown: Page, tmp_path: Path
+) -> None:
+    address = f"/v1/models/{model.id}"
+    section = shown.locator("#downloads")
+
+    def row(link: str) -> Locator:
+        return section.get_by_role("row").filter(has=shown.get_by_role("link", name=link))
+
+    def known(format: str) -> dict[str, Any]:
+        formats = service.http.get(f"{address}/formats").json()["formats"]
+        return next(each for each in formats if each["format"] == format)
+
+    whole = service.http.get(address).json()
+    size, psnr = (row("model.ply").get_by_role("cell").nth(index) for index in (1, 2))
+    expect(size).to_have_text(f"{whole['bytes'] / 1000:.0f} kB")
+    expect(psnr).to_have_text(f"{whole['psnr']:.2f} dB")
+    assert known("glb")["bytes"] is None, "another test has made it"
+    glb = row("binary glTF")
+    expect(glb.get_by_role("cell").nth(1)).to_have_text("made on demand")
+    with shown.expect_download(timeout=WAIT) as downloading:
+        glb.get_by_role("link").click()
+    downloading.value.save_as(tmp_path / "model.glb")
+    made = known("glb")
+    assert (tmp_path / "model.glb").stat().st_size == made["bytes"]
+    expect(glb.get_by_role("cell").nth(1)).to_have_text(f"{made['bytes'] / 1000:.0f} kB", timeout=WAIT)
+    expect(glb.get_by_role("cell").nth(2)).to_contain_text(f"{made['conversion']['psnr']:.2f} dB")
+    expect(glb.get_by_role("cell").nth(2)).to_contain_text("as model.ply")
+    expect(section.get_by_role("status")).to_be_empty()
+    for link, name, start in (
+        ("Page in one file", "html", b"<!doctype html>"),
+        ("cameras.zip", "zip", b"PK"),
+    ):
+        with shown.expect_download(timeout=WAIT) as downloading:
+            row(link).get_by_role("link").click()
+        downloading.value.save_as(tmp_path / name)
+        assert (tmp_path / name).read_bytes().startswith(start)
+    expect(row("SOG, version 2").get_by_role("cell").nth(1)).to_contain_text("kB", timeout=WAIT)
+
+
+def test_a_phone_shows_the_whole_page(service: Up, model: SmallModel, open_window: Open) -> None:
+    page = open_window(service, viewport={"width": 360, "height": 740}, color_scheme="dark").page
+    show(page, model)
+    page.get_by_role("button", name="Measure").click()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    expect(page.get_by_role("link", name="Page in one file")).to_be_attached(timeout=WAIT)
+    table = page.locator("#downloads .scroll")
+    assert table.evaluate("(table) => table.scrollWidth <= table.clientWidth"), (
+        "sizes are seen without scrolling"
+    )
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_assistive_technology_finds_nothing_serious(
+    service: Up, model: SmallModel, open_window: Open, scheme: str
+) -> None:
+    if not AXE.is_file():
+        pytest.skip("axe-core is not installed: python server/web/packages.py fetch --dev")
+    page = open_window(service, color_scheme=scheme).page
+    show(page, model)
+    page.get_by_role("button", name="Measure").click()
+    page.evaluate(AXE.read_text())
+    found = page.evaluate("axe.run().then((result) => result.violations)")
+    serious = [f"{v['id']}: {v['nodes'][0]['html']}" for v in found if v["impact"] in ("serious", "critical")]
+    assert not serious
+
+
+def test_a_model_that_is_not_there_is_said(visit: Visit) -> None:
+    visit.watched.allow("404")
+    visit.page.goto("/models/0123456789abcdef")
+    expect(visit.page.get_by_role("alert")).to_contain_text("There is no model '0123456789abcdef'.")
+
+
+def test_deleting_asks_first(model: SmallModel, shown: Page) -> None:
+    shown.get_by_role("button", name="Delete").click()
+    dialog = shown.get_by_role("dialog")
+    expect(dialog).to_contain_text("This cannot be undone")
+    dialog.get_by_role("button", name="Keep").click()
+    expect(dialog).to_have_count(0)
+    assert shown.url.endswith(model.id)
+
+
+def test_a_crop_makes_a_new_model_and_keeps_the_first(service: Up, model: SmallModel, shown: Page) -> None:
+    first = service.http.get(f"/v1/models/{model.id}").json()
+    shown.get_by_role("button", name="Crop and clean").click()
+    panel = shown.get_by_role("form", name="Crop and clean")
+    panel.get_by_role("slider", name="The box along x, from").fill("100")
+    assert shown.evaluate("document.querySelectorAll('.view canvas').length") == 2
+    panel.get_by_role("button", name="Measure what it does").click()
+    said = re.compile(r"^[\d,]+ of [\d,]+ Gaussians would be left out: [\d.]+ dB before, [\d.]+ dB after\.$")
+    expect(panel.get_by_role("status").locator("p")).to_have_text(said, timeout=WAIT)
+    assert len(service.http.get("/v1/models").json()["models"]) == 1, "a preview makes no model"
+    panel.get_by_role("button", name="Make a new model").click()
+    panel.get_by_role("link", name="Open the new model").click(timeout=WAIT)
+    expect(shown.locator("#viewer[data-ready]")).to_be_visible(timeout=WAIT)
+    made = service.http.get(f"/v1/models/{shown.url.rsplit('/', 1)[-1]}").json()
+    assert made["id"] != model.id
+    assert 0 < made["gaussians"] < first["gaussians"]
+    assert made["psnr"] is not None
+    cameras = service.http.get(f"/v1/models/{made['id']}/cameras").json()["cameras"]
+    held = [camera for camera in cameras if camera["split"] == "test"]
+    assert sum(camera["psnr"] for camera in held) / len(held) == pytest.approx(made["psnr"])
+    assert service.http.get(f"/v1/models/{made['id']}/files/{held[0]['photo']}").status_code == 200
+    shown.get_by_role("button", name="Delete").click()
+    shown.get_by_role("button", name="Delete the model").click()
+    shown.wait_for_url("**/models", timeout=WAIT)
+    assert service.http.get(f"/v1/models/{made['id']}").status_code == 404
+    assert service.http.get(f"/v1/models/{model.id}").json() == first
+
+
+def test_edits_that_make_no_sense_are_refused(service: Up, model: SmallModel) -> None:
+    address = f"/v1/models/{model.id}/edits"
+    for body in (
+        {},
+        {"box": {"min": [0, 0, 0], "max": [0, 1, 1]}},
+        {"min_opacity": 2},
+        {"box": {"min": [0]}},
+    ):
+        answer = service.http.post(address, json=body)
+        assert answer.status_code == 422, answer.text
+    answer = service.http.post(address, json={"max_size": 1e-9})
+    assert answer.status_code == 422
+    assert answer.json()["detail"] == "The edit leaves no Gaussian of the model."

@@ -1,0 +1,530 @@
+"""The page at `/`: files are sorted and judged, sent and sent on after breaks, and become one job.
+
+The photos are those of the still life. Not proved here: the training of the jobs (they are cancelled), decoding in
+other browsers, and a phone's own camera dialogue.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import random
+import re
+import shutil
+import subprocess
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image, ImageFilter
+from playwright.sync_api import Locator, Page, Request, expect
+
+from splatmill.local_capture import find_files
+from splatmill.schema import describe_options
+from tests.browser.conftest import Open, SmallModel, Visit
+from tests.support import still_life
+from tests.support.paths import ROOT
+from tests.support.up import Up
+
+CHECKED = 30_000
+"""Milliseconds that the photos of a test may take to be checked on a busy machine."""
+
+WEB = ROOT / "server" / "web"
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of 14 photos of the still life."""
+    folder = tmp_path_factory.mktemp("photos")
+    for number, (_, rgb, _) in enumerate(still_life.pictures()):
+        picture = Image.fromarray(rgb).resize((4 * still_life.WIDTH, 4 * still_life.HEIGHT))
+        picture.save(folder / f"still_{number:02d}.jpg", quality=95)
+    return folder
+
+
+@pytest.fixture
+def jobs(service: Up) -> Iterator[None]:
+    """Cancel and delete what the test has started."""
+    before = {job["id"] for job in service.http.get("/v1/jobs").json()["jobs"]}
+    yield
+    for job in service.http.get("/v1/jobs").json()["jobs"]:
+        if job["id"] not in before:
+            service.http.post(f"/v1/jobs/{job['id']}/cancel")
+            service.ended(job["id"])
+
+
+def opened(page: Page, path: str = "/") -> Page:
+    page.goto(path)
+    page.locator("html[data-ready]").wait_for()
+    return page
+
+
+def give(page: Page, *paths: Path) -> None:
+    """Give a folder or files and wait until they have been checked."""
+    if paths[0].is_dir():
+        page.set_input_files("#folder", paths[0])
+    else:
+        page.set_input_files("#files", list(paths))
+    expect(page.locator("#given")).to_be_visible()
+    expect(page.locator("#summary")).not_to_contain_text("being checked", timeout=CHECKED)
+
+
+def tile(page: Page, name: str) -> Locator:
+    return page.locator(".photo").filter(has=page.get_by_text(name, exact=True))
+
+
+def started(page: Page, service: Up) -> Any:
+    """The job whose page has come."""
+    page.wait_for_url(re.compile("/jobs/[0-9a-f]+$"), timeout=CHECKED)
+    return service.job(page.url.rsplit("/", 1)[-1])
+
+
+def files_of(service: Up, capture: str) -> dict[str, str]:
+    files = service.http.get(f"/v1/captures/{capture}").json()["files"]
+    return {f"{file['role']}/{file['name']}": file["sha256"] for file in files}
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_each_photo_gets_a_verdict_and_those_advised_against_are_left_out_at_once(
+    visit: Visit, service: Up, photos: Path, tmp_path: Path, jobs: None
+) -> None:
+    for path in photos.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    names = sorted(path.name for path in photos.iterdir())
+    picture = Image.open(photos / names[3])
+    picture.filter(ImageFilter.GaussianBlur(6)).save(tmp_path / names[3], quality=95)
+    picture.point(lambda level: level * 0.08).save(tmp_path / "night.png")
+    picture.resize((14, 10)).save(tmp_path / "stamp.png")
+    (tmp_path / "twin.jpg").write_bytes((photos / names[5]).read_bytes())
+    Image.open(photos / names[7]).save(tmp_path / "still_07_again.jpg", quality=60)
+    (tmp_path / "cut.jpg").write_bytes((photos / names[0]).read_bytes()[:300])
+    (tmp_path / "phone.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(2000))
+    (tmp_path / "notes.txt").write_text("of the walk")
+
+    page = opened(visit.page)
+    give(page, tmp_path)
+    bad = {
+        names[3]: "Blurred",
+        "night.png": "Too dark",
+        "stamp.png": "Too small: 14 × 10",
+        "twin.jpg": f"The same file as {names[5]}",
+        "cut.jpg": "damaged",
+    }
+    for name, text in bad.items():
+        expect(tile(page, name)).to_have_attribute("data-verdict", "bad")
+        expect(tile(page, name).locator(".verdict")).to_contain_text(text)
+    expect(tile(page, "still_07_again.jpg").locator(".verdict")).to_have_text(
+        "Almost the same view as still_07.jpg."
+    )
+    expect(tile(page, "phone.heic").locator(".verdict")).to_contain_text("The server checks it")
+    good = page.locator('.photo[data-verdict="good"]')
+    expect(good).to_have_count(len(names) - 1)
+    assert good.locator("img").count() == len(names) - 1
+    expect(page.get_by_text("notes.txt (not used")).to_be_visible()
+
+    page.get_by_role("button", name="Leave out all 5").click()
+    expect(page.locator('.photo[data-verdict="left"]')).to_have_count(5)
+    page.get_by_role("button", name="Use twin.jpg").click()
+    page.get_by_label("Name").fill("mixed")
+    page.get_by_role("button", name="Upload and train").click()
+    job = started(page, service)
+    assert job["name"] == "mixed"
+    expected = {*names, "twin.jpg", "still_07_again.jpg", "phone.heic"} - {names[3]}
+    assert set(files_of(service, job["capture"])) == {f"images/{name}" for name in expected}
+
+
+def test_photos_of_one_kind_are_not_told_apart(page: Page, photos: Path, tmp_path: Path) -> None:
+    # All are blurred, and all are bright: that is the scene, not a mistake of one of them.
+    for path in photos.iterdir():
+        Image.open(path).filter(ImageFilter.GaussianBlur(6)).point(lambda level: 242 + level / 20).save(
+            tmp_path / path.name
+        )
+    opened(page)
+    give(page, tmp_path)
+    expect(page.locator('.photo[data-verdict="bad"]')).to_have_count(0)
+
+
+TREES = {
+    "photos in folders": "b.JPG a.heic day/c.png notes.txt .hidden/d.jpg ._a.jpg __MACOSX/e.jpg walk.mp4",
+    "masks": "images/a.jpg images/left/b.jpg masks/a.jpg.png masks/left/b.png masks/readme.txt d.jpg",
+    "mask": "a.jpg mask/a.png",
+    "colmap": "images/a.jpg sparse/0/cameras.bin sparse/0/images.bin sparse/0/project.ini sparse/1/cameras.bin",
+    "colmap in its root": "images/a.jpg cameras.txt images.txt points3D.txt frames.txt",
+    "colmap of nerfstudio": "images/a.jpg colmap/sparse/0/cameras.bin colmap/sparse/0/points3D.bin transforms.json",
+    "blender": "train/r_0.png test/r_0.png transforms_train.json transforms_test.json deep/transforms.json",
+    "videos": "a.mov b.webm",
+    "a zip": "photos.zip",
+    "code points": "é.jpg Z.jpg a.jpg \U0001f600.jpg ﬁ.jpg",
+}
+
+
+def test_files_are_sorted_as_by_the_command_line(page: Page, tmp_path: Path) -> None:
+    opened(page)
+    script = """async (paths) => {
+      const { sort } = await import("/page/any/new/kinds.js");
+      const { accepted } = await (await fetch("/v1/info")).json();
+      return sort(paths, accepted);
+    }"""
+    for title, names in TREES.items():
+        root = tmp_path / title
+        for name in names.split():
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            (root / name).write_bytes(b"x")
+        found = find_files(root)
+        here = page.evaluate(script, names.split())
+        listed = [(file["role"], file["name"], file["path"]) for file in here["files"]]
+        assert listed == [
+            (file.role.value, file.name, file.path.relative_to(root).as_posix()) for file in found.files
+        ], title
+        assert here["ignored"] == list(found.ignored), title
+
+
+def test_a_folder_with_cameras_is_dropped(visit: Visit, service: Up, tmp_path: Path, jobs: None) -> None:
+    made = still_life.posed_capture(tmp_path / "made")
+    data_set = tmp_path / "still life"
+    data_set.mkdir()
+    (made / "images").rename(data_set / "images")
+    (made / "poses" / "transforms.json").rename(data_set / "transforms.json")
+    page = opened(visit.page)
+    session = visit.context.new_cdp_session(page)
+    for kind in ("dragEnter", "dragOver", "drop"):
+        data = {"items": [], "files": [str(data_set)], "dragOperationsMask": 1}
+        session.send("Input.dispatchDragEvent", {"type": kind, "x": 400, "y": 300, "data": data})
+    expect(page.locator("#summary")).to_contain_text("14 photos")
+    expect(page.get_by_text("transforms.json (cameras")).to_be_visible()
+    page.get_by_role("button", name="Upload and train").click()
+    files = files_of(service, started(page, service)["capture"])
+    assert files["poses/transforms.json"] == digest(data_set / "transforms.json")
+    assert files["images/00.png"] == digest(data_set / "images" / "00.png")
+    assert len(files) == 15
+
+
+def test_a_killed_upload_sends_what_is_missing(visit: Visit, service: Up, tmp_path: Path, jobs: None) -> None:
+    noise = random.Random(1)
+    for number in range(9):
+        (tmp_path / f"{number}.jpg").write_bytes(noise.randbytes(60_000))
+    visit.watched.allow("Failed to load resource")
+    page = opened(visit.page)
+    give(page, tmp_path)
+    page.locator("#name").fill("twice")
+    page.locator("#option-time_budget").fill("7s")
+    slow(visit, page, 100_000)
+    page.get_by_role("button", name="Upload and train").click()
+    expect(page.locator("#sent-text")).to_contain_text(re.compile("[4-8] of 9 files"), timeout=CHECKED)
+    page.close(run_before_unload=False)
+
+    again = opened(visit.context.new_page())
+    expect(again.locator("#go-on")).to_contain_text(re.compile("twice, [4-8] of 9 files have arrived"))
+    sent: list[str] = []
+
+    def note(request: Request) -> None:
+        if request.method == "PUT":
+            sent.append(request.url)
+
+    again.on("request", note)
+    give(again, tmp_path)
+    expect(again.locator(".photo[data-stored]")).to_have_count(9 - len(left(again)))
+    again.get_by_role("button", name="Go on and train").click()
+    job = started(again, service)
+    assert (job["name"], job["options"]["time_budget"]) == ("twice", 7.0)
+    assert 1 <= len(sent) <= 5
+    assert files_of(service, job["capture"]) == {
+        f"images/{path.name}": digest(path) for path in sorted(tmp_path.iterdir())
+    }
+    opened(again)
+    expect(again.locator("#go-on")).to_have_count(0)
+
+
+def left(page: Page) -> list[str]:
+    """The names of the photos that the server does not hold."""
+    return page.locator(".photo:not([data-stored]) .name").all_inner_texts()
+
+
+def slow(visit: Visit, page: Page, rate: int) -> None:
+    """Let the page send `rate` bytes a second; 0 is as fast as it can."""
+    session = visit.context.new_cdp_session(page)
+    session.send("Network.enable")
+    limits = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": rate or -1}
+    session.send("Network.emulateNetworkConditions", limits)
+
+
+def test_a_large_file_goes_on_where_it_broke_off(
+    visit: Visit, service: Up, photos: Path, tmp_path: Path, jobs: None
+) -> None:
+    archive = tmp_path / "walk.zip"
+    with zipfile.ZipFile(archive, "w") as zipped:
+        for path in sorted(photos.iterdir()):
+            zipped.write(path, f"walk/images/{path.name}")
+        zipped.writestr("walk/notes.bin", random.Random(2).randbytes(20_000_000))
+    visit.watched.allow("Failed to load resource")
+    page = opened(visit.page)
+    give(page, archive)
+    expect(page.locator("#others")).to_contain_text("walk.zip (zip archive")
+    expect(page.locator("#others")).to_contain_text("15 files inside")
+    slow(visit, page, 6_000_000)
+    page.get_by_role("button", name="Upload and train").click()
+    expect(page.locator("#sent-text")).to_contain_text(re.compile(r"(9|1\d)\.\d MB of 20"), timeout=CHECKED)
+    page.get_by_role("button", name="Pause").click()
+    expect(page.get_by_role("button", name="Go on")).to_be_enabled()
+    expect(page.locator("#doing")).to_have_text("Paused")
+    expect(page.locator("#sent-text")).not_to_contain_text("/s")
+    offsets: list[int] = []
+
+    def note(request: Request) -> None:
+        if request.method == "PATCH":
+            offsets.append(int(request.headers["upload-offset"]))
+
+    page.on("request", note)
+    slow(visit, page, 0)
+    page.get_by_role("button", name="Go on").click()
+    job = started(page, service)
+    assert offsets
+    assert min(offsets) >= 8 << 20
+    assert files_of(service, job["capture"]) == {"images/walk.zip": digest(archive)}
+
+
+def test_a_lost_connection_is_waited_for(visit: Visit, service: Up, photos: Path, jobs: None) -> None:
+    visit.watched.allow("Failed to load resource|ERR_INTERNET_DISCONNECTED")
+    page = opened(visit.page)
+    give(page, photos)
+    lost: list[str] = []
+
+    def lose(route: Any) -> None:
+        if len(lost) < 3:
+            lost.append(route.request.url)
+            route.abort("connectionreset")
+        else:
+            route.continue_()
+
+    page.route("**/v1/captures/*/images/*", lose)
+    page.get_by_role("button", name="Upload and train").click()
+    job = started(page, service)
+    assert len(lost) == 3
+    assert len(files_of(service, job["capture"])) == 14
+
+
+def test_one_job_is_made_of_two_clicks_and_of_a_lost_answer(
+    visit: Visit, service: Up, photos: Path, jobs: None
+) -> None:
+    visit.watched.allow("Failed to load resource")
+    page = opened(visit.page)
+    give(page, *sorted(photos.iterdir())[:3])
+    keys: list[str] = []
+
+    def lose_first(route: Any) -> None:
+        keys.append(route.request.headers["idempotency-key"])
+        if len(keys) == 1:
+            assert route.fetch().status == 202
+            route.abort("connectionreset")
+        else:
+            route.continue_()
+
+    page.route("**/v1/jobs", lose_first)
+    page.get_by_role("button", name="Upload and train").dblclick()
+    expect(page.get_by_text("The server did not answer.")).to_be_visible(timeout=CHECKED)
+    page.get_by_role("button", name="Train", exact=True).click()
+    job = started(page, service)
+    assert len(keys) == 2
+    assert len(set(keys)) == 1
+    of_capture = service.http.get("/v1/jobs", params={"capture": job["capture"]}).json()["jobs"]
+    assert [found["id"] for found in of_capture] == [job["id"]]
+
+
+def test_settings_have_the_help_of_the_command_line_and_errors_beside_them(
+    visit: Visit, photos: Path
+) -> None:
+    visit.watched.allow("status of 422")
+    page = opened(visit.page)
+    give(page, *sorted(photos.iterdir())[:3])
+    for option in describe_options():
+        help_text = page.locator(f"#option-{option.name}-help")
+        expect(help_text).to_contain_text(option.help)
+        shown = option.name in ("preset", "time_budget", "image_size")
+        assert help_text.is_visible() == shown, option.name
+    size = page.locator("#option-image_size")
+    size.fill("5")
+    expect(page.locator("#option-image_size-error")).to_have_text(
+        "Input should be greater than or equal to 16."
+    )
+    expect(size).to_have_attribute("aria-invalid", "true")
+    size.fill("160")
+    expect(page.locator("#option-image_size-error")).to_be_empty()
+    expect(size).not_to_have_attribute("aria-invalid", "true")
+    page.get_by_text("All settings").click()
+    page.get_by_label("Time budget").fill("soon")
+    expect(page.locator("#option-time_budget-error")).to_contain_text("'soon' is not a duration")
+    # Nothing is sent with settings that are not valid.
+    page.get_by_role("button", name="Upload and train").click()
+    expect(page.locator("#option-time_budget-error")).to_contain_text("'soon' is not a duration")
+    expect(page.get_by_role("button", name="Upload and train")).to_be_enabled()
+
+
+def test_a_further_job_on_stored_photos_with_an_estimate(
+    page: Page, service: Up, model: SmallModel, jobs: None
+) -> None:
+    opened(page)
+    page.get_by_role("link", name=re.compile("still life")).first.click()
+    page.locator("html[data-ready]").wait_for()
+    assert page.url.endswith(f"/?capture={model.capture}")
+    expect(page.locator("#place")).to_contain_text("still life: 15 files")
+    expect(page.locator("#estimate")).to_contain_text(re.compile("About .+ for 14 photos"))
+    page.get_by_text("How this was derived").click()
+    expect(page.locator("#estimate")).to_contain_text("per step")
+    page.locator("#settings").get_by_text("draft", exact=True).click()
+    page.get_by_role("button", name="Train", exact=True).click()
+    job = started(page, service)
+    assert job["capture"] == model.capture
+    assert job["options"]["preset"] == "draft"
+
+
+def test_a_refused_file_is_named_and_the_others_can_be_trained(
+    visit: Visit, service: Up, photos: Path, jobs: None
+) -> None:
+    visit.watched.allow("status of 409")
+    given = sorted(photos.iterdir())[:3]
+    capture = service.http.post("/v1/captures", json={"name": "taken"}).json()["id"]
+    other = given[2].read_bytes() + b"\0"
+    service.http.put(f"/v1/captures/{capture}/images/{given[0].name}", content=other)
+    page = opened(visit.page, f"/?capture={capture}")
+    give(page, *given)
+    page.get_by_role("button", name="Upload and train").click()
+    expect(page.locator("#problem")).to_contain_text("The server refused one file", timeout=CHECKED)
+    expect(tile(page, given[0].name).locator(".verdict")).to_contain_text(
+        "already holds images/still_00.jpg with other bytes"
+    )
+    page.get_by_role("button", name="Train without it").click()
+    job = started(page, service)
+    assert job["capture"] == capture
+    names = [f"images/{path.name}" for path in given]
+    files = files_of(service, capture)
+    assert files == {
+        names[0]: hashlib.sha256(other).hexdigest(),
+        names[1]: digest(given[1]),
+        names[2]: digest(given[2]),
+    }
+
+
+def test_everything_works_by_keyboard(visit: Visit, service: Up, photos: Path, jobs: None) -> None:
+    visit.page.on("filechooser", lambda _: None)  # so that dialogues are intercepted from the beginning
+    page = opened(visit.page)
+    tab_to(page, "#choose")
+    with page.expect_file_chooser() as chooser:
+        page.keyboard.press("Enter")
+    chooser.value.set_files(sorted(photos.iterdir())[:4])
+    expect(page.locator('.photo[data-verdict="good"]')).to_have_count(4, timeout=CHECKED)
+    tab_to(page, '[aria-label="Leave out still_02.jpg"]')
+    page.keyboard.press("Enter")
+    expect(page.locator('[aria-label="Use still_02.jpg"]')).to_be_focused()
+    tab_to(page, '[name="preset"]')
+    page.keyboard.press("ArrowLeft")
+    expect(page.locator('[name="preset"]:checked')).to_have_value("draft")
+    tab_to(page, "#start")
+    page.keyboard.press("Enter")
+    job = started(page, service)
+    assert job["options"]["preset"] == "draft"
+    assert len(files_of(service, job["capture"])) == 3
+
+
+def tab_to(page: Page, selector: str) -> None:
+    for _ in range(60):
+        if page.evaluate("(selector) => document.activeElement.matches(selector)", selector):
+            return
+        page.keyboard.press("Tab")
+    raise AssertionError(f"the tabulator does not reach {selector}")
+
+
+def test_a_phone_takes_photos_one_by_one(
+    service: Up, open_window: Open, photos: Path, tmp_path: Path
+) -> None:
+    phone = open_window(service, viewport={"width": 360, "height": 740}, has_touch=True, is_mobile=True)
+    page = opened(phone.page)
+    expect(page.get_by_role("button", name="Take a photo")).to_be_visible()
+    expect(page.locator("#shot")).to_have_attribute("capture", "environment")
+    for number, path in enumerate(sorted(photos.iterdir())[:2]):
+        (tmp_path / str(number)).mkdir()
+        shot = tmp_path / str(number) / "image.jpg"  # phones call each photo so
+        shot.write_bytes(path.read_bytes())
+        page.set_input_files("#shot", shot)
+    expect(page.locator(".photo .name")).to_have_text(["image-2.jpg", "image.jpg"])
+    page.get_by_text("All settings").click()
+    expect(page.locator("#phone")).to_be_hidden()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+
+
+def test_the_code_for_phones_can_be_read(page: Page, tmp_path: Path) -> None:
+    opened(page)
+    page.get_by_text("Take the photos with a phone").click()
+    expect(page.locator("#phone-help")).to_contain_text("an address that only this machine reaches")
+    address = "http://192.168.0.20:8080/?capture=9f2b6c1d04e8a735"
+    script = """async (address) => {
+      const { phoneHelp } = await import("/page/any/new/phone.js");
+      const { isLoopback } = await import("/page/any/address.js");
+      document.getElementById("main").prepend(await phoneHelp(new URL(address), false, true));
+      return ["localhost", "127.0.0.1", "[::1]", "192.168.0.20", "example.org"].map(isLoopback);
+    }"""
+    assert page.evaluate(script, address) == [True, True, True, False, False]
+    picture = Image.open(io.BytesIO(page.locator("svg.qr").screenshot())).convert("RGBA")
+    (tmp_path / "pixels").write_bytes(picture.tobytes())
+    program = f"""
+        import decodeQR from "qr/decode.js"; import fs from "node:fs";
+        const data = new Uint8Array(fs.readFileSync({json.dumps(str(tmp_path / "pixels"))}));
+        console.log(decodeQR({{ width: {picture.width}, height: {picture.height}, data }}));"""
+    node = shutil.which("node")
+    if node is None or not (WEB / "node_modules" / "qr").is_dir():
+        pytest.skip("needs Node and the package qr: run `python server/web/packages.py fetch`")
+    command = [node, "--input-type=module", "-e", program]
+    done = subprocess.run(command, cwd=WEB, capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == address, done.stderr
+
+
+def test_without_the_packages_a_phone_is_told_the_address(page: Page) -> None:
+    opened(page)
+    # As the server marks its pages then; modules under another digest are evaluated anew.
+    script = """async (address) => {
+      document.documentElement.dataset.viewer = "missing";
+      const { phoneHelp } = await import("/page/anew/new/phone.js");
+      document.getElementById("phone-help").replaceChildren(await phoneHelp(new URL(address), false, true));
+    }"""
+    page.get_by_text("Take the photos with a phone").click()
+    expect(page.locator("#phone-help")).to_contain_text("an address that only this machine reaches")
+    page.route("**/vendor/**", lambda route: route.abort())
+    page.evaluate(script, "http://192.168.0.20:8080/")
+    expect(page.locator("#phone-help")).to_contain_text("Open http://192.168.0.20:8080/ on the phone.")
+    expect(page.locator("#phone-help")).to_contain_text("make install")
+    expect(page.locator("#phone-help .qr")).to_have_count(0)
+
+
+def test_digests_are_right_without_the_browsers_own(page: Page) -> None:
+    opened(page)
+    script = """async (size) => {
+      const { sha256, sha256InPieces } = await import("/page/any/new/digest.js");
+      const file = new Blob([new Uint8Array(size).map((_, index) => index % 251)]);
+      const library = import.meta?.resolve?.("@noble/hashes/sha2.js") ?? "@noble/hashes/sha2.js";
+      return [await sha256(file, library), await sha256InPieces(file, library)];
+    }""".replace('import.meta?.resolve?.("@noble/hashes/sha2.js") ?? ', "")
+    size = (4 << 20) + 17
+    expected = hashlib.sha256(bytes(index % 251 for index in range(size))).hexdigest()
+    assert page.evaluate(script, size) == [expected, expected]
+
+
+def test_axe_finds_nothing_serious(service: Up, open_window: Open, photos: Path) -> None:
+    axe = WEB / "node_modules" / "axe-core" / "axe.min.js"
+    if not axe.is_file():
+        pytest.skip("axe-core is not installed: `python server/web/packages.py fetch --dev` installs it")
+    visit = open_window(service)
+    visit.context.add_init_script(path=axe)
+    page = opened(visit.page)
+    give(page, *sorted(photos.iterdir())[:3])
+    page.get_by_text("All settings").click()
+    expect(page.locator("#estimate")).not_to_be_empty()
+    for theme, rules in (("light", "axe.run()"), ("dark", "axe.run({ runOnly: ['color-contrast'] })")):
+        page.get_by_label("Theme").select_option(theme)
+        found = page.evaluate(rules)["violations"]
+        serious = [one for one in found if one["impact"] in ("serious", "critical")]
+        assert not serious, json.dumps(serious, indent=1)[:3000]

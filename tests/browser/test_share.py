@@ -1,0 +1,133 @@
+"""The page of a shared link in a browser without a key: the scene, downloads, the frame, and what an ended link says.
+
+What a link opens and how it ends is tested in tests/server/test_shares.py; the viewer, in test_viewer.py.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import threading
+from collections.abc import Iterator
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.browser.conftest import Open, SmallModel
+from tests.support.up import Up
+
+DRAWN = "() => Number(document.querySelector('#view .view')?.dataset.frames) > 0"
+
+
+@pytest.fixture
+def link(service: Up, model: SmallModel) -> dict[str, Any]:
+    return dict(service.http.post(f"/v1/models/{model.id}/shares", json={"expires_in": "1h"}).json())
+
+
+def test_links_are_made_and_revoked_on_the_page(service: Up, model: SmallModel, page: Page) -> None:
+    page.goto("/models?name=still")
+    tile = page.get_by_role("listitem").filter(has_text="still life").first
+    tile.get_by_role("button", name="Share").press("Enter")
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Valid for").select_option("7 days")
+    dialog.get_by_label("For whom").fill("for mum")
+    page.keyboard.press("Enter")
+    link = dialog.get_by_label("The link").input_value()
+    assert httpx.get(f"{link}/model").json()["id"] == model.id
+    expect(dialog).to_contain_text("Only this machine reaches 127.0.0.1")
+    entry = dialog.get_by_role("listitem").filter(has_text="for mum")
+    expect(entry).to_contain_text("valid until")
+    entry.get_by_role("button", name="Revoke").click()
+    expect(entry).to_contain_text("revoked")
+    assert httpx.get(f"{link}/model").status_code == 410
+    page.keyboard.press("Escape")
+    expect(dialog).to_be_hidden()
+    page.goto(f"/models/{model.id}")
+    page.get_by_role("button", name="Share").click()
+    expect(page.get_by_role("dialog").get_by_role("listitem").filter(has_text="for mum")).to_contain_text(
+        "revoked"
+    )
+
+
+def test_a_link_shows_the_scene_and_its_files(
+    service: Up, model: SmallModel, link: dict[str, Any], open_window: Open
+) -> None:
+    visit = open_window(service)
+    asked: list[str] = []
+    visit.page.on("request", lambda request: asked.append(request.url))
+    visit.page.goto(link["path"])
+    expect(visit.page.get_by_role("heading", level=1)).to_have_text("still life")
+    expect(visit.page.locator("#figures")).to_contain_text("Gaussians")
+    visit.page.wait_for_function(DRAWN, polling=100)
+    expect(visit.page.locator("img.still")).to_have_count(0)
+    base = str(service.http.base_url).rstrip("/")
+    allowed = (f"{base}{link['path']}", f"{base}/page/", f"{base}/vendor/", "blob:", "data:")
+    assert not [url for url in asked if not url.startswith(allowed)], "it needs nothing that asks for a key"
+
+    with visit.page.expect_download() as downloading:
+        visit.page.locator("#downloads a[href$='/download/ply']").click()
+    assert downloading.value.suggested_filename == f"{model.id}.ply"
+    stored = service.http.get(f"/v1/models/{model.id}/files/model.ply").content
+    assert downloading.value.path().read_bytes() == stored
+    assert f'{link["path"]}/embed"' in visit.page.get_by_label("HTML of a frame").input_value()
+
+
+@contextlib.contextmanager
+def elsewhere(folder: Path) -> Iterator[str]:
+    """Serve a folder on another port, which is another origin; yields its address."""
+    handler = functools.partial(QuietHandler, directory=str(folder))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+class QuietHandler(SimpleHTTPRequestHandler):
+    """Serves files and says nothing."""
+
+    def log_message(self, format: str, *args: Any) -> None: ...
+
+
+def test_only_the_viewer_alone_can_be_framed_by_a_page_of_others(
+    service: Up, link: dict[str, Any], open_window: Open, tmp_path: Path
+) -> None:
+    visit = open_window(service)
+    visit.page.goto(link["path"] + "/embed")
+    visit.page.wait_for_function(DRAWN, polling=100)
+    expect(visit.page.get_by_role("link", name="Open the page")).to_have_attribute("href", link["path"])
+
+    base = str(service.http.base_url).rstrip("/")
+    (tmp_path / "index.html").write_text(
+        f"""<!doctype html><title>a page of others</title><link rel="icon" href="data:,">
+        <iframe id="frame" src="{base}{link["path"]}/embed"></iframe>
+        <iframe id="page" src="{base}{link["path"]}"></iframe>"""
+    )
+    with elsewhere(tmp_path) as address:
+        others = open_window(address)
+        others.watched.allow("request to another host")
+        others.watched.allow("frame-ancestors|Refused to frame|refused to display|X-Frame-Options")
+        others.page.goto("/")
+        inside = others.page.frame_locator("#frame")
+        expect(inside.get_by_role("heading", level=1)).to_have_text("still life")
+        expect(inside.locator("#view .view")).to_be_visible()
+        expect(others.page.frame_locator("#page").locator("#title")).to_have_count(0)
+        assert [text for text in others.watched.complaints if "frame" in text.lower()]
+
+
+def test_an_ended_link_says_so(
+    service: Up, model: SmallModel, link: dict[str, Any], open_window: Open
+) -> None:
+    service.http.delete(f"/v1/models/{model.id}/shares/{link['id']}")
+    visit = open_window(service)
+    visit.watched.allow("status of 410")
+    visit.watched.allow("status of 404")
+    visit.page.goto(link["path"])
+    expect(visit.page.get_by_role("alert")).to_contain_text("was revoked")
+    expect(visit.page.get_by_role("alert")).to_contain_text("Ask whoever sent it for a new one.")
+    expect(visit.page.get_by_role("heading", name="Download")).to_be_hidden()
+    visit.page.goto("/s/nothing")
+    expect(visit.page.get_by_role("alert")).to_contain_text("no such shared link")

@@ -1,0 +1,78 @@
+"""What every page has: header and navigation by keyboard, both themes, phone width; and that the rules of the fixtures
+bite. What the pages themselves do is tested page by page.
+"""
+
+from __future__ import annotations
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.browser.conftest import Open, SmallModel, Visit
+from tests.support.up import Up
+
+PAGES = ("/", "/jobs", "/models", "/sign-in")
+
+
+@pytest.mark.parametrize("path", PAGES)
+def test_pages_fit_a_phone_and_have_one_heading(service: Up, open_window: Open, path: str) -> None:
+    page = open_window(service, viewport={"width": 360, "height": 740}).page
+    page.goto(path)
+    expect(page.locator("header.bar")).to_be_visible()
+    expect(page.locator("h1")).to_have_count(1)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+
+
+def test_the_navigation_works_by_keyboard(page: Page) -> None:
+    page.goto("/")
+    expect(page.get_by_role("link", name="New")).to_have_attribute("aria-current", "page")
+    page.keyboard.press("Tab")
+    expect(page.get_by_role("link", name="Skip to the contents")).to_be_focused()
+    for _ in range(4):
+        page.keyboard.press("Tab")
+    expect(page.get_by_role("link", name="Models")).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", level=1)).to_have_text("Models")
+    assert page.url.endswith("/models")
+
+
+def test_the_theme_follows_the_system_until_it_is_chosen(service: Up, open_window: Open) -> None:
+    page = open_window(service, color_scheme="dark").page
+    page.goto("/jobs")
+    background = "getComputedStyle(document.body).backgroundColor"
+    dark = page.evaluate(background)
+    page.get_by_label("Theme").select_option("light")
+    light = page.evaluate(background)
+    assert dark != light
+    page.goto("/models")
+    assert page.evaluate(background) == light
+    page.get_by_label("Theme").select_option("auto")
+    assert page.evaluate(background) == dark
+
+
+def test_the_engine_of_the_viewer_loads_under_the_policy(page: Page) -> None:
+    page.goto("/models")
+    found = page.evaluate("import('playcanvas').then((pc) => [pc.version, typeof pc.Application])")
+    assert found == ["2.23.3", "function"]
+
+
+def test_the_policy_stops_scripts_of_others(visit: Visit) -> None:
+    visit.watched.allow("policy|Content Security Policy|request to another host")
+    visit.page.goto("/")
+    blocked = visit.page.evaluate(
+        """() => new Promise((resolve) => {
+             document.addEventListener("securitypolicyviolation", (e) => resolve(e.effectiveDirective), { once: true });
+             const script = document.createElement("script");
+             script.textContent = "globalThis.ran = true";
+             document.head.append(script);
+           })"""
+    )
+    assert blocked.startswith("script-src")
+    assert visit.page.evaluate("globalThis.ran") is None
+    assert visit.watched.complaints
+
+
+def test_the_small_model_is_whole(service: Up, model: SmallModel) -> None:
+    found = service.http.get(f"/v1/models/{model.id}").json()
+    assert 100 < found["gaussians"] <= 3000
+    cameras = service.http.get(f"/v1/models/{model.id}/cameras").json()["cameras"]
+    assert {camera["split"] for camera in cameras} == {"train", "test"}

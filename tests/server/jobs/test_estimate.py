@@ -1,0 +1,173 @@
+"""Estimates of the time of a job: from which finished jobs, how they are scaled, and what is said without any.
+
+Not proved here: how close an estimate comes. The records are those of a real job (tests/fixtures/formats), changed.
+"""
+
+import json
+from typing import Any
+
+import pytest
+
+from splatmill.backplane import layout
+from splatmill.schema import EstimateJob
+from splatmill_server.jobs.estimate import estimate
+from splatmill_server.jobs.finished import Figures, figures
+from tests.support.paths import ROOT
+from tests.support.served_app import ServedApp, problem
+
+STORED = ROOT / "tests" / "fixtures" / "formats" / "v1" / "storage" / "models" / "d30c898af4f8d541"
+
+
+def records() -> tuple[dict[str, Any], dict[str, Any]]:
+    return json.loads((STORED / "job.json").read_text()), json.loads((STORED / "report.json").read_text())
+
+
+def job(**changes: Any) -> Figures:
+    """A job of 20 photos that took 10 s for the cameras, 60 s to train, 0.1 s per photo and 5 s for all else."""
+    fields: dict[str, Any] = {
+        "photos": 20,
+        "posed": False,
+        "preset": "balanced",
+        "sized": False,
+        "image_size": 640,
+        "steps": 3000,
+        "kernels": "cpu",
+        "machine": "a processor, 2 cores",
+        "cameras": 10.0,
+        "train": 60.0,
+        "by_photo": 2.0,
+        "fixed": 5.0,
+        "pixel_share": 0.5,
+    }
+    return Figures(**(fields | changes))
+
+
+def seconds(request: dict[str, Any], *finished: Figures) -> list[float | None]:
+    found = estimate(EstimateJob.model_validate(request), finished)
+    return [stage.seconds for stage in found.stages]
+
+
+def test_stages_are_scaled_by_photos_and_steps() -> None:
+    assert seconds({"photos": 20}, job()) == [10.0, 60.0, 7.0]
+    assert seconds({"photos": 40}, job()) == [20.0, 60.0, 9.0]
+    assert seconds({"photos": 20, "options": {"preset": "draft"}}, job())[1] == 20.0
+    assert seconds({"photos": 20, "options": {"steps": 6000}}, job())[1] == 120.0
+    assert (
+        seconds({"photos": 20, "options": {"target_psnr": 30}}, job())[1] == 200.0
+    )  # at most: preset quality
+
+
+def test_a_time_budget_is_the_time_of_the_training() -> None:
+    assert seconds({"photos": 20, "options": {"time_budget": "2m"}}) == [None, 120.0, None]
+    assert seconds({"photos": 20, "options": {"time_budget": "2m"}}, job()) == [10.0, 120.0, 7.0]
+    both = {"photos": 20, "options": {"time_budget": "2m", "steps": 1000}}
+    assert seconds(both, job())[1] == 20.0
+    assert seconds(both)[1] == 120.0
+
+
+def test_only_the_share_of_a_step_that_pixels_take_grows_with_them() -> None:
+    # Twice the side is four times the pixels: half of the step takes four times as long, the other half as before.
+    assert seconds({"photos": 20, "options": {"image_size": 1280}}, job())[1] == 150.0
+    assert seconds({"photos": 20, "options": {"image_size": 1280}}, job(pixel_share=0.0))[1] == 60.0
+
+
+def test_the_jobs_that_are_most_alike_decide_and_give_a_range() -> None:
+    small = [job(photos=20, cameras=seconds) for seconds in (8.0, 9.0, 10.0, 11.0, 14.0)]
+    large = [job(photos=400, cameras=4000.0)] * 3
+    found = estimate(EstimateJob(photos=20), [*large, *small])
+    cameras = found.stages[0]
+    assert (cameras.lowest, cameras.seconds, cameras.highest) == (8.0, 10.0, 14.0)
+    assert found.jobs == 8
+    assert found.seconds == sum(stage.seconds or 0.0 for stage in found.stages)
+    assert found.lowest is not None
+    assert found.highest is not None
+    assert found.lowest < found.seconds < found.highest
+    assert "0.5 s per photo" in cameras.because
+    assert seconds({"photos": 400}, *large, *small)[0] == 4000.0
+
+
+def test_other_machines_kernels_and_kinds_of_cameras_do_not_count() -> None:
+    other = job(machine="another", train=1.0)
+    assert seconds({"photos": 20}, job(), other)[1] == 60.0
+    assert seconds({"photos": 20}, other, job())[1] == 1.0  # the machine of the newest job
+    gpu = job(kernels="gpu", machine="a card", train=3.0)
+    assert seconds({"photos": 20, "options": {"backend": "gpu"}}, job(), gpu)[1] == 3.0
+    assert seconds({"photos": 20, "options": {"backend": "cpu"}}, gpu, job())[1] == 60.0
+    found = estimate(EstimateJob(photos=20, posed=True), [job()])
+    assert found.stages[0].seconds is None
+    assert found.seconds is None  # no sum without one of its parts
+    assert "came with the photos" in found.stages[0].because
+    assert seconds({"photos": 20, "posed": True}, job(), job(posed=True, cameras=1.0))[0] == 1.0
+
+
+def test_nothing_is_made_up_without_history() -> None:
+    found = estimate(EstimateJob(photos=20), [])
+    assert found.model_dump(include={"seconds", "lowest", "highest", "jobs", "machine"}) == {
+        "seconds": None,
+        "lowest": None,
+        "highest": None,
+        "jobs": 0,
+        "machine": None,
+    }
+    assert all(
+        stage.seconds is None and "finished on this server yet" in stage.because for stage in found.stages
+    )
+
+
+def test_figures_are_read_from_the_records_of_a_real_job() -> None:
+    stored, report = records()
+    found = figures(stored, report)
+    assert found is not None
+    assert (found.photos, found.posed, found.steps, found.image_size, found.kernels) == (
+        8,
+        True,
+        60,
+        64,
+        "cpu",
+    )
+    assert found.machine == "Intel(R) Xeon(R) Processor, 2 cores"
+    assert found.train == pytest.approx(0.0662, abs=1e-4)
+    # All of its 8.31 s are accounted for.
+    wall = found.cameras + found.train + found.by_photo + found.fixed
+    assert wall == pytest.approx(8.3096, abs=1e-3)
+    assert 0.0 < found.pixel_share < 1.0
+    assert figures({**stored, "attempt": 2}, report) is None
+
+
+def test_cameras_that_an_earlier_job_recovered_count_with_the_time_that_took() -> None:
+    stored, report = records()
+    report["sfm"] = {"seconds": {"features": 20.0, "matching": 10.5}}
+    found = figures(stored, {**report, "facts": report["facts"] | {"source": "sfm"}})
+    assert found is not None
+    assert (found.cameras, found.posed) == (30.5, False)
+
+
+def test_the_endpoint_estimates_from_stored_models_and_creates_nothing(app: ServedApp) -> None:
+    body = {"photos": 8, "posed": True, "options": {"steps": 120}}
+    assert app.http.post("/v1/estimate", json=body).json()["jobs"] == 0
+    for name in ("report.json", "job.json"):
+        app.service.storage.put(layout.model_file(STORED.name, name), (STORED / name).read_bytes())
+    broken = "0123456789abcdef"
+    app.service.storage.put(layout.model_file(broken, "report.json"), b"{}")
+    app.service.storage.put(layout.job_record(broken), b'{"attempt": 1}')
+    found = app.http.post("/v1/estimate", json=body).json()
+    assert found["jobs"] == 1  # the one that cannot be read is left out
+    assert found["stages"][1]["seconds"] == pytest.approx(2 * 0.0662, abs=0.1)
+    assert found["seconds"] == pytest.approx(8.4, abs=0.2)
+    assert STORED.name not in json.dumps(found)
+    assert app.http.get("/v1/jobs").json()["jobs"] == []
+
+
+def test_options_are_checked_as_those_of_a_job(app: ServedApp) -> None:
+    answer = app.http.post("/v1/estimate", json={"photos": 8, "options": {"image_size": 5}})
+    assert problem(answer, 422, "option_out_of_range")["facts"]["errors"][0]["where"] == "options.image_size"
+    problem(app.http.post("/v1/estimate", json={"photos": 8, "options": {"size": 5}}), 422, "unknown_option")
+    problem(app.http.post("/v1/estimate", json={"photos": 0}), 422, "invalid_request")
+
+
+def test_info_tells_which_files_are_accepted_and_where_the_server_listens(app: ServedApp) -> None:
+    info = app.http.get("/v1/info").json()
+    assert ".jpg" in info["accepted"]["photos"]
+    assert ".zip" in info["accepted"]["archives"]
+    assert info["accepted"]["min_photo_side"] == 16
+    assert info["local"] is True

@@ -1,0 +1,109 @@
+"""Models made of a part of another one through the SDK, synchronous and asynchronous, and through `splatmill edit`, on
+a real server with a real renderer, Redis and storage.
+
+Not proved here: which Gaussians an edit keeps, and that its error is right (tests/worker/render_service/test_edit.py).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from splatmill import AsyncClient, Client
+from splatmill.backplane import layout
+from splatmill.cli.exits import Exit
+from splatmill.errors import InvalidRequest, NotFound
+from splatmill.schema import CameraSpec
+from splatmill_worker.splat.formats import ply
+from tests.support.ball import write_ply
+from tests.support.command_line import invoke
+from tests.support.rendering import hold_out, renderer_in
+from tests.support.served_app import Serve, ServedApp, store_model
+
+pytestmark = pytest.mark.slow
+
+MODEL = "a" * 16
+VIEWS = [CameraSpec.looking_at((4, side, 0), (0, 0, 0), width=96, height=64) for side in (0, 1)]
+RIGHT = {"min": [0, -2, -2], "max": [2, 2, 2]}
+"""The red half of the ball."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    path = tmp_path_factory.mktemp("edits")
+    with renderer_in(path):
+        yield path
+
+
+@pytest.fixture
+def app(serve: Serve, folder: Path) -> ServedApp:
+    running = serve(renderer_url=f"unix:{folder}/r.sock", storage=str(folder / "storage"))
+    running.service.storage.delete_prefix("models")
+    store_model(running.service, MODEL, "ball")
+    write_ply(folder / "model.ply")
+    running.service.storage.put(layout.model_file(MODEL, "model.ply"), folder / "model.ply")
+    return running
+
+
+def test_a_part_of_a_model_becomes_a_new_one(app: ServedApp, folder: Path, tmp_path: Path) -> None:
+    hold_out(app, MODEL, VIEWS)
+    right = int((ply.read(folder / "model.ply").gaussians.means[:, 0] >= 0).sum())
+    with Client(str(app.http.base_url)) as client:
+        model = client.model(MODEL)
+        seen = model.edit(box=RIGHT, preview=True)
+        assert (seen.model, seen.gaussians_before, seen.gaussians) == (None, 400, right)
+        assert [view.name for view in seen.views] == ["0.jpg", "1.jpg"]
+        assert seen.psnr_before is not None
+        assert seen.psnr is not None
+        assert seen.psnr < seen.psnr_before, "the ball's left half shows in the second photo"
+        assert len([*client.models()]) == 1
+        made = model.edit(box=RIGHT, min_opacity=0.1, name="half a ball")
+        assert made.model is not None
+        half = client.model(made.model)
+        assert (half.model.name, half.model.gaussians, half.model.psnr) == ("half a ball", right, made.psnr)
+        assert ply.read(half.download(tmp_path / "half.ply")).gaussians.means[:, 0].min() >= 0
+        assert client.model(MODEL).model.gaussians == 400
+        for wrong in ({}, {"box": {"min": [0, 0, 0], "max": [0, 1, 1]}}, {"min_opacity": 2.0}):
+            with pytest.raises(InvalidRequest):
+                model.edit(**wrong)
+        with pytest.raises(InvalidRequest, match="leaves no Gaussian"):
+            model.edit(max_size=1e-6)
+
+
+def test_the_asynchronous_twin(app: ServedApp) -> None:
+    async def live() -> None:
+        async with AsyncClient(str(app.http.base_url)) as client:
+            made = await (await client.model(MODEL)).edit(box=RIGHT)
+            assert made.psnr is None, "there are no held-out photos"
+            assert (await client.model(str(made.model))).model.gaussians == made.gaussians
+
+    asyncio.run(live())
+
+
+def test_the_command_says_what_is_left_out(app: ServedApp) -> None:
+    hold_out(app, MODEL, VIEWS)
+    at = ("--server", str(app.http.base_url))
+    corners = ("--box", "0", "-2", "-2", "2", "2", "2")
+    seen = invoke("edit", MODEL, *corners, "--preview", *at)
+    assert (seen.exit_code, seen.stdout.count("\n")) == (0, 1), seen.output
+    assert " of 400 Gaussians would be left out. PSNR on 2 held-out photos: " in seen.stdout
+    record = json.loads(invoke("edit", MODEL, *corners, "--preview", "--json", *at).stdout)
+    assert f"{400 - record['gaussians']} of 400" in seen.stdout
+    assert f"{record['psnr_before']:.2f} dB before, {record['psnr']:.2f} dB after." in seen.stdout
+    done = invoke("edit", MODEL, *corners, "--name", "half", *at)
+    with Client(str(app.http.base_url)) as client:
+        made = client.model(done.stdout.splitlines()[-1].removeprefix("model "))
+        assert (made.model.name, made.model.gaussians) == ("half", record["gaussians"])
+        made.delete()
+        with pytest.raises(NotFound):
+            client.model(made.id)
+    nothing = invoke("edit", MODEL, *at)
+    assert nothing.exit_code == Exit.usage
+    assert "give --box, --min-opacity or --max-size" in nothing.output
+    refused = invoke("edit", MODEL, "--max-size", "0.000001", *at)
+    assert refused.exit_code == Exit.refused
+    assert "leaves no Gaussian" in refused.stderr

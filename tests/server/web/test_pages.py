@@ -1,0 +1,117 @@
+"""The web page over HTTP: open addresses, files under digests that may be cached for ever, compression, the policy.
+
+Not proved here: that a browser shows it (tests/browser).
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+
+import httpx
+import pytest
+
+from splatmill_server.web import pages
+from splatmill_server.web.tree import Tree
+from tests.support.served_app import Serve, ServedApp, problem
+
+PAGES = ("/", "/jobs", "/jobs/0123456789abcdef", "/models", "/models/0123456789abcdef", "/sign-in")
+
+
+@pytest.mark.parametrize("path", PAGES)
+def test_pages_need_no_key_and_their_files_are_there(serve: Serve, path: str) -> None:
+    app = serve(api_key="s3cret")
+    with httpx.Client(base_url=app.http.base_url) as stranger:
+        answer = stranger.get(path)
+        assert answer.status_code == 200
+        assert answer.headers["content-type"] == "text/html; charset=utf-8"
+        assert answer.headers["cache-control"] == "no-cache"
+        assert stranger.head(path).status_code == 200
+        links = re.findall(r'(?:src|href)="(/page/[^"]+)"', answer.text)
+        assert len(links) >= 4
+        for link in links:
+            file = stranger.get(link)
+            assert file.status_code == 200, link
+            assert file.headers["cache-control"] == "public, max-age=31536000, immutable", link
+
+
+def test_what_is_below_v1_still_needs_a_key(serve: Serve) -> None:
+    app = serve(api_key="s3cret")
+    for path in ("/v1/models", "/metrics", "/jobs/a/b", "/page"):
+        answer = httpx.get(f"{app.http.base_url}".rstrip("/") + path)
+        assert answer.status_code == 401, path
+
+
+def test_only_the_import_map_may_run_inline(app: ServedApp) -> None:
+    answer = app.http.get("/")
+    policy = answer.headers["content-security-policy"]
+    rules = dict(rule.split(" ", 1) for rule in policy.split("; "))
+    assert rules["default-src"] == "'none'"
+    assert rules["frame-ancestors"] == "'none'"
+    assert "unsafe" not in policy
+    assert "http" not in policy
+    assert "*" not in policy
+    inline = re.findall(r"<script(?: type=\"importmap\")?>(.+?)</script>", answer.text)
+    digests = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in inline]
+    assert rules["script-src"].split() == ["'self'", *(f"'sha256-{digest}'" for digest in digests)]
+    assert not re.search(r" style=| on[a-z]+=|<style", answer.text)
+    for text in inline:
+        for address in json.loads(text)["imports"].values():
+            if not address.endswith("/"):
+                assert app.http.head(address).status_code == 200
+
+
+def test_files_are_compressed_where_the_client_accepts(app: ServedApp) -> None:
+    link = re.findall(r'"(/page/[^"]+base\.css)"', app.http.get("/").text)[0]
+    plain = app.http.get(link, headers={"Accept-Encoding": "identity"})
+    packed = app.http.get(link, headers={"Accept-Encoding": "br;q=1, gzip"})
+    assert packed.headers["content-encoding"] == "gzip"
+    assert "content-encoding" not in plain.headers
+    assert packed.content == plain.content  # httpx unpacks
+    assert int(packed.headers["content-length"]) < 0.5 * len(plain.content)
+    assert plain.headers["vary"] == "Accept-Encoding"
+    assert plain.headers["etag"] != packed.headers["etag"]
+    again = app.http.get(link, headers={"Accept-Encoding": "gzip", "If-None-Match": packed.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert "content-encoding" not in app.http.get(link, headers={"Accept-Encoding": "gzip;q=0"}).headers
+
+
+def test_another_digest_is_answered_but_not_for_ever(app: ServedApp) -> None:
+    answer = app.http.get("/page/0000000000000000/base.css")
+    assert (answer.status_code, answer.headers["cache-control"]) == (200, "no-cache")
+
+
+@pytest.mark.parametrize("name", ["nothing.css", "%2e%2e/pages.py", "..%2fpages.py", "", "new"])
+def test_nothing_else_is_served(app: ServedApp, name: str) -> None:
+    problem(app.http.get(f"/page/{pages.PAGE.digest}/{name}"), 404, "not_found")
+
+
+def test_a_changed_file_has_another_address(tmp_path) -> None:
+    (tmp_path / "a.css").write_text("a {}")
+    (tmp_path / ".hidden.css").write_text("")
+    (tmp_path / "secret.py").write_text("")
+    tree = Tree(tmp_path)
+    first = tree.digest
+    assert tree.names() == ["a.css"]
+    (tmp_path / "a.css").write_text("a { color: red }")
+    assert tree.digest != first
+    assert Tree(tmp_path / "absent").names() == []
+
+
+def test_without_the_packages_pages_say_what_is_missing(app: ServedApp, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(pages, "VENDOR", Tree(tmp_path / "absent"))
+    answer = app.http.get("/models")
+    assert '<html data-viewer="missing" ' in answer.text
+    assert "importmap" not in answer.text
+    assert app.http.get("/v1/models").status_code == 200
+
+
+def test_every_page_has_a_place_for_the_import_map() -> None:
+    found = [name for name in pages.PAGE.names() if name.endswith(".html")]
+    assert len(found) >= 6
+    for name in found:
+        text = (pages.PAGE.folder / name).read_text()
+        assert text.count(pages.IMPORT_MAP_HERE) == 1, name
+        assert '<html lang="en">' in text, name

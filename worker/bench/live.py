@@ -1,0 +1,274 @@
+"""What the live view costs a training: nobody can look, nobody looks, and somebody looks all the time.
+
+    splatmill bench live                                    # the still life, 1500 steps, 5 rounds: about 10 minutes
+    splatmill bench live --scene fox --steps 3000 --rounds 9
+    splatmill bench live --plot-only
+
+In each round the three runs follow each other in turning order, each in a process of its own, with the same seed,
+plan and number of steps. `without` has no live view, as `splatmill train` of earlier versions; `unwatched` has the
+worker's thread, which asks a Redis once a second whether anybody looks; `watched` has that key set, and this process
+fetches every snapshot, as the server does for a browser. Both also have what the live view itself took: the CPU seconds
+of that thread, and the seconds for which training waited for snapshots. Other work on the machine disturbs these two
+least. Seconds run from the first step to the export, evaluations and
+snapshots included, so that a snapshot cannot hide on a stopped clock. CPU seconds are those of the training process;
+other work on the machine disturbs them less. Rows go to results/live.jsonl, the table to live.md.
+
+Expected before it was measured: unwatched within the noise of `without`, watched at most 3 % more. A snapshot may take
+2 % of the time (live.SHARE), and Redis' copy the rest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import psutil
+import redis
+from _rows import HERE, Row, append, footer, lines, origin, worked
+from _train import scenes
+from _train.child import prepared
+
+from splatmill.backplane import keys
+from splatmill.schema import Event, JobState, StateEvent, TrainOptions
+
+ARMS = ("without", "unwatched", "watched")
+CACHE = HERE.parent / "build" / "bench"
+JOB = "bench000000live0"
+
+
+def main(argv: list[str]) -> int:
+    """Measure the rounds that were asked for, and write the table."""
+    parser = argparse.ArgumentParser(
+        prog="splatmill bench live", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--scene", default="synthetic", help="a scene of bench train, or the folder of a capture"
+    )
+    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument(
+        "--work", type=Path, default=CACHE, help="where photos and recovered cameras are kept"
+    )
+    parser.add_argument("--results", type=Path, default=HERE / "results" / "live.jsonl")
+    parser.add_argument("--plot-only", action="store_true", help="write the table of the rows that are there")
+    parser.add_argument("--run", help=argparse.SUPPRESS)
+    asked = parser.parse_args(argv)
+    if asked.run is not None:
+        return _measure(json.loads(asked.run))
+    if not asked.plot_only:
+        _rounds(asked)
+    found = lines(asked.results)
+    if not found:
+        print(f"There are no rows in {asked.results}.", file=sys.stderr)
+        return 1
+    table = HERE / "live.md" if asked.results.parent == HERE / "results" else asked.results.with_suffix(".md")
+    table.write_text(document(found))
+    print(f"Table: {table}")
+    return 0
+
+
+def _rounds(asked: argparse.Namespace) -> None:
+    scene = scenes.named(asked.scene, asked.work)
+    ready = prepared(scene, asked.work)
+    if "failure" in ready:
+        raise SystemExit(ready["failure"])
+    with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder, _redis(Path(folder)) as address:
+        for number in range(asked.rounds):
+            for arm in (*ARMS[number % 3 :], *ARMS[: number % 3]):
+                answer = Path(folder) / "answer.json"
+                job = {
+                    "arm": arm,
+                    "redis": address,
+                    "capture": str(scene.folder),
+                    "sfm": str((asked.work / scene.name / "sfm").resolve()),
+                    "options": scene.options | {"steps": asked.steps, "seed": 0},
+                    "answer": str(answer),
+                }
+                with _onlooker(address, arm == "watched") as fetched:
+                    subprocess.run([*_command(), "--run", json.dumps(job)], check=True)
+                row = json.loads(answer.read_text())
+                row |= {"bench": "live", "scene": scene.name, "asked_steps": asked.steps, "round": number}
+                row |= {"fetched": len(fetched), "fetched_bytes": sum(fetched)}
+                append(asked.results, row | origin())
+                print(
+                    f"{number + 1}/{asked.rounds} {arm}: {row['seconds']:.2f} s, {row['cpu_seconds']:.2f} CPU s, "
+                    f"{row['snapshots']} snapshots",
+                    flush=True,
+                )
+
+
+def _command() -> list[str]:
+    return [sys.executable, "-m", "splatmill_worker", "bench", "live"]
+
+
+def _measure(job: Row) -> int:
+    """One run, in this process."""
+    from splatmill_worker import pipeline
+    from splatmill_worker.__main__ import return_freed_memory
+    from splatmill_worker.service.attempt import Attempt
+    from splatmill_worker.service.live_view import LiveView
+    from splatmill_worker.service.lock import JobLock
+
+    return_freed_memory()
+    marks: dict[str, tuple[float, float, float]] = {}
+    snapshots = 0
+
+    def emit(event: Event) -> None:
+        nonlocal snapshots
+        snapshots += event.type == "snapshot"
+        if event.type == "plan":
+            marks["begin"] = time.perf_counter(), time.process_time(), worked()
+        elif isinstance(event, StateEvent) and event.state is JobState.exporting:
+            marks["end"] = time.perf_counter(), time.process_time(), worked()
+
+    connection = redis.Redis(unix_socket_path=job["redis"])
+    view = None
+    if job["arm"] != "without":
+        view = LiveView(Attempt(connection, JOB, 1, 1, JobLock(connection, JOB, "bench")), emit)
+    with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
+        workdir = Path(folder)
+        (workdir / "sfm").symlink_to(job["sfm"])
+        options = TrainOptions.model_validate(job["options"])
+        outcome = pipeline.run(Path(job["capture"]), workdir, options, emit, lambda: False, onlookers=view)
+        report = json.loads((outcome.out / "report.json").read_text())
+    own = _cpu_of("live view")
+    if view is not None:
+        view.close()
+    begin, end = marks["begin"], marks["end"]
+    cpu = end[1] - begin[1]
+    row = {
+        "arm": job["arm"],
+        "seconds": end[0] - begin[0],
+        "cpu_seconds": cpu,
+        "others_cpu_seconds": max(0.0, end[2] - begin[2] - cpu),
+        "train_seconds": report["seconds"]["train"],
+        "live_seconds": report["seconds"].get("live", 0.0),
+        "thread_cpu_seconds": own,
+        "steps": report["result"]["steps"],
+        "gaussians": report["result"]["gaussians"],
+        "psnr": report["result"]["psnr"],
+        "snapshots": snapshots,
+    }
+    Path(job["answer"]).write_text(json.dumps(row))
+    return 0
+
+
+def _cpu_of(name: str) -> float:
+    """CPU seconds of the threads of this process with this name, to 10 ms."""
+    ids = {thread.native_id for thread in threading.enumerate() if thread.name == name}
+    return float(sum(row.user_time + row.system_time for row in psutil.Process().threads() if row.id in ids))
+
+
+@contextmanager
+def _redis(folder: Path) -> Iterator[str]:
+    """A Redis of our own; yields the path of its socket."""
+    program = next(
+        (found for name in ("redis-server", "valkey-server") if (found := shutil.which(name))), None
+    )
+    if program is None:
+        raise SystemExit("No redis-server is on PATH. Install one (Debian: apt-get install redis-server).")
+    path = folder / "redis.sock"
+    quiet = [
+        "--port",
+        "0",
+        "--save",
+        "",
+        "--unixsocket",
+        str(path),
+        "--dir",
+        str(folder),
+        "--loglevel",
+        "warning",
+    ]
+    with subprocess.Popen([program, *quiet], stdout=subprocess.DEVNULL) as server:
+        try:
+            while not path.exists():
+                time.sleep(0.02)
+            yield str(path)
+        finally:
+            server.terminate()
+
+
+@contextmanager
+def _onlooker(address: str, watches: bool) -> Iterator[list[int]]:
+    """Somebody who looks, if `watches`, and fetches each snapshot; yields the sizes of those fetched."""
+    sizes: list[int] = []
+    over = threading.Event()
+
+    def look() -> None:
+        connection, seen = redis.Redis(unix_socket_path=address), None
+        while not over.wait(0.25):
+            connection.set(keys.watched(JOB), b"1", ex=20)
+            tag = connection.hget(keys.snapshot(JOB), "tag")
+            if tag is not None and tag != seen:
+                seen = tag
+                sizes.append(connection.hstrlen(keys.snapshot(JOB), "ply"))
+                connection.hget(keys.snapshot(JOB), "ply")
+        connection.delete(keys.watched(JOB), keys.snapshot(JOB))
+
+    if not watches:
+        yield sizes
+        return
+    looker = threading.Thread(target=look)
+    looker.start()
+    try:
+        yield sizes
+    finally:
+        over.set()
+        looker.join()
+
+
+def document(rows: list[Row]) -> str:
+    """The table of the medians, by scene and number of steps."""
+    parts = [
+        "# What the live view costs",
+        "",
+        "Made by `splatmill bench live`; the head of `live.py` says what is compared, and what was expected. Medians",
+        "of the rounds; in brackets, over the median of `without`. Seconds include snapshots and evaluations. The last",
+        "two columns: the share of these seconds for which training waited for snapshots, and the share of the CPU",
+        "seconds of the thread that asks whether anybody looks.",
+        "",
+        "| scene | steps | live view | rounds | seconds | CPU seconds | snapshots | training waited | thread |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    groups = dict.fromkeys((row["scene"], row["asked_steps"]) for row in rows)
+    for scene, steps in groups:
+        of = {
+            arm: [r for r in rows if (r["scene"], r["asked_steps"], r["arm"]) == (scene, steps, arm)]
+            for arm in ARMS
+        }
+        for arm, found in of.items():
+            if not found or not of["without"]:
+                continue
+            cells = []
+            for name in ("seconds", "cpu_seconds"):
+                own, base = (statistics.median(row[name] for row in some) for some in (found, of["without"]))
+                cells.append(f"{own:.2f} ({100 * (own / base - 1):+.1f} %)")
+            snapshots = statistics.median(row["snapshots"] for row in found)
+            waited, thread = (
+                statistics.median(row[name] / row[whole] for row in found)
+                for name, whole in (("live_seconds", "seconds"), ("thread_cpu_seconds", "cpu_seconds"))
+            )
+            parts.append(
+                f"| {scene} | {steps} | {arm} | {len(found)} | {cells[0]} | {cells[1]} | {snapshots:g} "
+                f"| {100 * waited:.2f} % | {100 * thread:.2f} % |"
+            )
+    others = statistics.median(row["others_cpu_seconds"] / row["seconds"] for row in rows)
+    parts += [
+        "",
+        f"Meanwhile other programs used {others:.1f} cores (median), Redis and the onlooker included.",
+        "",
+        footer(rows),
+        "",
+    ]
+    return "\n".join(parts)

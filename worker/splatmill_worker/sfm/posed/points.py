@@ -1,0 +1,299 @@
+"""Points of scenes whose cameras were given: the given ones where photos confirm them, or else found with the cameras.
+
+What is tried, in this order: given points with tracks; given points without tracks, judged by their colours in the
+photos; features triangulated with the cameras as they are; a plane sweep (`stereo`). Where all of it fails, training
+starts at random, and `facts["no_points"]` of the scene says why.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatmill.files import replacing
+from splatmill_worker.colmap import pycolmap
+from splatmill_worker.scene import PointViews, Scene
+from splatmill_worker.sfm import stereo
+from splatmill_worker.sfm.callbacks import OnProgress
+from splatmill_worker.sfm.matching import two_view
+from splatmill_worker.sfm.options import LEAN, STANDARD
+from splatmill_worker.sfm.posed.evidence import Evidence, evidence_of
+from splatmill_worker.sfm.posed.triangulation import Triangulated, triangulate
+
+VERSION = 1
+"""Version of the method; points stored under another version are searched for anew."""
+
+LEAST_POINTS = 20
+"""Points below which a scene counts as one without points."""
+
+LEAST_OBSERVATIONS = 20.0
+"""Mean number of points per photo below which given points are not relied on, and triangulated ones replace them."""
+
+FEW_OBSERVATIONS = 100.0
+"""Mean number of triangulated points per photo below which more features are searched for."""
+
+MOST_LOOSE = 200_000
+"""Given points without tracks that are used, at most: a laser scan has more than a model has Gaussians."""
+
+ABOVE_CHANCE = 1.25
+"""Factor by which photos must show the colours of given points more often than exchanged colours."""
+
+PLAIN = 0.5
+"""Share of the photos that show a point's colour from which it does not matter that others would agree as well: in a
+scene of one colour, all do."""
+
+LOOKED_AT = 4
+"""Photos that tell whether a data set has transparent ones: this many, and less than twice as many."""
+
+CONTRADICTED = 0.5
+"""Share of the matches that the given cameras explain, below which the cameras are called wrong."""
+
+
+def with_points(
+    scene: Scene,
+    workdir: Path,
+    *,
+    seed: int = 0,
+    on_progress: OnProgress = lambda stage, done, total, note: None,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> Scene:
+    """The scene with the points that its photos confirm or give; what was found is kept in `workdir`.
+
+    No camera is moved. Scenes of transparent photos without points stay as they are: training starts them from
+    the visual hull (decisions: hull-start).
+
+    Raises OSError and ValueError for photos as `images.load_view` does, and Cancelled.
+    """
+    scene = _with_loose_points(scene, cancelled)
+    if not _lacks_points(scene):
+        return _with_stereo(scene, workdir, on_progress, cancelled)
+    if _transparent(scene, cancelled):
+        return replace(
+            scene,
+            facts=scene.facts
+            | {
+                "no_points": "Photos are transparent, and bound the object better than the few points of its features."
+            },
+        )
+    stored = workdir / "sfm" / f"triangulated-{_digest(scene)}-{seed}.npz"
+    if not stored.is_file():
+        _save(_searched(scene, seed, on_progress, cancelled), stored)
+    found = _load(stored)
+    scene = _with_triangulated(scene, found, cancelled)
+    scene = _with_stereo(scene, workdir, on_progress, cancelled)
+    if len(scene.points) >= LEAST_POINTS:
+        return scene
+    return replace(scene, facts=scene.facts | {"no_points": _failure(scene, found)})
+
+
+def _with_loose_points(scene: Scene, cancelled: Callable[[], bool]) -> Scene:
+    """The scene with those of its points without tracks that some photo shows in their colour.
+
+    None are kept where photos show the colours hardly more often than exchanged ones: the points then lie in another
+    frame than the cameras. Points that all have one colour get that of the photos.
+    """
+    given = len(scene.points)
+    if scene.point_views is not None or not given:
+        return scene
+    stride = -(-given // MOST_LOOSE)
+    points, colors = scene.points[::stride], scene.colors[::stride]
+    views = [view for view in scene.views if view.split != "test"]
+    evidence = evidence_of(points, colors, views, cancelled)
+    plain = bool((colors == colors[0]).all())
+    kept = evidence.shown > 0 if plain else evidence.agreeing > 0
+    kept &= evidence.through == 0
+    note = _loose_note(given, len(points), int(kept.sum()), evidence, plain)
+    if not plain and _elsewhere(evidence):
+        kept[:] = False
+        note = (
+            f"The {given} points that came without tracks are not used: the photos show their colours at "
+            f"{100 * evidence.agreement:.0f} % of the places, and exchanged colours at {100 * evidence.chance:.0f} %. "
+            "Their coordinates are probably not those of the cameras."
+        )
+    return replace(
+        scene,
+        points=points[kept],
+        colors=(evidence.colors if plain else colors)[kept],
+        notes=(*scene.notes, note),
+        facts=scene.facts
+        | {
+            "loose_points": given,
+            "loose_points_used": int(kept.sum()),
+            "transparent_photos": evidence.transparent,
+        },
+    )
+
+
+def _elsewhere(evidence: Evidence) -> bool:
+    agreement = evidence.agreement
+    unseen = float((evidence.shown == 0).mean())
+    return unseen > 0.5 or not (agreement >= PLAIN or agreement > ABOVE_CHANCE * evidence.chance)
+
+
+def _loose_note(given: int, judged: int, kept: int, evidence: Evidence, plain: bool) -> str:
+    unseen = int((evidence.shown == 0).sum())
+    through = int((evidence.through > 0).sum())
+    thinned = "" if judged == given else f" Every {-(-given // judged)}th was taken, {judged} in all."
+    why = "their colours were read from the photos" if plain else "photos show their colours"
+    return (
+        f"{given} points came without tracks.{thinned} {kept} of them are used, since {why}; of the others, no photo "
+        f"shows {unseen}, and {through} lie where a photo is transparent."
+    )
+
+
+def _lacks_points(scene: Scene) -> bool:
+    few = len(scene.points) < LEAST_POINTS or stereo.observations_per_view(scene) < LEAST_OBSERVATIONS
+    return few and sum(view.split != "test" for view in scene.views) >= 2
+
+
+def _transparent(scene: Scene, cancelled: Callable[[], bool]) -> bool:
+    """Whether some of a few photos, evenly chosen, have transparent pixels."""
+    views = [view for view in scene.views if view.split != "test"]
+    some = views[:: max(1, len(views) // LOOKED_AT)]
+    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    return evidence_of(*nothing, some, cancelled).transparent > 0
+
+
+def _searched(
+    scene: Scene, seed: int, on_progress: OnProgress, cancelled: Callable[[], bool]
+) -> Triangulated:
+    """What triangulation finds, with more features where the first ones give few points."""
+    views = [view for view in scene.views if view.split != "test"]
+    found = triangulate(views, LEAN, seed=seed, on_progress=on_progress, cancelled=cancelled)
+    if sum(map(len, found.tracks)) >= FEW_OBSERVATIONS * len(views) or _contradicted(found):
+        return found
+    again = triangulate(views, STANDARD, seed=seed, on_progress=on_progress, cancelled=cancelled)
+    spent = {stage: again.seconds[stage] + found.seconds[stage] for stage in again.seconds}
+    return replace(again if len(again.points) > len(found.points) else found, seconds=spent)
+
+
+def _contradicted(found: Triangulated) -> bool:
+    return found.matches > 0 and found.agreeing < CONTRADICTED * found.matches
+
+
+def _with_triangulated(scene: Scene, found: Triangulated, cancelled: Callable[[], bool]) -> Scene:
+    """The scene with the triangulated points in place of its own few, and what is to be said about them."""
+    used = [index for index, view in enumerate(scene.views) if view.split != "test"]
+    through = evidence_of(
+        found.points, found.colors, [scene.views[index] for index in used], cancelled
+    ).through
+    kept = np.flatnonzero(through == 0)
+    tracks = [found.tracks[row] for row in kept]
+    lengths = np.array([len(track) for track in tracks], np.int32)
+    given = len(scene.points)
+    facts = {
+        "triangulated_points": len(kept),
+        "matches": found.matches,
+        "verified_pairs": found.pairs,
+        "matches_explained_by_cameras": round(found.agreeing / max(1, found.matches), 4),
+        "match_error_px": None if not found.matches else round(found.disagreement, 3),
+        "features_per_photo": found.features,
+        "transparent_photos": found.transparent,
+        "seconds": found.seconds,
+    }
+    messages = [_triangulated_note(given, len(kept), found)]
+    warnings = list(scene.warnings)
+    if _contradicted(found):
+        warnings.append(
+            f"The given cameras explain only {100 * found.agreeing / found.matches:.0f} % of the {found.matches} "
+            f"matches between the photos; half of them are off by {found.disagreement:.1f} pixels or more. The poses "
+            "or the intrinsics are wrong: correct them, or remove them to have the cameras recovered from the photos."
+        )
+    if len(kept) < LEAST_POINTS or len(kept) <= given:
+        return replace(
+            scene, facts=scene.facts | facts, notes=(*scene.notes, *messages), warnings=tuple(warnings)
+        )
+    return replace(
+        scene,
+        points=found.points[kept],
+        colors=found.colors[kept],
+        point_errors=found.errors[kept],
+        track_lengths=lengths,
+        point_views=PointViews(
+            np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)]).astype(np.int64),
+            np.array([used[index] for track in tracks for index in track], np.int32),
+        ),
+        facts=scene.facts | facts,
+        notes=(*scene.notes, *messages),
+        warnings=tuple(warnings),
+    )
+
+
+def _triangulated_note(given: int, kept: int, found: Triangulated) -> str:
+    had = "no points" if not given else f"only {given} points"
+    said = f"The cameras came with {had}. "
+    if not found.matches:
+        return said + "No points could be triangulated: no two photos match."
+    return said + (
+        f"{kept} points were triangulated with them in {sum(found.seconds.values()):.1f} seconds; they explain "
+        f"{100 * found.agreeing / found.matches:.0f} % of {found.matches} matches between {found.pairs} pairs of "
+        f"photos, and half of the matches are off by {found.disagreement:.2f} pixels or less."
+    )
+
+
+def _failure(scene: Scene, found: Triangulated) -> str:
+    """Why there are no points, for the plan."""
+    if found.features < 2 * two_view.MIN_INLIERS:
+        return f"Half of the photos have at most {found.features:.0f} features, too few to be matched."
+    if not found.matches:
+        return "No two photos match, so nothing could be triangulated with the given cameras."
+    if _contradicted(found):
+        return (
+            f"The given cameras explain only {100 * found.agreeing / found.matches:.0f} % of the matches between the "
+            "photos, so nothing could be triangulated."
+        )
+    return f"Only {len(found.points)} points could be triangulated with the given cameras."
+
+
+def _with_stereo(
+    scene: Scene, workdir: Path, on_progress: OnProgress, cancelled: Callable[[], bool]
+) -> Scene:
+    if scene.facts.get("transparent_photos") or not stereo.has_few_points(scene):
+        return scene
+    stored = workdir / "sfm" / f"posed-{_digest(scene)}.npz"
+    return stereo.with_stereo_points(scene, stored, on_progress, cancelled)
+
+
+def _save(found: Triangulated, path: Path) -> None:
+    """Write the result to the .npz file `path`, atomically."""
+    values: dict[str, Any] = asdict(found)
+    lengths = np.array([len(track) for track in found.tracks], np.int64)
+    values["tracks"] = np.array([index for track in found.tracks for index in track], np.int64)
+    values["seconds"] = json.dumps(found.seconds)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as part, part.open("wb") as file:
+        np.savez(file, **values, lengths=lengths)
+
+
+def _load(path: Path) -> Triangulated:
+    """The result that `_save` wrote."""
+    with np.load(path) as stored:
+        ends = np.cumsum(stored["lengths"])[:-1]
+        split = np.split(stored["tracks"], ends) if len(stored["lengths"]) else []
+        values = {field.name: stored[field.name] for field in fields(Triangulated)}
+        values["tracks"] = tuple(tuple(int(index) for index in track) for track in split)
+        values["seconds"] = json.loads(str(stored["seconds"]))
+        for name in ("matches", "pairs", "agreeing", "disagreement", "features", "transparent"):
+            values[name] = values[name].item()
+        return Triangulated(**values)
+
+
+def _digest(scene: Scene) -> str:
+    """A name for everything that found points depend on: the method, cameras, known points and masks."""
+    digest = hashlib.sha256(
+        repr((VERSION, stereo.VERSION, pycolmap.__version__, scene.points.shape)).encode()
+    )
+    digest.update(scene.points.tobytes())
+    for view in scene.views:
+        camera = view.camera
+        digest.update(repr((view.name, view.lens, view.split, camera.width, camera.height)).encode())
+        digest.update(camera.viewmat.tobytes() + camera.K.tobytes())
+        if view.mask is not None:
+            digest.update(hashlib.sha256(view.mask.read_bytes()).digest())
+    return digest.hexdigest()[:24]

@@ -1,0 +1,1 @@
+"""The file formats of a model, one file each with `read` and `write`; `registry` finds the one of a path."""

@@ -1,0 +1,57 @@
+"""What a file of Gaussians says, whatever its format, and which Gaussians files hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from splatmill_worker.splat.gaussians import Gaussians
+
+Offset = tuple[float, float, float]
+
+NO_OFFSET: Offset = (0.0, 0.0, 0.0)
+
+MIN_OPACITY = 1.0 / 255.0
+"""Gaussians of less opacity are not written: they cannot change an 8-bit image."""
+
+OPAQUE = 16.0
+"""Logit of the largest opacity: 1 - 1e-7, the last one under 1 in float32."""
+
+
+@dataclass(frozen=True)
+class Contents:
+    """The model in a file, in the frame of the standard `.ply`: x to the right, y down, z to the front.
+
+    gaussians: float32, rows with a non-finite value left out.
+    offset: world = file + offset. Export subtracts it where float32 could not hold the coordinates of the world.
+    antialiased: whether the model was trained with the low-pass filter of Mip-Splatting (Yu et al. 2024); None where
+        the format does not say.
+    """
+
+    gaussians: Gaussians
+    offset: Offset = NO_OFFSET
+    antialiased: bool | None = None
+
+
+def finite(gaussians: Gaussians) -> Gaussians:
+    """The rows whose every parameter is finite and whose quaternion has a direction."""
+    keep = gaussians.finite()
+    return gaussians if bool(keep.all()) else gaussians.select(keep)
+
+
+def visible(gaussians: Gaussians) -> Gaussians:
+    """The rows that a file holds, on the CPU as float32: all finite, and of MIN_OPACITY or more."""
+    gaussians = gaussians.map(lambda value: value.detach().to("cpu", torch.float32))
+    return gaussians.select(gaussians.finite() & (torch.sigmoid(gaussians.logit_opacities) >= MIN_OPACITY))
+
+
+def logits(opacities: Tensor) -> Tensor:
+    """Logits of opacities from 0 to 1, both of which formats of 8 bits contain, up to OPAQUE in size."""
+    return torch.logit(opacities).clamp(-OPAQUE, OPAQUE)
+
+
+def unit(quats: Tensor) -> Tensor:
+    """The quaternions [N, 4] at a norm of 1, computed in float64 because a norm may leave the range of float32."""
+    return torch.nn.functional.normalize(quats.double(), dim=1, eps=0.0).float()

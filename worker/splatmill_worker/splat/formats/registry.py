@@ -1,0 +1,95 @@
+"""The formats by suffix: `read` and `write` choose the one of a path. What they are is `splatmill.schema.formats`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from splatmill.schema.formats import MODEL_FORMATS, format_of
+from splatmill_worker.errors import ModelUnreadable
+from splatmill_worker.splat.formats import compressed_ply, glb, ksplat, ply, sog, splat, spz
+from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset
+from splatmill_worker.splat.gaussians import Gaussians
+
+Reader = Callable[[Path], Contents]
+
+
+class Writer(Protocol):
+    """Writes Gaussians in the frame of the standard .ply and returns how many; see `write`."""
+
+    def __call__(
+        self, path: Path, gaussians: Gaussians, *, offset: Offset = ..., antialiased: bool = ...
+    ) -> int: ...
+
+
+@dataclass(frozen=True)
+class Codec:
+    """The functions of a format; None where it is not read, or not written."""
+
+    read: Reader | None
+    write: Writer | None
+
+
+def _read_ply(path: Path) -> Contents:
+    """A .ply of either form: many compressed ones carry no more than this suffix."""
+    document = ply.parsed(path)
+    return (
+        compressed_ply.decode(path, document)
+        if compressed_ply.is_compressed(document)
+        else ply.decode(path, document)
+    )
+
+
+CODECS: dict[str, Codec] = {
+    ".ply": Codec(_read_ply, ply.write),
+    ".compressed.ply": Codec(_read_ply, compressed_ply.write),
+    ".spz": Codec(spz.read, spz.write),
+    ".splat": Codec(splat.read, None),
+    ".ksplat": Codec(ksplat.read, None),
+    ".sog": Codec(sog.read, sog.write),
+    "meta.json": Codec(sog.read, None),
+    ".glb": Codec(glb.read, glb.write),
+}
+"""One for each of `MODEL_FORMATS`; a test compares them."""
+
+
+def reader(path: Path) -> Reader:
+    """The function that reads a file, by its suffix. Raises ModelUnreadable for a suffix that is not read."""
+    found = format_of(path.name)
+    function = CODECS[found.suffix].read if found is not None else None
+    if function is None:
+        known = ", ".join(suffix for suffix, of in MODEL_FORMATS.items() if of.readable)
+        raise ModelUnreadable(f"{path.name} is of a format that is not read. Those that are: {known}.")
+    return function
+
+
+def writer(path: Path) -> Writer:
+    """The function that writes a file, by its suffix. Raises ModelUnreadable for a suffix that is not written."""
+    found = format_of(path.name)
+    function = CODECS[found.suffix].write if found is not None else None
+    if function is None:
+        known = ", ".join(suffix for suffix, of in MODEL_FORMATS.items() if of.writable)
+        raise ModelUnreadable(f"{path.name} is of a format that is not written. Those that are: {known}.")
+    return function
+
+
+def read(path: Path) -> Contents:
+    """Read the model in a file of any readable format, which the suffix tells.
+
+    Raises ModelUnreadable for a damaged file or an unknown suffix, and FileNotFoundError where there is no file.
+    """
+    return reader(path)(path)
+
+
+def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antialiased: bool = False) -> int:
+    """Write Gaussians to a file whose suffix tells the format, and return how many it holds.
+
+    gaussians: in the frame of the standard .ply, of any dtype and on any device.
+    offset, antialiased: as in `Contents`, stored where the format has a place for them.
+
+    Rows with a non-finite parameter and rows with an opacity under MIN_OPACITY are left out. The file is replaced
+    atomically. Raises ModelUnreadable for a suffix that is not written, and OSError.
+    """
+    return writer(path)(path, gaussians, offset=offset, antialiased=antialiased)

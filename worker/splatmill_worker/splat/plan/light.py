@@ -1,0 +1,185 @@
+"""How the light of each photo departs from that of the photos around it, from points that several photos see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatmill_worker.scene import Scene
+from splatmill_worker.splat.plan.observations import Observations
+from splatmill_worker.splat.views import TrainingView
+
+Float = npt.NDArray[np.float64]
+
+DARKEST, BRIGHTEST = 8, 247
+"""Grey levels of 255 between which a value tells of the light: darker ones are mostly noise, brighter ones clipped."""
+
+RESIDUAL_FLOOR = 0.02
+"""Natural logarithm of brightness: residuals below this floor have the same weight."""
+
+ITERATIONS = 30
+"""Iterations of the reweighted least squares that separates exposures from the brightness of points."""
+
+ENOUGH_OF_A_PHOTO = 10
+"""Number of observations of a photo from which its exposure counts."""
+
+ENOUGH_PHOTOS = 3
+"""Number of such photos from which exposures are compared."""
+
+REACHES = (0.25, 0.5, 1.0, 2.0)
+"""Distances between cameras over which light is smooth, in radii of the cameras around their mean; turns count by the
+chord between the directions. The one that predicts best is taken."""
+
+SHARES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+"""Variances of what is not smooth, over the variance of what is. The one that predicts best is taken."""
+
+CLEAR = 2.0
+"""Standard errors by which the prediction has to be better than a constant: one of many may be so by chance."""
+
+TAIL = 0.9
+"""Share of the photos that depart less than the fact `light_tail` says."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """Exposure and white balance of n photos, as natural logarithms of factors on red, green and blue.
+
+    exposures: [n, 3]; their mean over photos is zero. Zero for a photo that shows too few points.
+    departures: the part of them [n, 3] that the photos around do not predict; its mean is zero too.
+    errors: standard error of an exposure [n], from the spread of the photo's points; infinite without an exposure.
+    """
+
+    exposures: Float
+    departures: Float
+    errors: Float
+
+    @property
+    def spread(self) -> float:
+        """Robust standard deviation of the exposures."""
+        return _spread(self.exposures[self._known].mean(axis=1))
+
+    @property
+    def tint_spread(self) -> float:
+        """The same of red over green or of blue over green, whichever spreads more."""
+        red, green, blue = self.exposures[self._known].T
+        return max(_spread(red - green), _spread(blue - green))
+
+    @property
+    def tail(self) -> float:
+        """Largest departure of any colour that TAIL of the photos stay below."""
+        return float(np.quantile(np.abs(self.departures[self._known]).max(axis=1), TAIL))
+
+    @property
+    def error(self) -> float:
+        """Median standard error of the exposures."""
+        return float(np.median(self.errors[self._known]))
+
+    @property
+    def _known(self) -> npt.NDArray[np.bool_]:
+        known: npt.NDArray[np.bool_] = np.isfinite(self.errors)
+        return known
+
+
+def light_of(scene: Scene, views: Sequence[TrainingView]) -> Light | None:
+    """The light of the photos `views` of `scene`, in the same world; None where it cannot be compared."""
+    seen = Observations.of(scene, views)
+    return None if seen is None else compared(seen, views)
+
+
+def compared(seen: Observations, views: Sequence[TrainingView]) -> Light | None:
+    """The light of the photos `views` from their observations; None where too few photos have enough of them.
+
+    The logarithm of each value is modelled as the sum of a term of its point and a term of its photo. Adding a constant
+    to all photos and taking it from all points changes no value: that is the gauge of the model. It is fixed by a mean
+    of zero over photos, each photo counting once, since a mean by visits or points would let the photos of what many
+    photos show decide for the others.
+
+    A trained scene has more freedom than this model: its colours depend on the direction of view. Light that changes
+    smoothly with the camera is then as much a property of the scene as of the photos, and held-out photos, taken
+    between the others, share it. These smooth changes are a gauge freedom too, to the extent that the photos around
+    predict them. So they are taken out of the exposures, and `departures` has what is left: the error of predicting
+    each photo from all others by a Gaussian process over the cameras' positions and directions with a free constant,
+    whose reach and noise are those of the least mean error (Rasmussen and Williams 2006, section 5.4.2). The constant
+    alone predicts where that is not clearly worse.
+    """
+    exposures, errors = _exposures(seen)
+    known = np.isfinite(errors)
+    if known.sum() < ENOUGH_PHOTOS:
+        return None
+    cameras = [view.full.camera for view, wanted in zip(views, known, strict=True) if wanted]
+    places = np.array([camera.center for camera in cameras])
+    places -= places.mean(axis=0)
+    places /= max(float(np.linalg.norm(places, axis=1).max()), 1e-12)
+    directions = np.array([camera.viewmat[2, :3] for camera in cameras])
+    departures = np.zeros_like(exposures)
+    departures[known] = _unpredicted(exposures[known], places, directions)
+    return Light(exposures, departures, errors)
+
+
+def _exposures(seen: Observations) -> tuple[Float, Float]:
+    """Exposures [n, 3] and their standard errors [n] by reweighted least squares, solved in alternation.
+
+    Weights fall with the residual, so that outliers (highlights, occlusions) have little influence.
+    """
+    exposures = np.zeros((seen.photos, 3))
+    errors = np.zeros(seen.photos)
+    for channel in range(3):
+        values = seen.color[:, channel].astype(np.float64)
+        told = ((values >= DARKEST) & (values <= BRIGHTEST)).astype(np.float64)
+        log = np.log(np.maximum(values, 1.0))
+        of_photo, residual, weight = np.zeros(seen.photos), log, told
+        enough = np.bincount(seen.photo, told, minlength=seen.photos) >= ENOUGH_OF_A_PHOTO
+        for _ in range(ITERATIONS):
+            of_point = _group_mean(log - of_photo[seen.photo], weight, seen.point, seen.points)
+            of_photo = _group_mean(log - of_point[seen.point], weight, seen.photo, seen.photos)
+            of_photo = np.where(enough, of_photo - of_photo[enough].mean() if enough.any() else 0.0, 0.0)
+            residual = log - of_point[seen.point] - of_photo[seen.photo]
+            weight = told / np.maximum(np.abs(residual), RESIDUAL_FLOOR)
+        exposures[:, channel] = of_photo
+        # The mean absolute deviation of a normal distribution is 0.8 of its standard deviation.
+        deviation = _group_mean(np.abs(residual), told, seen.photo, seen.photos) / 0.8
+        count = np.bincount(seen.photo, told, minlength=seen.photos)
+        errors = np.maximum(errors, np.where(enough, deviation / np.sqrt(np.maximum(count, 1.0)), np.inf))
+    exposures[~np.isfinite(errors)] = 0.0
+    return exposures, errors
+
+
+def _unpredicted(exposures: Float, places: Float, directions: Float) -> Float:
+    """What the exposures [n, 3] differ by from those that a smooth function of the other photos' cameras predicts."""
+    apart = _squared_distances(places) + _squared_distances(directions)
+    count = len(exposures)
+    constant = np.full((count, count), 1e3)  # a prior so wide that the mean is free
+    brightness = exposures.mean(axis=1)
+    kernels = [(np.zeros((count, count)), 1.0)]  # a constant alone
+    kernels += [(np.exp(-0.5 * apart / reach**2), share) for reach in REACHES for share in SHARES]
+    found: list[tuple[Float, Float]] = []
+    for kernel, share in kernels:
+        inverse = np.linalg.inv(kernel + constant + share * np.eye(count))
+        left = inverse / np.diag(inverse)[:, None]  # times the values: the error of each from all others
+        found.append((np.abs(left @ brightness), left @ exposures))
+    (plain, by_constant), (least, rest) = found[0], min(found, key=lambda each: float(each[0].mean()))
+    gain = plain - least
+    if not gain.mean() > CLEAR * gain.std() / np.sqrt(count):
+        rest = by_constant
+    centred: Float = rest - rest.mean(axis=0)
+    return centred
+
+
+def _squared_distances(points: Float) -> Float:
+    squared: Float = ((points[:, None] - points[None]) ** 2).sum(axis=2)
+    return squared
+
+
+def _spread(values: Float) -> float:
+    # 1.4826 times the median absolute deviation is the standard deviation of a normal distribution.
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+
+
+def _group_mean(values: Float, weights: Float, group: npt.NDArray[np.int64], groups: int) -> Float:
+    """Weighted mean of `values` per group; 0 where a group is empty."""
+    total = np.bincount(group, weights, minlength=groups)
+    mean: Float = np.bincount(group, weights * values, minlength=groups) / np.maximum(total, 1e-12)
+    return mean

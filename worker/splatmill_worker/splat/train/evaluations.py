@@ -1,0 +1,161 @@
+"""When a run is evaluated while it trains, and on how many photos, so that this takes a bounded share of its time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
+
+from splatmill_worker.splat.evaluate import Score, evaluate
+from splatmill_worker.splat.machine import resident_memory
+from splatmill_worker.splat.train.curve import CurvePoint
+from splatmill_worker.splat.train.renderer import evaluation_background, renderer
+from splatmill_worker.splat.train.run import TrainingRun
+from splatmill_worker.splat.views import TrainingView
+
+View = TypeVar("View")
+
+EVALUATED_AT = (0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""Shares of the budget at which held-out views are evaluated: close together where the curve is steep."""
+
+SHORT_EVALUATED_AT = (0.04, 0.11, 0.22, 0.4, 0.6, 0.8, 1.0)
+"""The same for runs that are too short for the longer list."""
+
+SHARE = 0.05
+"""Largest share of the training time that all evaluations take, wherever the run is long enough for the final one."""
+
+VIEW_STEPS = 0.9
+"""Time of evaluating one view, in training steps (decisions: VIEW_STEPS)."""
+
+LEAST_HELD_OUT = 4
+"""Held-out views at a point of the curve, at least; all of them where there are fewer."""
+
+ALSO_EVALUATED = 4
+"""Training views, evenly chosen, that are evaluated at each point beside the held-out ones, at most."""
+
+FINALLY_EVALUATED = 16
+"""Training views, evenly chosen, that are evaluated at the end: this many, and less than twice as many."""
+
+
+class CurveViews(NamedTuple):
+    """What is evaluated at each point of the curve but the last, which shows all held-out views.
+
+    shares: of the budget, at which the points lie.
+    held_out, training: number of views, evenly chosen from those there are.
+    """
+
+    shares: tuple[float, ...]
+    held_out: int
+    training: int
+
+
+def curve_views(held_out: int, training: int, steps: int) -> CurveViews:
+    """The points of the curve of a run of `steps` steps that has so many held-out and training views.
+
+    It depends on these numbers alone, so that runs of one plan have the same points.
+    """
+    finally_ = held_out + len(finally_evaluated(range(training)))
+    affordable = SHARE * steps / VIEW_STEPS - finally_
+    least = min(held_out, LEAST_HELD_OUT) + 1
+    shares = EVALUATED_AT if affordable >= least * (len(EVALUATED_AT) - 1) else SHORT_EVALUATED_AT
+    each = max(least, int(affordable / (len(shares) - 1)))
+    also = min(ALSO_EVALUATED, training, max(1, each // 3))
+    return CurveViews(shares, min(held_out, max(least - 1, each - also)), also)
+
+
+def finally_evaluated(views: Sequence[View]) -> Sequence[View]:
+    """Those of the training views that are evaluated at the end."""
+    return views[:: max(1, len(views) // FINALLY_EVALUATED)]
+
+
+def evenly(views: Sequence[View], count: int) -> list[View]:
+    """`count` of the views, evenly chosen from the first on; all of them where there are no more."""
+    return (
+        [views[index * len(views) // count] for index in range(count)] if count < len(views) else list(views)
+    )
+
+
+@dataclass(frozen=True)
+class FinalScores:
+    """The scores of all held-out views, None where there are none, and of an even choice of the training views."""
+
+    held_out: Score | None
+    on_training: Score
+
+
+class Evaluations:
+    """Evaluates a run at shares of its budget.
+
+    seconds: time that this has taken.
+    final: the scores of the last evaluation where that was at the end of the budget; None before.
+    """
+
+    def __init__(self, run: TrainingRun, held_out: Sequence[TrainingView]) -> None:
+        self._run, self._held_out = run, held_out
+        self._chosen = curve_views(len(held_out), len(run.views), run.plan.schedule.expected_steps)
+        self.seconds = 0.0
+        self.final: FinalScores | None = None
+        # A resumed run is evaluated at the end again: an attempt may die after its last step and before its export.
+        passed = sum(share <= run.progress for share in self._chosen.shares)
+        self._next = min(passed, len(self._chosen.shares) - 1)
+
+    @property
+    def due(self) -> bool:
+        """Whether the next share of the budget is reached."""
+        return self._run.progress >= self._chosen.shares[self._next]
+
+    def evaluate(self) -> CurvePoint:
+        """Evaluate now; the point is added to the curve of the run."""
+        started = time.perf_counter()
+        run, shares = self._run, self._chosen.shares
+        while self._next < len(shares) and run.progress >= shares[self._next]:
+            self._next += 1
+        scores = (
+            self._all()
+            if run.progress >= 1.0
+            else self._of(
+                evenly(self._held_out, self._chosen.held_out), evenly(corrected(run), self._chosen.training)
+            )
+        )
+        self.final = scores if run.progress >= 1.0 else None
+        held_out = scores.held_out
+        point = CurvePoint(
+            seconds=run.clock.seconds,
+            step=run.step,
+            loss=run.loss,
+            psnr=None if held_out is None else held_out.psnr,
+            ssim=None if held_out is None else held_out.ssim,
+            gaussians=run.engine.count,
+            memory=resident_memory(),
+            train_psnr=scores.on_training.psnr,
+            train_ssim=scores.on_training.ssim,
+            views=None if held_out is None else len(held_out.views),
+        )
+        run.curve.append(point)
+        self.seconds += time.perf_counter() - started
+        return point
+
+    def finish(self) -> FinalScores:
+        """The final scores, of the scene as it is now."""
+        if self.final is None:
+            started = time.perf_counter()
+            self.final = self._all()
+            self.seconds += time.perf_counter() - started
+        return self.final
+
+    def _all(self) -> FinalScores:
+        return self._of(self._held_out, finally_evaluated(corrected(self._run)))
+
+    def _of(self, held_out: Sequence[TrainingView], training: Sequence[TrainingView]) -> FinalScores:
+        run = self._run
+        render, background = renderer(run.engine, run.plan), evaluation_background(run.plan, run.views)
+        return FinalScores(
+            evaluate(render, held_out, background) if held_out else None,
+            evaluate(render, training, background),
+        )
+
+
+def corrected(run: TrainingRun) -> tuple[TrainingView, ...]:
+    """The training views with their cameras as they are now."""
+    return tuple(run.views if run.poses is None else run.poses.corrected(run.views))
