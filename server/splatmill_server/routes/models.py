@@ -3,8 +3,6 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Path, Request
-from fastapi.exceptions import RequestValidationError
-from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
@@ -20,10 +18,9 @@ from splatmill.schema import (
     Scope,
 )
 from splatmill_server.access.permission import needs
-from splatmill_server.answers.files import file_response
 from splatmill_server.answers.forward import CLIENT_GONE, forward, while_connected
+from splatmill_server.answers.model_outputs import model_file, model_in_format, rendered_by_query
 from splatmill_server.answers.single_file import single_file
-from splatmill_server.conversions import format_of_key
 from splatmill_server.filters import Filter
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.routes.openapi import CAMERA, RENDER_REQUESTS, answer, binary, problems
@@ -103,15 +100,7 @@ def get_model(service: Shared, model_id: ModelId) -> Model:
 )
 async def get_file(service: Shared, model_id: ModelId, name: str, request: Request) -> Response:
     """Download a file of a model: `model.ply`, `report.json`, `cameras.json`, `held_out/000.webp`, ..."""
-    entry = await run_in_threadpool(service.models.file, model_id, name)
-    download = f"{model_id}.ply" if name == "model.ply" else None
-    return await file_response(
-        request,
-        service.storage,
-        entry.path,
-        layout.model_media_type(name) or "application/octet-stream",
-        download_name=download,
-    )
+    return await model_file(service, model_id, name, request)
 
 
 @router.get("/{model_id}/formats", responses=problems("model_not_found", "model_not_ready", "model_corrupt"))
@@ -179,13 +168,7 @@ async def download(
     request: Request,
 ) -> Response:
     """Download a model in a file format, such as `sog`. The first request converts it, which takes seconds."""
-    form = format_of_key(format)
-    path = await while_connected(request, service.conversions.path(model_id, form))
-    if path is None:
-        return Response(status_code=CLIENT_GONE)
-    return await file_response(
-        request, service.storage, path, form.media_type, download_name=f"{model_id}{form.suffix}"
-    )
+    return await model_in_format(service, model_id, format, request)
 
 
 @router.get(
@@ -225,15 +208,8 @@ async def render(
 )
 async def render_cacheable(service: Shared, model_id: ModelId, request: Request) -> Response:
     """Render an image of a model at an address that browsers and proxies can cache."""
-    try:
-        body = RenderRequest.from_query(request.query_params)
-    except ValidationError as error:
-        located = [{**found, "loc": ("query", *found["loc"])} for found in error.errors()]
-        raise RequestValidationError(located) from error
     await run_in_threadpool(service.models.check, model_id)
-    return await forward(
-        service.renderer, request, rendering.render_path(model_id), body, service.settings.render_timeout
-    )
+    return await rendered_by_query(service, model_id, request)
 
 
 @router.post(

@@ -4,17 +4,13 @@ this model. Their addresses are those of `/v1/models/{model_id}`, below another 
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Request
-from fastapi.exceptions import RequestValidationError
-from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from splatmill.backplane import layout, rendering
-from splatmill.schema import DOWNLOADS, KeyLimits, ModelCameras, ModelDownloads, RenderRequest, SharedModel
+from splatmill.backplane import layout
+from splatmill.schema import DOWNLOADS, KeyLimits, ModelCameras, ModelDownloads, SharedModel
 from splatmill_server.access.caller import Caller
-from splatmill_server.answers.files import file_response
-from splatmill_server.answers.forward import CLIENT_GONE, forward, while_connected
-from splatmill_server.conversions import format_of_key
+from splatmill_server.answers.model_outputs import model_file, model_in_format, rendered_by_query
 from splatmill_server.problems import ProblemError
 from splatmill_server.routes.models import CAMERA_QUERY, RENDER_PROBLEMS, RENDERED
 from splatmill_server.routes.openapi import answer, binary, problems
@@ -70,10 +66,7 @@ async def get_shared_file(service: Shared, share: OpenShare, name: str, request:
     """Download a file of the model that a link shows."""
     if name in HIDDEN_FILES:
         raise ProblemError("file_not_found", f"The link gives out no file {name!r}.")
-    entry = await run_in_threadpool(service.models.file, share.model, name)
-    download = f"{share.model}.ply" if name == "model.ply" else None
-    media_type = layout.model_media_type(name) or "application/octet-stream"
-    return await file_response(request, service.storage, entry.path, media_type, download_name=download)
+    return await model_file(service, share.model, name, request)
 
 
 @router.get(
@@ -118,13 +111,7 @@ async def download_shared(
     request: Request,
 ) -> Response:
     """Download the model that a link shows in a file format. The first request of anybody converts it."""
-    form = format_of_key(format)
-    path = await while_connected(request, service.conversions.path(share.model, form))
-    if path is None:
-        return Response(status_code=CLIENT_GONE)
-    return await file_response(
-        request, service.storage, path, form.media_type, download_name=f"{share.model}{form.suffix}"
-    )
+    return await model_in_format(service, share.model, format, request)
 
 
 @router.get(
@@ -147,10 +134,4 @@ def get_shared_cameras(service: Shared, share: OpenShare) -> ModelCameras:
 )
 async def render_shared(service: Shared, share: OpenShare, request: Request) -> Response:
     """Render an image of the model that a link shows."""
-    try:
-        body = RenderRequest.from_query(request.query_params)
-    except ValidationError as error:
-        located = [{**found, "loc": ("query", *found["loc"])} for found in error.errors()]
-        raise RequestValidationError(located) from error
-    path, seconds = rendering.render_path(share.model), service.settings.render_timeout
-    return await forward(service.renderer, request, path, body, seconds)
+    return await rendered_by_query(service, share.model, request)

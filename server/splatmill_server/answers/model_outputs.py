@@ -1,0 +1,46 @@
+"""What a model gives out: files, other formats, renderings. The endpoints of models and of links answer with it."""
+
+from fastapi import Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import ValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import Response
+
+from splatmill.backplane import layout, rendering
+from splatmill.schema import RenderRequest
+from splatmill_server.answers.files import file_response
+from splatmill_server.answers.forward import CLIENT_GONE, forward, while_connected
+from splatmill_server.conversions import format_of_key
+from splatmill_server.service import Service
+
+
+async def model_file(service: Service, model_id: str, name: str, request: Request) -> Response:
+    """Return a file of a model, or the range of it that the request names."""
+    entry = await run_in_threadpool(service.models.file, model_id, name)
+    download = f"{model_id}.ply" if name == "model.ply" else None
+    media_type = layout.model_media_type(name) or "application/octet-stream"
+    return await file_response(request, service.storage, entry.path, media_type, download_name=download)
+
+
+async def model_in_format(service: Service, model_id: str, key: str, request: Request) -> Response:
+    """Return a model in the format of this key, such as `sog`, converted first if nobody has asked for it before."""
+    form = format_of_key(key)
+    path = await while_connected(request, service.conversions.path(model_id, form))
+    if path is None:
+        return Response(status_code=CLIENT_GONE)
+    name = f"{model_id}{form.suffix}"
+    return await file_response(request, service.storage, path, form.media_type, download_name=name)
+
+
+async def rendered_by_query(service: Service, model_id: str, request: Request) -> Response:
+    """Return an image of a model as the query of the request describes it.
+
+    Raises `RequestValidationError`, which names the parameter, for a query that describes none.
+    """
+    try:
+        body = RenderRequest.from_query(request.query_params)
+    except ValidationError as error:
+        located = [{**found, "loc": ("query", *found["loc"])} for found in error.errors()]
+        raise RequestValidationError(located) from error
+    path, seconds = rendering.render_path(model_id), service.settings.render_timeout
+    return await forward(service.renderer, request, path, body, seconds)
