@@ -89,7 +89,7 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
     assert box.get_attribute("data-pose") == turned
     assert seen(page).std() > 0.05
 
-    expect(page.locator("#state")).to_have_text("succeeded", timeout=60_000)
+    expect(page.locator("#state")).to_have_text("Finished", timeout=60_000)
     link = page.get_by_role("link", name="Open the model")
     expect(link).to_have_attribute("href", f"/models/{job_id}")
     job, report = service.job(job_id), service.http.get(f"/v1/jobs/{job_id}/report").json()
@@ -250,7 +250,7 @@ def test_a_lost_connection_is_shown_and_the_page_goes_on_where_it_was(
     expect(page.locator("#lost")).to_be_visible()
     service.ended(job_id)
     relay.mend()
-    expect(page.locator("#state")).to_have_text("succeeded", timeout=30_000)
+    expect(page.locator("#state")).to_have_text("Finished", timeout=30_000)
     expect(page.locator("#lost")).to_have_count(0)
     rows = service.http.get(f"/v1/jobs/{job_id}/curve").json()["rows"]
     expect(page.locator("#curve tbody tr")).to_have_count(len(rows))

@@ -42,7 +42,7 @@ def test_from_photos_to_a_shared_link(service: Up, open_window: Open, tmp_path: 
     page.wait_for_url(re.compile("/jobs/"), timeout=LONG)
     expect(page.get_by_role("heading", level=1)).to_have_text("journey")
     expect(page.locator("#live .box[data-snapshots]")).to_have_count(1, timeout=LONG)
-    expect(page.locator("#state")).to_have_text("succeeded", timeout=LONG)
+    expect(page.locator("#state")).to_have_text("Finished", timeout=LONG)
     expect(page.locator("#curve polyline")).not_to_have_count(0)
     page.get_by_role("link", name="Open the model").click()
 

@@ -4,8 +4,9 @@ import { Problem, follow, get, idOfPage, send } from "./api.js";
 import { ErrorChart } from "./chart.js";
 import { byId, h } from "./dom.js";
 import { bytes, decibels, moment, number, seconds } from "./format.js";
+import { FINAL, badgeKind, badgeText } from "./job_states.js";
 import { confirmAction, noticeOf, notify, startShell } from "./shell.js";
-import { Course, FINAL, STATES } from "./job/course.js";
+import { Course } from "./job/course.js";
 import { LiveScene } from "./job/live_scene.js";
 import { showLog, warningsOf } from "./job/log.js";
 import { kindsOf, photoParts } from "./job/photos.js";
@@ -134,7 +135,7 @@ function draw() {
   drawing = 0;
   if (!job) return;
   if (shown.state !== course.state) {
-    if (shown.state !== "" || course.final) byId("announcement").textContent = `${sentenceOf(course.state)}.`;
+    if (shown.state !== "" || course.final) byId("announcement").textContent = `${badgeText(course.state, false)}.`;
     shown.state = course.state;
     showState();
     watching.check();
@@ -170,23 +171,18 @@ function draw() {
   }
 }
 
-/** @param {string} state */
-function sentenceOf(state) {
-  return /** @type {Record<string, string>} */ ({ ...STATES, succeeded: "The model is finished", failed: "The job failed", cancelled: "The job is cancelled" })[state] ?? state;
-}
-
 function titleOf() {
   const name = job.name || `Job ${id}`;
   const { progress } = course;
-  if (course.final || !progress?.total) return `${name}: ${sentenceOf(course.state).toLowerCase()}`;
+  if (course.final || !progress?.total) return `${name}: ${badgeText(course.state, false).toLowerCase()}`;
   return `${Math.floor((100 * progress.done) / progress.total)} % of ${progress.stage}: ${name}`;
 }
 
 /** The state, the outcome, and what may be done now. */
 function showState() {
   const badge = byId("state");
-  badge.dataset.state = course.final || course.state === "queued" ? course.state : "running";
-  badge.textContent = job.cancel_requested && !course.final ? "being cancelled" : course.state === "sfm" ? "cameras" : course.state;
+  badge.dataset.state = badgeKind(course.state);
+  badge.textContent = badgeText(course.state, job.cancel_requested);
   showOutcome();
   showActions();
   byId("facts").replaceChildren(...facts().flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));

@@ -3,21 +3,15 @@
 import { get, send } from "./api.js";
 import { h } from "./dom.js";
 import { ago, moment, seconds } from "./format.js";
+import { FINAL, RUNNING, badgeKind, badgeText } from "./job_states.js";
 import { listing } from "./listing.js";
 import { confirmAction, notify, startShell } from "./shell.js";
 
-const RUNNING = ["preparing", "sfm", "training", "exporting"];
-const FINAL = ["succeeded", "failed", "cancelled"];
-const NAMES = /** @type {Record<string, string>} */ ({
-  queued: "Waiting", preparing: "Reading photos", sfm: "Finding cameras", training: "Training",
-  exporting: "Writing files", succeeded: "Finished", failed: "Failed", cancelled: "Cancelled",
-});
 const REFRESH_MS = 4000; // between two looks at the jobs that are not finished, while the page is seen
 
 /** @param {any} job */
 function entry(job) {
   const name = job.name || `Job ${job.id.slice(0, 8)}`;
-  const kind = RUNNING.includes(job.state) ? "running" : job.state;
   const done = FINAL.includes(job.state);
   const { progress } = job;
   return h("li", {},
@@ -25,7 +19,7 @@ function entry(job) {
     h("div", {},
       h("div", { class: "title" },
         h("a", { class: "whole", href: `/jobs/${job.id}`, "data-focus": "open" }, name),
-        h("span", { class: "badge", "data-state": kind }, job.cancel_requested && !done ? "Stopping" : NAMES[job.state] ?? job.state)),
+        h("span", { class: "badge", "data-state": badgeKind(job.state) }, badgeText(job.state, job.cancel_requested))),
       !done && progress?.total
         ? h("progress", { value: progress.done, max: progress.total, "aria-label": `${name}: ${progress.stage}` }) : null,
       h("p", { class: "meta", title: `Created ${moment(job.created_at)}` }, facts(job).join(" · "))),

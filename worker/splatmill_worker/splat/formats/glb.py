@@ -122,7 +122,7 @@ def read(path: Path) -> Contents:
             f"{path.name} could not be read as a .glb: {error.args[0]!r:.100} is missing."
         ) from error
     except (ValueError, OSError, TypeError, IndexError, struct.error, AttributeError) as error:
-        raise ModelUnreadable(f"{path.name} could not be read as a .glb of Gaussians: {error}") from error
+        raise ModelUnreadable(f"{path.name} could not be read as a .glb of Gaussians: {error}.") from error
 
 
 @dataclass

@@ -138,7 +138,7 @@ def parsed(path: Path) -> PlyData:
     except FileNotFoundError:
         raise
     except (PlyParseError, ValueError, OSError, IndexError, KeyError) as error:
-        raise ModelUnreadable(f"{path.name} could not be read as a .ply file: {error}") from error
+        raise ModelUnreadable(f"{path.name} could not be read as a .ply file: {error}.") from error
     return document
 
 

@@ -1,14 +1,6 @@
 // The course of a job, from its events: a reader of the same events gets the same course, from whichever event it begins.
 
-/** The states in order, and what happens in each, for people. */
-export const STATES = /** @type {const} */ ({
-  queued: "Waiting in the queue",
-  preparing: "Preparing",
-  sfm: "Finding the cameras",
-  training: "Training",
-  exporting: "Writing the model",
-});
-export const FINAL = ["succeeded", "failed", "cancelled"];
+import { FINAL } from "../job_states.js";
 
 /** Names of the stages that progress is reported of. */
 export const STAGES = new Map(Object.entries({

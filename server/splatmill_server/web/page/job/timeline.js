@@ -2,7 +2,8 @@
 
 import { h } from "../dom.js";
 import { number, seconds } from "../format.js";
-import { STAGES, STATES } from "./course.js";
+import { STATES } from "../job_states.js";
+import { STAGES } from "./course.js";
 
 /** Stages of structure from motion, in the order in which they come. */
 const SFM = ["images", "features", "pairs", "matching", "mapping", "stereo"];
