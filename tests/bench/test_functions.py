@@ -1,0 +1,64 @@
+"""Proves `bench functions`: what it counts, that no float is left out, and its quick form.
+
+Not proven here: that the functions are as exact as the table says (tests/kernels/test_functions.py).
+"""
+
+from __future__ import annotations
+
+import importlib
+from itertools import pairwise
+
+import pytest
+from _functions.library import errors, load, measure
+from _functions.spans import FUNCTIONS, Function, Span, bits_at, place, runs, value
+from _rows import HERE
+
+from splatmill_worker.kernels.cpu import isa
+
+bench = importlib.import_module("functions")
+SPANS = list(bench.spans())
+
+
+@pytest.mark.slow
+def test_what_is_counted_is_right() -> None:
+    """A correctly rounded function has errors of up to half an ulp, no more, and just so; 1/sqrt x is not sqrt x."""
+    (function,) = [f for f in FUNCTIONS if f.name == "sqrt"]
+    found = measure("baseline", function, function.spans[-1])
+    assert found["count"] == 2**24 + 1
+    assert found["rounded"] == 1
+    assert 0.4999 < found["ulp"] <= 0.5
+    # Errors of rounding are spread evenly over an ulp: 1/sqrt 12 of it in the root mean square.
+    assert found["rms_ulp"] == pytest.approx(12**-0.5, rel=1e-3)
+    assert found["absolute"] == pytest.approx(2.0**-24, rel=1e-3)
+    with pytest.raises(ValueError, match="no function 'sine'"):
+        errors(load("baseline"), "sine", [(0, 1)])
+
+
+@pytest.mark.slow
+def test_the_quick_form_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    before = sorted((HERE / "results").glob("functions*"))
+    assert bench.main(["--stride", "1000003"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(SPANS) * len(isa.supported()) + len(isa.ISAS) - len(isa.supported())
+    assert sorted((HERE / "results").glob("functions*")) == before
+
+
+def test_every_float_has_one_place() -> None:
+    for x in (0.0, -0.0, 1.0, -1.5, 2.0**127, -(2.0**-149)):
+        assert value(place(x)) == x
+    assert place(-0.0) == -1
+    assert bits_at(place(-0.0)) == 1 << 31
+    for stride in (1, 2, 3, 7):
+        for first, end in ((-10, 12), (-9, -2), (4, 30), (-1, 1), (5, 5)):
+            bits = [low + i * stride for low, count in runs(first, end, stride) for i in range(count)]
+            assert sorted(bits) == sorted(bits_at(at) for at in range(first, end, stride))
+
+
+@pytest.mark.parametrize(("function", "span"), SPANS, ids=[f"{f.name} on {s.label}" for f, s in SPANS])
+def test_parts_are_the_whole_span(function: Function, span: Span) -> None:
+    parts = span.parts(256)
+    edges = [edge for low, high in span.intervals for edge in (place(low), place(high) + 1)]
+    assert parts[0][0] == edges[0]
+    assert parts[-1][1] == edges[-1]
+    jumps = [(a[1], b[0]) for a, b in pairwise(parts) if a[1] != b[0]]
+    assert [edge for jump in jumps for edge in jump] == edges[1:-1]

@@ -1,0 +1,1 @@
+"""Parts of `bench functions`: functions and their arguments, the library that counts errors, what follows."""

@@ -1,0 +1,120 @@
+"""The functions of the CPU kernels, and the arguments at which their errors are counted.
+
+Floats are numbered in order: `place` is 0 at 0.0, 1 at the smallest denormal, -1 at -0.0, and so on up to both
+infinities. A range of places is every float between two values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+SMALLEST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+"""The smallest and the largest normal float."""
+
+BINS = 256
+"""Parts of a drawn span, of which each has its largest error in the rows."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """Every float in one or two intervals, ends included.
+
+    by_value: the parts of the figure have the same width, rather than the same number of floats.
+    """
+
+    label: str
+    intervals: tuple[tuple[float, float], ...]
+    by_value: bool = False
+
+    def parts(self, count: int) -> list[tuple[int, int]]:
+        """About `count` ranges [first, end) of places that together are the span, in order."""
+        found = []
+        for low, high in self.intervals:
+            first, end = place(low), place(high) + 1
+            n = max(count // len(self.intervals), 1)
+            if self.by_value:
+                inner = [place(x) for x in np.linspace(low, high, n + 1)[1:-1]]
+            else:
+                inner = [first + (end - first) * i // n for i in range(1, n)]
+            edges = [first, *inner, end]
+            found += [(a, b) for a, b in pairwise(edges) if a < b]
+        return found
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function of math.hpp or simd.hpp; its errors are drawn over the last of its spans."""
+
+    name: str
+    exact: str  # what it approximates
+    header: str
+    spans: tuple[Span, ...]
+
+
+NORMAL = Span("all positive normal floats", ((SMALLEST, LARGEST),))
+TWO_OCTAVES = Span("[1, 4]", ((1.0, 4.0),), by_value=True)
+LEAST_ALPHA = float(np.float32(1 / 255))
+LOG2_LEAST_ALPHA = float(np.float32(-7.994353436858858))
+LEAST_LEFT = float(np.float32(1) - np.float32(0.999))
+
+FUNCTIONS = (
+    # Log-scales and logits: any float, held within these limits by the function itself.
+    Function("exp", "e^x", "math.hpp", (Span("[-87, 88]", ((-87.0, 88.0),), by_value=True),)),
+    # An opacity, held above 1/255.
+    Function(
+        "log2", "log2 x", "math.hpp", (NORMAL, Span("[1/255, 1]", ((LEAST_ALPHA, 1.0),), by_value=True))
+    ),
+    # log2 of an alpha of at least 1/255. It cannot exceed log2 of the opacity, which is at most 0.
+    Function(
+        "exp2_of_alpha", "2^x", "math.hpp",
+        (
+            Span("[-125, 126]", ((-125.0, 126.0),)),
+            Span("[log2(1/255), 0]", ((LOG2_LEAST_ALPHA, -0.0),), by_value=True),
+        ),
+    ),
+    # 1 - alpha, with an alpha of at most 0.999; denominators of SSIM and Adam. Estimates near 2^-126 are flushed to 0.
+    Function(
+        "reciprocal", "1/x", "simd.hpp",
+        (
+            Span("2^-126 <= |x| <= 2^125", ((-(2.0**125), -SMALLEST), (SMALLEST, 2.0**125))),
+            Span("[1 - 0.999, 1]", ((LEAST_LEFT, 1.0),), by_value=True),
+        ),
+    ),
+    # Adam's second moment. Two octaves repeat in all others.
+    Function("reciprocal_sqrt", "1/sqrt x", "simd.hpp", (NORMAL, TWO_OCTAVES)),
+    Function("sqrt", "sqrt x", "simd.hpp", (NORMAL, TWO_OCTAVES)),
+)  # fmt: skip
+
+
+def place(x: float) -> int:
+    """The number of a float32 value in order."""
+    return place_of(int(np.float32(x).view(np.uint32)))
+
+
+def place_of(bits: int) -> int:
+    """The place of the float with these bits."""
+    return bits if bits < 2**31 else 2**31 - 1 - bits
+
+
+def value(at: int) -> float:
+    """The float at a place."""
+    return float(np.uint32(bits_at(at)).view(np.float32))
+
+
+def bits_at(at: int) -> int:
+    """The bits of the float at a place."""
+    return at if at >= 0 else 2**31 - 1 - at
+
+
+def runs(first: int, end: int, stride: int) -> Iterator[tuple[int, int]]:
+    """The floats at places first, first + stride, ... below end, as runs of bits `stride` apart: (lowest, how many)."""
+    below = range(first, min(end, 0), stride)
+    if len(below):
+        yield bits_at(below[-1]), len(below)
+    above = range(first - (min(first, 0) // stride) * stride, end, stride)
+    if len(above):
+        yield above[0], len(above)
