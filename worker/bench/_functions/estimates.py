@@ -13,5 +13,5 @@ ESTIMATE_BOUNDS = {
     ("reciprocal_sqrt", "avx512"): 1.5 / 16 + 0.5 + 0.5 + 0.01,
 }
 """Largest errors in ulp on any processor, where a function starts from the processor's estimate. The digits of
-estimates differ from one processor to the next. The hundredth covers products of two roundings. Without an estimate, the
-operations are those of IEEE 754, and the measured error of a build is that of every processor."""
+estimates differ from one processor to the next. The hundredth covers products of two roundings. Without an estimate,
+the operations are those of IEEE 754, and the measured error of a build is that of every processor."""
