@@ -139,7 +139,7 @@ def test_a_queued_job_says_its_place_and_a_job_is_cancelled_by_keyboard(
         page.goto(f"/jobs/{job_id}")
         page.get_by_role("button", name="Cancel").press("Enter")
         page.get_by_role("button", name="Cancel the job").press("Enter")
-        expect(page.locator("#state")).to_have_text("cancelled", timeout=30_000)
+        expect(page.locator("#state")).to_have_text("Cancelled", timeout=30_000)
         expect(page.get_by_role("button", name="Restart")).to_be_visible()
         assert service.job(job_id)["state"] == "cancelled"
 
@@ -156,7 +156,7 @@ def test_a_failed_job_says_why_and_what_to_do(service: Up, visit: Visit) -> None
     asked = {"capture": capture, "options": options}
     job_id = service.http.post("/v1/jobs", json=asked).json()["id"]
     page.goto(f"/jobs/{job_id}")
-    expect(page.locator("#state")).to_have_text("failed", timeout=60_000)
+    expect(page.locator("#state")).to_have_text("Failed", timeout=60_000)
     expect(page.get_by_role("heading", name="Log", exact=True)).to_be_visible()
     for name in ("Live view", "Error against time"):
         expect(page.get_by_role("heading", name=name)).to_be_hidden()
