@@ -71,7 +71,7 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
     service: Up, capture: str, open_window: Open
 ) -> None:
     page = open_window(service, viewport={"width": 800, "height": 500}).page
-    job_id = submit(service, capture, time_budget="8s")
+    job_id = submit(service, capture, time_budget="12s")
     page.goto(f"/jobs/{job_id}")
     expect(page.get_by_role("heading", level=1)).to_have_text("watched")
     snapshots(page, 1)
