@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import pytest
 from _functions.library import errors, load, measure
-from _functions.spans import FUNCTIONS, Function, Span, bits_at, place, runs, value
+from _functions.spans import FUNCTIONS, NEAR_0, Function, Span, bits_at, place, runs, value
 from _rows import HERE
 
 from splatmill_worker.kernels.cpu import isa
@@ -62,3 +62,14 @@ def test_parts_are_the_whole_span(function: Function, span: Span) -> None:
     assert parts[-1][1] == edges[-1]
     jumps = [(a[1], b[0]) for a, b in pairwise(parts) if a[1] != b[0]]
     assert [edge for jump in jumps for edge in jump] == edges[1:-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("build", isa.supported())
+@pytest.mark.parametrize(("name", "at_0"), [("exp", 1.0), ("exp2_of_alpha", 0.9999992847442627)])
+def test_what_is_left_out_near_0_has_one_result(name: str, at_0: float, build: str) -> None:
+    """The error is then that of the result at 0, but for the distance from 1 of the exact value."""
+    ends = (place(-NEAR_0), place(NEAR_0) + 1)
+    found = errors(load(build), name, [ends], stride=100_003)
+    assert found.count > 10_000
+    assert found.absolute == pytest.approx(1 - at_0, abs=1.01 * NEAR_0)

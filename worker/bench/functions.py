@@ -1,7 +1,7 @@
 # ruff: noqa: E501  (prose and rows of Markdown tables are as long as they are)
 """`bench functions`: the error of every elementary function of the CPU kernels, at every float that it is meant for.
 
-    splatmill bench functions                  # all inputs: about ten CPU minutes for two instruction sets
+    splatmill bench functions                  # all inputs: about three CPU minutes for two instruction sets
     splatmill bench functions --stride 1021    # one input in 1021, printed only: seconds
     splatmill bench functions --plot-only
 
@@ -130,7 +130,9 @@ def table(rows: list[Row]) -> str:
         f"or {max(r['ulp'] for r in alpha):.1f} ulp.", "",
         "One ulp is the distance of neighbouring floats at the exact value, so 0.5 is the least that a largest error can be. Denormal numbers are "
         "flushed to 0, as in every kernel. `rounded` is the share of results that are the nearest float; `mean` is the mean relative error with its "
-        "sign. 2^x and log2 have a line for the arguments that occur: alpha is at least 1/255, and so is the opacity whose logarithm is taken. "
+        "sign. The arguments are all that the kernels can come to: `exp` holds its own within the limits, alpha is at least 1/255, and so is the "
+        "opacity whose logarithm is taken. Nearer to 0 than 2^-30, where e^x and 2^x have the same result for every x, their errors are not counted. "
+        "Negative arguments of `reciprocal` do not occur. "
         "`round_small` and `floor` are exact, and sums, products, quotients and `sqrt` are rounded correctly by IEEE 754.", "",
         "| function | arguments | build | inputs | largest, ulp | at | rms, ulp | rounded | largest relative | mean | largest absolute |",
         "|---|---|---|---|---|---|---|---|---|---|---|",

@@ -27,12 +27,12 @@ double power_of_two(int exponent) {
   return x;
 }
 
-// The distance of neighbouring normal floats at y.
-double ulp_at(double y) {
+// 1 over the distance of neighbouring normal floats at y.
+double per_ulp(double y) {
   uint64_t bits;
   std::memcpy(&bits, &y, sizeof bits);
   const int exponent = static_cast<int>(bits >> 52 & 0x7FF) - 1023;
-  return power_of_two((exponent > -126 ? exponent : -126) - 23);
+  return power_of_two(23 - (exponent > -126 ? exponent : -126));
 }
 
 void enlarge(double& largest, uint32_t& at, double error, uint32_t bits) {
@@ -43,7 +43,7 @@ void enlarge(double& largest, uint32_t& at, double error, uint32_t bits) {
 
 void compare(Errors& e, uint32_t bits, float got, double exact) {
   const double error = static_cast<double>(got) - exact, size = std::fabs(error);
-  const double relative = size == 0 ? 0 : error / std::fabs(exact), ulp = size / ulp_at(exact);
+  const double relative = size == 0 ? 0 : error / std::fabs(exact), ulp = size * per_ulp(exact);
   ++e.count;
   e.rounded += got == static_cast<float>(exact);
   enlarge(e.ulp, e.at_ulp, ulp, bits);

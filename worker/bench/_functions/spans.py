@@ -47,11 +47,15 @@ class Span:
 
 @dataclass(frozen=True)
 class Function:
-    """A function of math.hpp or simd.hpp; its errors are drawn over the last of its spans."""
+    """A function of math.hpp or simd.hpp.
+
+    The first span has all arguments that occur, the last is drawn.
+    """
 
     name: str
     exact: str  # what it approximates
     header: str
+    used_for: str
     spans: tuple[Span, ...]
 
 
@@ -60,33 +64,36 @@ TWO_OCTAVES = Span("[1, 4]", ((1.0, 4.0),), by_value=True)
 LEAST_ALPHA = float(np.float32(1 / 255))
 LOG2_LEAST_ALPHA = float(np.float32(-7.994353436858858))
 LEAST_LEFT = float(np.float32(1) - np.float32(0.999))
+NEAR_0 = 2.0**-30
+"""Nearer to 0, where half of all floats are, e^x and 2^x have one and the same result: every sum rounds x away."""
 
 FUNCTIONS = (
-    # Log-scales and logits: any float, held within these limits by the function itself.
-    Function("exp", "e^x", "math.hpp", (Span("[-87, 88]", ((-87.0, 88.0),), by_value=True),)),
-    # An opacity, held above 1/255.
+    # Any log-scale or logit: the function itself holds it within these limits.
     Function(
-        "log2", "log2 x", "math.hpp", (NORMAL, Span("[1/255, 1]", ((LEAST_ALPHA, 1.0),), by_value=True))
+        "exp", "e^x", "math.hpp", "scales, opacities",
+        (Span("[-87, 88]", ((-87.0, -NEAR_0), (NEAR_0, 88.0)), by_value=True),),
+    ),
+    # An opacity, which is held above 1/255.
+    Function(
+        "log2", "log2 x", "math.hpp", "opacity to level and extents",
+        (Span("[1/255, 1]", ((LEAST_ALPHA, 1.0),), by_value=True),),
     ),
     # log2 of an alpha of at least 1/255. It cannot exceed log2 of the opacity, which is at most 0.
     Function(
-        "exp2_of_alpha", "2^x", "math.hpp",
-        (
-            Span("[-125, 126]", ((-125.0, 126.0),)),
-            Span("[log2(1/255), 0]", ((LOG2_LEAST_ALPHA, -0.0),), by_value=True),
-        ),
+        "exp2_of_alpha", "2^x", "math.hpp", "alpha of every pixel",
+        (Span("[log2(1/255), 0]", ((LOG2_LEAST_ALPHA, -NEAR_0),), by_value=True),),
     ),
     # 1 - alpha, with an alpha of at most 0.999; denominators of SSIM and Adam. Estimates near 2^-126 are flushed to 0.
     Function(
-        "reciprocal", "1/x", "simd.hpp",
+        "reciprocal", "1/x", "simd.hpp", "1 - alpha in the backward pass, SSIM, Adam",
         (
-            Span("2^-126 <= |x| <= 2^125", ((-(2.0**125), -SMALLEST), (SMALLEST, 2.0**125))),
+            Span("[2^-126, 2^125]", ((SMALLEST, 2.0**125),)),
             Span("[1 - 0.999, 1]", ((LEAST_LEFT, 1.0),), by_value=True),
         ),
     ),
-    # Adam's second moment. Two octaves repeat in all others.
-    Function("reciprocal_sqrt", "1/sqrt x", "simd.hpp", (NORMAL, TWO_OCTAVES)),
-    Function("sqrt", "sqrt x", "simd.hpp", (NORMAL, TWO_OCTAVES)),
+    # What is drawn repeats in all other octaves.
+    Function("reciprocal_sqrt", "1/sqrt x", "simd.hpp", "Adam", (NORMAL, TWO_OCTAVES)),
+    Function("sqrt", "sqrt x", "simd.hpp", "norms, the conic's factor, extents", (NORMAL, TWO_OCTAVES)),
 )  # fmt: skip
 
 
