@@ -12,7 +12,7 @@ import torch
 from tests.support.kernels.bounds import within
 from tests.support.kernels.cases import CASES
 from tests.support.kernels.exact import exact
-from tests.support.kernels.proof import Run, alpha_error, backends, brightest, run, use
+from tests.support.kernels.proof import alpha_error, backends, brightest, peak, run, use
 
 
 @pytest.mark.parametrize("backend", backends())
@@ -68,26 +68,10 @@ def test_no_pair_that_reaches_a_pixel_is_missing(name: str, backend: str) -> Non
         # A pair may differ only where the ellipse touches the tile within the error of alpha; such a pair is dim.
         error = alpha_error(case, want.projected)
         for i in missing | extra:
-            assert _peak(want, i, tile, case.width) <= (1 / 255) * (1 + 2 * float(error[i]) + 2e-4)
+            assert peak(want.projected, i, tile, case.width) <= (1 / 255) * (1 + 2 * float(error[i]) + 2e-4)
         depth = got.projected.depths.detach().cpu()[mine]
         order = torch.stack([depth.double(), mine.double()], 1)
         later = (order[1:, 0] > order[:-1, 0]) | (
             (order[1:, 0] == order[:-1, 0]) & (order[1:, 1] > order[:-1, 1])
         )
         assert later.all(), "front to back, ties by index"
-
-
-def _peak(want: Run, i: int, tile: int, width: int) -> float:
-    """The largest alpha of Gaussian i at the pixel centres of a whole tile."""
-    columns = -(-width // 16)
-    y, x = torch.meshgrid(
-        torch.arange(16) + 0.5 + tile // columns * 16,
-        torch.arange(16) + 0.5 + tile % columns * 16,
-        indexing="ij",
-    )
-    p = want.projected
-    dx, dy = x.double() - p.means2d[i, 0].detach(), y.double() - p.means2d[i, 1].detach()
-    a, b, c = p.conics[i].detach()
-    return float(
-        (p.opacities[i].detach() * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).max()
-    )

@@ -27,7 +27,11 @@ class Exact:
 @cache
 def exact(name: str) -> Exact:
     """The definition of the case of that name."""
-    case = CASES[name]()
+    return exact_of(CASES[name]())
+
+
+def exact_of(case: Case) -> Exact:
+    """The definition of any case."""
     want = define(case)
     error = alpha_error(case, want.projected)
     weights = image_weights(case, want, error)

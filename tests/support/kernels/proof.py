@@ -188,3 +188,18 @@ def brightest(exact: Run) -> tuple[float, float]:
         float(exact.leaves["background"].detach().max()), *exact.projected.colors.flatten().tolist(), 1e-6
     )
     return color, max([*exact.projected.depths.tolist(), 1e-6])
+
+
+def peak(p: Projected, i: int, tile: int, width: int) -> float:
+    """The largest alpha of Gaussian i at the pixel centres of a whole tile."""
+    columns = -(-width // TILE)
+    y, x = torch.meshgrid(
+        torch.arange(TILE) + 0.5 + tile // columns * TILE,
+        torch.arange(TILE) + 0.5 + tile % columns * TILE,
+        indexing="ij",
+    )
+    dx, dy = x.double() - p.means2d[i, 0].detach(), y.double() - p.means2d[i, 1].detach()
+    a, b, c = p.conics[i].detach()
+    return float(
+        (p.opacities[i].detach() * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).max()
+    )

@@ -13,7 +13,7 @@ blended so far, so that a splat's gradient gets the rounding of the whole pixel.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -89,8 +89,12 @@ def by_ops(
     return Values(color.detach(), gradients), Projected(*(x.detach() for x in p)), bins
 
 
-def state(scene: Scene, draws: int, seed: int = 0) -> Problem:
-    """The exact outputs of a scene and their units, over `draws` changes of the inputs."""
+def state(scene: Scene, draws: int, seed: int = 0, exponents: float = 0.0) -> Problem:
+    """The exact outputs of a scene and their units, over `draws` changes of the inputs.
+
+    exponents: log-scales and logits are moved as if they were at least this large. At 1, the rounding of exp's result
+    is counted, which that of an argument near 0 does not contain.
+    """
     g = torch.Generator().manual_seed(seed)
     h, w = scene.height, scene.width
     weights = torch.randn(h, w, 3, generator=g).double()
@@ -102,7 +106,19 @@ def state(scene: Scene, draws: int, seed: int = 0) -> Problem:
         with torch.no_grad():
             return ops.project(*_groups(x), x.viewmat, x.K, w, h, degree=3, backend="reference")
 
-    changed = [scene.mapped(moved) for _ in range(draws)]
+    def changed_scene() -> Scene:
+        found = scene.mapped(moved)
+        if not exponents:
+            return found
+
+        def argument(x: Tensor) -> Tensor:
+            return x + (moved(torch.ones_like(x)) - 1) * x.abs().clamp_min(exponents)
+
+        return replace(
+            found, log_scales=argument(scene.log_scales), logit_opacities=argument(scene.logit_opacities)
+        )
+
+    changed = [changed_scene() for _ in range(draws)]
     at = project(scene)
     bins = ops.bin(at, w, h, backend="reference")
     undecided = _undecided(at, [project(x) for x in changed], bins, w, h)
@@ -122,19 +138,38 @@ def state(scene: Scene, draws: int, seed: int = 0) -> Problem:
 
     exact = outputs(scene, weights)
     by_inputs = spread(outputs(x, moved(weights)) for x in changed)
-    with inexact_exponential(g):
-        by_function = spread(outputs(scene, weights) for _ in range(draws))
 
-    def remainder() -> dict[str, Tensor]:
+    # The other two roundings come after the projection, whose derivative is taken once for all draws.
+    leaves, xi, projected = _projected(scene, "reference", torch.float64)
+    fields = [x.detach().requires_grad_() for x in projected[:5]]
+
+    def blended() -> Tensor:
+        p = Projected._make([*fields, projected.extents])
+        return ops.composite(p, bins, w, h, backend="reference")[0]
+
+    def pulled(totals: list[Tensor]) -> list[dict[str, Tensor]]:
+        """The gradients of every total to the leaves and the motion."""
+        found = [torch.autograd.grad(x, fields, materialize_grads=True) for x in totals]
+        stacked = [torch.stack(x) for x in zip(*found, strict=True)]
+        pulled_back = torch.autograd.grad(
+            projected[:5], [*leaves, xi], stacked, retain_graph=True, is_grads_batched=True
+        )
+        names = (*GROUPS, "pose")
+        return [dict(zip(names, x, strict=True)) for x in zip(*pulled_back, strict=True)]
+
+    with inexact_exponential(g):
+        images = [blended() for _ in range(draws)]
+    slopes = pulled([(x * weights).sum() for x in images])
+    by_function = spread({"image": x.detach(), **k} for x, k in zip(images, slopes, strict=True))
+
+    def remainder() -> Tensor:
         with rounded_remainders(torch.cat([weights, 0 * weights[..., :1]], 2), g) as terms:
-            leaves, xi, p = _projected(scene, "reference", torch.float64)
-            color, _, _ = ops.composite(p, bins, w, h, backend="reference")
-        # The image takes part with weight 0, so that every leaf has a gradient.
-        found = torch.autograd.grad(torch.stack(terms).sum() + 0 * color.sum(), [*leaves, xi])
-        return dict(zip((*GROUPS, "pose"), found, strict=True))
+            color = blended()
+        return sum(terms, 0 * color.sum())
 
     by_difference = spread(
-        {**exact, **{k: exact[k] + x for k, x in remainder().items()}} for _ in range(draws)
+        {**exact, **{k: exact[k] + x for k, x in slope.items()}}
+        for slope in pulled([remainder() for _ in range(draws)])
     )
 
     def unit(square: dict[str, Tensor]) -> Values:
