@@ -8,9 +8,10 @@ import platform
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import psutil
@@ -95,12 +96,16 @@ def read(name: str) -> list[Row]:
     return [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
 
 
-@contextmanager
-def build(name: str) -> Iterator[None]:
+def build(name: str) -> AbstractContextManager[None]:
     """Run every CPU op in this block with one build of the kernels: avx512, avx2 or baseline."""
+    return running(isa.load(name))
+
+
+@contextmanager
+def running(engine: ModuleType) -> Iterator[None]:
+    """Run every CPU op in this block with an extension module of the kernels."""
     from splatmill_worker.kernels.cpu import bin, composite, loss, project, step  # noqa: F401
 
-    engine = isa.load(name)
     prefix = "splatmill_worker.kernels.cpu"
     modules = [m for k, m in sys.modules.items() if k.startswith(prefix) and hasattr(m, "engine")]
     before = [m.engine for m in modules]

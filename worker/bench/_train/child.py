@@ -23,7 +23,7 @@ class Fault(Exception):
 
 def prepared(scene: Scene, work: Path) -> Row:
     """The numbers of views and points of the scene with its cameras; `failure` says why there are none."""
-    return _ask({"do": "prepare", **_of(scene, work), "options": scene.options})
+    return _ask({"do": "prepare", **located(scene, work), "options": scene.options})
 
 
 def measured(run: BenchRun, work: Path) -> Row:
@@ -31,7 +31,7 @@ def measured(run: BenchRun, work: Path) -> Row:
     return _ask(
         {
             "do": "measure",
-            **_of(run.scene, work),
+            **located(run.scene, work),
             "identity": run.identity(),
             "budget": run.budget.options,
         }
@@ -41,10 +41,11 @@ def measured(run: BenchRun, work: Path) -> Row:
 def judged(scene: Scene, name: str, model: Path, seconds: float, work: Path) -> Row:
     """The row of a peer's model; `failure` says why it cannot be judged. Raises Fault."""
     job = {"scene": scene.name, "options": scene.options, "name": name, "model": str(model)}
-    return _ask({"do": "judge", **_of(scene, work), **job, "seconds": seconds})
+    return _ask({"do": "judge", **located(scene, work), **job, "seconds": seconds})
 
 
-def _of(scene: Scene, work: Path) -> Row:
+def located(scene: Scene, work: Path) -> Row:
+    """Where a job finds the capture of a scene, and keeps its cameras."""
     kept = work / scene.name / "sfm"
     return {"capture": str(scene.folder), "made": scene.made, "sfm": str(kept.resolve())}
 

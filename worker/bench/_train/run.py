@@ -118,23 +118,22 @@ def judge(job: Row) -> Row:
     """The scores of another trainer's model on the held-out views of the runs, at the same size."""
     path = Path(job["model"])
     options = TrainOptions.model_validate(job["options"])
+    if options.image_size is None:
+        return {"failure": f"{job['scene']} has no size of images, so that nothing can be judged on it."}
     try:
         gaussians = ply.read(path).gaussians
-        scene = _posed(job, options)
-        _, test = split_views(scene, options)
+        frame, views = held_out(job, options, options.image_size)
     except (ModelUnreadable, *NAMED) as failure:
         return {"failure": str(failure)}
-    if not test or options.image_size is None:
+    if not views:
         return {"failure": f"{job['scene']} holds out no view, so that nothing can be judged on it."}
     # The training world, for the same near plane and the same float32 rounding as a run's own evaluation.
-    frame = Normalization.of(scene)
     moved = gaussians.moved(frame.scale, torch.from_numpy(frame.translation))
     backend = choose_kernels(options)
 
     def draw(target: Target, background: Tensor) -> Tensor:
         return render(moved, target.camera, background=background, backend=backend).color
 
-    views = [TrainingView.of(photo, frame) for photo in load_views(test, options.image_size)]
     with torch.no_grad():
         score = evaluate(draw, views, benchmark_background(views))
     judged: Row = rounded(
@@ -154,6 +153,14 @@ def judge(job: Row) -> Row:
         }
     )
     return judged
+
+
+def held_out(job: Row, options: TrainOptions, image_size: int) -> tuple[Normalization, list[TrainingView]]:
+    """The frame of the training world of a scene, and the held-out views in it."""
+    scene = _posed(job, options)
+    _, test = split_views(scene, options)
+    frame = Normalization.of(scene)
+    return frame, [TrainingView.of(photo, frame) for photo in load_views(test, image_size)]
 
 
 JOBS: dict[str, Callable[[Row], Row]] = {"prepare": prepare, "measure": measure, "judge": judge}

@@ -118,8 +118,9 @@ void bind_bin(nb::module_& m) {
         collect_touches(frame, count, threads, [&](int64_t begin, int64_t end, TouchWriter& writer) {
           for (int64_t i = begin * kLanes; i < std::min(count, end * kLanes); ++i) {
             if (culled(rows, i)) continue;
-            frame.records[i] = record_of(rows, i);
-            writer.add(static_cast<uint32_t>(i));
+            const Record record = record_of(rows, i);
+            frame.records[i] = record;
+            writer.add(static_cast<uint32_t>(i), record);
           }
         });
         bin_frame(frame, threads);

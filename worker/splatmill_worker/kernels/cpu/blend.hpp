@@ -14,13 +14,14 @@ struct TileLanes {
 };
 SPLATMILL_INLINE TileLanes tile_lanes() {
   const Float l = iota(), row = floor(l * 0.25f), column = fma(row, splat(-4.0f), l);
-  return {column, row, column * 4.0f, row * 4.0f};
+  const Float block_row = floor(l * (1.0f / kBlocksAcross)), block_column = fma(block_row, splat(-1.0f * kBlocksAcross), l);
+  return {column, row, block_column * 4.0f, block_row * 4.0f};
 }
 
 // u and v of a Gaussian over a tile: at block b, the lanes' part plus the offset of the block.
 struct TileForm {
   Float u, v;
-  alignas(64) float block_u[kTileBlocks], block_v[kTileBlocks];
+  alignas(64) float block_u[kLanes], block_v[kLanes];
 
   // The tile's first pixel centre is at (x0, y0).
   SPLATMILL_INLINE TileForm(const Record& r, const TileLanes& lanes, float x0, float y0) {
@@ -42,14 +43,14 @@ SPLATMILL_INLINE Float log2_alpha(Float level, Float u, Float v) { return fnma(v
 inline uint32_t blocks_inside(int tile_x, int tile_y, const Camera& cam) {
   uint32_t inside = 0;
   for (int b = 0; b < kTileBlocks; ++b)
-    if (tile_x * kTile + b % 4 * kBlockSide < cam.width && tile_y * kTile + b / 4 * kBlockSide < cam.height)
+    if (tile_x * kTile + b % kBlocksAcross * kBlockSide < cam.width && tile_y * kTile + b / kBlocksAcross * kBlockSide < cam.height)
       inside |= 1u << b;
   return inside;
 }
 
 // Loading and storing a block's sixteen pixels of a plane.
 SPLATMILL_INLINE float* block_origin(const Planes& image, int plane, int tile_x, int tile_y, int block) {
-  return image.at(plane, tile_y * kTile + block / 4 * kBlockSide, tile_x * kTile + block % 4 * kBlockSide);
+  return image.at(plane, tile_y * kTile + block / kBlocksAcross * kBlockSide, tile_x * kTile + block % kBlocksAcross * kBlockSide);
 }
 SPLATMILL_INLINE Float load_block(const float* origin, int64_t stride) {
   alignas(64) float lanes[kLanes];

@@ -35,7 +35,7 @@ void blend_tile(Frame& frame, const Planes& image, const float background[3], in
 
   Block<kDepth> blocks[kTileBlocks];
   for (int b = 0; b < kTileBlocks; ++b) {
-    const Float x = lanes.pixel_x + (x0 + b % 4 * kBlockSide), y = lanes.pixel_y + (y0 + b / 4 * kBlockSide);
+    const Float x = lanes.pixel_x + (x0 + b % kBlocksAcross * kBlockSide), y = lanes.pixel_y + (y0 + b / kBlocksAcross * kBlockSide);
     const Mask inside = (x < static_cast<float>(cam.width)) & (y < static_cast<float>(cam.height));
     store(blocks[b].T, select(inside, splat(1.0f), splat(-1.0f)));
     store(blocks[b].red, zero);
@@ -51,7 +51,7 @@ void blend_tile(Frame& frame, const Planes& image, const float background[3], in
     if ((k - begin) % kEntriesBetweenChecks == 0 && !(live = still_live(blocks, live))) break;
     if (k + kEntriesAhead < end) __builtin_prefetch(&frame.records[frame.entries[k + kEntriesAhead].id]);
     Entry& entry = frame.entries[k];
-    const Record& r = frame.records[entry.id];
+    const Record& r = widened(frame.records[entry.id]);
     const TileForm form(r, lanes, x0, y0);
     const Float level = splat(r.level);
     const Float red = splat(r.color[0]), green = splat(r.color[1]), blue = splat(r.color[2]);

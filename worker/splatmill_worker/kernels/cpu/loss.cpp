@@ -292,9 +292,9 @@ Band band(int i, int bands, int height) { return {height * i / bands, height * (
 LossValue loss(const Planes& color, const Photo& photo, float dssim_weight, const Planes& gradient, LossScratch& scratch,
                int threads) {
   LossValue value;
-  const int height = photo.height, padded = tiles_across(height) * kTile;
+  const int height = photo.height;
   for (int c = 0; c < 3; ++c)
-    std::fill(gradient.at(c, photo.count > 0 ? height : 0), gradient.at(c, padded), 0.0f);
+    std::fill(gradient.at(c, photo.count > 0 ? height : 0), gradient.at(c, padded(height)), 0.0f);
   if (!(photo.count > 0)) return value;
 
   const int vectors = static_cast<int>(photo.stride / kLanes), strips = (vectors * kLanes + kStrip - 1) / kStrip;

@@ -46,7 +46,7 @@ void project_frame(const float* blocks, int64_t count, int degree, Frame& frame,
   const Camera cam = frame.camera;
   collect_touches(frame, count, threads, [&](int64_t begin, int64_t end, TouchWriter& writer) {
     for (int64_t b = begin; b < end; ++b) {
-      const float* p = blocks + b * kBlockFloats;
+      const float* p = blocks + b * kParameterFloats;
       uint32_t seen = 0;
       Projection o;
       project_geometry(p, cam, o);
@@ -58,8 +58,10 @@ void project_frame(const float* blocks, int64_t count, int degree, Frame& frame,
         for (uint32_t left = bits(o.visible); left; left &= left - 1) {
           const int lane = __builtin_ctz(left);
           const int64_t id = b * kLanes + lane;
-          store(reinterpret_cast<float*>(&frame.records[id]), records[lane]);
-          if (writer.add(static_cast<uint32_t>(id))) seen |= 1u << lane;
+          Record record;
+          store(reinterpret_cast<float*>(&record), records[lane]);
+          frame.records[id] = record;
+          if (writer.add(static_cast<uint32_t>(id), record)) seen |= 1u << lane;
         }
       }
       frame.visible[b] = static_cast<uint16_t>(seen);
@@ -76,7 +78,7 @@ void project_rows(const float* blocks, int64_t count, int degree, const Camera& 
     const FlushDenormals flush;
 #pragma omp for schedule(static)
     for (int64_t b = 0; b < n; ++b) {
-      const float* p = blocks + b * kBlockFloats;
+      const float* p = blocks + b * kParameterFloats;
       Projection o;
       project_geometry(p, cam, o);
       Float color[3], fields[kProjectedFloats];
@@ -117,7 +119,7 @@ void project_rows_backward(const float* blocks, int64_t count, int degree, const
   for (int64_t chunk = 0; chunk < chunks; ++chunk) {
     const FlushDenormals flush;
     for (int64_t b = chunk * kChunk; b < std::min(n, (chunk + 1) * kChunk); ++b) {
-      const float* p = blocks + b * kBlockFloats;
+      const float* p = blocks + b * kParameterFloats;
       float* g = grad_blocks + b * kBlockFloats;
       for (int r = 0; r < kRows; ++r) store(g + r * kLanes, splat(0.0f));
       Projection o;

@@ -7,17 +7,20 @@
 
 namespace splatmill {
 
-// A tile's pixels as vectors: block b is 4x4 pixels at (4 (b % 4), 4 (b / 4)), lane l of it the pixel (l % 4, l / 4).
+// A tile's pixels as vectors: block b is 4x4 pixels at 4 (b % kBlocksAcross, b / kBlocksAcross), lane l of it the pixel
+// (l % 4, l / 4).
 inline constexpr int kBlockSide = 4;
-inline constexpr int kTileBlocks = 16;
+inline constexpr int kBlocksAcross = kTile / kBlockSide;
+inline constexpr int kTileBlocks = kBlocksAcross * kBlocksAcross;
+static_assert(kTileBlocks <= kLanes);
 
 // Lane b: the left and the upper pixel centre of block b within a tile.
 struct BlockOffsets {
   Float x, y;
 };
 SPLATMILL_INLINE BlockOffsets block_offsets() {
-  const Float b = iota(), row = floor(b * 0.25f);
-  return {fma(row, splat(-16.0f), b * 4.0f) + 0.5f, fma(row, 4.0f, splat(0.5f))};
+  const Float b = iota(), row = floor(b * (1.0f / kBlocksAcross));
+  return {fma(row, splat(-1.0f * kTile), b * 4.0f) + 0.5f, fma(row, 4.0f, splat(0.5f))};
 }
 
 // The test for one Gaussian, tile by tile.
@@ -48,7 +51,7 @@ class Reach {
     const Float u1 = fma(uy_, dy, ux_ * nearest), v1 = vy_ * dy;
     const Float dx = min(max(row.best_x, left), right);
     const Float u2 = fma(ux_, dx, row.u);
-    return bits(min(fma(u1, u1, v1 * v1), fma(u2, u2, row.v2)) <= cut_);
+    return bits(min(fma(u1, u1, v1 * v1), fma(u2, u2, row.v2)) <= cut_) & ((1u << kTileBlocks) - 1u);
   }
 
  private:

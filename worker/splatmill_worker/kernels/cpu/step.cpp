@@ -32,6 +32,7 @@ struct Update {
   float *params = nullptr, *exp_avg = nullptr, *exp_avg_sq = nullptr;
   float rates[kRows] = {};  // with the bias correction of the first moment
   float root = 0;           // bias correction of the second
+  int64_t step = 0;
   float* gradients = nullptr;
   float* scores = nullptr;  // [kScoreRows][score_stride]; null where none are kept
   int64_t score_stride = 0;
@@ -84,12 +85,29 @@ SPLATMILL_INLINE void add_scores(const Update& update, const Camera& cam, int64_
   store(at(kExtent), visible, max(max(o.extent_x, o.extent_y) * per_image, load(at(kExtent))));
 }
 
+// Where the rows of a block lie in memory.
+class BlockState {
+ public:
+  SPLATMILL_INLINE BlockState(const Update& update, int64_t b)
+      : params_(reinterpret_cast<char*>(update.params + b * kParameterFloats)),
+        exp_avg_(reinterpret_cast<char*>(update.exp_avg) + b * kRows * kLanes * FirstMoment::kBytes),
+        exp_avg_sq_(reinterpret_cast<char*>(update.exp_avg_sq) + b * kRows * kLanes * SecondMoment::kBytes) {}
+  SPLATMILL_INLINE char* param(int r) const {
+    return params_ + kLanes * (r < kSh ? r * 4 : kSh * 4 + (r - kSh) * Harmonics::kBytes);
+  }
+  SPLATMILL_INLINE char* exp_avg(int r) const { return exp_avg_ + r * kLanes * FirstMoment::kBytes; }
+  SPLATMILL_INLINE char* exp_avg_sq(int r) const { return exp_avg_sq_ + r * kLanes * SecondMoment::kBytes; }
+
+ private:
+  char *params_, *exp_avg_, *exp_avg_sq_;
+};
+
 // Updates one block; returns how many gradient values Adam refused. With kPose, adds the camera's gradient to `pose`.
 template <bool kAdam, bool kPose>
 int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, int64_t b,
                      double* pose) {
   const int rows = kSh + 3 * (scene.degree + 1) * (scene.degree + 1);
-  const float* p = scene.params + b * kBlockFloats;
+  const float* p = scene.params + b * kParameterFloats;
   const uint32_t seen = frame.visible[b];
   const Mask visible = mask_of(seen);
   alignas(64) float gradient[kBlockFloats];
@@ -112,16 +130,19 @@ int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& sc
     return 0;
   } else {
     int64_t refused = 0;
-    float *params = update.params + b * kBlockFloats, *exp_avg = update.exp_avg + b * kBlockFloats,
-          *exp_avg_sq = update.exp_avg_sq + b * kBlockFloats;
+    const BlockState at(update, b);
+    Noise noise(update.step, b);
     for (int r = 0; r < rows; ++r) {
-      Float x = row(params, r), m = row(exp_avg, r), v = row(exp_avg_sq, r);
+      Float x = r < kSh ? row(p, r) : sh_row(p, r), m = FirstMoment::load(at.exp_avg(r)), v = SecondMoment::load(at.exp_avg_sq(r));
       const Float slope = seen ? keep(visible, load(gradient + r * kLanes)) : splat(0.0f);
       const Mask good = adam_update(x, m, v, slope, splat(update.rates[r]), splat(update.root));
       refused += kLanes - __builtin_popcount(bits(good));
-      store(params + r * kLanes, x);
-      store(exp_avg + r * kLanes, m);
-      store(exp_avg_sq + r * kLanes, v);
+      if (r < kSh)
+        Float32::store(at.param(r), x, noise);
+      else
+        Harmonics::store(at.param(r), x, noise);
+      FirstMoment::store(at.exp_avg(r), m, noise);
+      SecondMoment::store(at.exp_avg_sq(r), v, noise);
     }
     return refused;
   }
@@ -199,6 +220,7 @@ void bind_step(nb::module_& m) {
         const AdamStep scale(step);
         for (int r = 0; r < kRows; ++r) update.rates[r] = rates.at(r) * scale.size;
         update.root = scale.root;
+        update.step = step;
         const ImageGradient g{planes_of(image, frame.camera), planes_of(gradient, frame.camera), gradient.shape(0) == 5};
         if (scores) update.scores = scores->data(), update.score_stride = static_cast<int64_t>(scores->shape(1));
         nb::gil_scoped_release release;

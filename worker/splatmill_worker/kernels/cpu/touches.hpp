@@ -20,10 +20,9 @@ class TouchWriter {
       : frame_(frame), columns_(frame.camera.columns()), rows_(frame.camera.rows()), begin_(frame.stretch * thread),
         next_(begin_), limit_(begin_ + frame.stretch), order_(frame.order.get() + first_id), keys_(frame.keys.get() + first_id) {}
 
-  // Adds the touches of Gaussian `id`. False when it reaches no block of the image, or when the stretch has no room for all
+  // Adds the touches of Gaussian `id`, whose record is `r`. False when it reaches no block of the image, or when the stretch has no room for all
   // tiles of its box, which then count as wanted.
-  SPLATMILL_INLINE bool add(uint32_t id) {
-    const Record& r = frame_.records[id];
+  SPLATMILL_INLINE bool add(uint32_t id, const Record& r) {
     const TileRange range = tile_range(r, columns_, rows_);
     const int64_t before = next_, most = range.tiles();
     if (next_ + most > limit_) {
