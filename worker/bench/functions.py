@@ -1,8 +1,9 @@
 # ruff: noqa: E501  (prose and rows of Markdown tables are as long as they are)
-"""`bench functions`: the error of every elementary function of the CPU kernels, at every float that it is meant for.
+"""`bench functions`: the error of every elementary function of the CPU kernels, at every float that occurs.
 
-    splatmill bench functions                  # all inputs: about three CPU minutes for two instruction sets
-    splatmill bench functions --stride 1021    # one input in 1021, printed only: seconds
+    splatmill bench functions                  # every build that this processor runs: 20 CPU seconds each
+    splatmill bench functions --build avx2     # one build; the rows of the others stay
+    splatmill bench functions --stride 1021    # one input in 1021, printed only
     splatmill bench functions --plot-only
 
 The kernels' headers are compiled into a small library for each instruction set, with the kernels' flags, and compared with
@@ -14,17 +15,21 @@ from __future__ import annotations
 
 import argparse
 import importlib
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import _plot
 from _functions.estimates import ESTIMATE_BOUNDS
 from _functions.library import load, measure
-from _functions.spans import FUNCTIONS, Function, Span, place_of, value
-from _rows import HERE, Row, footer, read, write
+from _functions.spans import BINS, FUNCTIONS, Function, place_of, value
+from _rows import HERE, Row, footer, origin, read
 from matplotlib import pyplot as plt
 
 from splatmill_worker.kernels.cpu import isa
+
+ORACLE = "float64"
+"""What stands in place of a build in the rows of the comparison with 50 digits."""
 
 SAMPLES = 1000
 """Arguments of each function at which the float64 value is compared with 50 decimal digits."""
@@ -43,8 +48,7 @@ def oracle(build: str, function: Function, worst: Iterable[int]) -> Row:
         "sqrt": mpmath.sqrt,
     }[function.name]
     places = {place_of(bits) for bits in worst}
-    for span in function.spans:
-        places |= {first for first, _ in span.parts(SAMPLES)}
+    places |= {first for first, _ in function.span.parts(SAMPLES)}
     largest = 0.0
     with mpmath.workdps(50):
         for x in (value(at) for at in places):
@@ -53,7 +57,7 @@ def oracle(build: str, function: Function, worst: Iterable[int]) -> Row:
                 ulp = mpmath.mpf(2) ** (mpmath.frexp(want)[1] - 24)
                 largest = max(largest, float(abs(library.exact(function.name.encode(), x) - want) / ulp))
     return {
-        "bench": "functions", "function": function.name, "build": "float64", "samples": len(places), "ulp": largest,
+        "bench": "functions", "function": function.name, "build": ORACLE, "samples": len(places), "ulp": largest,
     }  # fmt: skip
 
 
@@ -62,44 +66,51 @@ def float_of(bits: int) -> float:
     return value(place_of(bits))
 
 
-def spans() -> Iterable[tuple[Function, Span]]:
-    return ((function, span) for function in FUNCTIONS for span in function.spans)
-
-
-def run(stride: int) -> list[Row]:
-    """Rows of all functions and instruction sets; one that this processor lacks has a row that says so."""
+def run(builds: Sequence[str], stride: int = 1) -> list[Row]:
+    """Rows of all functions; a build that this processor cannot run has a row that says so."""
     rows: list[Row] = []
-    here = isa.supported()
-    for build in isa.ISAS:
-        if build not in here:
+    for build in builds:
+        if build not in isa.supported():
             rows.append(
                 {"bench": "functions", "function": "", "build": build, "outcome": "not on this processor"}
             )
-            print(f"{build}: not on this processor")
+            print(f"{build}: not on this processor", flush=True)
             continue
-        for function, span in spans():
-            row = measure(build, function, span, stride)
+        for function in FUNCTIONS:
+            row = measure(build, function, stride)
             rows.append(row)
+            other = f", {row['unlike']} of the floats in {row['octaves']} differ" if "octaves" in row else ""
             print(
-                f"{build:9} {function.name:16} {span.label:28} {row['count']:>11,} inputs: {row['ulp']:.3f} ulp at "
-                f"{float_of(row['ulp_bits']):.9g}, relative {row['relative']:.2e}, absolute {row['absolute']:.2e}",
+                f"{build:9} {function.name:16} {row['arguments']:16} {row['count']:>11,} inputs: {row['ulp']:.3f} ulp at "
+                f"{float_of(row['ulp_bits']):.9g}, relative {row['relative']:.2e}, absolute {row['absolute']:.2e}{other}",
                 flush=True,
             )
     return rows
 
 
+def written(rows: list[Row], name: str = "functions") -> None:
+    """Replace the rows of the builds in `rows`, and keep those of others: no processor need run them all."""
+    builds = [row["build"] for row in rows if "outcome" not in row]
+    path = HERE / "results" / f"{name}.jsonl"
+    before = read(name) if path.exists() else []
+    known = [row for row in before if row["build"] not in builds]
+    known += [{**row, **origin()} for row in rows if row["build"] not in {old["build"] for old in known}]
+    order = [*isa.ISAS, ORACLE]
+    known.sort(key=lambda row: order.index(row["build"]))
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("".join(json.dumps(row) + "\n" for row in known))
+
+
 def draw(rows: list[Row]) -> None:
-    """The largest error over each part of the arguments that occur, by function and instruction set."""
+    """The largest error over each part of the arguments, by function and instruction set."""
     figure, panels = plt.subplots(2, 3, figsize=(15, 7))
     for panel, function in zip(panels.flat, FUNCTIONS, strict=True):
-        span = function.spans[-1]
-        starts = [value(first) for first, _ in span.parts(len(_drawn(rows, function)[0]["bins"]))]
-        for row in _drawn(rows, function):
-            ends = [*starts[1:], span.intervals[-1][1]]
-            panel.stairs(
-                row["bins"], [*starts, ends[-1]], baseline=None, label=row["build"],
-                color=_plot.COLORS[f"cpu {row['build']}"], lw=1.3,
-            )  # fmt: skip
+        edges = [value(first) for first, _ in function.span.parts(BINS)] + [function.span.intervals[-1][1]]
+        for row in rows:
+            if row["function"] == function.name and "bins" in row:
+                panel.stairs(
+                    row["bins"], edges, baseline=None, label=row["build"], color=_plot.COLORS[f"cpu {row['build']}"], lw=1.3
+                )  # fmt: skip
         panel.axhline(0.5, color="#999999", lw=0.8, ls=":")
         panel.set_ylim(bottom=0)
         panel.set_title(f"{function.name}: {function.exact}", fontsize=10)
@@ -110,36 +121,33 @@ def draw(rows: list[Row]) -> None:
     _plot.save(figure, HERE / "figures" / "functions.png", footer(rows))
 
 
-def _drawn(rows: list[Row], function: Function) -> list[Row]:
-    return [row for row in rows if row["function"] == function.name and "bins" in row]
-
-
 def table(rows: list[Row]) -> str:
     """The report."""
     measured = [row for row in rows if "arguments" in row]
     checked = [row for row in rows if "samples" in row]
     absent = [row["build"] for row in rows if "outcome" in row]
-    order = [(function.name, span.label) for function, span in spans()]
-    inputs = sum(row["count"] for row in measured)
     most = max(row["ulp"] for row in measured if row["function"] != "exp2_of_alpha")
-    alpha = [row for row in measured if row["function"] == "exp2_of_alpha" and "bins" in row]
+    alpha = [row for row in measured if row["function"] == "exp2_of_alpha"]
     lines = [
         "# Errors of the kernels' functions", "",
-        f"Over {inputs:,} evaluations, which are all floats of the ranges below, no function of the CPU kernels is off by more than {most:.2f} ulp, "
-        f"except 2^x of compositing, which is a polynomial of degree 4 by choice: its relative error is at most {max(r['relative'] for r in alpha):.2e}, "
+        f"At every float that occurs as an argument, every function of the CPU kernels is within {most:.2f} ulp, "
+        f"except the 2^x of compositing, which is a polynomial of degree 4 by choice: its relative error is at most {max(r['relative'] for r in alpha):.2e}, "
         f"or {max(r['ulp'] for r in alpha):.1f} ulp.", "",
         "One ulp is the distance of neighbouring floats at the exact value, so 0.5 is the least that a largest error can be. Denormal numbers are "
         "flushed to 0, as in every kernel. `rounded` is the share of results that are the nearest float; `mean` is the mean relative error with its "
-        "sign. The arguments are all that the kernels can come to: `exp` holds its own within the limits, alpha is at least 1/255, and so is the "
-        "opacity whose logarithm is taken. Nearer to 0 than 2^-30, where e^x and 2^x have the same result for every x, their errors are not counted. "
-        "Negative arguments of `reciprocal` do not occur. "
+        "sign.", "",
+        "These are all arguments that occur. `exp` holds its own within the limits; alpha is at least 1/255, and so is the opacity whose "
+        "logarithm is taken. Nearer to 0 than 2^-30, e^x and 2^x have the same result for every x, and nothing is counted. "
+        "For the last three, the errors in [1, 4) are those of all octaves: the results at 4^k x were compared with those at x, and `unlike` of them differ by "
+        "more than the power of 2 that they should. "
         "`round_small` and `floor` are exact, and sums, products, quotients and `sqrt` are rounded correctly by IEEE 754.", "",
-        "| function | arguments | build | inputs | largest, ulp | at | rms, ulp | rounded | largest relative | mean | largest absolute |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| function | arguments | build | counted | octaves compared | unlike | largest, ulp | at | rms, ulp | rounded | largest relative | mean | largest absolute |",
+        "|---" * 13 + "|",
         *(
-            f"| `{r['function']}` | {escaped(r['arguments'])} | {r['build']} | {r['count']:,} | {r['ulp']:.3f} | {float_of(r['ulp_bits']):.9g} | "
-            f"{r['rms_ulp']:.3f} | {100 * r['rounded']:.1f} % | {r['relative']:.2e} | {r['mean_relative']:+.1e} | {r['absolute']:.1e} |"
-            for r in sorted(measured, key=lambda r: order.index((r["function"], r["arguments"])))
+            f"| `{r['function']}` | {r['arguments']} | {r['build']} | {r['count']:,} | {r.get('octaves', '')} | {r.get('unlike', '')} | {r['ulp']:.3f} | "
+            f"{float_of(r['ulp_bits']):.9g} | {r['rms_ulp']:.3f} | {100 * r['rounded']:.1f} % | {r['relative']:.2e} | {r['mean_relative']:+.1e} | "
+            f"{r['absolute']:.1e} |"
+            for function in FUNCTIONS for r in measured if r["function"] == function.name
         ), "",
     ]  # fmt: skip
     if absent:
@@ -162,29 +170,49 @@ def table(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
-def escaped(label: str) -> str:
-    """A label within a Markdown table."""
-    return label.replace("|", "\\|")
+def summary(rows: list[Row]) -> list[str]:
+    """The table of docs/numerics.md: the largest errors, in ulp, over all arguments that occur."""
+    builds = [
+        build for build in isa.ISAS if any(row["build"] == build and "arguments" in row for row in rows)
+    ]
+    lines = [
+        f"| function | used for | {' | '.join(builds)} | on any processor |",
+        "| --- " * (3 + len(builds)) + "|",
+    ]
+    for function in FUNCTIONS:
+        found = {
+            row["build"]: row["ulp"]
+            for row in rows
+            if row["function"] == function.name and "arguments" in row
+        }
+        documented = [bound for (name, _), bound in ESTIMATE_BOUNDS.items() if name == function.name]
+        cells = [*(found[build] for build in builds), max([*found.values(), *documented])]
+        lines.append(
+            f"| `{function.name}`: {function.exact} | {function.used_for} | {' | '.join(f'{x:.1f}' for x in cells)} |"
+        )
+    return lines
 
 
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="bench functions", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--build", choices=isa.ISAS, action="append", help="only this instruction set")
     parser.add_argument("--stride", type=int, help="only every so many-th input, printed and not written")
     parser.add_argument("--plot-only", action="store_true", help="figure and table from the rows there are")
     options = parser.parse_args(argv)
+    builds = options.build or isa.ISAS
     if options.stride:
-        run(options.stride)
+        run(builds, options.stride)
         return 0
     if not options.plot_only:
-        rows = run(1)
+        rows = run(builds)
         first = isa.supported()[0]
         for function in FUNCTIONS:
             mine = [row for row in rows if row["function"] == function.name]
             at = [row[f"{figure}_bits"] for row in mine for figure in ("ulp", "relative", "absolute")]
             rows.append(oracle(first, function, at))
-        write("functions", rows)
+        written(rows)
     rows = read("functions")
     draw(rows)
     (HERE / "functions.md").write_text(table(rows))

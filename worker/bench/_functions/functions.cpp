@@ -67,6 +67,26 @@ void sweep(uint32_t first, int64_t count, uint32_t stride, Errors& e) {
   }
 }
 
+// Of the floats 4^k x with x in [1, 4) and first <= k <= last, how many do not give exactly 2^(k power) function(x).
+template <Float function(Float)>
+int64_t unlike(int first, int last, int power) {
+  const FlushDenormals flush;
+  constexpr int32_t kOne = 127 << 23, kFour = 129 << 23, kDouble = 1 << 23;
+  alignas(64) int32_t places[kLanes];
+  alignas(64) float x[kLanes];
+  int64_t found = 0;
+  for (int32_t one = kOne; one < kFour; one += kLanes) {
+    for (int i = 0; i < kLanes; ++i) places[i] = one + i;
+    std::memcpy(x, places, sizeof x);
+    const Int input = as_int(load(x)), result = as_int(function(load(x)));
+    for (int k = first; k <= last; ++k) {
+      const Int got = as_int(function(as_float(input + 2 * k * kDouble)));
+      found += kLanes - __builtin_popcount(bits(got == result + splat(k * power * kDouble)));
+    }
+  }
+  return found;
+}
+
 double exact_exp(double x) { return std::exp(x); }
 double exact_log2(double x) { return std::log2(x); }
 double exact_exp2(double x) { return std::exp2(x); }
@@ -78,15 +98,16 @@ struct Function {
   const char* name;
   void (*sweep)(uint32_t first, int64_t count, uint32_t stride, Errors& e);
   double (*exact)(double);
+  int64_t (*unlike)(int first, int last, int power);
 };
 
 const Function kFunctions[] = {
-    {"exp", sweep<exp, exact_exp>, exact_exp},
-    {"log2", sweep<log2, exact_log2>, exact_log2},
-    {"exp2_of_alpha", sweep<exp2_of_alpha, exact_exp2>, exact_exp2},
-    {"reciprocal", sweep<reciprocal, exact_reciprocal>, exact_reciprocal},
-    {"reciprocal_sqrt", sweep<reciprocal_sqrt, exact_reciprocal_sqrt>, exact_reciprocal_sqrt},
-    {"sqrt", sweep<sqrt, exact_sqrt>, exact_sqrt},
+    {"exp", sweep<exp, exact_exp>, exact_exp, unlike<exp>},
+    {"log2", sweep<log2, exact_log2>, exact_log2, unlike<log2>},
+    {"exp2_of_alpha", sweep<exp2_of_alpha, exact_exp2>, exact_exp2, unlike<exp2_of_alpha>},
+    {"reciprocal", sweep<reciprocal, exact_reciprocal>, exact_reciprocal, unlike<reciprocal>},
+    {"reciprocal_sqrt", sweep<reciprocal_sqrt, exact_reciprocal_sqrt>, exact_reciprocal_sqrt, unlike<reciprocal_sqrt>},
+    {"sqrt", sweep<sqrt, exact_sqrt>, exact_sqrt, unlike<sqrt>},
 };
 
 const Function* find(const char* name) {
@@ -106,6 +127,12 @@ __attribute__((visibility("default"))) bool add_errors(const char* name, uint32_
   const splatmill::Function* f = splatmill::find(name);
   if (f) f->sweep(first, count, stride, *e);
   return f != nullptr;
+}
+
+// How many of the floats of other octaves differ from those of [1, 4) by more than a power of two; -1 for no such function.
+__attribute__((visibility("default"))) int64_t unlike_octaves(const char* name, int first, int last, int power) {
+  const splatmill::Function* f = splatmill::find(name);
+  return f ? f->unlike(first, last, power) : -1;
 }
 
 // The float64 value that the function is compared with; NaN where there is no such function.

@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from .spans import BINS, Function, Span, runs
+from .spans import BINS, Function, runs
 
 WORKER = Path(__file__).resolve().parents[2]
 BUILD = WORKER / "build" / "functions"
@@ -75,6 +75,8 @@ def load(build: str) -> ctypes.CDLL:
         ctypes.c_char_p, ctypes.c_uint32, ctypes.c_int64, ctypes.c_uint32, ctypes.POINTER(Errors),
     ]  # fmt: skip
     library.add_errors.restype = ctypes.c_bool
+    library.unlike_octaves.argtypes = [ctypes.c_char_p, ctypes.c_int, ctypes.c_int, ctypes.c_int]
+    library.unlike_octaves.restype = ctypes.c_int64
     library.exact.argtypes = [ctypes.c_char_p, ctypes.c_double]
     library.exact.restype = ctypes.c_double
     return library
@@ -90,22 +92,29 @@ def errors(library: ctypes.CDLL, function: str, ranges: Iterable[tuple[int, int]
     return found
 
 
-def measure(build: str, function: Function, span: Span, stride: int = 1) -> dict[str, Any]:
-    """A row: the largest and mean errors over a span, and for the drawn one the largest of each of `BINS` parts."""
+def measure(build: str, function: Function, stride: int = 1) -> dict[str, Any]:
+    """A row: the largest and mean errors over a function's arguments, and the largest of each of `BINS` parts of them.
+
+    With a stride of 1, the other octaves are compared with those of the span too.
+    """
     library = load(build)
-    parts = span.parts(BINS)
+    parts = function.span.parts(BINS)
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
         each = list(threads.map(lambda part: errors(library, function.name, [part], stride), parts))
     total = Errors()
     for one in each:
         total.add(one)
     row: dict[str, Any] = {
-        "bench": "functions", "function": function.name, "build": build, "arguments": span.label, "count": total.count,
-        "rounded": total.rounded / total.count, "rms_ulp": math.sqrt(total.ulp_squares / total.count),
-        "mean_relative": total.relative_sum / total.count,
+        "bench": "functions", "function": function.name, "build": build, "arguments": function.span.label,
+        "count": total.count, "rounded": total.rounded / total.count,
+        "rms_ulp": math.sqrt(total.ulp_squares / total.count), "mean_relative": total.relative_sum / total.count,
     }  # fmt: skip
     for field in ("ulp", "relative", "absolute"):
         row |= {field: getattr(total, field), f"{field}_bits": getattr(total, f"at_{field}")}
-    if span is function.spans[-1]:
-        row["bins"] = [round(one.ulp, 4) for one in each]
-    return row
+    octaves = function.octaves
+    if octaves is not None and stride == 1:
+        row["octaves"] = octaves.label
+        row["unlike"] = library.unlike_octaves(
+            function.name.encode(), octaves.first, octaves.last, octaves.power
+        )
+    return {**row, "bins": [round(one.ulp, 4) for one in each]}

@@ -12,88 +12,83 @@ from itertools import pairwise
 
 import numpy as np
 
-SMALLEST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
-"""The smallest and the largest normal float."""
-
 BINS = 256
-"""Parts of a drawn span, of which each has its largest error in the rows."""
+"""Parts of a span, of which each has its largest error in the rows, for the figure."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """Every float in one or two intervals, ends included.
-
-    by_value: the parts of the figure have the same width, rather than the same number of floats.
-    """
+    """Every float in one or two intervals, ends included."""
 
     label: str
     intervals: tuple[tuple[float, float], ...]
-    by_value: bool = False
 
     def parts(self, count: int) -> list[tuple[int, int]]:
-        """About `count` ranges [first, end) of places that together are the span, in order."""
+        """About `count` ranges [first, end) of places, equally wide by value, that together are the span, in order."""
         found = []
         for low, high in self.intervals:
-            first, end = place(low), place(high) + 1
-            n = max(count // len(self.intervals), 1)
-            if self.by_value:
-                inner = [place(x) for x in np.linspace(low, high, n + 1)[1:-1]]
-            else:
-                inner = [first + (end - first) * i // n for i in range(1, n)]
-            edges = [first, *inner, end]
+            n = count // len(self.intervals)
+            inner = [place(x) for x in np.linspace(low, high, n + 1)[1:-1]]
+            edges = [place(low), *inner, place(high) + 1]
             found += [(a, b) for a, b in pairwise(edges) if a < b]
         return found
+
+    @property
+    def count(self) -> int:
+        """The number of floats."""
+        return sum(place(high) + 1 - place(low) for low, high in self.intervals)
+
+
+@dataclass(frozen=True)
+class Octaves:
+    """The other octaves of a function: 4^k x for k from `first` to `last` has the result of x times 2^(k power)."""
+
+    first: int
+    last: int
+    power: int
+
+    @property
+    def label(self) -> str:
+        return f"[2^{2 * self.first}, 2^{2 * self.last + 2})"
 
 
 @dataclass(frozen=True)
 class Function:
-    """A function of math.hpp or simd.hpp.
-
-    The first span has all arguments that occur, the last is drawn.
-    """
+    """A function of math.hpp or simd.hpp, and all arguments of it that occur: a span, and any octaves beside it."""
 
     name: str
     exact: str  # what it approximates
     header: str
     used_for: str
-    spans: tuple[Span, ...]
+    span: Span
+    octaves: Octaves | None = None
 
 
-NORMAL = Span("all positive normal floats", ((SMALLEST, LARGEST),))
-TWO_OCTAVES = Span("[1, 4]", ((1.0, 4.0),), by_value=True)
+TWO_OCTAVES = Span("[1, 4)", ((1.0, float(np.nextafter(np.float32(4), np.float32(0)))),))
 LEAST_ALPHA = float(np.float32(1 / 255))
 LOG2_LEAST_ALPHA = float(np.float32(-7.994353436858858))
-LEAST_LEFT = float(np.float32(1) - np.float32(0.999))
 NEAR_0 = 2.0**-30
 """Nearer to 0, where half of all floats are, e^x and 2^x have one and the same result: every sum rounds x away."""
 
 FUNCTIONS = (
     # Any log-scale or logit: the function itself holds it within these limits.
     Function(
-        "exp", "e^x", "math.hpp", "scales, opacities",
-        (Span("[-87, 88]", ((-87.0, -NEAR_0), (NEAR_0, 88.0)), by_value=True),),
+        "exp", "e^x", "math.hpp", "scales, opacities", Span("[-87, 88]", ((-87.0, -NEAR_0), (NEAR_0, 88.0)))
     ),
     # An opacity, which is held above 1/255.
-    Function(
-        "log2", "log2 x", "math.hpp", "opacity to level and extents",
-        (Span("[1/255, 1]", ((LEAST_ALPHA, 1.0),), by_value=True),),
-    ),
+    Function("log2", "log2 x", "math.hpp", "opacity to level and extents", Span("[1/255, 1]", ((LEAST_ALPHA, 1.0),))),
     # log2 of an alpha of at least 1/255. It cannot exceed log2 of the opacity, which is at most 0.
     Function(
         "exp2_of_alpha", "2^x", "math.hpp", "alpha of every pixel",
-        (Span("[log2(1/255), 0]", ((LOG2_LEAST_ALPHA, -NEAR_0),), by_value=True),),
+        Span("[log2(1/255), 0]", ((LOG2_LEAST_ALPHA, -NEAR_0),)),
     ),
-    # 1 - alpha, with an alpha of at most 0.999; denominators of SSIM and Adam. Estimates near 2^-126 are flushed to 0.
+    # From 1e-15 (Adam's epsilon) up; in compositing 1 - alpha, from 0.001 to 1. Estimates near 2^-126 are flushed to 0.
     Function(
-        "reciprocal", "1/x", "simd.hpp", "1 - alpha in the backward pass, SSIM, Adam",
-        (
-            Span("[2^-126, 2^125]", ((SMALLEST, 2.0**125),)),
-            Span("[1 - 0.999, 1]", ((LEAST_LEFT, 1.0),), by_value=True),
-        ),
+        "reciprocal", "1/x", "simd.hpp", "1 - alpha in the backward pass, SSIM, Adam", TWO_OCTAVES, Octaves(-63, 61, -2)
     ),
-    # What is drawn repeats in all other octaves.
-    Function("reciprocal_sqrt", "1/sqrt x", "simd.hpp", "Adam", (NORMAL, TWO_OCTAVES)),
-    Function("sqrt", "sqrt x", "simd.hpp", "norms, the conic's factor, extents", (NORMAL, TWO_OCTAVES)),
+    # All positive normal floats.
+    Function("reciprocal_sqrt", "1/sqrt x", "simd.hpp", "Adam", TWO_OCTAVES, Octaves(-63, 63, -1)),
+    Function("sqrt", "sqrt x", "simd.hpp", "norms, the conic's factor, extents", TWO_OCTAVES, Octaves(-63, 63, 1)),
 )  # fmt: skip
 
 
