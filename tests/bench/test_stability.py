@@ -24,7 +24,7 @@ def beside() -> Problem:
 
 
 def worst(problem: Problem, name: str) -> float:
-    return max(row.get("gaussian", 0.0) for row in bench.measure(problem, engines(False)[name]))
+    return max(row.get("gaussian", 0.0) for row in bench.measure(problem, engines()[name]))
 
 
 def test_the_unit_of_a_colour_is_its_condition_times_the_roundoff() -> None:
@@ -48,7 +48,7 @@ def test_the_unit_of_a_colour_is_its_condition_times_the_roundoff() -> None:
 
 
 def test_on_needles_beside_the_image_a_conic_is_lost_and_the_fused_step_is_not(beside: Problem) -> None:
-    fused = [worst(beside, name) for name in engines(False) if name.startswith(FUSED)]
+    fused = [worst(beside, name) for name in engines() if name.startswith(FUSED)]
     assert max(fused) < 100
     assert worst(beside, CHAIN) > 1000
     assert worst(beside, CONIC) > 10_000

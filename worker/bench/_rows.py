@@ -68,10 +68,12 @@ def worked() -> float:
 
 
 def write(name: str, rows: list[Row]) -> Path:
-    """Replace results/NAME.jsonl by `rows`, each with its origin; returns the path."""
+    """Replace results/NAME.jsonl by `rows`, each with its origin, which a row that was read keeps; returns the path."""
     path = HERE / "results" / f"{name}.jsonl"
     path.parent.mkdir(exist_ok=True)
-    path.write_text("".join(json.dumps({**row, **origin()}) + "\n" for row in rows))
+    path.write_text(
+        "".join(json.dumps(row if "commit" in row else {**row, **origin()}) + "\n" for row in rows)
+    )
     return path
 
 

@@ -112,7 +112,7 @@ NEXT = [
     cpu("1/z forgets the scales", "geometry.hpp", "fma(du, o.u, fma(dv, o.v, with_scale))", "fma(du, o.u, dv * o.v)"),
     cpu("the direction's gradient keeps its radial part", "geometry.hpp", "fnma(radial, dir.x, dd.x) * inv_distance",
         "dd.x * inv_distance"),
-    cpu("no gate at colour 0", "geometry.hpp", "keep(color[c] > 0.0f, d.color[c])", "d.color[c]"),
+    cpu("no gate at colour 0", "geometry.hpp", "keep(color[c] >= 0.0f, d.color[c])", "d.color[c]"),
     cpu("a factor in one harmonic's slope", "harmonics.hpp", "y * z * e[11] * (8 * k11)", "y * z * e[11] * (4 * k11)"),
     cpu("no gradient to the camera's third row by x/z", "geometry.hpp", "fx_z * o.u_held * dT0[n] + fy_z * o.v_held",
         "fy_z * o.v_held"),

@@ -1,6 +1,6 @@
 """One of several processes that train a scene together.
 
-`python -m tests.support.kernels.replica OUT cpu:3 gpu:2` takes three steps with the CPU's kernels, two with the GPU's.
+`python -m tests.support.kernels.replica OUT reference:3 gpu:2` takes three steps with the reference and two with gpu.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def main(out: Path, *runs: str) -> None:
     replicas = join("gloo")
     for run in runs:
         engine, _, steps = run.partition(":")
-        train("gpu" if engine == "gpu" else "cpu", int(steps), replicas, out)
+        train("gpu" if engine == "gpu" else "reference", int(steps), replicas, out)
     torch.distributed.destroy_process_group()
 
 

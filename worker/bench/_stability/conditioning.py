@@ -27,7 +27,7 @@ from .scenes import GROUPS, Scene
 
 @dataclass(frozen=True)
 class Values:
-    """Outputs of one scene: image [H,W,3], a gradient of each group's shape, and the gradient [6] to a motion."""
+    """Outputs of one scene: image [H,W,3], a gradient of each group's shape, and that to a motion [6], if any."""
 
     image: Tensor
     gradients: dict[str, Tensor]

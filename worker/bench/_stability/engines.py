@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 
 import torch
@@ -15,6 +16,7 @@ from .conditioning import Problem, Values, by_ops
 
 STILL = Rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 FUSED, CHAIN, CONIC = "fused step", "op chain", "reference float32"
+GPU = "GPU step, interpreted"
 
 Engine = Callable[[Problem], Values]
 
@@ -36,14 +38,28 @@ def fused(problem: Problem) -> Values:
     return Values(image, {**gradients, "pose": step.pose_gradient})
 
 
+def fused_gpu(problem: Problem) -> Values:
+    """The GPU's training step in Triton's interpreter; it has no gradient to the camera.
+
+    Triton must not have been imported before TRITON_INTERPRET=1 was set.
+    """
+    from splatmill_worker.kernels.gpu.step import Step
+
+    scene = problem.scene
+    step = Step(*scene.groups(torch.float32))
+    color, _, _ = step.forward(scene.viewmat.float(), scene.K.float(), scene.width, scene.height, degree=3)
+    gradients = step.gradients(problem.weights.float())
+    return Values(color.cpu(), {name: value.cpu() for name, value in gradients.items()})
+
+
 def chain(problem: Problem, backend: ops.Backend = "cpu") -> Values:
     """The separate ops of a backend in float32."""
     values, _, _ = by_ops(problem.scene, problem.weights, backend, torch.float32)
     return values
 
 
-def engines(interpreter: bool) -> dict[str, Engine]:
-    """Every engine that runs here, by its name in rows; the GPU's kernels in Triton's interpreter only if asked for."""
+def engines() -> dict[str, Engine]:
+    """Every engine that runs here, by its name in rows. The GPU's takes milliseconds for each splat of a tile."""
 
     def on(name: str, engine: Engine) -> Engine:
         def run(problem: Problem) -> Values:
@@ -55,6 +71,6 @@ def engines(interpreter: bool) -> dict[str, Engine]:
     found: dict[str, Engine] = {f"{FUSED}, {name}": on(name, fused) for name in isa.supported()}
     found[CHAIN] = on(isa.supported()[0], chain)
     found[CONIC] = lambda problem: chain(problem, "reference")
-    if interpreter:
-        found["gpu ops, interpreted"] = lambda problem: chain(problem, "gpu")
+    if importlib.util.find_spec("triton") is not None:
+        found[GPU] = fused_gpu
     return found

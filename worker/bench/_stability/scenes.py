@@ -19,6 +19,9 @@ SHORT = -8.0
 LONG_SIDE, SHORT_SIDE = 768, 64
 """Pixels of the image of needles and grazing planes."""
 
+FEW = 10, 96, 32
+"""Needles, and pixels of their image, that take Triton's interpreter seconds."""
+
 GROUPS = ("means", "log_scales", "quats", "logit_opacities", "sh")
 
 
@@ -97,30 +100,41 @@ def in_plane(angle: Tensor) -> Tensor:
     return torch.stack([torch.cos(angle / 2), 0 * angle, 0 * angle, torch.sin(angle / 2)], 1)
 
 
-def needles(ratio: float, seed: int) -> Scene:
+def needles(ratio: float, seed: int, n: int = 24, width: int = LONG_SIDE, height: int = SHORT_SIDE) -> Scene:
     """Needles in the image plane, centres on the image; the short axis is the 0.3 pixel^2 of the filter alone."""
-    n, focal, depth = 24, 400.0, 3.0
-    scene, draw = cloud(n, seed=seed, width=LONG_SIDE, height=SHORT_SIDE, focal=focal), draws(seed + 100)
-    points = torch.stack([draw(n) * 0.8, draw(n) * 0.1, depth + 0.2 * draw(n)], 1)
+    focal, depth = 400.0, 3.0
+    scene, draw = cloud(n, seed=seed, width=width, height=height, focal=focal), draws(seed + 100)
+    spread = 0.8 * width / LONG_SIDE, 0.1 * height / SHORT_SIDE  # world units
+    points = torch.stack([draw(n) * spread[0], draw(n) * spread[1], depth + 0.2 * draw(n)], 1)
     log_scales = torch.full((n, 3), SHORT, dtype=torch.float64)
     log_scales[:, 0] = math.log(math.sqrt(0.3) * ratio * depth / focal)
     angle = torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * math.pi
     return facing(scene, points, in_plane(angle), log_scales=log_scales)
 
 
-def needles_beside(ratio: float, seed: int) -> Scene:
+def needles_beside(
+    ratio: float, seed: int, n: int = 24, width: int = LONG_SIDE, height: int = SHORT_SIDE
+) -> Scene:
     """Needles that cross the image with centres 3000 pixels from its middle."""
-    n, focal, depth, away = 24, 400.0, 3.0, 3000.0
-    scene, draw = cloud(n, seed=seed, width=LONG_SIDE, height=SHORT_SIDE, focal=focal), draws(seed + 200)
+    focal, depth, away = 400.0, 3.0, 3000.0
+    scene, draw = cloud(n, seed=seed, width=width, height=height, focal=focal), draws(seed + 200)
     angle = torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * math.pi
     along = torch.stack([torch.cos(angle), torch.sin(angle)], 1)
     across = torch.stack([-along[:, 1], along[:, 0]], 1)
-    pixels = along * away + across * (60 * draw(n))[:, None]
+    pixels = along * away + across * (60 * width / LONG_SIDE * draw(n))[:, None]
     z = depth + 0.2 * draw(n)
     points = torch.cat([pixels * (z / focal)[:, None], z[:, None]], 1)
     log_scales = torch.full((n, 3), SHORT, dtype=torch.float64)
     log_scales[:, 0] = math.log(math.sqrt(0.3) * ratio * depth / focal)
     return facing(scene, points, in_plane(angle), log_scales=log_scales)
+
+
+def few_needles(ratio: float, seed: int) -> Scene:
+    return needles(ratio, seed, *FEW)
+
+
+def few_needles_beside(ratio: float, seed: int) -> Scene:
+    return needles_beside(ratio, seed, *FEW)
 
 
 def discs(ratio: float, seed: int) -> Scene:
@@ -252,7 +266,11 @@ def quaternion(norm: float, seed: int) -> Scene:
 
 @dataclass(frozen=True)
 class Axis:
-    """One way to make a scene extreme; `dear` says that a scene takes seconds, so that one seed has to do."""
+    """One way to make a scene extreme.
+
+    dear: a scene takes seconds, so that one seed has to do.
+    tiny: a scene is small enough for the GPU's kernels in Triton's interpreter.
+    """
 
     name: str
     label: str
@@ -260,6 +278,7 @@ class Axis:
     make: Callable[[float, int], Scene]
     dear: bool = False
     log: bool = True
+    tiny: bool = False
 
 
 AXES = [
@@ -268,6 +287,20 @@ AXES = [
     ),
     Axis(
         "beside", "axis ratio of needles centred 3000 pixels off", [3e3, 1e4, 1e5, 1e6], needles_beside, True
+    ),
+    Axis(
+        "axis_ratio_tiny",
+        "axis ratio of needles on an image of 96 x 32",
+        [1, 1e2, 1e4, 1e6],
+        few_needles,
+        tiny=True,
+    ),
+    Axis(
+        "beside_tiny",
+        "axis ratio of needles 3000 pixels off one of 96 x 32",
+        [3e3, 1e4, 1e5, 1e6],
+        few_needles_beside,
+        tiny=True,
     ),
     Axis("discs", "radius / thickness of discs", [1, 1e2, 1e4, 1e6], discs),
     Axis("grazing", "1 / angle at which planes are seen", [1, 1e2, 1e4, 1e6], grazing, True),

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatmill_worker.kernels import ops
 from splatmill_worker.splat.motion import motion
 from splatmill_worker.splat.plan.probe import ZERO_RATES
 from splatmill_worker.splat.train.loop import Trained, train
@@ -133,11 +134,21 @@ def test_depth_of_an_empty_view_is_the_radius_of_the_cameras() -> None:
 def test_the_reference_gives_the_same_gradient_as_the_fused_step() -> None:
     views, _ = split()
     target = views[0].reduced(2)
+    height, width = target.rgb.shape[:2]
     engines = [first_engine(kernels, 200) for kernels in ("cpu", "reference")]
-    gradients = []
+    images = []
     for engine in engines:
         engine.keep_pose_gradient = True
-        engine.train_photo(target.viewmat, target.K, target.rgb, degree=0, rates=ZERO_RATES, step=1)
+        images.append(engine.forward(target.viewmat, target.K, width, height, degree=0)[0].clone())
+    # Where float32 takes another decision at a threshold (1/255, the end of a list), the image and its gradient jump.
+    # Elsewhere the images differ by some errors of 2^x, 2.7e-6 each.
+    alike = (images[0] - images[1]).abs().amax(2) < 1e-5
+    assert alike.float().mean() > 0.9
+    color = images[0].requires_grad_()
+    (d_color,) = torch.autograd.grad(ops.loss(color, target.rgb, backend="cpu"), color)
+    gradients = []
+    for engine in engines:
+        engine.backward_update(d_color * alike[..., None], rates=ZERO_RATES, step=1)
         assert engine.pose_gradient is not None
         gradients.append(engine.pose_gradient)
     fused, reference = gradients

@@ -222,7 +222,7 @@ SPLATMILL_INLINE void project_backward(const float* p, const Camera& cam, int de
   sh_basis(degree, dir, basis);
   sh_color(p, basis, degree, color);
   Float d_color[3];
-  for (int c = 0; c < 3; ++c) d_color[c] = keep(color[c] > 0.0f, d.color[c]);
+  for (int c = 0; c < 3; ++c) d_color[c] = keep(color[c] >= 0.0f, d.color[c]);
   const int n_basis = (degree + 1) * (degree + 1);
   for (int n = 0; n < n_basis; ++n) {
     const int r = kSh + 3 * n;

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -13,11 +14,17 @@ from ..records import ALPHA_MIN, TILE, Bins, Projected
 from . import device, record
 from .argument import Floats, Int, Ints, Longs, Shorts
 from .constant import constant
-from .record import CONIC_A, CONIC_B, CONIC_C, EXTENT_X, EXTENT_Y, MEAN_X, MEAN_Y, OPACITY, STRIDE
+from .record import EXTENT_X, EXTENT_Y, FACTOR_UX, FACTOR_UY, FACTOR_VY, LEVEL, MEAN_X, MEAN_Y, STRIDE
 
 SIDE = constant(float(TILE))
 SPAN = constant(TILE - 1.0)  # from the first pixel centre of a tile to its last
-CUT = constant(ALPHA_MIN)
+LOG2_CUT = constant(math.log2(ALPHA_MIN))
+# Added to the cut, so that a list leaves out no pair with a pixel that compositing finds at or above 1/255. u = ux dx +
+# uy dy has three roundings of 2^-24 of its terms, in which |dx| and |dy| are at most those of any pixel inside image
+# and ellipse; they move u^2 <= log2 255 by twice u times that, here and again where the pixel is blended. What is left
+# (the level, the sum of squares, the device's 2^x and log2) is a few 2^-22 of 8.
+MARGIN = constant(2e-5)
+MARGIN_PER_TERM = constant(2 * 2 * math.sqrt(math.log2(255.0)) * 3 * 2.0**-24)
 BLOCK = 8
 """Splats per program."""
 
@@ -48,23 +55,21 @@ def tile_range(center, extent, tiles):
 
 
 @triton.jit
-def form(a, b, c, x, y):
-    """The quadratic form d^T C d of the conic (a, b, c) at d = (x, y)."""
-    return a * x * x + 2.0 * b * x * y + c * y * y
+def least(ux, uy, vy, slope_x, slope_y, mx, my, column, row):
+    """The smallest u^2 + v^2 (`record`) over the rectangle of a tile's pixel centres.
 
-
-@triton.jit
-def least(a, b, c, mx, my, column, row):
-    """The smallest d^T C d over the rectangle of a tile's pixel centres: 0 with the mean inside, else on an edge."""
+    It lies on the edge nearest the mean in x or in y; both are tried.
+    """
     x0 = column.to(tl.float32) * SIDE + 0.5 - mx
     y0 = row.to(tl.float32) * SIDE + 0.5 - my
     x1, y1 = x0 + SPAN, y0 + SPAN
-    value = form(a, b, c, x0, tl.minimum(tl.maximum(-b * x0 / c, y0), y1))
-    value = tl.minimum(value, form(a, b, c, x1, tl.minimum(tl.maximum(-b * x1 / c, y0), y1)))
-    value = tl.minimum(value, form(a, b, c, tl.minimum(tl.maximum(-b * y0 / a, x0), x1), y0))
-    value = tl.minimum(value, form(a, b, c, tl.minimum(tl.maximum(-b * y1 / a, x0), x1), y1))
-    inside = (x0 <= 0.0) & (x1 >= 0.0) & (y0 <= 0.0) & (y1 >= 0.0)
-    return tl.where(inside, 0.0, value)
+    near_x = tl.minimum(tl.maximum(x0, 0.0), x1)
+    near_y = tl.minimum(tl.maximum(y0, 0.0), y1)
+    dy = tl.minimum(tl.maximum(slope_y * near_x, y0), y1)
+    dx = tl.minimum(tl.maximum(slope_x * near_y, x0), x1)
+    u1, v1 = ux * near_x + uy * dy, vy * dy
+    u2, v2 = ux * dx + uy * near_y, vy * near_y
+    return tl.minimum(u1 * u1 + v1 * v1, u2 * u2 + v2 * v2)
 
 
 @triton.jit
@@ -83,10 +88,15 @@ def pairs_kernel(
     splat = tl.load(order + slot, mask=here, other=0)
     source = records + splat.to(tl.int64) * STRIDE
     mx, my = tl.load(source + MEAN_X), tl.load(source + MEAN_Y)
-    a, b, c = tl.load(source + CONIC_A), tl.load(source + CONIC_B), tl.load(source + CONIC_C)
-    level = 2.0 * tl.log(tl.load(source + OPACITY) / CUT)
+    ux, uy, vy = tl.load(source + FACTOR_UX), tl.load(source + FACTOR_UY), tl.load(source + FACTOR_VY)
+    # The dx where u^2 + v^2 is smallest, per dy, and the dy, per dx.
+    slope_x, slope_y = -uy / ux, -ux * uy / (uy * uy + vy * vy)
     ex = tl.load(source + EXTENT_X, mask=here, other=0.0)
     ey = tl.load(source + EXTENT_Y, mask=here, other=0.0)
+    most_x = tl.minimum(ex, tl.maximum(mx, columns * SIDE - mx))
+    most_y = tl.minimum(ey, tl.maximum(my, rows * SIDE - my))
+    margin = MARGIN + MARGIN_PER_TERM * (ux * most_x + tl.abs(uy) * most_y)
+    cut = tl.load(source + LEVEL) - LOG2_CUT + margin
     left, across = tile_range(mx, ex, columns)
     top, down = tile_range(my, ey, rows)
     area = tl.where(here, across * down, 0)
@@ -101,8 +111,11 @@ def pairs_kernel(
         candidate = done + tl.arange(0, LANES)[None, :]
         column = left[:, None] + candidate % across[:, None]
         row = top[:, None] + candidate // across[:, None]
-        value = least(a[:, None], b[:, None], c[:, None], mx[:, None], my[:, None], column, row)
-        hit = (candidate < area[:, None]) & (value <= level[:, None])
+        value = least(
+            ux[:, None], uy[:, None], vy[:, None], slope_x[:, None], slope_y[:, None], mx[:, None], my[:, None],
+            column, row,
+        )  # fmt: skip
+        hit = (candidate < area[:, None]) & (value <= cut[:, None])
         one = hit.to(tl.int32)
         if WRITE:
             at = place[:, None] + found[:, None] + (tl.cumsum(one, axis=1) - one)
@@ -147,9 +160,7 @@ def lists(records: Tensor, width: int, height: int, room: Room | None) -> Lists:
     packed.scatter_(0, slot, torch.arange(records.shape[0], device=dev))
     packed = packed[:most]
     held = visible.clamp(max=most)
-    depths = torch.where(
-        torch.arange(most, device=dev) < held, record.fields(records).depths[packed], torch.inf
-    )
+    depths = torch.where(torch.arange(most, device=dev) < held, record.depths(records)[packed], torch.inf)
     order = packed[torch.sort(depths, stable=True).indices].to(torch.int32)
 
     counts = torch.zeros(most, dtype=torch.int64, device=dev)

@@ -20,14 +20,22 @@ CHECKPOINT = constant(PLANES * TILE * TILE)  # floats
 LEAST = constant(ALPHA_MIN)
 MOST = constant(ALPHA_MAX)
 STOP = constant(TRANSMITTANCE_MIN)
-LOG2E = constant(1.4426950408889634)
 
 
 @triton.jit
-def alpha_of(dx, dy, a, b, c, opacity):
-    """min(0.999, o exp(-d^T C d / 2)) at offsets d [256]. The caller skips what is below 1/255, and NaN with it."""
-    power = dx * ((-0.5 * LOG2E * a) * dx + (-LOG2E * b) * dy) + ((-0.5 * LOG2E * c) * dy) * dy
-    return tl.minimum(opacity * tl.exp2(power), MOST)
+def along_factor(dx, dy, ux, uy, vy):
+    """u and v of a record (`record`) at offsets d [256].
+
+    Which product is fused with the sum is written down, because a compiler that chose would round differently in the
+    two passes.
+    """
+    return tl.fma(dx, ux, dy * uy), dy * vy
+
+
+@triton.jit
+def raw_alpha(u, v, level):
+    """Alpha before the clamp at 0.999. The caller skips what is below 1/255, and NaN with it."""
+    return tl.exp2(level - u * u - v * v)
 
 
 @triton.jit

@@ -13,19 +13,30 @@ from torch.autograd.function import once_differentiable
 from ..records import TILE, Bins, Projected
 from . import device, record
 from .argument import Floats, Int, Ints, Longs
-from .blend import PIXELS, STOP, advance, alpha_of, checkpoint_of, store_checkpoint, tile_pixels
+from .blend import (
+    MOST,
+    PIXELS,
+    STOP,
+    advance,
+    along_factor,
+    checkpoint_of,
+    raw_alpha,
+    store_checkpoint,
+    tile_pixels,
+)
 from .blended import PLANES, SEGMENT, Blended
 from .composite_backward import blend_backward
 from .record import (
     BLUE,
-    CONIC_A,
-    CONIC_B,
-    CONIC_C,
     DEPTH,
+    FACTOR_UX,
+    FACTOR_UY,
+    FACTOR_VY,
     GREEN,
+    LEVEL,
     MEAN_X,
     MEAN_Y,
-    OPACITY,
+    NOTHING,
     RED,
     STRIDE,
 )
@@ -64,12 +75,12 @@ def composite_kernel(
             listed = done + j < count
             splat = tl.load(ids + start + done + j, mask=listed, other=0)
             source = records + splat.to(tl.int64) * STRIDE
-            alpha = alpha_of(
+            u, v = along_factor(
                 x - tl.load(source + MEAN_X), y - tl.load(source + MEAN_Y),
-                tl.load(source + CONIC_A), tl.load(source + CONIC_B), tl.load(source + CONIC_C),
-                tl.load(source + OPACITY, mask=listed, other=0.0),
+                tl.load(source + FACTOR_UX), tl.load(source + FACTOR_UY), tl.load(source + FACTOR_VY),
             )  # fmt: skip
-            weight, through, _ = advance(through, alpha)
+            raw = raw_alpha(u, v, tl.load(source + LEVEL, mask=listed, other=NOTHING))
+            weight, through, _ = advance(through, tl.minimum(raw, MOST))
             red += weight * tl.load(source + RED)
             green += weight * tl.load(source + GREEN)
             blue += weight * tl.load(source + BLUE)
@@ -154,8 +165,8 @@ class _Composite(torch.autograd.Function):
         d_background = None
         if background is not None and ctx.needs_input_grad[6]:
             d_background = (ctx.made.transmittance[..., None] * d_color).sum((0, 1))
-        by_field = record.fields(gradient)
-        return *by_field[:5], None, d_background, None, None, None
+        by_field = record.gradient_of_fields(gradient, records)
+        return *by_field, None, d_background, None, None, None
 
 
 def composite(

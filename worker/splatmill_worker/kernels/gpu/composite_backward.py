@@ -9,23 +9,39 @@ from torch import Tensor
 
 from ..records import TILE, Bins
 from .argument import Floats, Int, Ints, Longs
-from .blend import MOST, PIXELS, STOP, advance, alpha_of, checkpoint_of, load_checkpoint, tile_pixels
+from .blend import (
+    MOST,
+    PIXELS,
+    STOP,
+    advance,
+    along_factor,
+    checkpoint_of,
+    load_checkpoint,
+    raw_alpha,
+    tile_pixels,
+)
 from .blended import SEGMENT, Blended
+from .projection import LN2
 from .record import (
     BLUE,
-    CONIC_A,
-    CONIC_B,
-    CONIC_C,
     DEPTH,
     DIFFERENTIABLE,
+    FACTOR_UX,
+    FACTOR_UY,
+    FACTOR_VY,
     GRADIENT_STRIDE,
     GRADIENT_WIDTH,
     GREEN,
+    LEVEL,
     MEAN_X,
     MEAN_Y,
-    OPACITY,
+    NOTHING,
     RED,
     STRIDE,
+    SUM_Q,
+    SUM_QUU,
+    SUM_QUV,
+    SUM_QVV,
 )
 from .tuning import COMPOSITE_BACKWARD, autotune
 
@@ -89,29 +105,31 @@ def composite_backward_kernel(
             source = records + splat.to(tl.int64) * STRIDE
             dx = x - tl.load(source + MEAN_X)
             dy = y - tl.load(source + MEAN_Y)
-            a, b, c = tl.load(source + CONIC_A), tl.load(source + CONIC_B), tl.load(source + CONIC_C)
-            opacity = tl.load(source + OPACITY, mask=listed, other=0.0)
-            alpha = alpha_of(dx, dy, a, b, c, opacity)
+            ux, uy = tl.load(source + FACTOR_UX), tl.load(source + FACTOR_UY)
+            vy = tl.load(source + FACTOR_VY)
+            u, v = along_factor(dx, dy, ux, uy, vy)
+            raw = raw_alpha(u, v, tl.load(source + LEVEL, mask=listed, other=NOTHING))
+            alpha = tl.minimum(raw, MOST)
             before = through
             weight, through, kept = advance(before, alpha)
             shine = tl.load(source + RED) * g_red + tl.load(source + GREEN) * g_green
             shine += tl.load(source + BLUE) * g_blue
             if WITH_DEPTH:
                 shine += tl.load(source + DEPTH) * g_depth
-            behind -= weight * shine
-            d_alpha_here = before * shine - behind / (1.0 - alpha)
-            # Where alpha is clamped, no gradient flows to opacity, conic or mean.
-            pull = tl.where(kept & (alpha < MOST), alpha * d_alpha_here, 0.0)
-            pull_x, pull_y = pull * dx, pull * dy
-            sum_x, sum_y = tl.sum(pull_x, axis=0), tl.sum(pull_y, axis=0)
+            gain = weight * shine
+            behind -= gain
+            # alpha dL/dalpha. Where alpha is clamped, no gradient flows to opacity, factor or mean.
+            q = tl.where(kept & (raw <= MOST), gain - behind * (alpha / (1.0 - alpha)), 0.0)
+            qu, qv = q * u, q * v
+            sum_u, sum_v = 2.0 * LN2 * tl.sum(qu, axis=0), 2.0 * LN2 * tl.sum(qv, axis=0)
 
             # One record of sums, and so one coalesced atomic per tile and splat.
-            sums = pick(k, MEAN_X, a * sum_x + b * sum_y, tl.zeros([GRADIENT_STRIDE], tl.float32))
-            sums = pick(k, MEAN_Y, b * sum_x + c * sum_y, sums)
-            sums = pick(k, CONIC_A, -0.5 * tl.sum(pull_x * dx, axis=0), sums)
-            sums = pick(k, CONIC_B, -tl.sum(pull_x * dy, axis=0), sums)
-            sums = pick(k, CONIC_C, -0.5 * tl.sum(pull_y * dy, axis=0), sums)
-            sums = pick(k, OPACITY, tl.sum(pull, axis=0) / tl.maximum(opacity, 1e-30), sums)
+            sums = pick(k, MEAN_X, ux * sum_u, tl.zeros([GRADIENT_STRIDE], tl.float32))
+            sums = pick(k, MEAN_Y, uy * sum_u + vy * sum_v, sums)
+            sums = pick(k, SUM_QUU, tl.sum(qu * u, axis=0), sums)
+            sums = pick(k, SUM_QUV, tl.sum(qu * v, axis=0), sums)
+            sums = pick(k, SUM_QVV, tl.sum(qv * v, axis=0), sums)
+            sums = pick(k, SUM_Q, tl.sum(q, axis=0), sums)
             sums = pick(k, RED, tl.sum(weight * g_red, axis=0), sums)
             sums = pick(k, GREEN, tl.sum(weight * g_green, axis=0), sums)
             sums = pick(k, BLUE, tl.sum(weight * g_blue, axis=0), sums)

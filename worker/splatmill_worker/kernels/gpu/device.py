@@ -9,6 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..records import TILE
+from .blended import PLANES, SEGMENT
+
 OLDEST = (8, 0)
 """Oldest compute capability that Triton compiles for without gaps (Ampere; RTX 30 and later)."""
 
@@ -16,10 +19,9 @@ STEP_BYTES = 1300
 """Device bytes per Gaussian of a training step, estimated: parameters and two moments 3 * 59 * 4 = 708, gradients
 236, records 112, scores and lists 60, and the buffers of the sort. `memory_needed` adds densification's copy."""
 
-PAIR_BYTES = 60
-"""Device bytes per (tile, Gaussian) pair, estimated: 36 for key, id, their sorted copies, the 64-bit index and the
-buffers of the sort, and 24 for checkpoints. A list of full segments has 40 bytes of checkpoints for each pair; the
-margin of `largest_budget` covers the difference."""
+PAIR_BYTES = 36 + PLANES * TILE * TILE * 4 // SEGMENT
+"""Device bytes per (tile, Gaussian) pair: 36, estimated, for key, id, their sorted copies, the 64-bit index and the
+buffers of the sort; and a pair's share of the checkpoint that each segment has."""
 
 PIXEL_BYTES = 120
 """Device bytes per pixel of a training step, estimated: image, transmittance, gradients, and nine float32 planes of

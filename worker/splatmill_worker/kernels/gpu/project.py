@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -18,7 +19,9 @@ from .harmonics import shade
 from .project_backward import project_backward
 from .projection import (
     COMPENSATION_MIN,
+    LN2,
     covariance,
+    factor,
     finite,
     load3,
     load4,
@@ -30,22 +33,24 @@ from .projection import (
 )
 from .record import (
     BLUE,
-    CONIC_A,
-    CONIC_B,
-    CONIC_C,
     DEPTH,
     EXTENT_X,
     EXTENT_Y,
+    FACTOR_UX,
+    FACTOR_UY,
+    FACTOR_VY,
     GREEN,
+    LEVEL,
     MEAN_X,
     MEAN_Y,
-    OPACITY,
+    NOTHING,
     RED,
     STRIDE,
 )
 from .tuning import PROJECT, autotune
 
 CUT = constant(ALPHA_MIN)
+LOG2_CUT = constant(math.log2(ALPHA_MIN))
 
 
 @autotune(PROJECT, key=["USED", "PLANAR"])
@@ -55,7 +60,7 @@ def project_kernel(
     records: Floats, count: Int, stride: Int, width: Int, height: Int, near: Float,
     COEFFICIENTS: tl.constexpr, USED: tl.constexpr, PLANAR: tl.constexpr, ANTIALIAS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the record of each Gaussian: all of it, or zeros where it is culled."""
+    """Write the record of each Gaussian: all of it or, where it is culled, zeros and no opacity."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     w00, w01, w02, w10, w11, w12, w20, w21, w22, t0, t1, t2, fx, fy, cx, cy = load_camera(viewmat, K)
@@ -83,7 +88,11 @@ def project_kernel(
     opacity = 1.0 / (1.0 + tl.exp(-logit))
     if ANTIALIAS:
         opacity = opacity * tl.sqrt_rn(tl.maximum(sharp / det, COMPENSATION_MIN))
-    reach = 2.0 * tl.log(tl.maximum(opacity / CUT, 1.0))
+    ux, uy, vy = factor(b, c, det)
+    level = tl.log2(tl.maximum(opacity, CUT))
+    reach = tl.maximum(
+        2.0 * LN2 * (level - LOG2_CUT), 0.0
+    )  # squared standard deviations of the 1/255 ellipse
     ex = tl.sqrt_rn(reach * a)
     ey = tl.sqrt_rn(reach * c)
 
@@ -99,17 +108,17 @@ def project_kernel(
     keep = here & (z > near) & (opacity > CUT) & finite(logit) & finite(size)
     keep = keep & finite(m0) & finite(m1) & finite(m2) & finite(l0) & finite(l1) & finite(l2)
     keep = keep & finite(qw) & finite(qx) & finite(qy) & finite(qz)
-    keep = keep & finite(mx) & finite(my) & finite(c / det) & finite(b / det) & finite(a / det)
+    keep = keep & finite(mx) & finite(my) & finite(det) & finite(a) & finite(c)  # b is bounded by a and c
     keep = keep & finite(red) & finite(green) & finite(blue) & finite(z) & finite(ex) & finite(ey)
     keep = keep & (ex > 0.0) & (ey > 0.0)
     keep = keep & (mx + ex > 0.0) & (mx - ex < width) & (my + ey > 0.0) & (my - ey < height)
     out = records + i.to(tl.int64) * STRIDE
     tl.store(out + MEAN_X, tl.where(keep, mx, 0.0), mask=here)
     tl.store(out + MEAN_Y, tl.where(keep, my, 0.0), mask=here)
-    tl.store(out + CONIC_A, tl.where(keep, c / det, 0.0), mask=here)
-    tl.store(out + CONIC_B, tl.where(keep, -b / det, 0.0), mask=here)
-    tl.store(out + CONIC_C, tl.where(keep, a / det, 0.0), mask=here)
-    tl.store(out + OPACITY, tl.where(keep, opacity, 0.0), mask=here)
+    tl.store(out + FACTOR_UX, tl.where(keep, ux, 0.0), mask=here)
+    tl.store(out + FACTOR_UY, tl.where(keep, uy, 0.0), mask=here)
+    tl.store(out + FACTOR_VY, tl.where(keep, vy, 0.0), mask=here)
+    tl.store(out + LEVEL, tl.where(keep, level, NOTHING), mask=here)
     tl.store(out + RED, tl.where(keep, tl.maximum(red, 0.0), 0.0), mask=here)
     tl.store(out + GREEN, tl.where(keep, tl.maximum(green, 0.0), 0.0), mask=here)
     tl.store(out + BLUE, tl.where(keep, tl.maximum(blue, 0.0), 0.0), mask=here)
@@ -173,12 +182,7 @@ class _Project(torch.autograd.Function):
     def backward(ctx: Any, *d_fields: Tensor | None) -> tuple[Tensor | None, ...]:
         *groups, viewmat, K, records = ctx.saved_tensors
         width, height = ctx.size
-        gradient = torch.zeros(records.shape[0], record.GRADIENT_WIDTH, device=records.device)
-        for place, given in zip(
-            record.fields(gradient)[:5], d_fields[:5], strict=True
-        ):  # all but the extents
-            if given is not None:
-                place.copy_(given)
+        gradient = record.gradient_record(d_fields[:5], records)  # all but the extents
         grads, d_viewmat = project_backward(
             tuple(groups), viewmat, K, width, height, records, gradient,
             degree=ctx.degree, antialias=ctx.antialias, with_viewmat=ctx.needs_input_grad[5],
@@ -203,7 +207,7 @@ def project(
 ) -> Projected:
     """Project Gaussians into one camera, as `reference.project` defines it; float32 tensors on the GPU.
 
-    The fields are views of one array of records. Gradients reach the five groups and viewmat.
+    Gradients reach the five groups and viewmat.
     """
     device.require(means)
     out = _Project.apply(

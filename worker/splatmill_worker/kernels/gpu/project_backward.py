@@ -11,8 +11,9 @@ from .argument import Floats, Int
 from .harmonics import at, basis, shade, slope
 from .projection import (
     BLUR,
-    COMPENSATION_MIN,
+    LN2,
     covariance,
+    factor,
     load3,
     load4,
     load_camera,
@@ -23,18 +24,18 @@ from .projection import (
 )
 from .record import (
     BLUE,
-    CONIC_A,
-    CONIC_B,
-    CONIC_C,
     DEPTH,
     EXTENT_X,
     GRADIENT_STRIDE,
     GREEN,
     MEAN_X,
     MEAN_Y,
-    OPACITY,
     RED,
     STRIDE,
+    SUM_Q,
+    SUM_QUU,
+    SUM_QUV,
+    SUM_QVV,
 )
 from .tuning import PROJECT_BACKWARD, autotune
 
@@ -54,6 +55,14 @@ def add_row(pointer, x, y, z, t):
     tl.atomic_add(pointer + 1, tl.sum(y, axis=0))
     tl.atomic_add(pointer + 2, tl.sum(z, axis=0))
     tl.atomic_add(pointer + 3, tl.sum(t, axis=0))
+
+
+@triton.jit
+def back_through_factor(u, v, ux, uy, vy, quu, quv, qvv):
+    """For one column (p, q) of M with F (p, q) = (u, v): dL/dp, dL/dq, and dL/d log-scale of that column."""
+    to_u = 2.0 * (quu * u + quv * v)
+    to_v = 2.0 * (quv * u + qvv * v)
+    return ux * to_u, uy * to_u + vy * to_v, u * to_u + v * to_v
 
 
 @autotune(PROJECT_BACKWARD, key=["USED", "PLANAR"])
@@ -118,7 +127,7 @@ def shape_backward_kernel(
     d_viewmat: Floats, count: Int, stride: Int, width: Int, height: Int,
     PLANAR: tl.constexpr, ANTIALIAS: tl.constexpr, VIEWMAT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """From the 2-D mean, conic, opacity and depth to mean, scales, quaternion, logit and, with VIEWMAT, the camera."""
+    """From the 2-D mean, factor, opacity and depth to mean, scales, quaternion, logit and, with VIEWMAT, the camera."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     row = records + i.to(tl.int64) * STRIDE
@@ -132,10 +141,10 @@ def shape_backward_kernel(
     grow = gradient + i.to(tl.int64) * GRADIENT_STRIDE
     g_mx = tl.load(grow + MEAN_X, mask=seen, other=0.0)
     g_my = tl.load(grow + MEAN_Y, mask=seen, other=0.0)
-    g_a = tl.load(grow + CONIC_A, mask=seen, other=0.0)
-    g_b = tl.load(grow + CONIC_B, mask=seen, other=0.0)
-    g_c = tl.load(grow + CONIC_C, mask=seen, other=0.0)
-    g_o = tl.load(grow + OPACITY, mask=seen, other=0.0)
+    quu = 2.0 * LN2 * LN2 * tl.load(grow + SUM_QUU, mask=seen, other=0.0)
+    quv = 2.0 * LN2 * LN2 * tl.load(grow + SUM_QUV, mask=seen, other=0.0)
+    qvv = 2.0 * LN2 * LN2 * tl.load(grow + SUM_QVV, mask=seen, other=0.0)
+    q = tl.load(grow + SUM_Q, mask=seen, other=0.0)
     g_z = tl.load(grow + DEPTH, mask=seen, other=0.0)
 
     # The forward pass again: cheaper than keeping it. A row that is not seen gets z = 1 and stays finite.
@@ -154,29 +163,29 @@ def shape_backward_kernel(
     p0, p1, p2 = through(a0, a1, a2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
     q0, q1, q2 = through(b0, b1, b2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
     p0, p1, p2, q0, q1, q2 = p0 * s0, p1 * s1, p2 * s2, q0 * s0, q1 * s1, q2 * s2  # rows of M
-    a, b, c, sharp, det = covariance(p0, p1, p2, q0, q1, q2)
+    _, b, c, _, det = covariance(p0, p1, p2, q0, q1, q2)
 
-    # Opacity.
-    sigmoid = 1.0 / (1.0 + tl.exp(-logit))
-    d_logit = g_o * sigmoid * (1.0 - sigmoid)
-    if ANTIALIAS:
-        d_logit = d_logit * tl.sqrt_rn(tl.maximum(sharp / det, COMPENSATION_MIN))
-    tl.store(d_logits + i, d_logit, mask=here)
+    # d ln opacity / d logit = 1 - sigmoid, written so that it does not cancel. The antialiasing compensation is a
+    # factor of the opacity, without gradient, and does not change the logarithm's.
+    against = tl.exp(-logit)
+    tl.store(d_logits + i, q * (against / (1.0 + against)), mask=here)
 
-    # The conic c/det, -b/det, a/det by the rows p, q of M. The determinant's part goes through the minors
-    # n = p x q, as in the forward pass: -X dX X is the same, but its terms cancel for needles.
-    d_det = -(g_a * (c / det) - g_b * (b / det) + g_c * (a / det)) / det
-    d_tr0, d_tr1, d_b = g_c / det + BLUR * d_det, g_a / det + BLUR * d_det, -g_b / det
+    # Sigma' = M M^T + 0.3 I and dL/dSigma' = F^T Q F with the conic's factor F, so dL/dM = 2 F^T Q (F M). For a needle
+    # F M is small where M is large: its first row, ux (p - b/c q), is taken as ux/c (0.3 p + q x minors), in which
+    # nothing cancels.
+    ux, uy, vy = factor(b, c, det)
+    ux_c = ux / c
     n0, n1, n2 = p1 * q2 - p2 * q1, p2 * q0 - p0 * q2, p0 * q1 - p1 * q0
-    dp0 = 2.0 * d_tr0 * p0 + d_b * q0 + 2.0 * d_det * (q1 * n2 - q2 * n1)
-    dp1 = 2.0 * d_tr0 * p1 + d_b * q1 + 2.0 * d_det * (q2 * n0 - q0 * n2)
-    dp2 = 2.0 * d_tr0 * p2 + d_b * q2 + 2.0 * d_det * (q0 * n1 - q1 * n0)
-    dq0 = 2.0 * d_tr1 * q0 + d_b * p0 + 2.0 * d_det * (n1 * p2 - n2 * p1)
-    dq1 = 2.0 * d_tr1 * q1 + d_b * p1 + 2.0 * d_det * (n2 * p0 - n0 * p2)
-    dq2 = 2.0 * d_tr1 * q2 + d_b * p2 + 2.0 * d_det * (n0 * p1 - n1 * p0)
-    store3(
-        d_log_scales, i, here, stride, p0 * dp0 + q0 * dq0, p1 * dp1 + q1 * dq1, p2 * dp2 + q2 * dq2, PLANAR
+    dp0, dq0, d0 = back_through_factor(
+        ux_c * (BLUR * p0 + (q1 * n2 - q2 * n1)), vy * q0, ux, uy, vy, quu, quv, qvv
     )
+    dp1, dq1, d1 = back_through_factor(
+        ux_c * (BLUR * p1 + (q2 * n0 - q0 * n2)), vy * q1, ux, uy, vy, quu, quv, qvv
+    )
+    dp2, dq2, d2 = back_through_factor(
+        ux_c * (BLUR * p2 + (q0 * n1 - q1 * n0)), vy * q2, ux, uy, vy, quu, quv, qvv
+    )
+    store3(d_log_scales, i, here, stride, d0, d1, d2, PLANAR)
     dp0, dp1, dp2, dq0, dq1, dq2 = dp0 * s0, dp1 * s1, dp2 * s2, dq0 * s0, dq1 * s1, dq2 * s2
 
     # The rotation, through the unit quaternion, to the quaternion of any norm.
@@ -205,7 +214,8 @@ def shape_backward_kernel(
     free_v = tl.where((v >= low_v) & (v <= high_v), 1.0, 0.0)
     du = fx * g_mx - free_u * ku * (ga0 * w20 + ga1 * w21 + ga2 * w22)
     dv = fy * g_my - free_v * kv * (gb0 * w20 + gb1 * w21 + gb2 * w22)
-    dz = g_z - (ga0 * a0 + ga1 * a1 + ga2 * a2 + gb0 * b0 + gb1 * b1 + gb2 * b2 + u * du + v * dv) / z
+    # 1/z scales J W, and with it M, as the three scales together do.
+    dz = g_z - (d0 + d1 + d2 + u * du + v * dv) / z
     dx, dy = du / z, dv / z
 
     # color_backward_kernel left the part through the direction m + W^T t in d_means.

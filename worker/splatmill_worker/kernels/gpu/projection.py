@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import triton
 import triton.language as tl
 
@@ -11,6 +13,8 @@ from .harmonics import at
 
 BLUR = constant(records.BLUR)
 COMPENSATION_MIN = constant(records.COMPENSATION_MIN)
+LN2 = constant(math.log(2.0))
+HALF_LOG2E = constant(0.5 / math.log(2.0))
 
 
 @triton.jit
@@ -101,3 +105,10 @@ def covariance(p0, p1, p2, q0, q1, q2):
     minor2 = p0 * q1 - p1 * q0
     sharp = minor0 * minor0 + minor1 * minor1 + minor2 * minor2
     return tr0 + BLUR, b, tr1 + BLUR, sharp, sharp + BLUR * (tr0 + tr1) + BLUR * BLUR
+
+
+@triton.jit
+def factor(b, c, det):
+    """ux, uy, vy of a record (`record`) from the covariance and its determinant."""
+    ux = tl.sqrt_rn(HALF_LOG2E * (c / det))
+    return ux, -(ux * (b / c)), tl.sqrt_rn(HALF_LOG2E / c)

@@ -210,11 +210,7 @@ class Step:
     def parameters(self) -> dict[str, Tensor]:
         """Return copies [N, ...] of the five groups after all steps, the missed ones included; sh [N, 16, 3]."""
         self._catch_up()
-        shapes = {"logit_opacities": (self.count,), "sh": (self.count, 16, 3)}
-        return {
-            name: self._params[planes].t().reshape(shapes.get(name, (self.count, GROUPS[name]))).clone()
-            for name, planes in PLANES.items()
-        }
+        return self._rows(self._params)
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """Return Adam's first and second moments, [N, 59] each, after all steps; columns in the order of `GROUPS`."""
@@ -308,6 +304,29 @@ class Step:
             refused = torch.zeros(1, dtype=torch.int32, device=self.device)
             self._move(seen, view.degree, rates, step, refused)
         self._listen(view.key, torch.zeros(3, device=self.device), view.lists.used, refused)
+
+    def gradients(
+        self, d_color: Tensor, d_alpha: Tensor | None = None, d_depth: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Return the gradients of the last `forward` to the parameters, [N, ...] each, and change nothing.
+
+        Arguments and errors are those of `backward_update`.
+        """
+        if self._view is None:
+            raise RuntimeError("There is nothing to differentiate; gradients needs a forward pass before it.")
+        view = self._view
+        with self._sparing():
+            records = blend_backward(
+                view.records, view.lists.bins, view.image, view.width, view.height, d_color.to(self.device),
+                d_alpha=None if d_alpha is None else d_alpha.to(self.device),
+                d_depth=None if d_depth is None else d_depth.to(self.device),
+            )  # fmt: skip
+            planes = torch.zeros_like(self._params)
+            project_backward(
+                self._groups(self._params), view.viewmat, view.K, view.width, view.height, view.records, records,
+                degree=view.degree, antialias=view.antialias, planar=self.count, into=self._groups(planes),
+            )  # fmt: skip
+            return self._rows(planes)
 
     def train(
         self,
@@ -473,6 +492,14 @@ class Step:
         if tensor.device.type == "cpu" and self.device.type == "cuda":
             return tensor.contiguous().pin_memory().to(self.device, non_blocking=True)
         return tensor.to(self.device).contiguous()
+
+    def _rows(self, planes: Tensor) -> dict[str, Tensor]:
+        """Copies [N, ...] of the groups among planes [59, N]."""
+        shapes = {"logit_opacities": (self.count,), "sh": (self.count, 16, 3)}
+        return {
+            name: planes[group].t().reshape(shapes.get(name, (self.count, GROUPS[name]))).clone()
+            for name, group in PLANES.items()
+        }
 
     def _groups(self, planes: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         means, log_scales, quats, logit_opacities, sh = (planes[group] for group in PLANES.values())

@@ -1,4 +1,4 @@
-"""The engine that differentiates with torch's autograd, for any backend whose ops are differentiable."""
+"""The engine that differentiates the definition with torch's autograd, in float64."""
 
 from __future__ import annotations
 
@@ -13,19 +13,23 @@ from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.motion import motion
 
+BACKEND: ops.Backend = "reference"
+
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 """Adam's decay of the first and second moment, and the term that keeps its divisor above 0."""
 
 
 class AutogradEngine:
-    """An Engine over `kernels.ops`. It is slow, and takes the same steps as the fused engines.
+    """An Engine over the reference's ops in float64: slow, with the steps that the fused engines should take.
+
+    It takes no other backend: `cpu` and `gpu` pass conics of three float32 numbers from one separate op to the next,
+    from which a needle's gradient comes out with no right digit (docs/numerics.md). Their fused steps train instead.
 
     Adam updates all Gaussians; those that a photo does not show have a zero gradient. Scores are always kept, whatever
     `keep_scores` says, because autograd has them anyway.
     """
 
-    def __init__(self, gaussians: Gaussians, *, backend: ops.Backend) -> None:
-        self._backend = backend
+    def __init__(self, gaussians: Gaussians) -> None:
         self.keep_scores = True
         self.keep_pose_gradient = False
         self.pose_gradient: Tensor | None = None
@@ -36,15 +40,18 @@ class AutogradEngine:
         return self._gaussians.count
 
     def parameters(self) -> dict[str, Tensor]:
-        return {name: value.detach().clone() for name, value in self._gaussians.parameters().items()}
+        return {name: value.detach().float() for name, value in self._gaussians.parameters().items()}
 
     def moments(self) -> tuple[Tensor, Tensor]:
-        return self._packed(self._exp_avg), self._packed(self._exp_avg_sq)
+        return self._packed(self._exp_avg).float(), self._packed(self._exp_avg_sq).float()
 
     def replace(
         self, parameters: dict[str, Tensor], exp_avg: Tensor | None, exp_avg_sq: Tensor | None
     ) -> None:
-        leaves = {name: value.detach().clone().requires_grad_() for name, value in parameters.items()}
+        leaves = {
+            name: value.detach().to(torch.float64, copy=True).requires_grad_()
+            for name, value in parameters.items()
+        }
         self._gaussians = Gaussians(**leaves)
         self._exp_avg = self._unpacked(exp_avg)
         self._exp_avg_sq = self._unpacked(exp_avg_sq)
@@ -68,30 +75,31 @@ class AutogradEngine:
         gaussians = self._gaussians
         self._twist = None
         if self.keep_pose_gradient and torch.is_grad_enabled():
-            self._twist = torch.zeros(6, requires_grad=True)
-            viewmat = motion(self._twist) @ viewmat
+            self._twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+            viewmat = motion(self._twist) @ viewmat.double()
         projected = ops.project(
             gaussians.means,
             gaussians.log_scales,
             gaussians.quats,
             gaussians.logit_opacities,
             gaussians.sh,
-            viewmat,
-            K,
+            viewmat.double(),
+            K.double(),
             width,
             height,
             degree=degree,
             antialias=antialias,
-            backend=self._backend,
+            backend=BACKEND,
         )
         if projected.means2d.requires_grad:
             projected.means2d.retain_grad()
-        bins = ops.bin(projected, width, height, backend=self._backend)
+        bins = ops.bin(projected, width, height, backend=BACKEND)
+        background = None if background is None else background.double()
         color, alpha, depth = ops.composite(
-            projected, bins, width, height, background=background, backend=self._backend
+            projected, bins, width, height, background=background, backend=BACKEND
         )
         self._pending = (projected, color, alpha, depth)
-        return color.detach(), alpha.detach(), depth.detach()
+        return color.detach().float(), alpha.detach().float(), depth.detach().float()
 
     def backward_update(
         self,
@@ -106,14 +114,15 @@ class AutogradEngine:
             raise RuntimeError("backward_update needs a forward pass before it.")
         projected, *outputs = self._pending
         wanted = [
-            (out, grad)
+            (out, grad.to(out))
             for out, grad in zip(outputs, (d_color, d_alpha, d_depth), strict=True)
             if grad is not None
         ]
         torch.autograd.backward([out for out, _ in wanted], [grad for _, grad in wanted])
         height, width = outputs[0].shape[:2]
         self._score(projected, width, height)
-        self.pose_gradient = None if self._twist is None else self._twist.grad
+        twist = None if self._twist is None else self._twist.grad
+        self.pose_gradient = None if twist is None else twist.float()
         self._adam(rates, step)
         self._pending = None
 
@@ -132,13 +141,11 @@ class AutogradEngine:
         key: Hashable | None = None,
     ) -> StepResult:
         height, width = photo.shape[:2]
-        color, _, _ = self.forward(
-            viewmat, K, width, height, degree=degree, background=background, antialias=antialias
-        )
-        color.requires_grad_()
-        loss = ops.loss(color, photo, mask=mask, backend=self._backend)
-        (gradient,) = torch.autograd.grad(loss, color)
+        self.forward(viewmat, K, width, height, degree=degree, background=background, antialias=antialias)
         assert self._pending is not None
+        color = self._pending[1].detach().requires_grad_()
+        loss = ops.loss(color, photo, mask=mask, backend=BACKEND)
+        (gradient,) = torch.autograd.grad(loss, color)
         visible = int((self._pending[0].extents[:, 0] > 0).sum())
         self.backward_update(gradient, rates=rates, step=step)
         return StepResult(float(loss.detach()), visible)
@@ -153,7 +160,7 @@ class AutogradEngine:
             ndc = gradient * gradient.new_tensor([width / 2, height / 2])
             self.plain_sum += torch.linalg.vector_norm(ndc, dim=1)
             self.visible_count += visible
-            extent = 2.0 * projected.extents.amax(dim=1) / max(width, height)
+            extent = 2.0 * projected.extents.amax(dim=1).float() / max(width, height)
             self.max_extent = torch.maximum(self.max_extent, extent)
 
     def _adam(self, rates: Rates, step: int) -> None:
@@ -181,10 +188,10 @@ class AutogradEngine:
         """The groups of `packed` [N, 59] by name; zeros where it is None."""
         shapes = {name: value.shape for name, value in self._gaussians.parameters().items()}
         if packed is None:
-            return {name: torch.zeros(shape) for name, shape in shapes.items()}
+            return {name: torch.zeros(shape, dtype=torch.float64) for name, shape in shapes.items()}
         widths = [shape[1:].numel() for shape in shapes.values()]
         parts = torch.split(packed, widths, dim=1)
         return {
-            name: part.reshape(shape).clone()
+            name: part.reshape(shape).to(torch.float64, copy=True)
             for (name, shape), part in zip(shapes.items(), parts, strict=True)
         }

@@ -10,14 +10,14 @@ from splatmill_worker.splat.gaussians import Gaussians
 
 
 def open_engine(gaussians: Gaussians, kernels: ops.Backend) -> Engine:
-    """The engine of a backend, holding `gaussians`: the fused step on cpu and gpu, autograd elsewhere."""
+    """The engine of a backend, holding `gaussians`: the fused step on cpu and gpu, autograd on reference."""
     if kernels == "cpu":
         return CpuEngine(gaussians)
     if kernels == "gpu":
         from splatmill_worker.splat.engine.gpu import GpuEngine
 
         return GpuEngine(gaussians)
-    return AutogradEngine(gaussians, backend=kernels)
+    return AutogradEngine(gaussians)
 
 
 def gaussians_of(engine: Engine) -> Gaussians:

@@ -102,9 +102,9 @@ def join(backend: str | None = None) -> Replicas:
 class ReplicatedEngine(AutogradEngine):
     """The autograd engine with gradients averaged over the processes before Adam, and scores over all their views."""
 
-    def __init__(self, gaussians: Gaussians, replicas: Replicas, *, backend: ops.Backend) -> None:
+    def __init__(self, gaussians: Gaussians, replicas: Replicas) -> None:
         self._replicas = replicas
-        super().__init__(gaussians, backend=backend)
+        super().__init__(gaussians)
 
     def _score(self, projected: ops.Projected, width: int, height: int) -> None:
         total, count, extent = self.plain_sum, self.visible_count, self.max_extent
@@ -133,11 +133,20 @@ class ReplicatedEngine(AutogradEngine):
 
 
 def open_replica(gaussians: Gaussians, kernels: ops.Backend, replicas: Replicas) -> Engine:
-    """The engine of one process. Raises RuntimeError where the processes were given different Gaussians."""
+    """The engine of one process, on gpu or, slowly, on reference.
+
+    Raises ValueError for cpu, and RuntimeError where the processes were given different Gaussians.
+    """
+    if kernels == "cpu":
+        raise ValueError(
+            "Several processes cannot train one scene with the cpu kernels: averaging gradients would take their "
+            "separate ops, which pass on conics of three float32 numbers, and a needle's gradient has no right digit "
+            "then. Train in one process, whose fused step uses every core, or with the gpu kernels."
+        )
     replicas.check_same(gaussians)
     if kernels == "gpu":
         from splatmill_worker.splat.engine.gpu import GpuEngine
 
         where = gaussians.means.device if interpreting() else f"cuda:{torch.cuda.current_device()}"
         return GpuEngine(gaussians, where=str(where), together=replicas)
-    return ReplicatedEngine(gaussians, replicas, backend=kernels)
+    return ReplicatedEngine(gaussians, replicas)
