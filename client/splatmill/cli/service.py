@@ -22,7 +22,7 @@ def doctor(context: typer.Context) -> None:
 
 
 def bench(context: typer.Context) -> None:
-    """Measure error against run time: kernels, functions, stability, sfm, train, live, formats. See bench --help."""
+    """Measure errors and times: kernels, functions, stability, stiffness, sfm, train, live, formats (bench --help)."""
     require("splatmill_worker", "`splatmill bench`")
     exec_module("splatmill_worker", "bench", *context.args)
 
