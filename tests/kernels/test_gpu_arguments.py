@@ -5,9 +5,7 @@ Says nothing about what the kernels compute (test_gpu_ops, test_gpu_step), nor w
 
 from __future__ import annotations
 
-import importlib
 import inspect
-import pkgutil
 from typing import Any
 
 import pytest
@@ -18,11 +16,12 @@ pytest.importorskip(
     "triton", reason="Triton comes with torch's GPU builds; pip install triton to test the kernels here"
 )
 
-from splatmill_worker.kernels import gpu, ops
+from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.gpu.argument import declared
 from splatmill_worker.kernels.gpu.step import Step
 from splatmill_worker.kernels.records import Rates
 from tests.support.kernels.cases import scene
+from tests.support.kernels.launches import Launch, watch
 
 pytestmark = [
     pytest.mark.slow,
@@ -38,32 +37,6 @@ ARRAYS = {
 }
 
 
-class Watched:
-    """A kernel that compares the arguments of its launches with their declared types."""
-
-    def __init__(self, kernel: Any) -> None:
-        self.kernel = kernel
-        function = kernel.fn if hasattr(kernel, "configs") else kernel
-        self.parameters = inspect.signature(function.fn).parameters
-        self.types = {
-            name: declared(function, name)
-            for name, parameter in self.parameters.items()
-            if "constexpr" not in str(parameter.annotation)
-        }
-        self.launches = 0
-
-    def __getitem__(self, grid: Any) -> Any:
-        def launch(*arguments: Any, **named: Any) -> None:
-            self.launches += 1
-            given = {**dict(zip(self.parameters, arguments, strict=False)), **named}
-            for name, kind in self.types.items():
-                if given[name] is not None:
-                    assert passed(given[name]) == kind, f"{name} of {self.kernel}"
-            self.kernel[grid](*arguments, **named)
-
-        return launch
-
-
 def passed(value: Any) -> str:
     if isinstance(value, Tensor):
         return ARRAYS[value.dtype]
@@ -71,13 +44,18 @@ def passed(value: Any) -> str:
 
 
 def test_launches_pass_the_declared_types(monkeypatch: pytest.MonkeyPatch) -> None:
-    kernels = {}
-    for module in (
-        importlib.import_module(f"{gpu.__name__}.{m.name}") for m in pkgutil.iter_modules(gpu.__path__)
-    ):
-        for name in [name for name in vars(module) if name.endswith("_kernel")]:
-            kernels[name] = Watched(getattr(module, name))
-            monkeypatch.setattr(module, name, kernels[name])
+    launched: set[str] = set()
+
+    def compare(launch: Launch) -> None:
+        kernel = kernels[launch.kernel]
+        function = kernel.fn if hasattr(kernel, "configs") else kernel
+        for name, parameter in inspect.signature(function.fn).parameters.items():
+            if "constexpr" not in str(parameter.annotation) and launch.given[name] is not None:
+                seen, wanted = passed(launch.given[name]), declared(function, name)
+                assert seen == wanted, f"{name} of {launch.kernel}"
+        launched.add(launch.kernel)
+
+    kernels = watch(monkeypatch, compare)
     case = scene("types", 6, width=17, height=5)
     groups = [group.to(DEVICE).requires_grad_() for group in case.groups()]
     viewmat = case.viewmat.to(DEVICE).requires_grad_()
@@ -112,6 +90,7 @@ def test_launches_pass_the_declared_types(monkeypatch: pytest.MonkeyPatch) -> No
     )
     step = Step(*case.groups(), where=DEVICE)
     step.train(
-        case.viewmat, case.K, photo, degree=0, rates=Rates(0.1, 0.1, 0.1, 0.1, 0.1, 0.1), step=1, mask=mask
-    )
-    assert {name for name, kernel in kernels.items() if not kernel.launches} == set()
+        case.viewmat, case.K, photo, degree=0, rates=Rates(0.1, 0.1, 0.1, 0.1, 0.1, 0.1), step=1, mask=mask,
+        alpha=photo[..., 0].contiguous(),
+    )  # fmt: skip
+    assert launched == set(kernels)

@@ -163,12 +163,13 @@ class _Fit:
         result = self.engine.train_photo(
             target.viewmat,
             target.K,
-            target.over(background),
+            target.rgb,
             degree=0,
             rates=rates_at(progress, self.pixel),
             step=self.step,
             background=background,
-            key=factor if target.alpha is None else None,
+            alpha=target.alpha,
+            key=factor,
         )
         if not math.isfinite(result.loss):
             raise TrainingFailed(FailureName.non_finite, f"the loss became {result.loss}.", step=self.step)

@@ -42,10 +42,14 @@ class Target(NamedTuple):
 
     def over(self, background: Tensor) -> Tensor:
         """The photo uint8 [H, W, 3] over an RGB `background` [3] in 0 to 1."""
-        if self.alpha is None:
-            return self.rgb
-        cover = self.alpha[..., None].float() / 255.0
-        return (self.rgb * cover + (1.0 - cover) * (255.0 * background) + 0.5).to(torch.uint8)
+        return self.rgb if self.alpha is None else over(self.rgb, self.alpha, background)
+
+
+def over(photo: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
+    """A photo uint8 [H, W, 3] with its alpha uint8 [H, W] over an RGB `background` [3] in 0 to 1, or over black."""
+    cover = alpha[..., None].float() / 255.0
+    behind = 0.0 if background is None else (1.0 - cover) * (255.0 * background)
+    return (photo * cover + behind + 0.5).to(torch.uint8)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from ..reference.adam import BETA1, BETA2, EPS, MEMORY
 from . import device
 from .argument import Bytes, Float, Floats, Int, Ints
 from .constant import LARGEST, constant
+from .transfer import to_device
 
 B1, B2, EPSILON = constant(BETA1), constant(BETA2), constant(EPS)
 LOG2_B1, LOG2_B2 = constant(math.log2(BETA1)), constant(math.log2(BETA2))
@@ -40,7 +41,7 @@ def correction(room: int, where: torch.device) -> Tensor:
     """
     s = torch.arange(1, room, dtype=torch.float64)
     values = torch.sqrt(1 - BETA2**s) / (1 - BETA1**s)
-    return torch.cat([torch.zeros(1, dtype=torch.float64), values]).to(where, torch.float32)
+    return to_device(torch.cat([torch.zeros(1, dtype=torch.float64), values]).float(), where)
 
 
 @triton.jit

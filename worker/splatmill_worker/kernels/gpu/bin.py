@@ -14,7 +14,7 @@ from ..records import ALPHA_MIN, TILE, Bins, Projected
 from . import device, record
 from .argument import Floats, Int, Ints, Longs, Shorts
 from .constant import constant
-from .record import EXTENT_X, EXTENT_Y, FACTOR_UX, FACTOR_UY, FACTOR_VY, LEVEL, MEAN_X, MEAN_Y, STRIDE
+from .record import DEPTH, EXTENT_X, EXTENT_Y, FACTOR_UX, FACTOR_UY, FACTOR_VY, LEVEL, MEAN_X, MEAN_Y, STRIDE
 
 SIDE = constant(float(TILE))
 SPAN = constant(TILE - 1.0)  # from the first pixel centre of a tile to its last
@@ -31,6 +31,13 @@ BLOCK = 8
 LANES = 32
 """Candidate tiles that a program tests at a time for each of its splats."""
 
+SHORT_TILES = 2**15 - 2
+"""Tiles whose numbers, with one more for unused room, are sorted as 16-bit keys: half the passes of the radix sort.
+Images of up to 8 megapixels have no more."""
+
+MOST_PAIRS = 2**31 - 1
+"""Pairs that one view's lists hold."""
+
 
 @dataclass(frozen=True)
 class Room:
@@ -42,6 +49,24 @@ class Room:
 
     visible: int
     pairs: int
+
+
+COMPACT_BLOCK = 256
+"""Gaussians per program of `compact_kernel`."""
+
+
+@triton.jit
+def compact_kernel(
+    records: Floats, rank: Longs, depths: Floats, ids: Ints, count: Int, room: Int, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Write depth and number of the first `room` visible splats, in their order; rank [N] counts them up to each."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = i < count
+    source = records + i.to(tl.int64) * STRIDE
+    slot = tl.load(rank + i, mask=here, other=0) - 1
+    shown = here & (tl.load(source + EXTENT_X, mask=here, other=0.0) > 0.0) & (slot < room)
+    tl.store(depths + slot, tl.load(source + DEPTH, mask=shown, other=0.0), mask=shown)
+    tl.store(ids + slot, i, mask=shown)
 
 
 @triton.jit
@@ -133,10 +158,12 @@ class Lists:
     """The tile lists of one view.
 
     bins: as `Bins`, except that with a `Room` its ids have `room.pairs` entries, of which offsets[-1] are in use.
+    shown: bool [N], which Gaussians are visible.
     used: int64 [2] on the device, how many visible splats and pairs the view has, whether they fit or not.
     """
 
     bins: Bins
+    shown: Tensor
     used: Tensor
 
 
@@ -154,14 +181,15 @@ def lists(records: Tensor, width: int, height: int, room: Room | None) -> Lists:
     rank = torch.cumsum(shown, 0)
     visible = rank[-1:] if records.shape[0] else torch.zeros(1, dtype=torch.int64, device=dev)
     most = int(visible) if room is None else min(room.visible, records.shape[0])
-    # Compaction without a data-dependent shape: hidden splats and those past the room go to a spare last slot.
-    slot = torch.where(shown & (rank <= most), rank - 1, most)
-    packed = torch.zeros(most + 1, dtype=torch.int64, device=dev)
-    packed.scatter_(0, slot, torch.arange(records.shape[0], device=dev))
-    packed = packed[:most]
+    # Compaction without a data-dependent shape: the unused room sorts behind every splat.
     held = visible.clamp(max=most)
-    depths = torch.where(torch.arange(most, device=dev) < held, record.depths(records)[packed], torch.inf)
-    order = packed[torch.sort(depths, stable=True).indices].to(torch.int32)
+    depths = torch.full((most,), torch.inf, dtype=torch.float32, device=dev)
+    packed = torch.zeros(most, dtype=torch.int32, device=dev)
+    if most:
+        compact_kernel[(triton.cdiv(records.shape[0], COMPACT_BLOCK),)](
+            records, rank, depths, packed, records.shape[0], most, BLOCK=COMPACT_BLOCK
+        )
+    order = packed[torch.sort(depths, stable=True).indices]
 
     counts = torch.zeros(most, dtype=torch.int64, device=dev)
     grid = (triton.cdiv(most, BLOCK),)
@@ -177,18 +205,17 @@ def lists(records: Tensor, width: int, height: int, room: Room | None) -> Lists:
     ends = torch.cumsum(counts, 0)
     total = ends[-1:] if most else torch.zeros(1, dtype=torch.int64, device=dev)
     limit = int(total) if room is None else room.pairs
-    if limit >= 2**31:
+    if limit > MOST_PAIRS:
         raise ValueError(
-            f"One view has {limit} tile-Gaussian pairs; the lists hold 2147483647. Use fewer or smaller Gaussians."
+            f"One view has {limit} tile-Gaussian pairs; the lists hold {MOST_PAIRS}. Use fewer or smaller Gaussians."
         )
-    # A 16-bit key halves the passes of the radix sort; tiles + 1 of them fit up to 2600 x 3200 pixels.
-    key_type = torch.int16 if tiles < 2**15 - 1 else torch.int32
+    key_type = torch.int16 if tiles <= SHORT_TILES else torch.int32
     keys = torch.full((limit,), tiles, dtype=key_type, device=dev)
     ids = torch.zeros(limit, dtype=torch.int32, device=dev)
     launch(ends, keys, ids, limit)
     keys, by_tile = torch.sort(keys, stable=True)
     offsets = torch.searchsorted(keys, torch.arange(tiles + 1, device=dev, dtype=key_type))
-    return Lists(Bins(offsets, ids[by_tile]), torch.cat([visible, total]))
+    return Lists(Bins(offsets, ids[by_tile]), shown, torch.cat([visible, total]))
 
 
 def bin(projected: Projected, width: int, height: int) -> Bins:

@@ -13,14 +13,14 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from . import adam, bin, composite, composite_backward, knn, loss, project, project_backward, step
+from . import adam, bin, composite, composite_backward, knn, loss, photos, project, project_backward, step
 from .argument import declared
 from .blended import SEGMENT
 
@@ -32,11 +32,13 @@ class Variant:
     kernel: the function under `triton.jit`, autotuned or not.
     constants: by argument name, those of the launch; None for arrays that it leaves out.
     settings: launch settings of a kernel that is not autotuned; None takes those of the autotuner.
+    types: those of arguments that are not always passed as declared.
     """
 
     kernel: Any
     constants: dict[str, Any]
     settings: tuple[triton.Config, ...] | None = None
+    types: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -73,10 +75,12 @@ def variants() -> Iterator[Variant]:
     yield Variant(project_backward.shape_backward_kernel, {**shape, "PLANAR": False, "VIEWMAT": True})
     lists = {"BLOCK": bin.BLOCK, "LANES": bin.LANES}
     warps = (triton.Config({}, num_warps=4),)
+    yield Variant(bin.compact_kernel, {"BLOCK": bin.COMPACT_BLOCK}, settings=warps)
     yield Variant(
         bin.pairs_kernel, {**lists, "WRITE": False, "ends": None, "keys": None, "ids": None}, settings=warps
     )
     yield Variant(bin.pairs_kernel, {**lists, "WRITE": True}, settings=warps)
+    yield Variant(bin.pairs_kernel, {**lists, "WRITE": True}, settings=warps, types={"keys": "*i32"})
     walk = {"SEGMENT": SEGMENT, "BACKGROUND": True}
     nothing = {"depth": None, "checkpoints": None, "first_segment": None, "segment_tile": None}
     yield Variant(composite.composite_kernel, {**walk, **nothing, "WITH_DEPTH": False, "CHECKPOINTS": False})
@@ -93,7 +97,9 @@ def variants() -> Iterator[Variant]:
     yield Variant(loss.value_kernel, {**photo, "MASK": True, "STATS": False, "SLOPES": True})
     yield Variant(loss.down_kernel, {})
     yield Variant(loss.gradient_kernel, bare)
-    yield Variant(step.scores_kernel, {"BLOCK": 256}, settings=warps)
+    yield Variant(loss.total_kernel, {"BLOCK": loss.TOTAL_BLOCK}, settings=warps)
+    yield Variant(photos.over_kernel, {"BLOCK": photos.BLOCK, "BACKGROUND": True}, settings=warps)
+    yield Variant(step.scores_kernel, {"BLOCK": step.SCORES_BLOCK}, settings=warps)
     yield Variant(adam.planes_kernel, {"BLOCK": adam.BLOCK}, settings=warps)
     yield Variant(adam.drift_kernel, {"BLOCK": adam.BLOCK}, settings=warps)
     yield Variant(adam.adam_kernel, {"CHANNELS": 3, "VISIBLE": True, "BLOCK": 4 * adam.BLOCK}, settings=warps)
@@ -112,7 +118,7 @@ def compile_variant(variant: Variant, setting: triton.Config, architecture: int)
         if name in constants:
             signature[name] = "constexpr"
             continue
-        signature[name] = declared(function, name)
+        signature[name] = variant.types.get(name) or declared(function, name)
         if signature[name].startswith("*"):
             attributes[(position,)] = [["tt.divisibility", 16]]
     made = triton.compile(

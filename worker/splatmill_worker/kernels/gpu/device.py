@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import sys
 from dataclasses import dataclass
 
 import torch
@@ -19,13 +20,19 @@ STEP_BYTES = 1300
 """Device bytes per Gaussian of a training step, estimated: parameters and two moments 3 * 59 * 4 = 708, gradients
 236, records 112, scores and lists 60, and the buffers of the sort. `memory_needed` adds densification's copy."""
 
-PAIR_BYTES = 36 + PLANES * TILE * TILE * 4 // SEGMENT
-"""Device bytes per (tile, Gaussian) pair: 36, estimated, for key, id, their sorted copies, the 64-bit index and the
-buffers of the sort; and a pair's share of the checkpoint that each segment has."""
+ROOM = 1.25
+"""Room of a view's buffers over what its last visit used: the parameters move slowly from visit to visit."""
 
-PIXEL_BYTES = 120
-"""Device bytes per pixel of a training step, estimated: image, transmittance, gradients, and nine float32 planes of
-the loss."""
+PAIR_BYTES = round(ROOM * (36 + PLANES * TILE * TILE * 4 / SEGMENT))
+"""Device bytes per (tile, Gaussian) pair: 36, estimated, for key, id, their sorted copies, the 64-bit index and the
+buffers of the sort; and a pair's share of the checkpoint that each full segment has; with room to spare."""
+
+PIXEL_BYTES = 127 + PLANES * 4
+"""Device bytes per pixel of a training step: image, its gradient and transmittance 28, a photo over its background 3,
+fifteen float32 planes of moments and nine of slopes in the loss 96, and the checkpoint of each tile's last segment."""
+
+STATS_SHARE = 0.05
+"""Share of the free memory that the statistics of photos may take; those of further photos are computed again."""
 
 _found_usable: set[int] = set()
 
@@ -109,9 +116,16 @@ def memory_needed(gaussians: int, pixels: int, photo_bytes: int, *, pairs_per_ga
     return int(gaussians * per_gaussian + pixels * PIXEL_BYTES + photo_bytes)
 
 
+def room_for_stats(where: torch.device) -> int:
+    """Return the bytes that the statistics of photos may take on a device; on the CPU, as many as they need."""
+    return int(STATS_SHARE * torch.cuda.mem_get_info(where)[0]) if where.type == "cuda" else sys.maxsize
+
+
 def largest_budget(free_bytes: int, pixels: int, photo_bytes: int, *, margin: float = 0.85) -> int:
-    """Return the largest number of Gaussians that fits into `margin` of the free memory; 0 when the photos do not."""
-    room = free_bytes * margin - memory_needed(0, pixels, photo_bytes)
+    """Return the largest number of Gaussians that fits into `margin` of the free memory, less what the statistics of
+    photos may take; 0 when the photos do not fit.
+    """
+    room = free_bytes * (margin - STATS_SHARE) - memory_needed(0, pixels, photo_bytes)
     return max(0, int(room / memory_needed(1, 0, 0)))
 
 

@@ -20,11 +20,15 @@ from ..reference.loss import C1, C2, SIGMA, WINDOW, PhotoStats
 from . import device
 from .argument import Bytes, Float, Floats, Int
 from .constant import constant
+from .transfer import to_device
 from .tuning import LOSS, SMALLEST_LOSS_BLOCK, autotune
 
 REACH = constant(WINDOW // 2)
 TAPS = constant(WINDOW)
 S1, S2 = constant(C1), constant(C2)
+TOTAL_BLOCK = 1024
+"""Rows of sums that the one program of `total_kernel` reads at a time."""
+
 # First of the three planes, one per channel, of each windowed moment: of x, x^2, x y, y and y^2 (rendered x, photo y).
 # The derivatives of SSIM by the first three, its slopes, have the same places.
 X, XX, XY, Y, YY = (constant(3 * number) for number in range(5))
@@ -180,12 +184,34 @@ def gradient_kernel(
     tl.store(d_color + p * 3 + channel, tl.where(used, value, 0.0), mask=here)
 
 
+@triton.jit
+def total_kernel(
+    sums: Floats, used_pixels: Floats, losses: Floats, rows: Int, weight: Float, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """From the programs' sums [rows, 2] to losses [3]: the loss, L1 and SSIM. All are 0 without a used pixel."""
+    off = tl.zeros([BLOCK], tl.float32)
+    similar = off
+    done = 0
+    while done < rows:
+        i = done + tl.arange(0, BLOCK)
+        off += tl.load(sums + 2 * i, mask=i < rows, other=0.0)
+        similar += tl.load(sums + 2 * i + 1, mask=i < rows, other=0.0)
+        done += BLOCK
+    count = tl.load(used_pixels)
+    share = 1.0 / (3.0 * tl.maximum(count, 1.0))
+    l1 = tl.sum(off, axis=0) * share
+    ssim = tl.sum(similar, axis=0) * share
+    tl.store(losses, (1.0 - weight) * l1 + weight * (tl.where(count > 0.0, 1.0, 0.0) - ssim))
+    tl.store(losses + 1, l1)
+    tl.store(losses + 2, ssim)
+
+
 @lru_cache(maxsize=4)
 def window_taps(where: torch.device) -> Tensor:
-    """Return the taps [11] of the window, kept per device: a copy from the host at every step would wait."""
+    """Return the taps [11] of the window, kept per device."""
     x = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
     taps = torch.exp(-x * x / (2 * SIGMA * SIGMA))
-    return (taps / taps.sum()).to(where, torch.float32)
+    return to_device((taps / taps.sum()).float(), where)
 
 
 def loss_and_gradient(
@@ -195,12 +221,13 @@ def loss_and_gradient(
     dssim_weight: float,
     mask: Tensor | None,
     stats: PhotoStats | None,
+    count: Tensor | None = None,
     gradient: bool = True,
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Return the loss, its L1 and its SSIM as 0-d tensors, and the gradient to color [H, W, 3] (None unless asked).
+) -> tuple[Tensor, Tensor | None]:
+    """Return the loss, its L1 and its SSIM as one tensor [3], and the gradient to color [H, W, 3] (None unless asked).
 
-    Arguments as in `reference.loss`. Nothing waits for the device. Raises ValueError for an image too large for 32-bit
-    offsets.
+    Arguments as in `reference.loss`; count float32 [], the number of pixels used, is computed where it is not given.
+    Nothing waits for the device. Raises ValueError for an image too large for 32-bit offsets.
     """
     height, width = color.shape[:2]
     pixels = height * width
@@ -211,9 +238,12 @@ def loss_and_gradient(
     like: dict[str, Any] = {"device": color.device, "dtype": torch.float32}
     if mask is not None:
         mask = mask.to(torch.uint8).contiguous()
-        count = torch.count_nonzero(mask).to(torch.float32)
-    else:
-        count = torch.full((), float(pixels), **like)
+    if count is None:
+        count = (
+            torch.full((), float(pixels), **like)
+            if mask is None
+            else torch.count_nonzero(mask).to(torch.float32)
+        )
     taps = window_taps(color.device)
     planes = torch.empty(3 if stats is not None else 5, 3, height, width, **like)
     slopes = torch.empty(3, 3, height, width, **like) if gradient else None
@@ -229,17 +259,16 @@ def loss_and_gradient(
         color, photo, mask, mean, variance, taps, planes, slopes, sums, width, height,
         MASK=masked, STATS=stats is not None, SLOPES=gradient,
     )  # fmt: skip
-    off, similar = sums.sum(0) / (3 * count.clamp_min(1))
-    # Without a used pixel both sums are 0, and the loss is 0.
-    value = (1 - dssim_weight) * off + dssim_weight * ((count > 0).float() - similar)
+    losses = torch.empty(3, **like)
+    total_kernel[(1,)](sums, count, losses, sums.shape[0], dssim_weight, BLOCK=TOTAL_BLOCK)
     if slopes is None:
-        return value, off, similar, None
+        return losses, None
     down_kernel[lambda meta: (triton.cdiv(pixels, meta["BLOCK"]), 9)](slopes, taps, planes, width, height)
     d_color = torch.empty_like(color)
     gradient_kernel[grid](
         color, photo, mask, taps, planes, count, d_color, width, height, dssim_weight, MASK=masked
     )
-    return value, off, similar, d_color
+    return losses, d_color
 
 
 class _Loss(torch.autograd.Function):
@@ -252,12 +281,12 @@ class _Loss(torch.autograd.Function):
         mask: Tensor | None,
         stats: PhotoStats | None,
     ) -> Tensor:
-        value, _, _, d_color = loss_and_gradient(
+        losses, d_color = loss_and_gradient(
             color.contiguous(), photo.contiguous(), dssim_weight=dssim_weight, mask=mask, stats=stats,
             gradient=ctx.needs_input_grad[0],
         )  # fmt: skip
         ctx.save_for_backward(d_color)
-        return value
+        return losses[0].clone()  # autograd takes no view
 
     @staticmethod
     @once_differentiable

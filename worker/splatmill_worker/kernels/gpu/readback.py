@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
+
+from .transfer import ToHost
 
 AHEAD = 8
 """Steps that the host may be ahead of the device. More would only make the numbers it reads older."""
@@ -31,16 +32,14 @@ class Numbers(NamedTuple):
 
 
 class Readback:
-    """A queue of small copies to pinned memory, each with the event that marks its arrival.
+    """A queue of copies that are on their way from the device.
 
     steady: numbers are handed out exactly `AHEAD` steps late, so that several processes read the same ones.
     """
 
     def __init__(self, *, steady: bool = False) -> None:
         self._steady = steady
-        self._pending: deque[tuple[tuple[int, tuple[int, int, int]], Tensor, torch.cuda.Event | None]] = (
-            deque()
-        )
+        self._pending: deque[tuple[tuple[int, tuple[int, int, int]], ToHost]] = deque()
         self._latest: Numbers | None = None
 
     def post(self, key: tuple[int, tuple[int, int, int]], values: Tensor) -> list[Numbers]:
@@ -48,23 +47,14 @@ class Readback:
 
         Waits only when nothing has ever arrived, or when the host is `AHEAD` steps in front.
         """
-        if values.is_cuda:
-            here = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
-            here.copy_(values, non_blocking=True)
-            arrived = torch.cuda.Event()
-            arrived.record()
-            self._pending.append((key, here, arrived))
-        else:
-            self._pending.append((key, values.clone(), None))
+        self._pending.append((key, ToHost(values)))
         found = []
         while self._pending:
-            name, numbers, event = self._pending[0]
-            early = self._steady or (event is not None and not event.query())
+            name, numbers = self._pending[0]
+            early = self._steady or not numbers.arrived
             if early and self._latest is not None and len(self._pending) <= AHEAD:
                 break
-            if event is not None:
-                event.synchronize()
-            loss, l1, ssim, visible, pairs, refused = numbers.tolist()
+            loss, l1, ssim, visible, pairs, refused = numbers.wait()
             self._latest = Numbers(name, loss, l1, ssim, int(visible), int(pairs), int(refused))
             found.append(self._latest)
             self._pending.popleft()

@@ -12,21 +12,22 @@ import torch
 import triton
 import triton.language as tl
 from torch import Tensor
-from torch.utils.weak import WeakTensorKeyDictionary
 
 from splatmill_worker.kernels.records import GROUPS, PARAMETERS, Rates
 
-from . import adam, device, record
+from . import adam, device
 from .argument import Float, Floats, Int
-from .bin import Lists, Room, lists
+from .bin import MOST_PAIRS, Lists, Room, lists
 from .blended import Blended
 from .composite import blend
 from .composite_backward import blend_backward
 from .loss import loss_and_gradient
+from .photos import Photos
 from .project import project_records
 from .project_backward import project_backward
 from .readback import Readback
 from .record import EXTENT_X, EXTENT_Y, GRADIENT_STRIDE, MEAN_X, MEAN_Y, STRIDE
+from .transfer import ToHost, to_device
 
 ViewKey = tuple[int, int, int]
 """What a view is recognised by: address of its viewmat, width and height in pixels."""
@@ -40,11 +41,14 @@ PLANES = {
 PLAIN_SUM, VISIBLE_COUNT, MAX_EXTENT = range(3)
 """Rows of the densification scores [3, N]."""
 
-SLACK = 1.25
-"""Room for a view's lists, over what its last visit used: the parameters move slowly from visit to visit."""
-
 SPARE = 4096
-"""Splats, and pairs, of room on top of that."""
+"""Splats, and pairs, of room in a view's lists on top of `device.ROOM` times what its last visit used."""
+
+FIRST_PAIRS = 3
+"""Pairs per Gaussian for which a scene's first view gets room. Where there are more, its lists are made twice."""
+
+SCORES_BLOCK = 256
+"""Gaussians per program of `scores_kernel`."""
 
 
 class Together(Protocol):
@@ -123,14 +127,19 @@ class _View:
 class Step:
     """Parameters, Adam moments and densification scores of one scene, and the training step over them.
 
-    Its methods are those of `kernels.cpu.step.Step`, without photo statistics and gradients to the camera. Photos,
-    masks and cameras on the host are copied to the device once, and the copy is kept as long as the caller keeps the
-    tensor. The first visit of a view reads the sizes of its lists back; later visits use room for what the visit before
-    needed. Adam moves the Gaussians that are visible; the others make up for the steps missed when they are visible
-    again, or read.
+    Its methods are those of `kernels.cpu.step.Step`, without gradients to the camera. Photos, masks and cameras on the
+    host are copied to the device once, and the copy is kept as long as the caller keeps the tensor, which nobody may
+    write into meanwhile. Adam moves the Gaussians that are visible; the others make up for the steps missed when they
+    are visible again, or read.
+
+    A training step waits for the device in two cases: at the first visit of a view, for the sizes of its lists, and
+    when the host is `readback.AHEAD` steps in front. Later visits use room for what the visit before needed. `forward`
+    waits once, when all is enqueued, to know that nothing was left out of the image; the lists are made again with more
+    room where something was.
 
     keep_scores: whether steps add to the densification scores.
-    overflowed: steps whose lists had more pairs than room; the farthest pairs were left out.
+    overflowed: training steps whose lists had more pairs than room; the farthest pairs were left out.
+    repeated: views rendered again because the first attempt had too little room.
     refused: gradient values that were not finite and were left out, over all steps heard of.
 
     The scores are views [N] that add up over steps until `replace` or `clear_scores`: `plain_sum`, `visible_count` and
@@ -167,12 +176,13 @@ class Step:
             self.device = torch.device("cuda", torch.cuda.current_device())
         self._together = together
         self._rooms: dict[ViewKey, Room] = {}
-        self._resident: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+        self._photos = Photos(self.device, device.room_for_stats(self.device))
         self._readback = Readback(steady=together is not None)
         self._steps = 0
         # Counts `replace`: list sizes that arrive from before the last one say nothing of the room needed now.
         self._generation = 0
         self.overflowed = 0
+        self.repeated = 0
         self.refused = 0
         self.replace(
             {
@@ -268,11 +278,13 @@ class Step:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Render color [H,W,3], alpha [H,W] and depth [H,W] = sum of weight times z, on the device.
 
-        viewmat [4,4] world to camera, K [3,3] pixels. `backward_update` differentiates the last call.
+        viewmat [4,4] world to camera, K [3,3] pixels. `backward_update` differentiates the last call. Raises ValueError
+        for 2^31 (tile, Gaussian) pairs or more.
         """
         with self._sparing():
+            behind = self._background(background)
             self._view = self._shown(
-                viewmat, K, width, height, degree, background, antialias, near, depth=True
+                viewmat, K, width, height, degree, behind, antialias, near, depth=True, whole=True
             )
         image = self._view.image
         assert image.depth is not None
@@ -298,7 +310,7 @@ class Step:
             )
         view, self._view = self._view, None
         with self._sparing():
-            given = [None if d is None else d.to(self.device) for d in (d_color, d_alpha, d_depth)]
+            given = [None if d is None else to_device(d, self.device) for d in (d_color, d_alpha, d_depth)]
             assert given[0] is not None
             seen = self._differentiate(view, given[0], given[1], given[2])
             refused = torch.zeros(1, dtype=torch.int32, device=self.device)
@@ -317,9 +329,9 @@ class Step:
         view = self._view
         with self._sparing():
             records = blend_backward(
-                view.records, view.lists.bins, view.image, view.width, view.height, d_color.to(self.device),
-                d_alpha=None if d_alpha is None else d_alpha.to(self.device),
-                d_depth=None if d_depth is None else d_depth.to(self.device),
+                view.records, view.lists.bins, view.image, view.width, view.height, to_device(d_color, self.device),
+                d_alpha=None if d_alpha is None else to_device(d_alpha, self.device),
+                d_depth=None if d_depth is None else to_device(d_depth, self.device),
             )  # fmt: skip
             planes = torch.zeros_like(self._params)
             project_backward(
@@ -338,6 +350,7 @@ class Step:
         rates: Rates,
         step: int,
         background: Tensor | None = None,
+        alpha: Tensor | None = None,
         mask: Tensor | None = None,
         dssim_weight: float = 0.2,
         antialias: bool = False,
@@ -345,47 +358,71 @@ class Step:
     ) -> StepResult:
         """One step on one photo, enqueued as a whole: render, L1 + D-SSIM, gradients, scores, Adam.
 
-        photo uint8 [H,W,3]; mask [H,W], nonzero where a pixel is used; step counts from 1. The numbers returned are
-        those of an earlier step; see `StepResult`.
+        photo uint8 [H,W,3]; alpha uint8 [H,W] of a transparent one, which is laid over the background; mask [H,W],
+        nonzero where a pixel is used; step counts from 1. The numbers returned are those of an earlier step; see
+        `StepResult`.
         """
         height, width = photo.shape[:2]
         with self._sparing():
-            view = self._shown(viewmat, K, width, height, degree, background, antialias, near, depth=False)
-            seen_photo = self._here(photo)
-            used_pixels = None if mask is None else self._here(mask)
-            color = view.image.color
-            value, l1, ssim, d_color = loss_and_gradient(
-                color, seen_photo, dssim_weight=dssim_weight, mask=used_pixels, stats=None
+            behind = self._background(background)
+            view = self._shown(
+                viewmat, K, width, height, degree, behind, antialias, near, depth=False, whole=False
             )
+            seen_photo = self._photos.seen(photo, alpha, mask, behind)
+            losses, d_color = loss_and_gradient(
+                view.image.color, seen_photo.pixels, dssim_weight=dssim_weight, mask=seen_photo.mask,
+                stats=seen_photo.stats, count=seen_photo.count,
+            )  # fmt: skip
             assert d_color is not None
             seen = self._differentiate(view, d_color, None, None)
             refused = torch.zeros(1, dtype=torch.int32, device=self.device)
             self._move(seen, degree, rates, step, refused)
-        losses = torch.stack([value, l1, ssim])
         if self._together is not None:
             self._together.average_(losses)
         self._listen(view.key, losses, view.lists.used, refused)
         return StepResult(*self._readback.latest[1:])
 
+    def _background(self, background: Tensor | None) -> Tensor | None:
+        return None if background is None else to_device(background.float(), self.device)
+
     def _shown(
         self, viewmat: Tensor, K: Tensor, width: int, height: int, degree: int, background: Tensor | None,
         antialias: bool, near: float,
-        *, depth: bool,
+        *, depth: bool, whole: bool,
     ) -> _View:  # fmt: skip
+        """Project and composite one view; with `whole`, and at its first visit, nothing is left out."""
         key = (viewmat.data_ptr(), width, height)
-        viewmat, K = self._here(viewmat).float().contiguous(), self._here(K).float().contiguous()
-        background = None if background is None else self._sent(background.float())
+        viewmat, K = (self._photos.here(x).float().contiguous() for x in (viewmat, K))
         records = project_records(
             self._groups(self._params), viewmat, K, width, height, degree=degree, near=near, antialias=antialias,
             planar=self.count,
         )  # fmt: skip
         known = self._rooms.get(key)
-        made = lists(records, width, height, known)
-        if known is None:
-            visible, pairs = made.used.tolist()
+        room = known or self._first_room()
+        while True:
+            made = lists(records, width, height, room)
+            sizes = ToHost(made.used) if whole or known is None else None
+            image = blend(records, made.bins, width, height, background, depth=depth, checkpoints=True)
+            if sizes is None:
+                break
+            visible, pairs = (int(number) for number in sizes.wait())
             self._rooms[key] = _room(visible, pairs)
-        image = blend(records, made.bins, width, height, background, depth=depth, checkpoints=True)
+            if visible <= room.visible and pairs <= room.pairs:
+                break
+            # With too few splats the number of pairs is too small as well, so this may come twice.
+            room = self._rooms[key]
+            self.repeated += 1
+            del made, image  # their memory is needed again
         return _View(key, viewmat, K, width, height, degree, antialias, records, made, image)
+
+    def _first_room(self) -> Room:
+        """Room for a view that was never visited: as much as any other view has."""
+        if not self._rooms:
+            return Room(self.count, FIRST_PAIRS * self.count + SPARE)
+        return Room(
+            max(room.visible for room in self._rooms.values()),
+            max(room.pairs for room in self._rooms.values()),
+        )
 
     def _differentiate(
         self,
@@ -407,15 +444,15 @@ class Step:
         )  # fmt: skip
         if self.keep_scores:
             self._score(view, gradient)
-        return record.visible(view.records).to(torch.uint8)
+        return view.lists.shown.view(torch.uint8)
 
     def _score(self, view: _View, gradient: Tensor) -> None:
         """Add a view's gradient records [N, 16] to the scores, of all processes where there are several."""
         scores = self._scores if self._together is None else torch.zeros_like(self._scores)
         if self.count:
-            scores_kernel[(triton.cdiv(self.count, 256),)](
+            scores_kernel[(triton.cdiv(self.count, SCORES_BLOCK),)](
                 gradient, view.records, scores, self.count, 0.5 * view.width, 0.5 * view.height,
-                2.0 / max(view.width, view.height), BLOCK=256,
+                2.0 / max(view.width, view.height), BLOCK=SCORES_BLOCK,
             )  # fmt: skip
         if self._together is not None:
             extent = scores[MAX_EXTENT].clone()
@@ -455,9 +492,9 @@ class Step:
         everyone = torch.ones(self.count, dtype=torch.uint8, device=self.device)
         missed = adam.CatchUp(everyone, self._last, self._steps + 1)
         self._last.fill_(self._steps)
-        rates = torch.tensor(self._rates, device=self.device).repeat_interleave(
-            torch.tensor([*list(GROUPS.values())[:-1], 3, GROUPS["sh"] - 3], device=self.device)
-        )
+        channels = [*list(GROUPS.values())[:-1], 3, GROUPS["sh"] - 3]
+        by_plane = [rate for rate, number in zip(self._rates, channels, strict=True) for _ in range(number)]
+        rates = to_device(torch.tensor(by_plane), self.device)
         drift = torch.where(self._exp_avg_sq > 0, self._exp_avg / self._exp_avg_sq.sqrt(), 0.0)
         self._params -= rates[:, None] * missed.travel * drift
         self._exp_avg *= missed.decay1
@@ -465,7 +502,7 @@ class Step:
 
     def _listen(self, key: ViewKey, losses: Tensor, used: Tensor, refused: Tensor) -> None:
         """Send a step's numbers to the host, and set the room of the views whose numbers have arrived."""
-        values = torch.cat([losses.double(), used.double(), refused.double()])
+        values = torch.cat([losses.double(), used, refused])
         for numbers in self._readback.post((self._generation, key), values):
             self.refused += numbers.refused
             generation, key = numbers.key
@@ -475,23 +512,6 @@ class Step:
             if numbers.visible > room.visible or numbers.pairs > room.pairs:
                 self.overflowed += 1
             self._rooms[key] = _room(numbers.visible, numbers.pairs)
-
-    def _here(self, tensor: Tensor) -> Tensor:
-        """Return the tensor on this device. A copy is made once, and kept while the caller keeps the original."""
-        if tensor.device == self.device:
-            return tensor.contiguous()
-        held = self._resident.get(tensor)
-        if held is None:
-            held = self._sent(tensor)
-            self._resident[tensor] = held
-        assert isinstance(held, Tensor)
-        return held
-
-    def _sent(self, tensor: Tensor) -> Tensor:
-        """Return a copy on this device, from pinned memory: from any other, the copy waits for all that is enqueued."""
-        if tensor.device.type == "cpu" and self.device.type == "cuda":
-            return tensor.contiguous().pin_memory().to(self.device, non_blocking=True)
-        return tensor.to(self.device).contiguous()
 
     def _rows(self, planes: Tensor) -> dict[str, Tensor]:
         """Copies [N, ...] of the groups among planes [59, N]."""
@@ -511,9 +531,12 @@ class Step:
         try:
             yield
         except torch.OutOfMemoryError as error:
+            self._photos.forget_stats()
             torch.cuda.empty_cache()
             raise device.GpuMemoryShort(self.device, getattr(self, "_params", None)) from error
 
 
 def _room(visible: int, pairs: int) -> Room:
-    return Room(int(visible * SLACK) + SPARE, int(pairs * SLACK) + SPARE)
+    """Room for a view of these sizes, and more. That for too many pairs is refused when the lists are made."""
+    roomy = int(pairs * device.ROOM) + SPARE
+    return Room(int(visible * device.ROOM) + SPARE, max(pairs, min(roomy, MOST_PAIRS)))

@@ -12,6 +12,7 @@ from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.motion import motion
+from splatmill_worker.splat.views import over
 
 BACKEND: ops.Backend = "reference"
 
@@ -136,12 +137,15 @@ class AutogradEngine:
         rates: Rates,
         step: int,
         background: Tensor | None = None,
+        alpha: Tensor | None = None,
         mask: Tensor | None = None,
         antialias: bool = False,
         key: Hashable | None = None,
     ) -> StepResult:
         height, width = photo.shape[:2]
         self.forward(viewmat, K, width, height, degree=degree, background=background, antialias=antialias)
+        if alpha is not None:
+            photo = over(photo, alpha, background)
         assert self._pending is not None
         color = self._pending[1].detach().requires_grad_()
         loss = ops.loss(color, photo, mask=mask, backend=BACKEND)

@@ -11,6 +11,7 @@ from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.views import over
 
 KEPT_BYTES = 400 * 10**6
 """Memory for the photos' statistics, bytes, at 28 a pixel. Those of further photos are computed at every visit."""
@@ -48,6 +49,7 @@ class CpuEngine(Step):
         rates: Rates,
         step: int,
         background: Tensor | None = None,
+        alpha: Tensor | None = None,
         mask: Tensor | None = None,
         antialias: bool = False,
         key: Hashable | None = None,
@@ -60,7 +62,9 @@ class CpuEngine(Step):
             rates=rates,
             step=step,
             background=background,
-            photo_stats=self._stats(photo, mask, key),
+            photo_stats=self._stats(photo, mask, key)
+            if alpha is None
+            else photo_stats(over(photo, alpha, background), mask=mask),
             antialias=antialias,
             pose_gradient=self.keep_pose_gradient,
         )

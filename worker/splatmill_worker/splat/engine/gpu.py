@@ -13,7 +13,7 @@ from splatmill_worker.splat.gaussians import Gaussians
 
 
 class GpuEngine(Step):
-    """An Engine on the Triton kernels. Photos stay on the device as uint8 for as long as their tensors live.
+    """An Engine on the Triton kernels. Photos stay on the device for as long as their tensors live.
 
     These kernels compute no gradient of the camera, so `pose_gradient` stays None; the plan refines no poses here.
     """
@@ -39,16 +39,17 @@ class GpuEngine(Step):
         rates: Rates,
         step: int,
         background: Tensor | None = None,
+        alpha: Tensor | None = None,
         mask: Tensor | None = None,
         antialias: bool = False,
         key: Hashable | None = None,
     ) -> StepResult:
         """Enqueue one step; the result is that of the latest step whose numbers have reached the host.
 
-        `key` is not used: computing the photo's window sums costs the device less than the memory to keep them.
+        `key` is not used: what is kept of a photo is kept with its tensor.
         """
         seen = self.train(
-            viewmat, K, photo,
-            degree=degree, rates=rates, step=step, background=background, mask=mask, antialias=antialias,
+            viewmat, K, photo, degree=degree, rates=rates, step=step, background=background, alpha=alpha, mask=mask,
+            antialias=antialias,
         )  # fmt: skip
         return StepResult(seen.loss, seen.visible)

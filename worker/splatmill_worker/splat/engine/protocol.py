@@ -94,6 +94,7 @@ class Engine(Protocol):
         rates: Rates,
         step: int,
         background: Tensor | None = None,
+        alpha: Tensor | None = None,
         mask: Tensor | None = None,
         antialias: bool = False,
         key: Hashable | None = None,
@@ -104,6 +105,8 @@ class Engine(Protocol):
         rates: learning rates of the step.
         step: its 1-based number.
         background: RGB [3] behind the scene; black where None.
+        alpha: uint8 [H, W] of a transparent photo, which is seen over the same background; None where it is opaque.
         antialias: compensate opacities for the dilation of small Gaussians.
         key: names the photo and its mask; the same key always comes with the same two, so work on them may be kept.
+            Nobody writes into the tensors of photos, alphas and masks that were given.
         """

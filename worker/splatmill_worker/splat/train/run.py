@@ -221,14 +221,15 @@ class TrainingRun:
             return self.engine.train_photo(
                 target.viewmat if self.poses is None else self.poses.viewmat(index),
                 target.K,
-                target.over(background),
+                target.rgb,
                 degree=self.plan.schedule.degree,
                 rates=rates,
                 step=self.step,
                 background=background,
+                alpha=target.alpha,
                 mask=target.mask,
                 antialias=self.plan.antialias,
-                key=(index, self.reduction) if target.alpha is None else None,
+                key=(index, self.reduction),
             )
         except MemoryError as short:
             raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
