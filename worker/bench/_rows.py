@@ -14,10 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import psutil
 import torch
-
-from splatmill_worker.kernels.cpu import isa
 
 HERE = Path(__file__).resolve().parent
 Row = dict[str, Any]
@@ -46,7 +43,13 @@ def origin() -> Row:
         model = names[0] if names else model
     versions = {"python": platform.python_version(), "torch": torch.__version__}
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"commit": commit, "machine": f"{model}, {cores} cores, {isa.chosen()}", "versions": versions}
+    try:
+        from splatmill_worker.kernels.cpu import isa
+
+        build = isa.chosen()
+    except ImportError:  # a machine where only the GPU is measured: the C++ is not built there
+        build = "no CPU kernels"
+    return {"commit": commit, "machine": f"{model}, {cores} cores, {build}", "versions": versions}
 
 
 def footer(rows: list[Row]) -> str:
@@ -63,6 +66,8 @@ def footer(rows: list[Row]) -> str:
 
 def worked() -> float:
     """CPU seconds of all programs on the machine since boot. The share of other programs is stored with each row."""
+    import psutil
+
     times = psutil.cpu_times()
     return float(sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0))
 
@@ -100,6 +105,8 @@ def read(name: str) -> list[Row]:
 
 def build(name: str) -> AbstractContextManager[None]:
     """Run every CPU op in this block with one build of the kernels: avx512, avx2 or baseline."""
+    from splatmill_worker.kernels.cpu import isa
+
     return running(isa.load(name))
 
 

@@ -1,277 +1,234 @@
-"""`bench gpu`: this engine against gsplat's released package, in one run on one card.
+"""`bench gpu`: the GPU engine on a card, in parts with a time limit each, in ten minutes together.
 
-`python worker/bench/gpu.py CAPTURE...` (folders with photos and cameras) writes results/gpu.jsonl:
-milliseconds per training step and per rendering at equal Gaussians and 1080p, and for every capture held-out
-error against training seconds of both, from the same first Gaussians, photos and split. Without a usable card
-it says so and measures nothing.
+`python worker/bench/gpu.py [CAPTURE...]` writes results/gpu.jsonl. The parts up to `tiles` need torch, Triton and this
+source tree, and nothing installed from it; `equal` and `curves` need the worker with what it imports, and gsplat for
+its half. Captures (folders with photos and cameras) are fox and lego of ../shared/data where that lies, unless given.
+Each part is a process of its own, whose rows are on disk as soon as they are measured: a part that is cut or fails
+leaves what it has, and a row that says why it ended. Without a usable card, one sentence says so and nothing is
+measured.
+
+    --only passes tiles      these parts alone
+    --dry --out FILE         everything up to `equal` in Triton's interpreter, at tiny sizes, without times
+    --table                  the table of the rows that there are
+
+Expected, before anything was measured: the bytes of a step at 1M Gaussians, 1 megapixel and 3M pairs, over the
+bandwidth of the card, are a floor that no step goes below; published steps of that size on an RTX 5090 take 3.8 ms
+(LiteGS) and 2.1 to 2.4 ms (jax-gs). Adam and the gradient of projection, which only move bytes, should come within a
+third of their floors; the compositing passes, which calculate, should take most of the step. Tiles of 8 pixels halve
+the pixels that a splat is tried on in vain and double the pairs: slower to list, faster to blend, and which wins is
+open. Needles are off by no more than a few units of their conditioning at every ratio.
 """
 
 from __future__ import annotations
 
 import argparse
-import statistics
+import multiprocessing
+import os
+import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
-from functools import partial
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import _gsplat
-import numpy as np
-import torch
-from _rows import Row, write
-from torch import Tensor
+HERE = Path(__file__).resolve().parent
+for folder in (
+    HERE,
+    HERE.parent,
+    HERE.parents[1],
+):  # a bare machine has the source tree, nothing installed from it
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
 
-from splatmill.schema import TrainOptions
-from splatmill_worker.images.load import load_views
-from splatmill_worker.kernels.gpu import device
-from splatmill_worker.pipeline import EXTENT
-from splatmill_worker.scene import Camera, Normalization, split
-from splatmill_worker.sfm import posed
-from splatmill_worker.splat.engine.open import open_engine
-from splatmill_worker.splat.engine.protocol import Engine
-from splatmill_worker.splat.evaluate import evaluate
-from splatmill_worker.splat.gaussians import Gaussians
-from splatmill_worker.splat.plan.decide import decide
-from splatmill_worker.splat.plan.facts import measure
-from splatmill_worker.splat.plan.probe import ZERO_RATES, probe
-from splatmill_worker.splat.render import render
-from splatmill_worker.splat.start.points import from_points
-from splatmill_worker.splat.train.loop import train
-from splatmill_worker.splat.views import Target, TrainingView
+import torch  # noqa: E402
+from _gpu import bandwidth, compared, errors, passes  # noqa: E402
+from _gpu.timing import Place  # noqa: E402
+from _rows import Row, append, lines, origin  # noqa: E402
 
-WIDTH, HEIGHT = 1920, 1080
-REPEATS = 30
-MEASURED_AT = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+RESULTS = HERE / "results" / "gpu.jsonl"
+CAPTURES = ("fox_540x960", "lego_400")
+UNUSABLE = 3
+"""Exit code of a part that found no usable card."""
+
+CURVE_SECONDS, CURVE_STEPS, CURVE_SIZE = 20.0, 7000, 960
+"""Time budget of this engine, steps of gsplat's run, and longest side of photos in pixels, for each curve."""
 
 
-def cloud(n: int, seed: int = 0) -> tuple[Gaussians, Target]:
-    """n Gaussians that fill a 1080p view, most of them a few pixels wide, some large, and a photo of
-    noise.
+@dataclass(frozen=True)
+class Part:
+    """One part of the benchmark.
+
+    name: as rows have it under `bench`.
+    seconds: its time limit.
+    rows: what it measures.
+    dry: whether it also runs in the interpreter.
     """
-    g = torch.Generator().manual_seed(seed)
-    depth = 2.0 + 8.0 * torch.rand(n, generator=g)
-    focal = 0.9 * WIDTH
-    place = (torch.rand(n, 2, generator=g) - 0.5) * torch.tensor([WIDTH, HEIGHT]) / focal
-    spacing = (WIDTH * HEIGHT / n) ** 0.5
-    size = spacing * torch.exp(0.6 * torch.randn(n, 3, generator=g)) * depth[:, None] / focal
-    gaussians = Gaussians(
-        torch.cat([place * depth[:, None], depth[:, None]], 1),
-        torch.log(size),
-        torch.randn(n, 4, generator=g),
-        torch.randn(n, generator=g),
-        0.2 * torch.randn(n, 16, 3, generator=g),
-    )
-    camera = Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, np.eye(4))
-    photo = torch.randint(0, 256, (HEIGHT, WIDTH, 3), generator=g, dtype=torch.uint8)
-    return gaussians, Target(
-        camera, torch.eye(4), torch.tensor(camera.K, dtype=torch.float32), photo, None, None
-    )
+
+    name: str
+    seconds: float
+    rows: Callable[[Place], Iterator[Row]]
+    dry: bool = True
 
 
-def median_ms(work: Callable[[], object], repeats: int = REPEATS) -> float:
-    """Median milliseconds on the device of `work`, after a first call that compiles and tunes."""
-    for _ in range(3):
-        work()
-    torch.cuda.synchronize()
-    taken = []
-    for _ in range(repeats):
-        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))  # type: ignore[no-untyped-call]  # torch's own gap
-        start.record()
-        work()
-        end.record()
-        end.synchronize()
-        taken.append(start.elapsed_time(end))
-    return float(statistics.median(taken))
+def card(place: Place) -> Iterator[Row]:
+    """What the card is. Ends the part with UNUSABLE where there is none."""
+    from splatmill_worker.kernels.gpu import device
+
+    if not place.dry:
+        if (reason := device.absence()) is not None:
+            print(f"Nothing was measured: {reason} This benchmark times kernels on a GPU.", flush=True)
+            raise SystemExit(UNUSABLE)
+        facts = device.describe()
+        assert facts is not None
+        yield {
+            "card": facts.name, "capability": ".".join(map(str, facts.capability)), "memory": facts.total_bytes,
+            "cuda": torch.version.cuda,
+        }  # fmt: skip
+    else:
+        yield {"card": "Triton's interpreter"}
 
 
-def seconds_to(curve: Sequence[Row], psnr: float) -> float | None:
-    """Training seconds at which a curve first reaches `psnr` dB, by linear interpolation; None
-    when it never does.
-    """
-    before: Row | None = None
-    for row in curve:
-        if row["psnr"] >= psnr:
-            if before is None or row["psnr"] == before["psnr"]:
-                return float(row["seconds"])
-            share = (psnr - before["psnr"]) / (row["psnr"] - before["psnr"])
-            return float(before["seconds"] + share * (row["seconds"] - before["seconds"]))
-        before = row
-    return None
+def parts(captures: Sequence[Path]) -> list[Part]:
+    """All parts in the order that they run in; their limits make ten minutes."""
 
+    def curves(_: Place) -> Iterator[Row]:
+        if not captures:
+            raise ValueError("no captures were given, and ../shared/data has none.")
+        return compared.curves(captures, CURVE_SIZE, CURVE_SECONDS, CURVE_STEPS, seed=0)
 
-def equal(counts: Sequence[int]) -> list[Row]:
-    """Step and render times of both engines on the same Gaussians, view and photo, with zero learning rates."""
-    rows: list[Row] = []
-    for n in counts:
-        gaussians, target = cloud(n)
-        ours = open_engine(gaussians, "gpu")
-        theirs = _gsplat.GsplatTrainer(gaussians, 1.0)
-        for optimizer in theirs.optimizers.values():
-            optimizer.param_groups[0]["lr"] = 0.0
-        here = gaussians.map(lambda value: value.cuda())
-        late = 3 * _gsplat.DEGREE_EVERY  # all of SH is in use
-
-        def our_step(engine: Engine = ours, seen: Target = target) -> None:
-            engine.train_photo(seen.viewmat, seen.K, seen.rgb, degree=3, rates=ZERO_RATES, step=1)
-
-        def our_view(scene: Gaussians = here, seen: Target = target) -> None:
-            with torch.no_grad():
-                render(scene, seen.camera)
-
-        def their_step(
-            trainer: _gsplat.GsplatTrainer = theirs, seen: Target = target, at: int = late
-        ) -> None:
-            trainer.step(seen, at, densify=False)
-
-        def their_view(trainer: _gsplat.GsplatTrainer = theirs, seen: Target = target) -> None:
-            with torch.no_grad():
-                trainer.render(seen, 3)
-
-        for name, step, view in (("splatmill", our_step, our_view), ("gsplat", their_step, their_view)):
-            rows.append(
-                {
-                    "bench": "equal",
-                    "engine": name,
-                    "gaussians": n,
-                    "width": WIDTH,
-                    "height": HEIGHT,
-                    "step_ms": median_ms(step),
-                    "render_ms": median_ms(view),
-                }
-            )
-    return rows
-
-
-def _drawn(trainer: _gsplat.GsplatTrainer, degree: int, target: Target, _: Tensor) -> Tensor:
-    """The view that gsplat's model renders of a target at an SH degree, over black."""
-    return trainer.render(target, degree)[0].clamp(0, 1)
-
-
-def curves(capture: Path, size: int, steps: int, seed: int) -> list[Row]:
-    """Held-out error against training seconds on one capture; evaluation is off the clock for both."""
-    found = posed.find(capture)
-    if found is None:
-        raise SystemExit(f"{capture} has no cameras: give a folder with a COLMAP model or transforms.json.")
-    scene = found.load()
-    frame = Normalization.of(scene)
-    world = frame.apply(scene)
-    chosen, kept = split(scene)
-    views, held_out = ([TrainingView.of(p, frame) for p in load_views(v, size)] for v in (chosen, kept))
-    first = from_points(torch.from_numpy(world.points), torch.from_numpy(world.colors))
-
-    speed = probe(open_engine(first, "gpu"), views)
-    options = TrainOptions(image_size=size, seed=seed)
-    card = device.describe()
-    assert card is not None
-    facts = replace(measure(world, views, len(held_out), speed), memory_available=card.free_bytes)
-    plan = decide(facts, options, "gpu")
-    done = train(open_engine(first, "gpu"), views, held_out, plan, extent=EXTENT)
-    common = {
-        "bench": "curve",
-        "scene": capture.name,
-        "views": len(views),
-        "held_out": len(held_out),
-        "seed": seed,
-    }
-    rows: list[Row] = [
-        {**common, "engine": "splatmill", "steps": done.steps, **asdict(row)}
-        for row in done.curve
-        if row.psnr is not None
+    return [
+        Part("card", 30, card),
+        Part("bandwidth", 20, bandwidth.measure),
+        Part("proofs", 80, errors.prove),
+        Part("needles", 90, errors.needles),
+        Part("passes", 80, passes.measure),
+        Part("tiles", 80, passes.measure_small_tiles),
+        Part("equal", 80, compared.equal),
+        Part("curves", 140, curves, dry=False),
     ]
 
-    trainer = _gsplat.GsplatTrainer(first, EXTENT, steps)
-    for number in range(3):
-        trainer.render(views[number % len(views)].full, 0)
-    due = [max(1, round(share * steps)) for share in MEASURED_AT]
-    seconds = 0.0
-    torch.cuda.synchronize()
-    started = time.perf_counter()
-    for number, view in enumerate(_gsplat.order(len(views), steps, seed)):
-        trainer.step(views[view].full, number)
-        if number + 1 == due[0]:
-            torch.cuda.synchronize()
-            seconds += time.perf_counter() - started
-            with torch.no_grad():
-                score = evaluate(
-                    partial(_drawn, trainer, _gsplat.degree_at(number)),
-                    held_out,
-                    torch.zeros(3),
-                )
-            rows.append(
-                {
-                    **common,
-                    "engine": "gsplat",
-                    "steps": steps,
-                    "step": number + 1,
-                    "seconds": seconds,
-                    "psnr": score.psnr,
-                    "ssim": score.ssim,
-                    "gaussians": trainer.count,
-                }
-            )
-            due.pop(0)
-            torch.cuda.synchronize()
-            started = time.perf_counter()
-    return rows
+
+def run(part: Part, place: Place, out: Path, common: Row) -> str:
+    """Run a part in a process of its own; returns `done`, or why it ended, which is also a row."""
+    context = multiprocessing.get_context("fork")  # the parent has imported everything and touched no device
+    child = context.Process(target=_measure, args=(part, place, out, common))
+    started = time.monotonic()
+    child.start()
+    child.join(None if place.dry else part.seconds)
+    outcome = "done"
+    if child.is_alive():
+        child.kill()
+        child.join()
+        outcome = f"cut after {part.seconds:.0f} s"
+    elif child.exitcode == UNUSABLE:
+        return "unusable"
+    elif child.exitcode:
+        outcome = "failed"
+    spent = {} if place.dry else {"seconds": round(time.monotonic() - started, 1)}
+    append(out, {**common, "bench": part.name, "outcome": outcome, **spent})
+    return outcome
 
 
-def verdict(rows: Sequence[Row]) -> list[str]:
-    """One sentence per scene: how much sooner this engine reaches the other's final held-out PSNR."""
-    said = []
-    for scene in sorted({row["scene"] for row in rows if row["bench"] == "curve"}):
-        ours, theirs = (
-            [r for r in rows if r.get("scene") == scene and r["engine"] == name]
-            for name in ("splatmill", "gsplat")
-        )
-        final = theirs[-1]
-        reached = seconds_to(ours, final["psnr"])
-        goal = f"gsplat's final {final['psnr']:.2f} dB ({final['seconds']:.0f} s, {final['gaussians']} Gaussians)"
-        if reached is None:
+def _measure(part: Part, place: Place, out: Path, common: Row) -> None:
+    try:
+        for row in part.rows(place):
+            append(out, {**common, "bench": part.name, **row})
+    except Exception as error:
+        traceback.print_exc()
+        append(out, {**common, "bench": part.name, "error": f"{type(error).__name__}: {error}"})
+        raise SystemExit(1) from None
+
+
+def _number(value: Any, unit: float = 1.0) -> str:
+    return "-" if value is None else f"{value / unit:.3g}"
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """The rows of the latest run as tables in Markdown, and a verdict for each capture."""
+    rows = rows[
+        max((i for i, row in enumerate(rows) if row["bench"] == "card" and "card" in row), default=0) :
+    ]
+    by = {name: [row for row in rows if row["bench"] == name] for name in {row["bench"] for row in rows}}
+    said = [f"On {row['card']}." for row in by.get("card", []) if "card" in row]
+    rates = [row["bytes_per_second"] for row in by.get("bandwidth", []) if row.get("bytes_per_second")]
+    rate = max(rates, default=None)
+    if rate is not None:
+        said.append(f"Memory moves {rate / 1e9:.0f} GB/s.")
+    for name in ("passes", "tiles"):
+        timed = [row for row in by.get(name, []) if "pass" in row]
+        if not timed:
+            continue
+        seen = timed[0]
+        said += [
+            "",
+            f"{seen['gaussians']} Gaussians, {seen['pixels']} pixels, {seen['pairs']} pairs, tiles of {seen['tile']}",
+            "",
+            "| pass | MB | floor ms | ms |",
+            "| --- | --- | --- | --- |",
+        ]
+        for row in timed:
+            floor = None if rate is None else 1e3 * row["bytes"] / rate
             said.append(
-                f"{scene}: {goal} was not reached; the best was {max(r['psnr'] for r in ours):.2f} dB."
+                f"| {row['pass']} | {row['bytes'] / 1e6:.3g} | {_number(floor)} | {_number(row['ms'])} |"
             )
-        else:
-            said.append(
-                f"{scene}: {goal} was reached in {reached:.1f} s, {final['seconds'] / reached:.1f} times sooner."
-            )
+    if worst := [row for row in by.get("needles", []) if "largest" in row]:
+        said += ["", "| needles | ratio | value | largest | median |", "| --- | --- | --- | --- | --- |"]
+        said += [
+            f"| {row['where']} | {row['ratio']:.0e} | {row['value']} | {row['largest']:.3g} | {row['median']:.3g} |"
+            for row in worst
+        ]
+    for row in by.get("proofs", []):
+        if "passed" in row:
+            share = max(row["share_of_allowed"].values())
+            said.append(f"Degree {row['degree']}: {share:.2g} of the error allowed, passed: {row['passed']}.")
+    for row in by.get("equal", []):
+        if "engine" in row:
+            times = f"{_number(row['ms'])} ms/step, {_number(row['render_ms'])} ms/view"
+            said.append(f"{row['engine']}, {row['gaussians']} Gaussians: {times}")
+    said += compared.verdict(by.get("curves", []))
+    said += [f"{row['bench']}: {row['outcome']}" for row in rows if row.get("outcome", "done") != "done"]
+    said += [f"{row['bench']}: {row['error']}" for row in rows if "error" in row]
     return said
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+def main(argv: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="bench gpu", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("captures", nargs="*", type=Path, help="folders with photos and cameras")
-    parser.add_argument(
-        "--gaussians", type=int, nargs="+", default=[100_000, 1_000_000], help="counts to compare at"
-    )
-    parser.add_argument("--size", type=int, default=1600, help="longest side of the photos in pixels")
-    parser.add_argument(
-        "--steps", type=int, default=_gsplat.STEPS, help="of gsplat's run; its default is 30000"
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    wish = parser.parse_args()
-    card = device.describe()
-    if card is None:
-        print(
-            f"Nothing was measured: {device.absence()} This benchmark compares two GPU engines on one card."
-        )
-        return
-    facts: Row = {
-        "card": card.name,
-        "capability": ".".join(map(str, card.capability)),
-        "memory": card.total_bytes,
-        "cuda": torch.version.cuda,
-    }
-    rows = equal(wish.gaussians)
-    for capture in wish.captures:
-        rows += curves(capture, wish.size, wish.steps, wish.seed)
-    path = write("gpu", [{**row, **facts} for row in rows])
-    for row in rows:
-        if row["bench"] == "equal":
-            taken = f"{row['step_ms']:8.2f} ms/step {row['render_ms']:8.2f} ms/view"
-            print(f"{row['engine']:10} {row['gaussians']:>9} {taken}")
-    print(*verdict(rows), f"{len(rows)} rows in {path}", sep="\n")
+    parser.add_argument("--only", nargs="+", metavar="PART", help="these parts alone")
+    parser.add_argument("--dry", action="store_true", help="tiny sizes in Triton's interpreter, no times")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="file that rows are added to")
+    parser.add_argument("--table", action="store_true", help="print the table of the rows that there are")
+    wish = parser.parse_args(argv)
+    if wish.table:
+        print("\n".join(table(lines(wish.out))))
+        return 0
+    if wish.dry:
+        if wish.out == RESULTS:
+            parser.error("--dry needs --out FILE, since its rows are no results")
+        os.environ["TRITON_INTERPRET"] = "1"
+        from tests.support.kernels.interpreter import ask_for_it
+
+        ask_for_it()  # with what makes the interpreter twice as fast
+    place = Place("cpu" if wish.dry else "cuda", wish.dry)
+    shared = HERE.parents[2] / "shared" / "data"
+    captures = wish.captures or [shared / name for name in CAPTURES if (shared / name).is_dir()]
+    wanted = [
+        part
+        for part in parts(captures)
+        if (part.dry or not wish.dry) and (wish.only is None or part.name in ("card", *wish.only))
+    ]
+    import triton
+
+    common = {**origin(), "triton": triton.__version__, "dry": wish.dry}
+    ended = []
+    for part in wanted:
+        ended.append(run(part, place, wish.out, common))
+        if ended[-1] == "unusable":
+            return 0
+    print("\n".join(table(lines(wish.out))))
+    return 0 if set(ended) <= {"done"} else 1
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main(sys.argv[1:]))

@@ -32,7 +32,8 @@ PIXEL_BYTES = 127 + PLANES * 4
 fifteen float32 planes of moments and nine of slopes in the loss 96, and the checkpoint of each tile's last segment."""
 
 STATS_SHARE = 0.05
-"""Share of the free memory that the statistics of photos may take; those of further photos are computed again."""
+"""Share of the free memory that the statistics of photos may take; those of further photos are computed again
+(decisions: STATS_SHARE)."""
 
 _found_usable: set[int] = set()
 
