@@ -6,17 +6,22 @@ Not proven here: that a pose refinement built on it converges.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
+from _stability.roundings import inexact_exponential
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu import isa
 from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.kernels.records import Rates
-from tests.support.kernels.cases import Case, scene
+from tests.support.kernels.alone import Change, rounding, spread
+from tests.support.kernels.bounds import SUM_LIMIT, within
+from tests.support.kernels.cases import GROUPS, Case, scene
 from tests.support.kernels.proof import use
+from tests.support.kernels.units import DRAWS, moved_leaf
 
 STILL = Rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -41,14 +46,32 @@ def slopes(case: Case) -> list[Tensor]:
     return [torch.randn(h, w, *more, generator=g) for more in ((3,), (), ())]
 
 
-def by_ops(case: Case, backend: ops.Backend, dtype: torch.dtype) -> Tensor:
+def by_ops(case: Case, backend: ops.Backend, dtype: torch.dtype, change: Change = lambda x: x) -> Tensor:
+    """The gradient to a motion by the separate ops, with every input changed."""
     xi = torch.zeros(6, dtype=dtype, requires_grad=True)
-    p = case.project(case.groups(dtype), motion(xi) @ case.viewmat.to(dtype), backend)
+    groups = [moved_leaf(k, x, change) for k, x in zip(GROUPS, case.groups(dtype), strict=True)]
+    viewmat, K = change(case.viewmat.to(dtype)), change(case.K.to(dtype))
+    p = replace(case, K=K).project(groups, motion(xi) @ viewmat, backend)
     bins = ops.bin(p, case.width, case.height, backend=backend)
     image = ops.composite(p, bins, case.width, case.height, backend=backend)
-    torch.autograd.backward(image, [s.to(dtype) for s in slopes(case)])
+    torch.autograd.backward(image, [change(s.to(dtype)) for s in slopes(case)])
     assert xi.grad is not None
     return xi.grad
+
+
+def unit_of(case: Case, exact: Tensor) -> Tensor:
+    """What rounding the inputs and the error of 2^x do to the gradient."""
+    g, moved = rounding()
+
+    def exponential(sign: float) -> Tensor:
+        with inexact_exponential(g, sign):
+            return by_ops(case, "reference", torch.float64)
+
+    return spread(
+        {"pose": exact},
+        ({"pose": by_ops(case, "reference", torch.float64, moved)} for _ in range(DRAWS)),
+        ({"pose": exponential(sign)} for sign in (1.0, 0.0, 0.0)),
+    )["pose"]
 
 
 def by_step(case: Case, threads: int = 2) -> Tensor:
@@ -64,12 +87,20 @@ def by_step(case: Case, threads: int = 2) -> Tensor:
 @pytest.mark.parametrize("degree", [0, 3])
 def test_it_is_that_of_the_ops_and_of_the_definition(degree: int, antialias: bool, build: str) -> None:
     case = replace(scene("pose", 150), degree=degree, antialias=antialias)
+    exact, unit = known(degree, antialias)
+    with use(f"cpu:{build}") as op:
+        fused, separate = by_step(case), by_ops(case, op, torch.float32)
+    what = f"degree {degree}{', antialias' if antialias else ''}"
+    within("pose, fused", what, (fused.double() - exact)[None], unit[None], SUM_LIMIT)
+    within("pose, separate ops", what, (separate.double() - exact)[None], unit[None], SUM_LIMIT)
+
+
+@cache
+def known(degree: int, antialias: bool) -> tuple[Tensor, Tensor]:
+    """The exact gradient and its unit, once for all builds."""
+    case = replace(scene("pose", 150), degree=degree, antialias=antialias)
     exact = by_ops(case, "reference", torch.float64)
-    with use(f"cpu:{build}"):
-        fused, separate = by_step(case), by_ops(case, "cpu", torch.float32)
-    # As for the parameters' gradients (test_cpu_step): the roundings of the conic, and the exponential's error.
-    assert float((fused - separate).norm() / exact.norm()) < 2e-5
-    assert float((fused.double() - exact).norm() / exact.norm()) < 1e-4
+    return exact, unit_of(case, exact)
 
 
 def test_the_loss_falls_along_it_by_its_length() -> None:

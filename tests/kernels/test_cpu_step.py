@@ -1,6 +1,6 @@
-"""The fused CPU step is the separate ops and Adam in one: gradients, scores, state, the same bytes on all threads.
+"""The fused CPU step is gradients and Adam in one: the update, scores, state, the same bytes on all threads.
 
-Not proven here: the ops themselves (test_proof_*), convergence of training, speed.
+Not proven here: the gradients themselves (test_proof_step), convergence of training, speed.
 """
 
 from __future__ import annotations
@@ -69,25 +69,13 @@ def fused_gradients(case: Case, step: Step) -> dict[str, Tensor]:
     return step.gradients(*slopes(case))
 
 
-def relative(a: Tensor, b: Tensor) -> float:
-    """Error of a in the 2-norm, as a share of b."""
-    return float((a.double() - b.double()).norm() / b.double().norm())
-
-
-@pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gradients_are_those_of_the_separate_ops_and_of_the_reference(degree: int, antialias: bool) -> None:
-    case = replace(scene("step", 150), degree=degree, antialias=antialias)
-    fused = fused_gradients(case, make_step(case))
-    separate, _ = differentiate(case, "cpu", torch.float32)
-    exact, _ = differentiate(case, "reference", torch.float64)
-    for name in GROUPS:
-        # The two ways differ by rounding alone (conic against its factor): a few hundred float32 roundings.
-        assert relative(fused[name], separate[name]) < 2e-5, name
-        # The exponential's error (math.hpp) reaches every weight; gradients sum hundreds of weights of either sign.
-        assert relative(fused[name], exact[name]) < 1e-4, name
+def test_coefficients_beyond_the_degree_have_no_gradient(degree: int) -> None:
+    case = replace(scene("step", 150), degree=degree)
+    found = fused_gradients(case, make_step(case))["sh"]
     unused = (degree + 1) ** 2
-    assert torch.count_nonzero(fused["sh"][:, unused:]) == 0
+    assert torch.count_nonzero(found[:, unused:]) == 0
+    assert torch.count_nonzero(found[:, unused - 1]) > 0
 
 
 def test_one_step_is_loss_gradient_and_adam() -> None:

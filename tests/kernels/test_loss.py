@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops, reference
-from tests.support.kernels.proof import EPS, backends, use
+from tests.support.kernels.alone import loss_units
+from tests.support.kernels.bounds import SUM_LIMIT, within
+from tests.support.kernels.proof import backends, use
 
 SIZES = [(1, 1), (15, 16), (17, 257), (257, 1), (40, 33), (23, 1100)]
 
@@ -54,18 +56,18 @@ def test_loss_is_the_definitions(size: tuple[int, int], kind: str, masked: bool,
     with use(backend) as op:
         mine = ops.loss(got, photo.to(device), mask=None if mask is None else mask.to(device), backend=op)
         (gradient,) = torch.autograd.grad(mine, got)
-    # A windowed moment of values up to 1 is known to 12 eps, a variance (a difference of two) to 24 eps; over C2 =
-    # 9e-4, that is 24 eps / 9e-4 = 1.6e-3 at worst where nothing varies, times the weight 0.2. Averages over pixels
-    # lose much of it.
-    flat = 24 * EPS / 9e-4
-    assert float(mine.detach().cpu().double() - value.detach()) == pytest.approx(0.0, abs=0.2 * flat)
+    exact = {"value": value.detach(), "gradient": expected}
+    unit = loss_units(color, photo, mask, exact)
+    what = f"{kind}-{'masked' if masked else 'whole'}-{size[0]}x{size[1]}"
+    off_value = (mine.detach().cpu().double() - value.detach())[None]
+    within("loss", what, off_value, unit["value"][None], SUM_LIMIT)
     off = (gradient.cpu().double() - expected).abs()
     if (
         kind == "equal"
     ):  # on the kink of |x - p| rounding decides a sign: the L1 term, 0.8 / (3 count), comes, goes or turns
         count = 3 * (float((mask != 0).sum()) if mask is not None else photo[..., 0].numel())
         off = torch.minimum(torch.minimum(off, (off - 0.8 / count).abs()), (off - 1.6 / count).abs())
-    assert float(off.max()) <= 4 * flat * float(expected.abs().max()) + 1e-12
+    within("gradient of the loss", what, off.reshape(-1, 3), unit["gradient"].reshape(-1, 3))
     if mask is not None:
         assert (gradient.cpu()[mask == 0] == 0).all()
 

@@ -8,14 +8,24 @@ they are few.
 
 from __future__ import annotations
 
+from functools import cache
+
 import pytest
 import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import Projected
-from tests.support.kernels.bounds import within
-from tests.support.kernels.cases import CASES, GROUPS
+from tests.support.kernels.alone import (
+    Outputs,
+    composite_gradients,
+    composite_units,
+    field_weights,
+    project_gradients,
+    project_units,
+)
+from tests.support.kernels.bounds import LIMIT, SUM_LIMIT, within
+from tests.support.kernels.cases import CASES, GROUPS, Case
 from tests.support.kernels.exact import exact, image_weights
 from tests.support.kernels.proof import (
     EPS,
@@ -26,7 +36,6 @@ from tests.support.kernels.proof import (
     filled,
     run,
     use,
-    weighted,
 )
 
 
@@ -67,35 +76,53 @@ ALONE = [
 @pytest.mark.parametrize("name", ALONE)
 def test_project_alone(name: str, backend: str) -> None:
     """Weights on project's own fields: means2d, conics, opacities, colours, depths."""
-    case = CASES[name]()
-
-    def gradients(op: ops.Backend, dtype: torch.dtype) -> dict[str, Tensor]:
-        device = "cuda" if op == "gpu" and torch.cuda.is_available() else "cpu"
-        leaves = [x.to(device).requires_grad_() for x in (*case.groups(dtype), case.camera(dtype)[0])]
-        p = case.project(leaves[:5], leaves[5], op)
-        g = torch.Generator().manual_seed(6)
-        total = torch.zeros((), dtype=dtype, device=device)
-        for field in p[:5]:
-            total = total + (field * torch.randn(field.shape, generator=g).to(device, dtype)).sum()
-        return dict(zip((*GROUPS, "viewmat"), torch.autograd.grad(total, leaves), strict=True))
-
-    expected = gradients("reference", torch.float64)
+    case, weights, expected, unit = alone_project(name)
     with use(backend) as op:
-        got = gradients(op, torch.float32)
-    # Every factor of the chain rule carries a few eps, and 1/z carries the error of the camera coordinate, to the
-    # third power at most. Between the two axes of a conic terms cancel in proportion to their ratio, the root of its
-    # condition.
-    p = define(case).projected
-    z = torch.where(p.depths > 0, p.depths, 1.0).detach()
-    coordinate = 4 * EPS * (case.means.double().abs().sum(1) + case.viewmat[:3, 3].double().abs().sum())
-    seen = p.depths > 0
-    axes = float(condition(p.conics.detach()[seen]).max().sqrt())
-    relative = (64 * EPS + 3 * float((coordinate / z)[seen].max())) * (1 + axes)
-    # A round Gaussian's quaternion gradient is a difference of equal terms.
-    floor = float(expected["log_scales"].norm()) / float(case.quats.norm(dim=1).min())
+        got = project_gradients(case, weights, op, torch.float32)
     for k, b in expected.items():
-        size = float(b.norm()) + (floor if k == "quats" else 0.0)
-        assert float((got[k].cpu().double() - b).norm()) <= relative * size + 1e-12, k
+        error, u = got[k].cpu().double() - b, unit[k]
+        alone = k == "viewmat"
+        within(
+            f"project alone, gradient to {k}", f"{name}, project alone",
+            error[None] if alone else error, u[None] if alone else u, SUM_LIMIT if alone else LIMIT,
+        )  # fmt: skip
+
+
+@cache
+def alone_project(name: str) -> tuple[Case, list[Tensor], Outputs, Outputs]:
+    """The case, the weights of project's fields, its exact gradients and their units, once for all backends."""
+    case = CASES[name]()
+    weights = field_weights(define(case).projected)
+    expected = project_gradients(case, weights, "reference", torch.float64)
+    return case, weights, expected, project_units(case, weights, expected)
+
+
+@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize(
+    "name", ["ordinary", "degree 1", "needles 1e+02", "sub-pixel", "pile of opaque", "dark", "portrait"]
+)
+def test_composite_alone(name: str, backend: str) -> None:
+    """The same rounded splats given to both: gradients to every field of them."""
+    case, rounded, weights, expected, unit = alone_composite(name)
+    with use(backend) as op:
+        got = composite_gradients(case, rounded, None, weights, op, torch.float32)
+    for k, b in expected.items():
+        within(f"composite alone, gradient to {k}", name, got[k].cpu().double() - b, unit[k])
+
+
+@cache
+def alone_composite(name: str) -> tuple[Case, Projected, tuple[Tensor, ...], Outputs, Outputs]:
+    """The case, its rounded splats, the images' weights, and the exact gradients and their units."""
+    case = CASES[name]()
+    want = define(case)
+    rounded = Projected(*(x.detach().float() for x in want.projected))
+    # A conic's smaller eigenvalue, recovered from three float32 numbers, is known to condition * 4 eps.
+    error = alpha_error(case, want.projected) + 5.5 * 4 * EPS * condition(rounded.conics)
+    fields = filled(rounded, [x.double() for x in rounded[:5]])
+    image = ops.composite(fields, want.bins, case.width, case.height, backend="reference")
+    weights = image_weights(case, Run({}, fields, want.bins, *image), error)
+    expected = composite_gradients(case, rounded, want.bins, weights, "reference", torch.float64)
+    return case, rounded, weights, expected, composite_units(case, rounded, want.bins, weights, expected)
 
 
 def condition(conics: Tensor) -> Tensor:
@@ -104,35 +131,3 @@ def condition(conics: Tensor) -> Tensor:
     root = torch.sqrt(((a - c) / 2) ** 2 + b * b)
     low = (a + c) / 2 - root
     return torch.where(low > 0, ((a + c) / 2 + root) / low.clamp_min(1e-30), 1.0)
-
-
-@pytest.mark.parametrize("backend", backends())
-@pytest.mark.parametrize(
-    "name", ["ordinary", "degree 1", "needles 1e+02", "sub-pixel", "pile of opaque", "dark", "portrait"]
-)
-def test_composite_alone(name: str, backend: str) -> None:
-    """The same rounded splats given to both: images and gradients to every field of them."""
-    case = CASES[name]()
-    want = define(case)
-    rounded = Projected(*(x.detach().float() for x in want.projected))
-    # A conic's smaller eigenvalue, recovered from three float32 numbers, is known to condition * 4 eps.
-    error = alpha_error(case, want.projected) + 5.5 * 4 * EPS * condition(rounded.conics)
-
-    def through(op: ops.Backend, dtype: torch.dtype) -> tuple[tuple[Tensor, Tensor, Tensor], list[Tensor]]:
-        device = "cuda" if op == "gpu" and torch.cuda.is_available() else "cpu"
-        fields = [x.to(device, dtype).requires_grad_() for x in rounded[:5]]
-        p = filled(rounded, fields)
-        bins = ops.bin(p, case.width, case.height, backend=op)
-        image = ops.composite(p, bins, case.width, case.height, backend=op)
-        return image, fields
-
-    image, fields = through("reference", torch.float64)
-    near = Run({}, filled(rounded, fields), want.bins, *image)
-    weights = image_weights(case, near, error)
-    expected = torch.autograd.grad(weighted(image, weights), fields)
-    with use(backend) as op:
-        image, fields = through(op, torch.float32)
-        got = torch.autograd.grad(weighted(image, weights), fields)
-    relative = 4 * float(error.max()) + 64 * EPS
-    for label, x, y in zip(Projected._fields, got, expected, strict=False):
-        assert float((x.cpu().double() - y).norm()) <= relative * float(y.norm()) + 1e-12, label

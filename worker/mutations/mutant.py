@@ -1,6 +1,6 @@
 """pytest plugin: one module of the kernels is replaced by a mutated build or source, before anything imports it.
 
-SPLATMILL_MUTANT is MODULE=PATH, with the path of an extension module or of a Python file.
+SPLATMILL_MUTANT is MODULE=PATH, with the path of an extension module or of a Python file; empty for no mutant.
 """
 
 import importlib.util
@@ -8,7 +8,7 @@ import os
 import sys
 from importlib.machinery import ModuleSpec
 
-module, path = os.environ["SPLATMILL_MUTANT"].split("=", 1)
+module, _, path = os.environ["SPLATMILL_MUTANT"].partition("=")
 
 
 class Finder:

@@ -1,20 +1,23 @@
 """Apply every mutation of `mutants.py` to a copy of the kernels, build it, and run the proofs against it.
 
-    python worker/mutations/run.py                  # all of them: about 20 minutes on two cores
+    python worker/mutations/run.py                  # all of them: hours
+    python worker/mutations/run.py --fresh          # those that have no row that says they are caught
+    python worker/mutations/run.py --backend gpu    # those of Triton's kernels, in its interpreter
     python worker/mutations/run.py --only "half the off-diagonal" --only "green twice"
-    python worker/mutations/run.py --next           # those that are not caught or not tried
+    python worker/mutations/run.py --next           # those that are known to survive
     python worker/mutations/run.py --table-only
 
-The copy lies in worker/build/mutations; the source tree is not touched. One instruction set is built, the best that
-runs here, without optimisation beyond -O1: contraction is off, so the results are the same. The proofs that `PROOFS`
-names for a file run first, then all others, until one fails; in the end every test that caught a mutant has to pass
-without mutations. Rows go to mutations.jsonl, the table to mutations.md.
-Ends with 1 where a mutant survives.
+The copy lies in worker/build/mutations, one for each --backend, so that these can run side by side; the source tree is
+not touched. One instruction set is built, the best that runs here, without optimisation beyond -O1: contraction is off,
+so the results are the same. The proofs that `PROOFS` names for a file run first, then all others, until one fails; in
+the end every test that caught a mutant has to pass without mutations. Rows go to mutations.jsonl, the table to
+mutations.md. Ends with 1 where a mutant survives.
 """
 
 from __future__ import annotations
 
 import argparse
+import fcntl
 import json
 import os
 import shutil
@@ -22,6 +25,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,101 +37,146 @@ from mutants import KERNELS, MUTANTS, NEXT, Mutant  # noqa: E402  (beside this f
 from splatmill_worker.kernels.cpu import isa  # noqa: E402
 
 ROOT = HERE.parents[1]
-WORK = ROOT / "worker" / "build" / "mutations"
-COPY = WORK / "worker"
-MUTATED = WORK / "mutated"
-"""There while a file of the copy is mutated."""
 ROWS, TABLE = HERE / "mutations.jsonl", HERE / "mutations.md"
 ISA = isa.supported()[0]
 TESTS = Path("tests/kernels")
 
+GRADIENTS = ["test_proof_step.py", "test_proof_backward.py"]
+FORWARD = ["test_proof_forward.py", "test_proof_step.py"]
+GPU_OPS = "test_gpu_ops.py::test_"
+PROJECTION = [
+    f"{GPU_OPS}{x}"
+    for x in ("project_agrees_with_the_definition", "gradient_of_project_agrees_with_the_definition")
+]
 PROOFS = {
-    "adam.hpp": ["test_adam", "test_cpu_step"],
-    "loss.cpp": ["test_loss"],
-    "knn.cpp": ["test_knn"],
-    "pose.hpp": ["test_cpu_pose"],
-    "step.cpp": ["test_proof_step", "test_cpu_step"],
-    "bin.cpp": ["test_proof_forward", "test_proof_step"],
-    "reach.hpp": ["test_proof_forward", "test_proof_step"],
-    "composite_forward.cpp": ["test_proof_forward"],
+    "cpu/adam": ["test_adam.py", "test_cpu_step.py"],
+    "cpu/loss": ["test_loss.py"],
+    "cpu/knn": ["test_knn.py"],
+    "cpu/pose": ["test_cpu_pose.py"],
+    "cpu/step": ["test_cpu_step.py", *GRADIENTS],
+    "cpu/threads": ["test_cpu_isa.py", "test_proof_poison.py"],
+    "cpu/touches": ["test_cpu_step.py", "test_cpu_input.py", *FORWARD],
+    "cpu/bin": FORWARD,
+    "cpu/reach": FORWARD,
+    "cpu/composite_forward": FORWARD,
+    "cpu/composite": ["test_proof_backward.py", "test_cpu_input.py"],
+    "cpu/project": ["test_proof_backward.py", "test_proof_poison.py"],
+    "reference/adam": ["test_adam.py"],
+    "reference/knn": ["test_knn.py"],
+    "reference/loss": ["test_loss.py"],
+    "gpu/adam": [f"{GPU_OPS}adam_agrees_with_the_definition", "test_gpu_step.py"],
+    "gpu/bin": [f"{GPU_OPS}bin_agrees_with_the_definition_but_for_real_crossings", "test_gpu_step.py"],
+    "gpu/blend": [f"{GPU_OPS}composite_and_its_gradient_agree_with_the_definition"],
+    "gpu/composite": [f"{GPU_OPS}composite_and_its_gradient_agree_with_the_definition"],
+    "gpu/composite_backward": [f"{GPU_OPS}composite_and_its_gradient_agree_with_the_definition"],
+    "gpu/loss": [f"{GPU_OPS}loss_and_its_gradient_agree_with_the_definition"],
+    "gpu/knn": [f"{GPU_OPS}knn_agrees_with_the_definition"],
+    "gpu/project": [*PROJECTION, f"{GPU_OPS}a_bad_number_culls_its_gaussian_and_touches_no_other"],
+    "gpu/project_backward": PROJECTION[::-1],
+    "gpu/projection": PROJECTION,
+    "gpu/harmonics": PROJECTION[::-1],
 }
-"""The tests most likely to catch a fault in a file, first; for others, those of the gradients."""
+"""The tests most likely to catch a fault in a file, by its path without suffix. Where none are named: `DEFAULT`."""
+
+DEFAULT = {
+    "cpu": GRADIENTS,
+    "reference": ["test_reference_order.py", "test_reference_gsplat.py"],
+    "gpu": ["test_gpu_step.py"],
+}
 
 ALL = [
-    "test_proof_backward", "test_proof_forward", "test_proof_step", "test_cpu_step", "test_cpu_pose", "test_adam",
-    "test_loss", "test_knn", "test_proof_poison", "test_cpu_input", "test_reference_order", "test_reference_gsplat",
+    "test_proof_backward.py", "test_proof_forward.py", "test_proof_step.py", "test_cpu_step.py", "test_cpu_pose.py",
+    "test_adam.py", "test_loss.py", "test_knn.py", "test_proof_poison.py", "test_cpu_input.py",
+    "test_reference_order.py", "test_reference_gsplat.py", "test_cpu_isa.py",
 ]  # fmt: skip
+ALL_GPU = ["test_gpu_step.py", "test_gpu_ops.py"]
 
 Row = dict[str, Any]
 
 
-def copy_tree() -> None:
+@dataclass(frozen=True)
+class Copy:
+    """A copy of the kernels and their tests, of its own for each backend whose mutants are tried."""
+
+    work: Path
+
+    @property
+    def worker(self) -> Path:
+        return self.work / "worker"
+
+    @property
+    def mutated(self) -> Path:
+        """There while a file of the copy is mutated."""
+        return self.work / "mutated"
+
+
+def copy_tree(copy: Copy) -> None:
     """The kernels' source and the tests, as they are. Files that have not changed keep their time and their objects."""
-    if MUTATED.exists():  # an interrupted run: what is built from its file may be the mutant
-        shutil.rmtree(WORK / "cmake", ignore_errors=True)
+    if copy.mutated.exists():  # an interrupted run: what is built from its file may be the mutant
+        shutil.rmtree(copy.work / "cmake", ignore_errors=True)
     kernels = [p for p in (ROOT / "worker" / KERNELS).rglob("*") if p.suffix in (".cpp", ".hpp", ".py")]
-    shutil.rmtree(WORK / "tests", ignore_errors=True)
+    shutil.rmtree(copy.work / "tests", ignore_errors=True)
     tests = [p for folder in ("kernels", "support") for p in (ROOT / "tests" / folder).rglob("*.py")]
     shared = [*(ROOT / "worker/bench/_stability").glob("*.py"), ROOT / "worker/bench/_rows.py"]
     for path in (*kernels, *tests, *shared, ROOT / "pyproject.toml", ROOT / "tests/conftest.py"):
-        copied(path, path.read_text())
+        copied(copy, path, path.read_text())
     cmake = ROOT / "worker" / "CMakeLists.txt"
-    copied(cmake, cmake.read_text().replace("set(flags -O3", "set(flags -O1"))
+    copied(copy, cmake, cmake.read_text().replace("set(flags -O3", "set(flags -O1"))
 
 
-def copied(path: Path, text: str) -> None:
-    target = WORK / path.relative_to(ROOT)
+def copied(copy: Copy, path: Path, text: str) -> None:
+    target = copy.work / path.relative_to(ROOT)
     if not target.exists() or target.read_text() != text:
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(text)
 
 
-def build() -> tuple[bool, str]:
+def build(copy: Copy) -> tuple[bool, str]:
     """Build the copy; whether that worked, and what the compiler said."""
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    if not (WORK / "cmake" / "CMakeCache.txt").exists():
+    cmake = copy.work / "cmake"
+    if not (cmake / "CMakeCache.txt").exists():
         subprocess.run(
-            ["cmake", "-G", "Ninja", "-S", COPY, "-B", WORK / "cmake", "-DCMAKE_BUILD_TYPE=Release",
+            ["cmake", "-G", "Ninja", "-S", copy.worker, "-B", cmake, "-DCMAKE_BUILD_TYPE=Release",
              f"-DPython_EXECUTABLE={sys.executable}"], check=True, env=environment, capture_output=True,
         )  # fmt: skip
     done = subprocess.run(
-        ["cmake", "--build", WORK / "cmake", "--target", f"_cpu_{ISA}"],
+        ["cmake", "--build", cmake, "--target", f"_cpu_{ISA}"],
         env=environment, capture_output=True, text=True, check=False,
     )  # fmt: skip
     return done.returncode == 0, done.stdout[-3000:]
 
 
-def module_of(mutant: Mutant | None) -> str:
-    """What the plugin replaces: MODULE=PATH."""
+def module_of(copy: Copy, mutant: Mutant | None) -> str:
+    """What the plugin replaces: MODULE=PATH, or nothing where there is neither a mutant nor a build of the copy."""
     if mutant is not None and mutant.file.endswith(".py"):
-        path = COPY / KERNELS / mutant.file
+        path = copy.worker / KERNELS / mutant.file
         return (
             ".".join(["splatmill_worker", "kernels", *Path(mutant.file).with_suffix("").parts]) + f"={path}"
         )
-    (built,) = (WORK / "cmake").glob(f"_cpu_{ISA}.*.so")
-    return f"splatmill_worker.kernels.cpu._cpu_{ISA}={built}"
+    built = next((copy.work / "cmake").glob(f"_cpu_{ISA}.*.so"), None)
+    return f"splatmill_worker.kernels.cpu._cpu_{ISA}={built}" if built else ""
 
 
-def prove(mutant: Mutant) -> str:
-    """The first test that fails, or nothing. The likeliest files run alone, then all others."""
-    first = PROOFS.get(Path(mutant.file).name, ["test_proof_step", "test_proof_backward"])
-    if mutant.file.endswith(".py"):
-        first = ["test_reference_order", "test_reference_gsplat", *first]
-    rest = [name for name in ALL if name not in first]
-    return pytest(mutant, [f"{TESTS}/{name}.py" for name in first]) or pytest(
-        mutant, [f"{TESTS}/{name}.py" for name in rest]
+def prove(copy: Copy, mutant: Mutant) -> str:
+    """The first test that fails, or nothing. The likeliest run alone, then all others."""
+    first = PROOFS.get(str(Path(mutant.file).with_suffix("")), DEFAULT[mutant.backend])
+    rest = [name for name in (ALL_GPU if mutant.backend == "gpu" else ALL) if name not in first]
+    return pytest(copy, mutant, [f"{TESTS}/{name}" for name in first]) or pytest(
+        copy, mutant, [f"{TESTS}/{name}" for name in rest]
     )
 
 
-def pytest(mutant: Mutant | None, tests: Sequence[str]) -> str:
+def pytest(copy: Copy, mutant: Mutant | None, tests: Sequence[str]) -> str:
     """The first of the tests that fails on the mutant, or on the copy as it is; nothing where all pass."""
     others = " or ".join(name for name in isa.ISAS if name != ISA)
-    chosen_tests = f"{ISA} or not ({others} or gpu)"
+    # The interpreter's tests run for its own mutants alone; two builds that disagree do not say which is wrong.
+    chosen_tests = f"({ISA} or not ({others} or gpu)) and not test_builds_agree"
     # Other plugins are not loaded: importing them takes as long as the tests.
-    plugins = {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": str(HERE)}
-    kernels = {"SPLATMILL_MUTANT": module_of(mutant), "SPLATMILL_CPU_ISA": ISA}
+    plugins = {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": str(HERE), "PYTHONUNBUFFERED": "1"}
+    kernels = {"SPLATMILL_MUTANT": module_of(copy, mutant), "SPLATMILL_CPU_ISA": ISA}
     arguments = [
-        "-q",
+        "-v",
         "-x",
         "-p",
         "mutant",
@@ -138,72 +187,82 @@ def pytest(mutant: Mutant | None, tests: Sequence[str]) -> str:
         "--timeout",
         "300",
     ]
+    if mutant is None or mutant.backend != "gpu":
+        arguments += ["-k", chosen_tests]
+    if mutant is None:  # each of these passes or fails as it was named
+        arguments = arguments[:-2]
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", *arguments, "-k", chosen_tests, *tests],
-        cwd=WORK, capture_output=True, text=True, check=False, env={**os.environ, **plugins, **kernels},
+        [sys.executable, "-m", "pytest", *arguments, *tests],
+        cwd=copy.work, capture_output=True, text=True, check=False, env={**os.environ, **plugins, **kernels},
     )  # fmt: skip
     if done.returncode == 0:
         return ""
     for line in done.stdout.splitlines():
         if line.startswith(("FAILED ", "ERROR ")):
             return line.split(" ", 1)[1].split(" - ")[0].removeprefix(f"{TESTS}/")
+    started = [line for line in done.stdout.splitlines() if line.startswith(f"{TESTS}/")]
+    if done.returncode < 0 and started:  # killed by a signal: the test that was running has caught it
+        return started[-1].split(" ", 1)[0].removeprefix(f"{TESTS}/")
     raise SystemExit(f"pytest ended with {done.returncode}:\n{done.stdout[-3000:]}{done.stderr[-1000:]}")
 
 
-def tried(mutant: Mutant) -> Row:
+def tried(copy: Copy, mutant: Mutant) -> Row:
     """The row of one mutant. The copy is as it was afterwards."""
-    path = COPY / KERNELS / mutant.file
+    path = copy.worker / KERNELS / mutant.file
     source = path.read_text()
     if source.count(mutant.before) != 1:
         raise SystemExit(
             f"{mutant.name}: {mutant.before!r} occurs {source.count(mutant.before)} times in {mutant.file}."
         )
     start = time.monotonic()
-    MUTATED.touch()
+    copy.mutated.touch()
     path.write_text(source.replace(mutant.before, mutant.after))
     try:
-        if mutant.file.endswith(".py"):
-            caught = prove(mutant)
-        else:
-            works, said = build()
-            if not works:
-                raise SystemExit(f"{mutant.name} does not build:\n{said}")
-            caught = prove(mutant)
+        works, said = (True, "") if mutant.file.endswith(".py") else build(copy)
+        if not works:
+            raise SystemExit(f"{mutant.name} does not build:\n{said}")
+        caught = prove(copy, mutant)
     finally:
         path.write_text(source)
-    MUTATED.unlink()
+    copy.mutated.unlink()
     seconds = round(time.monotonic() - start)
     return {"mutant": mutant.name, "file": mutant.file, "caught_by": caught, "build": ISA, "seconds": seconds}
 
 
-def read() -> dict[str, Row]:
+def read() -> dict[tuple[str, str], Row]:
     rows: list[Row] = [json.loads(line) for line in ROWS.read_text().splitlines()] if ROWS.exists() else []
-    return {row["mutant"]: row for row in rows}
+    return {(row["file"], row["mutant"]): row for row in rows}
 
 
-def write(rows: dict[str, Row]) -> None:
-    """Rows and table, in the order of the list."""
-    known = [rows[m.name] for m in (*MUTANTS, *NEXT) if m.name in rows]
-    ROWS.write_text("".join(json.dumps(row) + "\n" for row in known))
+def write(found: dict[tuple[str, str], Row]) -> None:
+    """Rows and table, in the order of the list, with those that another process has written meanwhile."""
+    with (HERE / "mutants.py").open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        rows = read() | found
+        known = [rows[m.file, m.name] for m in (*MUTANTS, *NEXT) if (m.file, m.name) in rows]
+        ROWS.write_text("".join(json.dumps(row) + "\n" for row in known))
     caught = sum(bool(row["caught_by"]) for row in known)
+    listed = [*MUTANTS, *NEXT]
     lines = [
         "# Mutations of the kernels", "",
-        f"{caught} of {len(known)} are caught. Generated by `python worker/mutations/run.py`, on the build {ISA}.", "",
+        f"{caught} of the {len(known)} tried are caught; {len(listed) - len(known)} were not tried. Generated "
+        f"by `python worker/mutations/run.py`, on the build {ISA}; Triton's kernels run in its interpreter.", "",
         "| fault | file | caught by |", "|---|---|---|",
-        *(f"| {r['mutant']} | {r['file']} | {shown(r['caught_by'])} |" for r in known),
+        *(f"| {m.name} | {m.file} | {shown(rows.get((m.file, m.name)))} |" for m in listed),
         "",
     ]  # fmt: skip
     TABLE.write_text("\n".join(lines))
 
 
-def shown(test: str) -> str:
-    return f"`{test}`" if test else "**nothing**"
+def shown(row: Row | None) -> str:
+    if row is None:
+        return "not tried"
+    return f"`{row['caught_by']}`" if row["caught_by"] else "**nothing**"
 
 
-def chosen(only: Sequence[str] | None, later: bool) -> list[Mutant]:
-    if only:
-        return [m for m in (*MUTANTS, *NEXT) if m.name in only]
-    return NEXT if later else MUTANTS
+def chosen(only: Sequence[str] | None, later: bool, backend: str | None) -> list[Mutant]:
+    listed = [*MUTANTS, *NEXT] if only else NEXT if later else MUTANTS
+    return [m for m in listed if (not only or m.name in only) and backend in (None, m.backend)]
 
 
 def main() -> int:
@@ -211,29 +270,37 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--only", action="append", help="the name of a mutant")
+    parser.add_argument("--backend", choices=["cpu", "gpu", "reference"], help="only the mutants of this one")
     parser.add_argument(
-        "--next", action="store_true", help="those of NEXT, which are not caught or not tried"
+        "--fresh", action="store_true", help="only those without a row that says they are caught"
     )
+    parser.add_argument("--next", action="store_true", help="those of NEXT, which are known to survive")
     parser.add_argument("--table-only", action="store_true")
     options = parser.parse_args()
-    rows = read()
+    found: dict[tuple[str, str], Row] = {}
     if not options.table_only:
-        copy_tree()
-        for mutant in chosen(options.only, options.next):
-            rows[mutant.name] = row = tried(mutant)
-            print(f"{row['seconds']:4} s  {mutant.name}: {row['caught_by'] or 'SURVIVES'}", flush=True)
-            write(rows)
-        works, said = build()
+        copy = Copy(ROOT / "worker" / "build" / "mutations" / (options.backend or "all"))
+        copy_tree(copy)
+        before = read()
+        for mutant in chosen(options.only, options.next, options.backend):
+            if options.fresh and before.get((mutant.file, mutant.name), {}).get("caught_by"):
+                continue
+            found[mutant.file, mutant.name] = row = tried(copy, mutant)
+            print(
+                f"{row['seconds']:4} s  {mutant.file}: {mutant.name}: {row['caught_by'] or 'SURVIVES'}",
+                flush=True,
+            )
+            write(found)
+        works, said = build(copy) if (copy.work / "cmake").exists() else (True, "")
         if not works:
             raise SystemExit(f"The kernels do not build:\n{said}")
-        failing = pytest(
-            None, sorted({f"{TESTS}/{row['caught_by']}" for row in rows.values() if row["caught_by"]})
-        )
-        if failing:
+        catchers = sorted({f"{TESTS}/{row['caught_by']}" for row in found.values() if row["caught_by"]})
+        if failing := pytest(copy, None, catchers) if catchers else "":
             raise SystemExit(f"This caught a mutant, and fails without any mutation too: {failing}")
         print("Every test that caught a mutant passes without mutations.")
-    write(rows)
-    return 0 if all(rows.get(m.name, {}).get("caught_by") for m in MUTANTS) else 1
+    write(found)
+    rows = read()
+    return 0 if all(rows[m.file, m.name]["caught_by"] for m in MUTANTS if (m.file, m.name) in rows) else 1
 
 
 if __name__ == "__main__":

@@ -203,6 +203,13 @@ def _all_culled() -> Case:
     return replace(case, means=behind + 0.1 * case.means)
 
 
+def _antialias_floor() -> Case:
+    """Points whose compensation is held at its floor, root of 2.5e-5, and which are visible by that alone."""
+    case = scene("", 40, seed=29)
+    case = _with_scales(case, "antialias at its floor", torch.full((40, 3), math.log(1e-4)))
+    return replace(case, antialias=True, logit_opacities=torch.full((40,), 3.0))
+
+
 def _huge() -> Case:
     case = scene("huge", 12, seed=14)
     return replace(
@@ -245,6 +252,7 @@ _MAKERS: list[Callable[[], Case]] = [
     lambda: replace(
         _with_scales(scene("", seed=17), "sub-pixel antialias", torch.full((200, 3), math.log(1e-2))), antialias=True
     ),
+    _antialias_floor,
     _huge,
     _near_plane,
     _far_off_axis,

@@ -50,11 +50,6 @@ def units(case: Case, want: Run, weights: Weights) -> Units:
     def moved(x: Tensor) -> Tensor:
         return rounded_up_or_down(x, g)
 
-    def moved_leaf(name: str, x: Tensor) -> Tensor:
-        # exp rounds its result, which is as if its argument had moved by the roundoff itself.
-        smallest = 1.0 if name in ("log_scales", "logit_opacities") else 0.0
-        return x + (moved(torch.ones_like(x)) - 1) * x.abs().clamp_min(smallest)
-
     exact = _outputs(case, leaves, intrinsics, want.bins, d_images)
 
     def squares(samples: Iterable[Outputs]) -> Outputs:
@@ -67,7 +62,7 @@ def units(case: Case, want: Run, weights: Weights) -> Units:
         return {k: x / max(count, 1) for k, x in total.items()}
 
     def inputs() -> Outputs:
-        changed = [moved_leaf(k, x) for k, x in zip(NAMES, leaves, strict=True)]
+        changed = [moved_leaf(k, x, moved) for k, x in zip(NAMES, leaves, strict=True)]
         return _outputs(case, changed, moved(intrinsics), want.bins, [moved(w) for w in d_images])
 
     def exponential(sign: float) -> Outputs:
@@ -101,6 +96,13 @@ def units(case: Case, want: Run, weights: Weights) -> Units:
         }
 
     return Units(rooted(parts), rooted([*parts, between]))
+
+
+def moved_leaf(name: str, x: Tensor, moved: Change) -> Tensor:
+    """x with a relative change, which for the argument of an exponential is at least that of its result."""
+    # exp rounds its result, which is as if its argument had moved by the roundoff itself.
+    smallest = 1.0 if name in ("log_scales", "logit_opacities") else 0.0
+    return x + (moved(torch.ones_like(x)) - 1) * x.abs().clamp_min(smallest)
 
 
 def _drawn(

@@ -1,6 +1,6 @@
-"""The three roundings whose effect is the unit of an error, put into the definition in float64 at random.
+"""The roundings whose effect is the unit of an error, put into the definition in float64 at random.
 
-Not for use from two threads at once: the last two change the reference's `composite` for the length of a block.
+Not for use from two threads at once: all but the first change a module of the reference for the length of a block.
 """
 
 from __future__ import annotations
@@ -55,6 +55,28 @@ def inexact_exponential(g: torch.Generator, sign: float = 0.0) -> Iterator[None]
         yield
     finally:
         definition.torch = torch
+
+
+@contextmanager
+def rounded_windows(g: torch.Generator, common: bool) -> Iterator[None]:
+    """Let the definition's loss work with windowed moments that are off by the roundoff, in the root mean square.
+
+    A window is 22 products and sums; the roundings of the first ones are of terms that are small beside the result.
+    common: by the same share everywhere, as in an image of one colour, where every window rounds alike.
+    """
+    definition: Any = importlib.import_module("splatmill_worker.kernels.reference.loss")
+    plain = definition._window
+
+    def rounded(image: Tensor) -> Tensor:
+        exact: Tensor = plain(image)
+        share = torch.ones(1, dtype=torch.float64) if common else torch.ones_like(exact)
+        return exact * rounded_up_or_down(share, g)
+
+    definition._window = rounded
+    try:
+        yield
+    finally:
+        definition._window = plain
 
 
 @contextmanager
