@@ -21,7 +21,8 @@ from _stability.engines import chain, fused, fused_gpu
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.gpu import bin as gpu_bin
-from splatmill_worker.kernels.gpu import record
+from splatmill_worker.kernels.gpu import device, record
+from splatmill_worker.kernels.gpu.blended import PLANES, SEGMENT
 from splatmill_worker.kernels.gpu.composite import blend
 from splatmill_worker.kernels.gpu.project import project_records
 from splatmill_worker.kernels.gpu.step import Step
@@ -195,6 +196,21 @@ def test_a_colour_of_exactly_0_has_the_gradient_that_the_definition_gives_it() -
             assert found[1][1] == pytest.approx(0.28209479177387814)
             return
     pytest.fail("no coefficient gives a colour of exactly 0 in both")
+
+
+def test_a_pair_is_reckoned_with_its_share_of_the_checkpoints() -> None:
+    pairs = 10 * SEGMENT
+    lists = Bins(
+        torch.zeros(2, dtype=torch.int64, device=DEVICE), torch.zeros(pairs, dtype=torch.int32, device=DEVICE)
+    )
+    made = blend(
+        torch.zeros(1, record.WIDTH, device=DEVICE), lists, 16, 16, None, depth=False, checkpoints=True
+    )
+    assert made.checkpoints is not None
+    last_of_a_tile = PLANES * 16 * 16 * 4
+    share = (made.checkpoints.nbytes - last_of_a_tile) / pairs
+    # PAIR_BYTES is a whole number.
+    assert abs(device.PAIR_BYTES / device.ROOM - device.LIST_BYTES - share) < 0.5
 
 
 def small() -> Case:

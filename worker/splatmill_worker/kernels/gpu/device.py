@@ -23,9 +23,12 @@ STEP_BYTES = 1300
 ROOM = 1.25
 """Room of a view's buffers over what its last visit used: the parameters move slowly from visit to visit."""
 
-PAIR_BYTES = round(ROOM * (36 + PLANES * TILE * TILE * 4 / SEGMENT))
-"""Device bytes per (tile, Gaussian) pair: 36, estimated, for key, id, their sorted copies, the 64-bit index and the
-buffers of the sort; and a pair's share of the checkpoint that each full segment has; with room to spare."""
+LIST_BYTES = 36
+"""Device bytes per (tile, Gaussian) pair, estimated: key, id, their sorted copies, the 64-bit index and the buffers of
+the sort."""
+
+PAIR_BYTES = round(ROOM * (LIST_BYTES + PLANES * TILE * TILE * 4 / SEGMENT))
+"""Device bytes per pair, with its share of the checkpoint that each full segment has, and with room to spare."""
 
 PIXEL_BYTES = 127 + PLANES * 4
 """Device bytes per pixel of a training step: image, its gradient and transmittance 28, a photo over its background 3,
