@@ -52,8 +52,8 @@ docs: $(VENV)/.installed-dev ## build the documentation into docs/build/html, wi
 screenshots: $(VENV)/.installed-dev ## make the documentation's pictures of the web page (needs a browser; some minutes)
 	$(BIN)/python docs/screenshots.py
 
-bench: install ## error against run time: kernels, functions, stability, stiffness, SfM, training, formats (long)
-	for name in kernels functions stability stiffness sfm train live formats; do $(BIN)/splatmill bench $$name || exit 1; done
+bench: install ## error against run time: kernels, functions, stability, worst inputs, stiffness, SfM, training, formats (long)
+	for name in kernels functions stability worst stiffness sfm train live formats; do $(BIN)/splatmill bench $$name || exit 1; done
 
 serve: install ## the whole service on this machine; Ctrl-C ends it
 	@$(BIN)/splatmill up

@@ -22,7 +22,7 @@ def doctor(context: typer.Context) -> None:
 
 
 def bench(context: typer.Context) -> None:
-    """Measure errors and times: kernels, functions, stability, stiffness, sfm, train, live, formats (bench --help)."""
+    """Measure errors and times: kernels, functions, stability, worst, stiffness, sfm, train, live, formats."""
     require("splatmill_worker", "`splatmill bench`")
     exec_module("splatmill_worker", "bench", *context.args)
 

@@ -121,7 +121,8 @@ def state(scene: Scene, draws: int, seed: int = 0, exponents: float = 0.0) -> Pr
     changed = [changed_scene() for _ in range(draws)]
     at = project(scene)
     bins = ops.bin(at, w, h, backend="reference")
-    undecided = _undecided(at, [project(x) for x in changed], bins, w, h)
+    others = [project(x) for x in changed]
+    undecided = _undecided(at, others, _reached([at, *others], w, h), w, h)
     weights = weights * ~undecided[..., None]
 
     def outputs(x: Scene, d_color: Tensor) -> dict[str, Tensor]:
@@ -194,6 +195,18 @@ SAFETY = 8.0
 
 FUNCTION_ERROR = 1e-5
 """Relative error of alpha that no draw shows: that of the engines' 2^x, with room."""
+
+
+def _reached(projected: list[Projected], width: int, height: int) -> Bins:
+    """Lists of what reaches a tile in any of the scenes, front to back in the first."""
+    lists = [ops.bin(p, width, height, backend="reference") for p in projected]
+    ids, offsets = [], [0]
+    for tile in range(len(lists[0].offsets) - 1):
+        found = {i for x in lists for i in x.ids[x.offsets[tile] : x.offsets[tile + 1]].tolist()}
+        every = torch.tensor(sorted(found), dtype=torch.int64)
+        ids.append(every[torch.argsort(projected[0].depths[every], stable=True)])
+        offsets.append(offsets[-1] + len(every))
+    return Bins(torch.tensor(offsets), torch.cat(ids).to(torch.int32))
 
 
 def _undecided(at: Projected, others: list[Projected], bins: Bins, width: int, height: int) -> Tensor:

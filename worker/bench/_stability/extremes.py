@@ -204,6 +204,22 @@ def twins(t: Numbers) -> Scene:
     return placed([splat(one, at), splat([*other[:-1], one[-1]], at)], at)
 
 
+def needle(t: Numbers) -> Scene:
+    """One Gaussian of 150 to 10^6 pixels, whose second axis is a sixteenth of that at most."""
+    t = list(t)
+    t[LENS + 3] = between(t[LENS + 3], 0.52, 1)
+    t[LENS + 4] *= 0.8
+    return several(1)(t)
+
+
+def disc(t: Numbers) -> Scene:
+    """One Gaussian with two equal axes and a third of a thousandth of them at most, seen near its edge."""
+    t = list(t)
+    t[LENS + 4], t[LENS + 5] = 1.0, 0.5 * t[LENS + 5]
+    t[LENS + 9] = between(t[LENS + 9], 0.2, 0.8)
+    return several(1)(t)
+
+
 @dataclass(frozen=True)
 class Family:
     """Scenes of one build: how many numbers make one."""
@@ -217,6 +233,8 @@ FAMILIES = {
     family.name: family
     for family in (
         Family("one", LENS + SPLAT, several(1)),
+        Family("needle", LENS + SPLAT, needle),
+        Family("disc", LENS + SPLAT, disc),
         Family("twins", LENS + SPLAT + 1, twins),
         Family("two", LENS + 2 * SPLAT, several(2)),
         Family("three", LENS + 3 * SPLAT, several(3)),

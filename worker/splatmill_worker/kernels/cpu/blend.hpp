@@ -26,9 +26,11 @@ struct TileForm {
   // The tile's first pixel centre is at (x0, y0).
   SPLATMILL_INLINE TileForm(const Record& r, const TileLanes& lanes, float x0, float y0) {
     const Float ux = splat(r.ux), uy = splat(r.uy), vy = splat(r.vy);
-    const Float y = lanes.pixel_y + (y0 - r.y);
-    u = fma(ux, lanes.pixel_x + (x0 - r.x), uy * y);
-    v = vy * y;
+    // At the first pixel u is a difference of numbers that are as large as the centre is far off. It is rounded once for the tile:
+    // that moves the Gaussian as a whole, as rounding its centre does. Rounded for each pixel, it would be noise in their sums.
+    const Float dy = splat(y0 - r.y), u0 = fma(ux, splat(x0 - r.x), uy * dy);
+    u = fma(ux, lanes.pixel_x, fma(uy, lanes.pixel_y, u0));
+    v = fma(vy, lanes.pixel_y, vy * dy);
     store(block_u, fma(ux, lanes.block_x, uy * lanes.block_y));
     store(block_v, vy * lanes.block_y);
   }
