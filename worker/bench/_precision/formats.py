@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from splatmill_worker.kernels.cpu.blocks import empty
+
 BYTES = {
     "Float32": 4,
     "BFloat16": 2,
@@ -32,7 +34,7 @@ class Narrow:
         """The blocks as a variant holds them: packed one behind the other, at the front of as many float32."""
         parts = [_bytes(blocks[:, : self.first]), narrowed(blocks[:, self.first :], self.format)]
         packed = torch.cat([part.flatten(1) for part in parts], 1).flatten()
-        room = torch.zeros_like(blocks)
+        room = empty(blocks.shape[0] * blocks.shape[2])  # backed by huge pages, as what it is compared with
         room.view(torch.uint8).view(-1)[: len(packed)] = packed
         return room
 

@@ -143,10 +143,10 @@ def times(found: Found) -> list[str]:
     plain = found.of("time", PLAIN)
     if not plain:
         return []
-    out = ["## Time of a training step", "", "CPU time over that of float32 in the same round, median and quartiles; in brackets wall time, then the update alone.", "",
+    out = ["## Time of a training step", "", "CPU time over that of float32 in the same round, median and quartiles; in brackets wall time.", "",
            "| variant | " + " | ".join(f"{r['gaussians'] // 1000}k, {r['threads']} thread{'s' * (r['threads'] > 1)}" for r in plain) + " |",
            "|---" * (1 + len(plain)) + "|",
-           "| float32, ms (CPU; wall; update) | " + " | ".join(f"{r['cpu_ms']:.1f}; {r['wall_ms']:.1f}; {r['update_ms']:.1f}" for r in plain) + " |"]  # fmt: skip
+           "| float32, ms (CPU; wall) | " + " | ".join(f"{r['cpu_ms']:.1f}; {r['wall_ms']:.1f}" for r in plain) + " |"]  # fmt: skip
     for variant in found.variants("time"):
         if variant is PLAIN:
             continue
@@ -158,7 +158,7 @@ def times(found: Found) -> list[str]:
                 if (r["scene"], r["threads"]) == (p["scene"], p["threads"])
             ]
             cells += [
-                f"{r['cpu_ratio']:.3f} ({r['cpu_quartiles'][0]:.3f} to {r['cpu_quartiles'][1]:.3f}) [{r['wall_ratio']:.3f}; {r['update_ratio']:.2f}]"
+                f"{r['cpu_ratio']:.3f} ({r['cpu_quartiles'][0]:.3f} to {r['cpu_quartiles'][1]:.3f}) [{r['wall_ratio']:.2f}]"
                 for r in mine
             ] or [""]
         out.append(f"| {variant.text} | " + " | ".join(cells) + " |")
