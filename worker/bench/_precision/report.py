@@ -190,7 +190,7 @@ def quality(found: Found) -> list[str]:
     first = plain[0]
     seeds = len({r["seed"] for r in plain})
     out = ["## Held-out PSNR after a short training", "",
-           f"{first['steps']} steps, photos of {first['size']} pixels, {seeds} seeds. Differences to float32 with the same seed, in dB; the mean is over scenes and seeds, with its "
+           f"{first['steps']} steps, photos of {first['size']} pixels, {seeds} seed{'s' * (seeds > 1)}. Differences to float32 with the same seed, in dB; the mean is over scenes and seeds, with its "
            "standard error. Any change of rounding changes which Gaussians are split, so that two trainings differ by chance: "
            "the error of the mean says by how much.", "",
            "| variant | " + " | ".join(scenes) + " | mean |", "|---" * (2 + len(scenes)) + "|",
@@ -200,7 +200,8 @@ def quality(found: Found) -> list[str]:
             continue
         cells = [f"{statistics.fmean(g):+.2f}" if (g := found.gains(variant, s)) else "" for s in scenes]
         gains = found.gains(variant)
-        mean = f"{statistics.fmean(gains):+.3f} ± {spread(gains):.3f} ({len(gains)})" if gains else ""
+        error = f" ± {spread(gains):.3f}" if len(gains) > 1 else ""
+        mean = f"{statistics.fmean(gains):+.3f}{error} ({len(gains)})" if gains else ""
         out.append(f"| {variant.text} | " + " | ".join(cells) + f" | {mean} |")
     return [*out, ""]
 
