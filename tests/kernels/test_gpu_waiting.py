@@ -21,10 +21,10 @@ pytest.importorskip(
 
 from splatmill_worker.kernels import reference
 from splatmill_worker.kernels.gpu import photos as gpu_photos
-from splatmill_worker.kernels.gpu.bin import MOST_PAIRS, Room
+from splatmill_worker.kernels.gpu.bin import Room
 from splatmill_worker.kernels.gpu.readback import AHEAD
 from splatmill_worker.kernels.gpu.step import Step
-from splatmill_worker.kernels.records import Rates
+from splatmill_worker.kernels.records import MOST_PAIRS, Rates, TooManyPairs
 from splatmill_worker.splat.views import over
 from tests.support.kernels.cases import Case, scene
 from tests.support.kernels.launches import LateDevice, Launch, nothing_waits, watch
@@ -150,7 +150,7 @@ def test_a_first_visit_of_training_leaves_nothing_out(case: Case, monkeypatch: p
 def test_more_pairs_than_the_lists_hold_are_refused_by_name(case: Case) -> None:
     here = engine(case)
     here._rooms[case.viewmat.data_ptr(), WIDTH, HEIGHT] = Room(100, MOST_PAIRS + 1)
-    with pytest.raises(ValueError, match="tile-Gaussian pairs; the lists hold 2147483647"):
+    with pytest.raises(TooManyPairs, match="cover 2147483648 tiles in this view; its lists hold 2147483647"):
         here.forward(case.viewmat, case.K, WIDTH, HEIGHT, degree=0)
 
 

@@ -32,6 +32,14 @@ PARAMETERS = sum(GROUPS.values())
 """Values of a Gaussian: 59. Where groups are joined, as in moments, they follow in the order of `GROUPS`."""
 
 
+MOST_PAIRS = 2**31 - 1
+"""(tile, Gaussian) pairs of a view at most: places in its lists are numbered in 31 bits."""
+
+
+class TooManyPairs(MemoryError):
+    """One view has more than MOST_PAIRS pairs; the message says about how many, and what to do."""
+
+
 class Projected(NamedTuple):
     """Gaussians in the image plane of one camera, one row each. A culled one has exactly 0 in every field.
 

@@ -1,6 +1,8 @@
 // The intermediate results between the parameters and the image of one view, in buffers that are kept from step to step.
 #pragma once
 
+#include <vector>
+
 #include "buffer.hpp"
 #include "camera.hpp"
 #include "layout.hpp"
@@ -44,8 +46,9 @@ struct Frame {
   Buffer<StoredRecord> records;  // [count], written where visible
   Buffer<uint16_t> visible;      // [blocks] one bit per Gaussian
   Buffer<Span> spans;            // [count], written where visible
-  Buffer<Touch> touches;         // one stretch per thread
-  int64_t stretch = 0;           // touches of a thread at most
+  Buffer<Touch> touches;         // one stretch per thread, one after the other
+  std::vector<int64_t> rooms;    // touches that fit into each thread's stretch
+  int64_t most_wanted = 0;       // touches of the view that needed the most room so far
   Buffer<Span> order, order_swap;     // the visible Gaussians' touches, by depth once sorted
   Buffer<uint32_t> keys, keys_swap;   // their depths' bits
   Buffer<uint32_t> histogram;    // [threads][max(tiles, digits)]

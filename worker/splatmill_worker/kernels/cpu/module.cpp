@@ -2,6 +2,7 @@
 #include "arguments.hpp"
 #include "frame.hpp"
 #include "threads.hpp"
+#include "touches.hpp"
 
 namespace splatmill {
 
@@ -35,6 +36,13 @@ std::vector<std::string> supported() {
 NB_MODULE(SPLATMILL_MODULE, m) {
   using namespace splatmill;
   nb::set_leak_warnings(false);  // tensors that live until exit keep frames alive, which is no leak
+  nb::register_exception_translator([](const std::exception_ptr& thrown, void*) {
+    try {
+      std::rethrow_exception(thrown);
+    } catch (const TooManyPairs& error) {
+      PyErr_SetString(nb::module_::import_("splatmill_worker.kernels.records").attr("TooManyPairs").ptr(), error.what());
+    }
+  });
   m.def("supported", &supported, "The builds that this processor can run, best first.");
   m.def("default_threads", &default_threads,
         "The number of threads that an op uses by default: that of OMP_NUM_THREADS, at most that of the affinity mask.");
@@ -51,7 +59,10 @@ NB_MODULE(SPLATMILL_MODULE, m) {
           [](const Frame& f) {
             return std::make_tuple(f.seconds.project, f.seconds.bin, f.seconds.forward, f.seconds.backward, f.seconds.update);
           },
-          "Wall seconds of the last project, bin, composite forward, composite backward and update.");
+          "Wall seconds of the last project, bin, composite forward, composite backward and update.")
+      .def_prop_ro(
+          "slots", [](const Frame& f) { return f.touches.capacity(); },
+          "(tile, Gaussian) pairs that there is room for, at 12 bytes each, and at 64 more once gradients were taken.");
   bind_adam(m);
   bind_bin(m);
   bind_composite(m);

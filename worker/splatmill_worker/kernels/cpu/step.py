@@ -269,6 +269,7 @@ class Step:
         planes: int,
     ) -> None:
         checks.camera(viewmat, K, width, height, degree, near, background)
+        self._rendered = False  # until it is: an error leaves the frame's lists half made
         shape = (planes, -(-height // TILE) * TILE, -(-width // TILE) * TILE)
         if self._image.shape != shape:
             self._image, self._gradient = torch.zeros(shape), torch.zeros(shape)

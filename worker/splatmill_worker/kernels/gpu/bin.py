@@ -10,7 +10,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ..records import ALPHA_MIN, TILE, Bins, Projected
+from ..records import ALPHA_MIN, MOST_PAIRS, TILE, Bins, Projected, TooManyPairs
 from . import device, record
 from .argument import Floats, Int, Ints, Longs, Shorts
 from .constant import constant
@@ -34,9 +34,6 @@ LANES = 32
 SHORT_TILES = 2**15 - 2
 """Tiles whose numbers, with one more for unused room, are sorted as 16-bit keys: half the passes of the radix sort.
 Images of up to 8 megapixels have no more."""
-
-MOST_PAIRS = 2**31 - 1
-"""Pairs that one view's lists hold."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +169,7 @@ def lists(records: Tensor, width: int, height: int, room: Room | None) -> Lists:
 
     With `room` nothing waits for the device, and pairs that do not fit are left out, farthest first; the caller reads
     `used` later and gives the view more room on its next visit. Without `room` the exact sizes are read back. Raises
-    ValueError for 2^31 pairs or more.
+    TooManyPairs.
     """
     dev = records.device
     columns, rows = -(-width // TILE), -(-height // TILE)
@@ -206,8 +203,9 @@ def lists(records: Tensor, width: int, height: int, room: Room | None) -> Lists:
     total = ends[-1:] if most else torch.zeros(1, dtype=torch.int64, device=dev)
     limit = int(total) if room is None else room.pairs
     if limit > MOST_PAIRS:
-        raise ValueError(
-            f"One view has {limit} tile-Gaussian pairs; the lists hold {MOST_PAIRS}. Use fewer or smaller Gaussians."
+        raise TooManyPairs(
+            f"The Gaussians cover {limit} tiles in this view; its lists hold {MOST_PAIRS}. "
+            "Use fewer Gaussians or smaller images; a few tiles for each are usual, so most may be far too large."
         )
     key_type = torch.int16 if tiles <= SHORT_TILES else torch.int32
     keys = torch.full((limit,), tiles, dtype=key_type, device=dev)

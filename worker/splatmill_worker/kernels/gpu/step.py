@@ -13,11 +13,11 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from splatmill_worker.kernels.records import GROUPS, PARAMETERS, Rates
+from splatmill_worker.kernels.records import GROUPS, MOST_PAIRS, PARAMETERS, Rates
 
 from . import adam, device
 from .argument import Float, Floats, Int
-from .bin import MOST_PAIRS, Lists, Room, lists
+from .bin import Lists, Room, lists
 from .blended import Blended
 from .composite import blend
 from .composite_backward import blend_backward
