@@ -20,6 +20,10 @@ HALF_STEP = 0.5
 """Of an 8-bit picture: what rounding to it may change."""
 
 
+NEAR = 0.03
+"""Labels of points that are nearer to one another along the time axis are stacked."""
+
+
 class Found:
     """The rows of one file, by what they measured."""
 
@@ -88,6 +92,7 @@ def draw(rows: list[Row], path: Path) -> None:
         panel.set_title(title, fontsize=10)
         panel.set_xlabel("CPU time of a step / that of float32")
         panel.axvline(1.0, color="#bbbbbb", lw=0.8)
+        panel.margins(x=0.25, y=0.15)
     for variant in timed:
         x = found.ratio(variant)
         gains = found.gains(variant)
@@ -111,7 +116,12 @@ def draw(rows: list[Row], path: Path) -> None:
                 )
             else:
                 panel.plot(x, y, "o", color=COLORS[variant.kind], ms=6)
-            panel.annotate(short(variant), (x, y), fontsize=7, xytext=(4, 3), textcoords="offset points")
+            crowd = sum(abs(text.xy[0] - x) < NEAR for text in panel.texts)  # type: ignore[attr-defined]  # annotations
+            offset = (6, 3 + 9 * crowd)
+            color = COLORS[variant.kind]
+            panel.annotate(
+                short(variant), (x, y), fontsize=7, color=color, xytext=offset, textcoords="offset points"
+            )
     for panel in panels[:2]:
         if panel.texts:
             panel.set_yscale("log")
