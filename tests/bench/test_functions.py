@@ -11,9 +11,11 @@ from itertools import pairwise
 import pytest
 from _functions.library import errors, load, measure
 from _functions.spans import FUNCTIONS, NEAR_0, Function, bits_at, place, runs, value
+from _functions.tolerances import ALPHA_ERROR, EXP2_ERROR
 from _rows import HERE
 
 from splatmill_worker.kernels.cpu import isa
+from tests.support.paths import ROOT
 
 bench = importlib.import_module("functions")
 
@@ -64,6 +66,32 @@ def test_parts_are_the_whole_span(function: Function) -> None:
     assert parts[-1][1] == edges[-1]
     jumps = [(a[1], b[0]) for a, b in pairwise(parts) if a[1] != b[0]]
     assert [edge for jump in jumps for edge in jump] == edges[1:-1]
+
+
+@pytest.mark.parametrize("function", FUNCTIONS, ids=lambda f: f.name)
+def test_the_rows_are_of_every_float(function: Function) -> None:
+    rows = [row for row in bench.read("functions") if row["function"] == function.name and "arguments" in row]
+    assert {"avx2", "baseline"} <= {row["build"] for row in rows}
+    for row in rows:
+        assert row["count"] == function.span.count
+        assert row["arguments"] == function.span.label
+        if function.octaves is not None:
+            assert row["octaves"] == function.octaves.label
+            assert row["unlike"] == 0
+
+
+def test_the_comparison_is_exact_enough() -> None:
+    rows = [row for row in bench.read("functions") if "samples" in row]
+    assert [row["function"] for row in rows] == [function.name for function in FUNCTIONS]
+    assert all(row["samples"] > 1000 and row["ulp"] < 1e-8 for row in rows)
+
+
+def test_the_report_and_the_page_are_made_from_rows() -> None:
+    rows = bench.read("functions")
+    assert bench.table(rows) == (HERE / "functions.md").read_text()
+    page = (ROOT / "docs" / "numerics.md").read_text()
+    assert "\n".join(bench.summary(rows)) in page
+    assert f"{1e6 * EXP2_ERROR:.1f}·10⁻⁶ of {1e6 * ALPHA_ERROR:.1f}·10⁻⁶" in page
 
 
 @pytest.mark.slow

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from _functions.tolerances import U
 from _stability import scenes
 from _stability.conditioning import Problem, state
 from _stability.engines import CHAIN, CONIC, FUSED, engines
-from _stability.roundings import U
 
 bench = importlib.import_module("stability")
 

@@ -84,10 +84,13 @@ DEFAULT = {
     "gpu": ["test_gpu_step.py"],
 }
 
+FUNCTIONS = "test_functions.py"
+"""It compiles math.hpp by itself, so that faults there are looked for before the engine is built."""
+
 ALL = [
     "test_proof_backward.py", "test_proof_forward.py", "test_proof_step.py", "test_cpu_step.py", "test_cpu_pose.py",
     "test_adam.py", "test_loss.py", "test_knn.py", "test_proof_poison.py", "test_cpu_input.py",
-    "test_reference_order.py", "test_reference_gsplat.py", "test_cpu_isa.py",
+    "test_reference_order.py", "test_reference_gsplat.py", "test_cpu_isa.py", FUNCTIONS,
 ]  # fmt: skip
 ALL_GPU = ["test_gpu_step.py", "test_gpu_ops.py"]
 
@@ -117,7 +120,11 @@ def copy_tree(copy: Copy) -> None:
     kernels = [p for p in (ROOT / "worker" / KERNELS).rglob("*") if p.suffix in (".cpp", ".hpp", ".py")]
     shutil.rmtree(copy.work / "tests", ignore_errors=True)
     tests = [p for folder in ("kernels", "support") for p in (ROOT / "tests" / folder).rglob("*.py")]
-    shared = [*(ROOT / "worker/bench/_stability").glob("*.py"), ROOT / "worker/bench/_rows.py"]
+    bench = ROOT / "worker" / "bench"
+    shared = [
+        *(bench / "_stability").glob("*.py"), *(bench / "_functions").glob("*.*"), bench / "_rows.py",
+        bench / "results" / "functions.jsonl",
+    ]  # fmt: skip
     for path in (*kernels, *tests, *shared, ROOT / "pyproject.toml", ROOT / "tests/conftest.py"):
         copied(copy, path, path.read_text())
     cmake = ROOT / "worker" / "CMakeLists.txt"
@@ -218,10 +225,12 @@ def tried(copy: Copy, mutant: Mutant) -> Row:
     copy.mutated.touch()
     path.write_text(source.replace(mutant.before, mutant.after))
     try:
-        works, said = (True, "") if mutant.file.endswith(".py") else build(copy)
-        if not works:
-            raise SystemExit(f"{mutant.name} does not build:\n{said}")
-        caught = prove(copy, mutant)
+        caught = pytest(copy, mutant, [f"{TESTS}/{FUNCTIONS}"]) if mutant.file == "cpu/math.hpp" else ""
+        if not caught:
+            works, said = (True, "") if mutant.file.endswith(".py") else build(copy)
+            if not works:
+                raise SystemExit(f"{mutant.name} does not build:\n{said}")
+            caught = prove(copy, mutant)
     finally:
         path.write_text(source)
     copy.mutated.unlink()

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from _functions.tolerances import ALPHA_ERROR
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
@@ -18,7 +19,6 @@ from splatmill_worker.kernels.records import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMI
 from tests.support.kernels.cases import GROUPS, Case
 
 EPS = 2.0**-24  # half a unit in the last place of float32
-EXP2_ERROR = 2e-5  # room for 2^x, whose error is 2.7e-6, where pixels near a threshold are looked for
 
 
 def backends() -> list[object]:
@@ -123,8 +123,8 @@ def alpha_error(case: Case, exact: Projected) -> Tensor:
     alpha = o 2^(-q/2 log2 e), q = d^T C d <= 2 ln 255 = 11. A camera-space coordinate is a sum of four products,
     known to 4 eps (|mean| + |t|). Divided by z it moves the centre by that times f/z (1 + |u|), and rounding the
     pixel coordinate by 2 eps |coordinate|; alpha's slope along q is at most sqrt(11 lambda_max(C)) <= 6 per pixel.
-    Relative errors of the covariance, 2 dz/z + 16 eps, act on q <= 11. The vector 2^x adds its own error, the sigmoid
-    and the products 8 eps.
+    Relative errors of the covariance, 2 dz/z + 16 eps, act on q <= 11. The functions and the sum of the exponent add
+    ALPHA_ERROR.
     """
     coordinate = 4 * EPS * (case.means.double().abs().sum(1) + case.viewmat[:3, 3].double().abs().sum())
     z = exact.depths.detach()
@@ -136,7 +136,7 @@ def alpha_error(case: Case, exact: Projected) -> Tensor:
     a, b, c = exact.conics.detach().unbind(1)
     stiffest = (a + c) / 2 + torch.sqrt(((a - c) / 2) ** 2 + b * b)
     q = 11.0
-    error = torch.sqrt(q * stiffest) * pixels + q / 2 * (2 * coordinate / z + 16 * EPS) + EXP2_ERROR + 8 * EPS
+    error = torch.sqrt(q * stiffest) * pixels + q / 2 * (2 * coordinate / z + 16 * EPS) + ALPHA_ERROR
     return torch.where(seen, error, 0.0)
 
 

@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from _stability.roundings import TINY, U, inexact_exponential, rounded_remainders, rounded_up_or_down
+from _functions.tolerances import U
+from _stability.roundings import TINY, inexact_exponential, rounded_remainders, rounded_up_or_down
 from torch import Tensor
 
 from splatmill_worker.kernels import ops

@@ -16,12 +16,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
+from _functions.tolerances import ALPHA_ERROR, U
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Bins, Projected
 
-from .roundings import TINY, U, inexact_exponential, rounded_remainders, rounded_up_or_down
+from .roundings import TINY, inexact_exponential, rounded_remainders, rounded_up_or_down
 from .scenes import GROUPS, Scene
 
 
@@ -193,9 +194,6 @@ def _groups(x: Scene) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
 SAFETY = 8.0
 """A decision is safe where its value is this many times its spread over the draws away from the threshold."""
 
-FUNCTION_ERROR = 1e-5
-"""Relative error of alpha that no draw shows: that of the engines' 2^x, with room."""
-
 
 def _reached(projected: list[Projected], width: int, height: int) -> Bins:
     """Lists of what reaches a tile in any of the scenes, front to back in the first."""
@@ -224,10 +222,10 @@ def _undecided(at: Projected, others: list[Projected], bins: Bins, width: int, h
 
         log_alphas = [_log_alpha(p, ids, pixel) for p in (at, *others)]
         exact = log_alphas[0]
-        slack = FUNCTION_ERROR + SAFETY * torch.stack([(a - exact).abs() for a in log_alphas[1:]]).amax(0)
+        slack = ALPHA_ERROR + SAFETY * torch.stack([(a - exact).abs() for a in log_alphas[1:]]).amax(0)
         lasting = [_log_transmittance(a) for a in log_alphas]
         alpha = torch.exp(exact).clamp_max(ALPHA_MAX)
-        lost = torch.cumsum(torch.where(exact >= LOG_CUT, FUNCTION_ERROR * alpha / (1 - alpha), 0.0), 1)
+        lost = torch.cumsum(torch.where(exact >= LOG_CUT, ALPHA_ERROR * alpha / (1 - alpha), 0.0), 1)
         unsure = lost + SAFETY * torch.stack([(a - lasting[0]).abs() for a in lasting[1:]]).amax(0)
         # Beyond the end of a pixel nothing is decided any more.
         before = lasting[0] > LOG_END - unsure

@@ -13,12 +13,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from _functions.tolerances import U
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import Projected
 
-from .roundings import U
 from .scenes import Scene, draws, rounded
 
 SIDE = 16

@@ -1,11 +1,13 @@
 # ruff: noqa: E501  (prose and rows of Markdown tables are as long as they are)
 """Prose of the report: the unit, and why an engine's line is not flat along an axis."""
 
-UNIT = """\
+from _functions.tolerances import EXP2_ERROR, U
+
+UNIT = f"""\
 **The unit.** Every input (parameters, camera, the image's gradient) is moved at random by the unit roundoff of float32, 2^-24, in the
 root mean square; the root mean square change of an output over eight such draws, in float64, is its condition number times
-the unit roundoff. To it are added, as squares, the change by an error of 2.7e-6 of every 2^x, which is what the kernels' polynomial has
-by design (45 roundoffs), and half an ulp of the output. An error of 1 is a backward stable algorithm's; a condition
+the unit roundoff. To it are added, as squares, the change by an error of {EXP2_ERROR:.1e} of every 2^x, which is what the kernels' polynomial has
+by design ({EXP2_ERROR / U:.0f} roundoffs, `functions.md`), and half an ulp of the output. An error of 1 is a backward stable algorithm's; a condition
 number that is itself large does not show here, because no algorithm can do better."""
 
 HIDDEN = """\

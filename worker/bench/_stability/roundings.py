@@ -12,18 +12,14 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+from _functions.tolerances import EXP2_ERROR
+from _functions.tolerances import U as U  # the unit of what is below: others take it from here
 from torch import Tensor
 
 from splatmill_worker.kernels.records import Projected
 
-U = 2.0**-24
-"""Unit roundoff of float32."""
-
 TINY = 2.0**-126
 """Smallest normal float32; what is smaller counts as 0 in the engines."""
-
-EXP2_ERROR = 2.7e-6
-"""Relative error of the engines' 2^x (`exp2_of_alpha` of kernels/cpu/math.hpp): 45 times the unit roundoff."""
 
 
 def even(x: Tensor, g: torch.Generator) -> Tensor:
