@@ -7,8 +7,9 @@
 
 Parts: `needles` (Gauss-Newton blocks), `curvature` (largest eigenvalue of Adam's preconditioned Hessian over a
 training), `products` (how exact the Hessian's products are), `runs` (the same trainings at boosts of the rates) and
-`groups` (boost of 8, and four times that for one group). Rows go to results/stiffness.jsonl, the last one of the same
-run counts; the report is stiffness.md, the figure figures/stiffness.png. No figure is a time.
+`groups` (boost of 8, and four times that for one group), `recovery` (a jump of all rates in the midst of a training).
+Rows go to results/stiffness.jsonl, the last one of the same run counts; the report is stiffness.md, the figure
+figures/stiffness.png. No figure is a time.
 
 Expected before the first run:
 1. With the exact gradient, Adam would train at the limit at every boost, since its metric adapts (Cohen et al. 2022).
@@ -40,7 +41,7 @@ from _stiffness.scenes import absence
 
 CACHE = HERE.parent / "build" / "bench"
 SCENES = ["synthetic", "fox", "lund", "lego"]
-PARTS = ["needles", "curvature", "products", "runs", "groups"]
+PARTS = ["needles", "curvature", "products", "runs", "groups", "recovery"]
 
 CURVATURE_STEPS, CURVATURE_LONGEST, MOST = 240, 96, 2000
 """Steps, longest side of photos in pixels, and most Gaussians of the trainings whose Hessian is measured."""
@@ -61,6 +62,10 @@ EXTREME = [64.0, 128.0, 256.0]
 
 EXTREME_STEPS = 480
 GROUP_FACTOR = 4.0
+RECOVERY_AFTER, RECOVERY_FACTORS = 300, [2.0, 4.0, 16.0, 64.0]
+"""Steps after which all rates of a training of EXTREME_STEPS are multiplied, and by how much: the loss is watched
+from
+step 260 on."""
 
 
 def main(argv: list[str]) -> int:
@@ -103,6 +108,8 @@ def _measure(asked: argparse.Namespace) -> Iterator[Row]:
             yield from _runs(asked, name)
         if "groups" in parts:
             yield from _groups(asked, name)
+        if "recovery" in parts:
+            yield from _recovery(asked, name)
 
 
 def _curvature(asked: argparse.Namespace, name: str) -> Iterable[Row]:
@@ -127,7 +134,7 @@ def _products(asked: argparse.Namespace, name: str) -> Iterable[Row]:
     from _stiffness.scenes import load
 
     small = load(name, asked.longest or CURVATURE_LONGEST, asked.work)
-    probe = Sampled(small, [SHARES[0]])
+    probe = Sampled(small, asked.shares[-1:])
     training(small, asked.steps or CURVATURE_STEPS, 8.0, asked.seeds[0], most=asked.most, probe=probe)
     yield from ({"scene": name, "longest": small.longest, **row} for row in probe.rows)
 
@@ -153,6 +160,15 @@ def _groups(asked: argparse.Namespace, name: str) -> Iterable[Row]:
     small = load(name, asked.longest or LONGEST, asked.work)
     for group in COLUMNS:
         yield training(small, asked.steps or min(STEPS), 8.0, asked.seeds[0], group=group, by=GROUP_FACTOR)
+
+
+def _recovery(asked: argparse.Namespace, name: str) -> Iterable[Row]:
+    from _stiffness.runs import ALL, training
+    from _stiffness.scenes import load
+
+    small = load(name, asked.longest or LONGEST, asked.work)
+    for by in RECOVERY_FACTORS:
+        yield training(small, EXTREME_STEPS, 8.0, asked.seeds[0], group=ALL, by=by, after=RECOVERY_AFTER)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -31,6 +31,8 @@ from .scenes import Small, planned
 LAST = 50
 """Steps over which the final training loss is averaged."""
 
+ALL = "all groups"
+
 EVERY, PHOTOS, SINGLE = 16, 8, 3
 """Training photos that a state keeps, evenly chosen; those whose mean stands for the loss over all; and those whose
 own
@@ -40,17 +42,18 @@ Hessians are searched."""
 class Watched(CpuEngine):
     """The fused CPU engine, with the rates of single groups multiplied, which keeps losses and counts refused values.
 
-    factors: by group of `Rates`.
+    factors: by group of `Rates`. after: steps with the plan's rates before they count.
     """
 
-    def __init__(self, gaussians: Gaussians, factors: dict[str, float]) -> None:
-        self.factors = factors
+    def __init__(self, gaussians: Gaussians, factors: dict[str, float], after: int = 0) -> None:
+        self.factors, self.after = factors, after
         self.refused = 0
         self.losses: list[float] = []
         super().__init__(gaussians)
 
     def train(self, *arguments: Any, rates: Rates, **named: Any) -> StepResult:
-        scaled = replace(rates, **{name: getattr(rates, name) * by for name, by in self.factors.items()})
+        factors = self.factors if len(self.losses) >= self.after else {}
+        scaled = replace(rates, **{name: getattr(rates, name) * by for name, by in factors.items()})
         seen = super().train(*arguments, rates=scaled, **named)
         self.refused += seen.refused
         self.losses.append(seen.loss)
@@ -65,18 +68,21 @@ def training(
     *,
     group: str | None = None,
     by: float = 1.0,
+    after: int = 0,
     most: int | None = None,
     probe: Probe | None = None,
 ) -> Row:
-    """The row of one training. group, by: the group whose rate is multiplied by a further factor."""
+    """The row of one training. group, by, after: the group whose rate, or ALL whose rates, are multiplied by a
+    further factor after so many steps."""
     plan, gaussians = planned(small, steps, seed, {"schedule.annealing.boost": boost}, most)
-    engine = Watched(gaussians, {} if group is None else {group: by})
+    faster = [] if group is None else list(COLUMNS) if group == ALL else [group]
+    engine = Watched(gaussians, dict.fromkeys(faster, by), after)
     warnings: list[str] = []
     if probe is not None:
         probe.begin(plan, warnings)
     row: Row = {
         "part": "runs", "scene": small.name, "longest": small.longest, "steps": steps, "boost": boost, "seed": seed,
-        "group": group, "by": by,
+        "group": group, "by": by, "after": after,
     }  # fmt: skip
     began = time.process_time()
     try:
