@@ -300,7 +300,8 @@ MUTANTS = [
     gpu("more candidates than lanes are left out", "bin.py", "while done < most:", "while (done < most) & (done < LANES):"),
     gpu("equal depths in any order", "bin.py", "torch.sort(depths, stable=True).indices",
         "torch.sort(depths.flip(0), stable=True).indices.neg().add(most - 1)"),
-    gpu("tile numbers of 16 bits in large images", "bin.py", "torch.int16 if tiles < 2**15 - 1 else torch.int32", "torch.int16"),
+    gpu("tile numbers of 16 bits in large images", "bin.py", "torch.int16 if tiles <= SHORT_TILES else torch.int32", "torch.int16"),
+    gpu("the background shows through what is opaque", "photos.py", "(1.0 - cover) * (255.0", "cover * (255.0"),
     gpu("the nearest pairs are left out", "bin.py", "fits = hit & (at < room)", "fits = hit & (at < room) & (at > 0)"),
     gpu("a colour that is not finite is drawn", "project.py", "keep = keep & finite(red) & finite(green) & finite(blue)", "keep = keep"),
     gpu("z = near is drawn", "project.py", "(z > near)", "(z >= near)"),
@@ -369,6 +370,7 @@ WITHOUT = {
     "gpu/constant.py": "one function for constants",
     "gpu/device.py": "finds the device; no kernel",
     "gpu/readback.py": "copies numbers to the host; no kernel",
+    "gpu/transfer.py": "copies between host and device; no kernel",
     "gpu/tuning.py": "settings of launches",
     "reference/__init__.py": "imports",
 }
