@@ -360,7 +360,8 @@ OUTCOME = """What came of the expectations (in `stiffness.py`):
    the differences between photos. From a boost of 1 to one of 8 the eigenvalue grows somewhat faster than the boost, not more slowly, and at 32
    all scenes stand at the limit of 38, where their quality falls: theory and trainings agree on an edge between 16 and 32.
 2. Single directions outgrow the limit of the mean square from a boost of 4 to 8 on. Each moves one or two Gaussians, by log-scale or
-   rotation, not by opacity. Adam bounds such a move by the rate, so that it is noise of the size of the rate, which falls tenfold towards the end.
+   rotation, not by opacity. Adam bounds such a move by the rate, so that it is noise of the size of the rate, which falls tenfold towards the end. In trainings too, four times the rate costs most in the log-scales: 1.8 dB on
+   fox and 3.5 on lund, while lego gains 0.3; no other group costs more than half a decibel.
    At a tenth of the training the largest eigenvalues, by far above 38, belong to the rotations of Gaussians that are still round: no
    gradient has reached their second moments yet. They cost nothing: `gain` is near 1 up to a boost of 8.
 3. The divergence is a loss that rises: no value is refused as not finite, in any run. Where it starts from a good state (all rates times 4, that is a boost of 32, from
