@@ -112,7 +112,7 @@ def draw(rows: list[Row]) -> None:
                     row["bins"], edges, baseline=None, label=row["build"], color=_plot.COLORS[f"cpu {row['build']}"], lw=1.3
                 )  # fmt: skip
         panel.axhline(0.5, color="#999999", lw=0.8, ls=":")
-        panel.set_ylim(bottom=0)
+        panel.set_ylim(0, 1.1 * panel.dataLim.y1)
         panel.set_title(f"{function.name}: {function.exact}", fontsize=10)
         panel.set_xlabel("x", fontsize=9)
         panel.legend(fontsize=8)
