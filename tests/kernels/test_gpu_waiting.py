@@ -100,14 +100,21 @@ def test_a_host_that_runs_ahead_waits_for_a_step_long_past(
 @pytest.mark.parametrize(
     "sin",
     [
-        lambda x: x.sum().item(), lambda x: bool(x[0] > 0), lambda x: int(x[0]), lambda x: x.cpu(),
-        lambda x: x.tolist(), lambda x: x[x > 0], lambda x: torch.nonzero(x),
-        lambda x: x.new_zeros(3).index_put_((x > 0,), x[:1]),
-        lambda x: torch.tensor([1.0]), lambda x: x.to("cpu"), lambda x: torch.unique(x),
-        lambda x: x.repeat_interleave(torch.ones_like(x).long()), lambda x: torch.equal(x, x),
+        pytest.param(lambda x: x.sum().item(), id="item"),
+        pytest.param(lambda x: bool(x[0] > 0), id="bool"),
+        pytest.param(lambda x: int(x[0]), id="int"),
+        pytest.param(lambda x: x.cpu(), id="cpu"),
+        pytest.param(lambda x: x.tolist(), id="tolist"),
+        pytest.param(lambda x: x[x > 0], id="index by a mask"),
+        pytest.param(lambda x: torch.nonzero(x), id="nonzero"),
+        pytest.param(lambda x: x.new_zeros(3).index_put_((x > 0,), x[:1]), id="put by a mask"),
+        pytest.param(lambda x: torch.tensor([1.0]), id="tensor of numbers"),
+        pytest.param(lambda x: x.to("cpu"), id="to the host"),
+        pytest.param(lambda x: torch.unique(x), id="unique"),
+        pytest.param(lambda x: x.repeat_interleave(torch.ones_like(x).long()), id="repeat_interleave"),
+        pytest.param(lambda x: torch.equal(x, x), id="equal"),
     ],
-    ids=str,
-)  # fmt: skip
+)
 def test_the_check_notices_what_waits(sin: Any) -> None:
     with pytest.raises(AssertionError, match="wait"), nothing_waits():
         sin(torch.ones(3))
