@@ -7,6 +7,7 @@ The order of the definition's gradient is measured in test_reference_order.
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import pytest
@@ -14,9 +15,10 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops, reference
+from splatmill_worker.kernels.cpu import isa
 from tests.support.kernels.alone import loss_units
 from tests.support.kernels.bounds import SUM_LIMIT, within
-from tests.support.kernels.proof import backends, use
+from tests.support.kernels.proof import EPS, backends, use
 
 SIZES = [(1, 1), (15, 16), (17, 257), (257, 1), (40, 33), (23, 1100)]
 
@@ -70,6 +72,42 @@ def test_loss_is_the_definitions(size: tuple[int, int], kind: str, masked: bool,
     within("gradient of the loss", what, off.reshape(-1, 3), unit["gradient"].reshape(-1, 3))
     if mask is not None:
         assert (gradient.cpu()[mask == 0] == 0).all()
+
+
+def gradient_of(color: Tensor, photo: Tensor, backend: ops.Backend) -> tuple[float, Tensor]:
+    leaf = color.clone().requires_grad_()
+    value = ops.loss(leaf, photo, backend=backend)
+    return float(value.detach()), torch.autograd.grad(value, leaf)[0].double()
+
+
+@cache
+def nearly_learnt(contrast: float) -> tuple[Tensor, Tensor, float, Tensor, float]:
+    """A bright picture, colours 0.02 off it, the loss, its gradient, and the root mean square of what half-ulp changes
+    of the colours do to that."""
+    g = torch.Generator().manual_seed(0)
+    photo = (245 + contrast * torch.randn(48, 64, 3, generator=g)).round().clamp(0, 255).to(torch.uint8)
+    color = (photo.float() / 255 + 0.02 * torch.randn(48, 64, 3, generator=g)).clamp(0, 1.2)
+    value, exact = gradient_of(color.double(), photo, "reference")
+    moved = []
+    for _ in range(2):
+        half_ulp = (torch.rand(color.shape, generator=g, dtype=torch.float64) * 2 - 1) * EPS
+        moved.append(gradient_of(color.double() * (1 + half_ulp), photo, "reference")[1] - exact)
+    return color, photo, value, exact, float(torch.stack(moved).square().mean().sqrt())
+
+
+@pytest.mark.parametrize("build", isa.supported())
+@pytest.mark.parametrize("contrast", [0, 1, 20])
+def test_bright_pictures_keep_the_digits_of_their_differences(contrast: float, build: str) -> None:
+    """The variance of bright, even colours as E[x^2] - E[x]^2 has an error of 8 to 24 units of conditioning."""
+    color, photo, value, exact, unit = nearly_learnt(contrast)
+    with use(f"cpu:{build}") as op:
+        mine, gradient = gradient_of(color, photo, op)
+    off = (gradient - exact).abs()
+    turned = off > 0.5 * 0.8 / color.numel()  # where rounding decides the sign of |x - p|
+    assert int(turned.sum()) <= 2
+    # Measured: 1.0 unit, which is the rounding of x - p.
+    assert float(off[~turned].square().mean().sqrt()) <= 2 * unit
+    assert mine == pytest.approx(value, rel=1e-6)
 
 
 @pytest.mark.parametrize("backend", backends())

@@ -78,10 +78,9 @@ MUTANTS = [
     cpu("the sort leaves out a bit", "bin.cpp", "const int bits = range ? 32 - __builtin_clz(range) : 0;",
         "const int bits = range ? 31 - __builtin_clz(range) : 0;"),
     # ---- pose, Adam, loss, neighbours
-    cpu("a variance of SSIM may be negative", "loss.cpp", "const Float variance1 = max(fnma(mu1, mu1, square.out[o]), 0.0f);",
-        "const Float variance1 = fnma(mu1, mu1, square.out[o]) - 1e-4f;"),
-    cpu("SSIM's slope by the mean lacks a term", "loss.cpp", "fnma(2.0f * mu1, by_square, fnma(mu2, by_product, direct))",
-        "fnma(mu2, by_product, direct)"),
+    cpu("a variance of SSIM may be negative", "loss.cpp", "const Float variance1 = max(fma(2.0f, covariance, variance2 + spread), 0.0f);",
+        "const Float variance1 = fma(2.0f, covariance, variance2 + spread) - 1e-4f;"),
+    cpu("SSIM's slope by the mean lacks a term", "loss.cpp", "fma(md, by_square, direct)", "direct"),
     cpu("a tap of the window", "loss.cpp", "0.0360007721f", "0.0350007721f"),
     # ---- the definition itself
     reference("half the off-diagonal of the conic", "project.py", "conics = torch.stack([c / det, -b / det, a / det], 1)",

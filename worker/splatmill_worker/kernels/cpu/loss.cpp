@@ -1,8 +1,14 @@
-// SSIM (Wang et al. 2004) needs the windowed moments of x, x^2 and x y; its gradient needs the same window over three maps of
-// derivatives. Both run in one sweep down the image: rows are filtered sideways as they are read, and blocks of four rows are
+// SSIM (Wang et al. 2004) needs windowed moments; its gradient needs the same window over three maps of derivatives. Moments are
+// those of the difference d = x - p from the photo p, of d^2 and of d p: the variance of x as E[x^2] - E[x]^2 would lose the
+// digits that bright, flat parts of a picture are about. With the photo's mean m and variance v, and over one window,
+//
+//   mean(x) = m + E[d],   c = E[d p] - m E[d],   V = E[d^2] - E[d]^2,   var(x) = v + 2 c + V,   cov(x, p) = v + c,
+//   SSIM = l s,   l = 1 - E[d]^2 / B1,   s = 1 - V / B2,   B1 = mean(x)^2 + m^2 + C1,   B2 = var(x) + v + C2.
+//
+// Both run in one sweep down the image: rows are filtered sideways as they are read, and blocks of four rows are
 // filtered downwards out of a ring of sixteen, so that nothing larger than a ring leaves the second cache.
 //
-//   row      m     moments of x, filtered sideways          -> ring `moments`
+//   row      m     moments of d, filtered sideways          -> ring `moments`
 //   row      m-5   moments filtered downwards, SSIM, derivatives -> ring `slopes`
 //   row      m-10  slopes filtered downwards, then sideways -> gradient
 #include "loss.hpp"
@@ -90,12 +96,12 @@ SPLATMILL_INLINE Float filter_across(const float* row, int j) {
 
 // Memory for all rings of a strip, carved in order.
 struct Rings {
-  Ring rendered, seen, mean, square, product, slope_mean, slope_square, slope_product;
+  Ring difference, seen, mean, square, product, slope_mean, slope_square, slope_product;
   Ring lines;  // rows of the three filtered slopes, three times four, for the last sideways pass
 
   static constexpr int kCount = 9;
   Rings(float* p, int width)
-      : rendered(p, width), seen(at(p, width, 1), width), mean(at(p, width, 2), width), square(at(p, width, 3), width),
+      : difference(p, width), seen(at(p, width, 1), width), mean(at(p, width, 2), width), square(at(p, width, 3), width),
         product(at(p, width, 4), width), slope_mean(at(p, width, 5), width), slope_square(at(p, width, 6), width),
         slope_product(at(p, width, 7), width), lines(at(p, width, 8), width) {}
   static std::size_t floats(int width) { return kCount * Ring::floats(width); }
@@ -130,23 +136,24 @@ class Strip {
 
   // Reads row y and filters its moments sideways. Rows and columns outside the image are zeros, and so are pixels not used.
   void read_row(int y) {
-    float *x = ring_.rendered.row(y), *p = ring_.seen.row(y);
+    float *d = ring_.difference.row(y), *p = ring_.seen.row(y);
     float *mean = ring_.mean.row(y), *square = ring_.square.row(y), *product = ring_.product.row(y);
     if (y < 0 || y >= photo_.height) {
-      for (float* row : {x, p, mean, square, product}) std::fill(row, row + width_, 0.0f);
+      for (float* row : {d, p, mean, square, product}) std::fill(row, row + width_, 0.0f);
       return;
     }
     const float* rendered = color_.at(channel_, y);
     const uint8_t* seen = photo_.pixels + offset(y);
     for (int j = 0; j < width_; j += kLanes) {
-      store(x + j, inside(j) ? keep(used(y, j), load(rendered + column(j))) : splat(0.0f));
-      store(p + j, inside(j) ? load_bytes(seen + column(j)) * (1.0f / 255.0f) : splat(0.0f));
+      const Float photo = inside(j) ? load_bytes(seen + column(j)) * (1.0f / 255.0f) : splat(0.0f);
+      store(p + j, photo);
+      store(d + j, inside(j) ? keep(used(y, j), load(rendered + column(j)) - photo) : splat(0.0f));
     }
     for (int j = kLanes; j < width_ - kLanes; j += kLanes) {
       Float m = splat(0.0f), s = m, q = m;
 #pragma GCC unroll 11
       for (int t = 0; t < kTaps; ++t) {
-        const Float a = load_unaligned(x + j + t - kHalf), b = load_unaligned(p + j + t - kHalf);
+        const Float a = load_unaligned(d + j + t - kHalf), b = load_unaligned(p + j + t - kHalf);
         const Float weighted = tap(t) * a;
         m = m + weighted;
         s = fma(weighted, a, s);
@@ -173,18 +180,19 @@ class Strip {
         Float by_mean = splat(0.0f), by_square = by_mean, by_product = by_mean;
         if (inside(j) && y + o >= 0 && y + o < photo_.height) {
           const int64_t at = offset(y + o) + column(j);
-          const Float mu1 = mean.out[o], mu2 = load(photo_.mean + at), variance2 = load(photo_.variance + at);
+          const Float md = mean.out[o], mu2 = load(photo_.mean + at), variance2 = load(photo_.variance + at), mu1 = mu2 + md;
           // Exactly, a variance is never negative; rounded, it can be, and would let the denominator near zero.
-          const Float variance1 = max(fnma(mu1, mu1, square.out[o]), 0.0f);
-          const Float both = mu1 * mu2, covariance = product.out[o] - both;
-          const Float a1 = fma(2.0f, both, splat(kC1)), a2 = fma(2.0f, covariance, splat(kC2));
+          const Float spread = max(fnma(md, md, square.out[o]), 0.0f), covariance = fnma(md, mu2, product.out[o]);
+          const Float variance1 = max(fma(2.0f, covariance, variance2 + spread), 0.0f);
           const Float b1 = fma(mu1, mu1, fma(mu2, mu2, splat(kC1))), b2 = variance1 + variance2 + splat(kC2);
-          const Float inverse = reciprocal(b1 * b2), ssim = a1 * a2 * inverse;
+          const Float inverse = reciprocal(b1 * b2), inverse1 = inverse * b2, inverse2 = inverse * b1;
+          const Float shift = md * inverse1, part = spread * inverse2;
+          const Float light = fnma(md, shift, splat(1.0f)), structure = splat(1.0f) - part, ssim = light * structure;
           const Mask counts = used(y + o, j);
-          by_square = keep(counts, -(ssim * b1 * inverse));                         // -S / B2
-          by_product = keep(counts, 2.0f * a1 * inverse);                           // 2 A1 / (B1 B2)
-          const Float direct = 2.0f * inverse * fnma(ssim * b2, mu1, mu2 * a2);     // 2 (mu2 A2 - S B2 mu1) / (B1 B2)
-          by_mean = keep(counts, fnma(2.0f * mu1, by_square, fnma(mu2, by_product, direct)));
+          by_square = keep(counts, -(ssim * inverse2));                             // -S / B2
+          by_product = keep(counts, 2.0f * light * part * inverse2);                // 2 l V / B2^2
+          const Float direct = structure * shift * fnma(mu1, shift, splat(1.0f));   // -dl/dE[d] s / 2
+          by_mean = keep(counts, fnma(splat(2.0f), fma(md, by_square, direct), -(mu2 * by_product)));
           if (j >= kMargin && j < width_ - kMargin) row_sum[o] += keep(counts, ssim);
         }
         store(ring_.slope_mean.row(y + o) + j, by_mean);
@@ -196,7 +204,7 @@ class Strip {
       if (y + o >= top && y + o < bottom) similarity[y + o] = sum(row_sum[o]);
   }
 
-  // Rows y .. y + 3 of d(loss) / dx = l1 sign(x - p) + ssim (G*slope_mean + 2 x G*slope_square + p G*slope_product).
+  // Rows y .. y + 3 of d(loss) / dx = l1 sign(d) + ssim (G*slope_mean + 2 d G*slope_square + p G*slope_product).
   void write_gradient(int y, int bottom, float l1_slope, float ssim_slope, const Planes& gradient, double* absolute) {
     const Ring* slopes[3] = {&ring_.slope_mean, &ring_.slope_square, &ring_.slope_product};
     for (int i = 0; i < 3; ++i)
@@ -205,12 +213,12 @@ class Strip {
         for (int o = 0; o < kBlock; ++o) store(line(i, o) + j, c.out[o]);
       }
     for (int o = 0; o < kBlock && y + o < bottom; ++o) {
-      const float *x = ring_.rendered.row(y + o), *p = ring_.seen.row(y + o);
+      const float *d = ring_.difference.row(y + o), *p = ring_.seen.row(y + o);
       Float row_sum = splat(0.0f);
       for (int j = kMargin; j < width_ - kMargin; j += kLanes) {
-        const Float a = load(x + j), b = load(p + j), difference = a - b;
+        const Float difference = load(d + j), b = load(p + j);
         const Float sign = select(difference > 0.0f, splat(l1_slope), keep(difference < 0.0f, splat(-l1_slope)));
-        const Float similar = fma(2.0f * a, filter_across(line(1, o), j),
+        const Float similar = fma(2.0f * difference, filter_across(line(1, o), j),
                                   fma(b, filter_across(line(2, o), j), filter_across(line(0, o), j)));
         store(gradient.at(channel_, y + o, column(j)), keep(used(y + o, j), fma(ssim_slope, similar, sign)));
         row_sum += abs(difference);
@@ -232,7 +240,7 @@ class StatsStrip {
  public:
   StatsStrip(const Photo& photo, int channel, float* memory)
       : photo_(photo), channel_(channel), width_(static_cast<int>(photo.stride) + 2 * kLanes), seen_(memory, width_),
-        mean_(memory + Ring::floats(width_), width_), square_(memory + 2 * Ring::floats(width_), width_) {}
+        mean_(memory + Ring::floats(width_), width_), variance_(memory + 2 * Ring::floats(width_), width_) {}
   static std::size_t floats(int64_t stride) { return 3 * Ring::floats(static_cast<int>(stride) + 2 * kLanes); }
 
   void sweep(int top, int bottom, float* mean, float* variance) {
@@ -242,11 +250,26 @@ class StatsStrip {
       const int y = m - kHalf;
       if (y + kBlock <= top) continue;
       for (int j = kLanes; j < width_ - kLanes; j += kLanes) {
-        const Column first = filter_down(mean_, y, j), second = filter_down(square_, y, j);
+        // The variance of a window is the mean of its rows' variances and the variance of their means. Both are taken about a
+        // centre nearby, so that they have the digits of the contrast and not those of the brightness.
+        const Float center = load(mean_.row(y) + j);
+        Column first, second;
+        for (int o = 0; o < kBlock; ++o) first.out[o] = second.out[o] = splat(0.0f);
+#pragma GCC unroll 14
+        for (int r = 0; r < kBlock + kTaps - 1; ++r) {
+          const Float off = load(mean_.row(y - kHalf + r) + j) - center;
+          const Float both = fma(off, off, load(variance_.row(y - kHalf + r) + j));
+#pragma GCC unroll 4
+          for (int o = 0; o < kBlock; ++o)
+            if (r - o >= 0 && r - o < kTaps) {
+              first.out[o] = fma(tap(r - o), off, first.out[o]);
+              second.out[o] = fma(tap(r - o), both, second.out[o]);
+            }
+        }
         for (int o = std::max(top - y, 0); o < kBlock && y + o < bottom; ++o) {
           const int64_t at = (static_cast<int64_t>(channel_) * photo_.height + y + o) * photo_.stride + j - kLanes;
           const Mask inside = iota() < static_cast<float>(photo_.width - (j - kLanes));
-          store(mean + at, keep(inside, first.out[o]));
+          store(mean + at, keep(inside, center + first.out[o]));
           store(variance + at, keep(inside, max(fnma(first.out[o], first.out[o], second.out[o]), 0.0f)));
         }
       }
@@ -255,9 +278,9 @@ class StatsStrip {
 
  private:
   void read_row(int y) {
-    float *p = seen_.row(y), *mean = mean_.row(y), *square = square_.row(y);
+    float *p = seen_.row(y), *mean = mean_.row(y), *variance = variance_.row(y);
     if (y < 0 || y >= photo_.height) {
-      for (float* row : {p, mean, square}) std::fill(row, row + width_, 0.0f);
+      for (float* row : {p, mean, variance}) std::fill(row, row + width_, 0.0f);
       return;
     }
     const uint8_t* seen = photo_.pixels + (static_cast<int64_t>(channel_) * photo_.height + y) * photo_.stride;
@@ -265,21 +288,22 @@ class StatsStrip {
     store(p + width_ - kLanes, splat(0.0f));
     for (int j = kLanes; j < width_ - kLanes; j += kLanes) store(p + j, load_bytes(seen + j - kLanes) * (1.0f / 255.0f));
     for (int j = kLanes; j < width_ - kLanes; j += kLanes) {
+      const Float middle = load(p + j);
       Float m = splat(0.0f), s = m;
 #pragma GCC unroll 11
       for (int t = 0; t < kTaps; ++t) {
-        const Float a = load_unaligned(p + j + t - kHalf), weighted = tap(t) * a;
+        const Float off = load_unaligned(p + j + t - kHalf) - middle, weighted = tap(t) * off;
         m = m + weighted;
-        s = fma(weighted, a, s);
+        s = fma(weighted, off, s);
       }
-      store(mean + j, m);
-      store(square + j, s);
+      store(mean + j, middle + m);
+      store(variance + j, fnma(m, m, s));
     }
   }
 
   const Photo& photo_;
   int channel_, width_;
-  Ring seen_, mean_, square_;
+  Ring seen_, mean_, variance_;  // the photo, and the mean and variance of the window's eleven pixels along its row
 };
 
 struct Band {
