@@ -181,6 +181,23 @@ def test_replace_takes_moments_and_clears_scores(case: Case) -> None:
     assert not here.moments()[0].any()
 
 
+def test_a_resumed_training_has_missed_nothing(case: Case) -> None:
+    views = [case.viewmat, away(case.viewmat), case.viewmat]
+    going = engine(case)
+    for step, (view, photo) in enumerate(zip(views[:2], photos(), strict=True), 501):
+        going.train(view, case.K, photo, degree=3, rates=RATES, step=step)
+    resumed = engine(case)
+    resumed.replace(going.parameters(), *going.moments())
+    for here in (going, resumed):
+        here.train(views[2], case.K, photos()[0], degree=3, rates=RATES, step=503)
+    states = [[*here.parameters().values(), *here.moments()] for here in (going, resumed)]
+    for one, other in zip(*states, strict=True):
+        # Bit by bit, but on a device, whose atomics add in any order.
+        assert (
+            torch.equal(one, other) if DEVICE == "cpu" else torch.allclose(one, other, rtol=1e-3, atol=5e-3)
+        )
+
+
 def test_what_does_not_fit_is_the_farthest_and_is_counted(case: Case) -> None:
     fields = case.project([group.to(DEVICE) for group in case.groups()], case.viewmat.to(DEVICE), "gpu")
     records = pack(fields)

@@ -468,6 +468,9 @@ class Step:
             # A Gaussian that any process saw moves in all of them.
             self._together.average_(self._gradient[:channels])
             self._together.largest_(seen)
+        if self._rates is None:
+            # What `replace` was given has missed nothing, whatever the number of this step: a resumed run begins late.
+            self._last.fill_(step - 1)
         self._rates = (
             rates.means, rates.log_scales, rates.quats, rates.logit_opacities, rates.sh_dc, rates.sh_rest,
         )  # fmt: skip

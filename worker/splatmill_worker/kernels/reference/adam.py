@@ -27,10 +27,11 @@ def adam_(
 ) -> int:
     """Take one Adam step in place (Kingma & Ba 2015; betas 0.9, 0.999, eps 1e-15) on groups [N, ...] with a rate each.
 
-    step counts from 1. With visible [N] (bool) only those rows move; last_step int32 [N] is the step up to which each
-    row is current, and a row that missed steps is first brought to where dense Adam with zero gradients would have
-    left it (`catch_up_`). An entry whose gradient, or the gradient's square, is not finite stays as it is. Returns the
-    number of such entries. Raises ValueError for visible without last_step.
+    step counts from 1; the bias is corrected by it for all rows, whenever they came (decisions: bias-correction). With
+    visible [N] (bool) only those rows move; last_step int32 [N] is the step up to which each row is current, and a row
+    that missed steps is first brought to where dense Adam with zero gradients would have left it (`catch_up_`). An
+    entry whose gradient, or the gradient's square, is not finite stays as it is. Returns the number of such entries.
+    Raises ValueError for visible without last_step.
 
     float32 state does not underflow: eps outweighs the root of the second moment v where v < 1e-30, while float32 holds
     v down to 1e-38. A gradient whose square is 0 in float32 moves its parameter by less than rate * 1e-3.
