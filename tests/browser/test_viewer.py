@@ -50,9 +50,9 @@ MOUNT = """async ([model, options]) => {
 }"""
 
 RESTED = """() => {
-  const same = view.frames > 0 && view.frames === globalThis.before;
+  globalThis.looks = view.frames > 0 && view.frames === globalThis.before ? globalThis.looks + 1 : 0;
   globalThis.before = view.frames;
-  return same;
+  return globalThis.looks >= 2;
 }"""
 
 
@@ -65,9 +65,9 @@ def mount(page: Page, model: SmallModel, **options: Any) -> str:
 
 
 def rest(page: Page) -> None:
-    """Wait until no frame was drawn between two looks."""
-    page.evaluate("globalThis.before = -1")
-    page.wait_for_function(RESTED, polling=300)
+    """Wait until no frame was drawn between three looks: on a busy machine the order of the Gaussians comes late."""
+    page.evaluate("globalThis.before = -1; globalThis.looks = 0")
+    page.wait_for_function(RESTED, polling=200)
 
 
 def pixels(page: Page) -> npt.NDArray[np.float64]:

@@ -24,6 +24,7 @@ from tests.support.kernels.launches import Enqueued, watch
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.no_cover,  # tracing makes the interpreter several times slower
     pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # the interpreter's numpy, in lanes that are masked
     pytest.mark.skipif(
         torch.cuda.is_available(), reason="autotuning launches more; the interpreter counts the same"

@@ -44,6 +44,7 @@ from tests.support.kernels.launches import Launch, watch
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.no_cover,  # tracing makes the interpreter several times slower
     pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # the interpreter's numpy, in lanes that are masked
 ]
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"

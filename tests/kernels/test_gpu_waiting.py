@@ -22,7 +22,6 @@ pytest.importorskip(
 from splatmill_worker.kernels import reference
 from splatmill_worker.kernels.gpu import photos as gpu_photos
 from splatmill_worker.kernels.gpu.bin import Room
-from splatmill_worker.kernels.gpu.readback import AHEAD
 from splatmill_worker.kernels.gpu.step import Step
 from splatmill_worker.kernels.records import MOST_PAIRS, Rates, TooManyPairs
 from splatmill_worker.splat.views import over
@@ -31,6 +30,7 @@ from tests.support.kernels.launches import LateDevice, Launch, nothing_waits, wa
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.no_cover,  # tracing makes the interpreter several times slower
     pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # the interpreter's numpy, in lanes that are masked
 ]
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
@@ -88,13 +88,15 @@ def test_a_step_over_a_known_view_asks_the_device_for_nothing(
 def test_a_host_that_runs_ahead_waits_for_a_step_long_past(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    ahead = 2
+    monkeypatch.setattr("splatmill_worker.kernels.gpu.readback.AHEAD", ahead)
     late, here = LateDevice(monkeypatch), engine(case)
     waits: list[int] = []
-    for step in range(1, AHEAD + 4):
+    for step in range(1, ahead + 4):
         here.train(case.viewmat, case.K, PHOTO, degree=0, rates=RATES, step=step)
         waits.append(late.waits)
-    # Two at the first visit; then the numbers of AHEAD steps may be on their way.
-    assert waits == [2] * (AHEAD + 1) + [3, 4]
+    # Two at the first visit; then the numbers of `ahead` steps may be on their way.
+    assert waits == [2] * (ahead + 1) + [3, 4]
 
 
 @pytest.mark.parametrize(
