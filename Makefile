@@ -18,7 +18,7 @@ WORKERS ?= 2
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-.PHONY: help install demo quick test check wheels docs screenshots bench serve sanitize clean
+.PHONY: help install demo quick test coverage check wheels docs screenshots bench serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -32,7 +32,10 @@ demo: install ## photos in, splats out, into demo/ (PHOTOS=path takes your own)
 quick: $(VENV)/.installed-dev ## run the tests that most changes need (not those marked slow), in under a minute
 	$(PYTEST) -m "not slow" $(PYTEST_ARGS)
 
-test: $(VENV)/.installed-dev ## run all tests and print their coverage (PYTEST_ARGS="..." chooses)
+test: $(VENV)/.installed-dev ## run all tests (PYTEST_ARGS="..." chooses)
+	$(PYTEST) $(PYTEST_ARGS)
+
+coverage: $(VENV)/.installed-dev ## run all tests and print their coverage, which takes a good deal longer
 	$(PYTEST) --cov $(PYTEST_ARGS)
 
 check: $(VENV)/.installed-dev ## ruff, mypy, import rules, TypeScript over the web page
