@@ -116,8 +116,9 @@ class TrainOptions(Request):
         ge=5,
         le=60,
         description=(
-            "Stop as soon as the held-out photos reach this mean PSNR, in dB. Without another budget, "
-            "training ends at the latest after the steps of the preset quality."
+            "Stop as soon as validation photos reach this mean PSNR, in dB. These are a few training photos that are "
+            "set aside for it. Without another budget, training ends at the latest after the steps of the preset "
+            "quality."
         ),
         json_schema_extra=_BUDGET,
     )

@@ -175,6 +175,26 @@ def test_only_a_run_without_budget_stops_when_its_curve_is_flat() -> None:
     assert not planned(time_budget=10).stops_when_flat
 
 
+def test_photos_are_set_aside_where_a_decision_reads_them() -> None:
+    assert planned().validation == 3
+    assert planned(changed(views=500)).validation == 8
+    assert planned(time_budget=10, target_psnr=30).validation == 3
+    for plan in (planned(steps=600), planned(time_budget=10)):
+        assert plan.validation is None
+        assert plan.left_out["validation"].startswith("The budget alone ends the training")
+
+
+def test_few_photos_are_all_trained_on_unless_a_target_needs_one() -> None:
+    few = planned(changed(views=11))
+    assert few.validation is None
+    assert not few.stops_when_flat
+    assert few.left_out["validation"].startswith("11 photos are too few to set one aside")
+    assert planned(changed(views=11), target_psnr=30).validation == 1
+    assert planned(changed(views=2), target_psnr=30).validation == 1
+    with pytest.raises(ValueError, match="the only photo is needed for training"):
+        planned(changed(views=1), target_psnr=30)
+
+
 def test_facts_as_plain_values_hold_the_speed_and_the_model() -> None:
     model = GivenModel(700, 2, psnr=27.0, one_color=12.0, another=None)
     told = changed(FACTS, start=model).as_dict()

@@ -33,12 +33,14 @@ def test_the_choice_is_even_and_never_more_than_there_are() -> None:
 
 
 @pytest.mark.parametrize("steps", [2000, 3000, 10_000, 30_000])
-@pytest.mark.parametrize(("held_out", "training"), [(0, 20), (1, 7), (7, 43), (13, 84)])
+@pytest.mark.parametrize(
+    ("held_out", "training", "validation"), [(0, 20, 0), (1, 7, 0), (7, 43, 0), (7, 40, 3), (13, 84, 0)]
+)
 def test_all_evaluations_of_a_long_run_stay_within_their_share(
-    held_out: int, training: int, steps: int
+    held_out: int, training: int, validation: int, steps: int
 ) -> None:
-    chosen = curve_views(held_out, training, steps)
-    views = (len(chosen.shares) - 1) * (chosen.held_out + chosen.training)
+    chosen = curve_views(held_out, training, steps, validation)
+    views = (len(chosen.shares) - 1) * (chosen.held_out + chosen.training + validation)
     views += held_out + len(finally_evaluated(range(training)))
     assert VIEW_STEPS * views <= SHARE * steps
     assert min(held_out, 4) <= chosen.held_out <= held_out

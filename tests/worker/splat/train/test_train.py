@@ -204,11 +204,75 @@ def test_a_cancel_is_seen_at_the_next_step() -> None:
     assert next(asked) == 8
 
 
-def test_a_target_ends_the_run() -> None:
+class Seen:
+    """An engine that keeps the numbers of the photos that steps were taken on."""
+
+    def __init__(self, engine: Any) -> None:
+        self._engine = engine
+        self.photos: list[int] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._engine, name)
+
+    def train_photo(self, *args: Any, **named: Any) -> Any:
+        self.photos.append(named["key"][0])
+        return self._engine.train_photo(*args, **named)
+
+
+def test_a_target_ends_the_run_by_photos_that_it_does_not_train_on() -> None:
     views, held_out = split()
-    trained = train(first_engine(), views, held_out, plan(2000, target_psnr=16.0), extent=1.1)
+    black = [
+        TrainingView(view.name, {1: view.full._replace(rgb=torch.zeros_like(view.full.rgb))})
+        for view in held_out
+    ]
+    engine = Seen(first_engine())
+    trained = train(engine, views, black, plan(2000, target_psnr=15.0, validation=2), extent=1.1)
     assert trained.steps < 2000
-    assert "reached" in trained.stopped
+    reached = trained.curve[-1].validation_psnr
+    assert reached is not None
+    assert reached >= 15.0
+    assert trained.stopped == f"the validation photos (2) reached {reached:.2f} dB"
+    assert trained.held_out is not None
+    assert trained.held_out.psnr < 10.0
+    assert trained.validation == tuple(views[index].name for index in (3, 9))
+    assert set(engine.photos) == set(range(len(views))) - {3, 9}
+    assert not set(trained.validation) & {view.name for view in trained.on_training.views}
+
+
+def test_held_out_photos_reach_no_target() -> None:
+    views, held_out = split()
+    trained = train(first_engine(), views, held_out, plan(60, target_psnr=5.0), extent=1.1)
+    assert trained.curve[0].psnr is not None
+    assert trained.curve[0].psnr > 5.0
+    assert trained.stopped == "the budget is spent"
+
+
+def test_photos_set_aside_are_trained_on_after_the_last_decision() -> None:
+    views, held_out = split()
+    engine = Seen(first_engine())
+    short = plan(200, target_psnr=60.0, validation=2, densify=False)
+    trained = train(engine, views, held_out, short, extent=1.1)
+    last = 0.8 * 200  # the point of the curve before that at the end
+    assert all(point.validation_psnr is not None for point in trained.curve[:-1])
+    assert trained.curve[-1].validation_psnr is None
+    assert not {3, 9} & set(engine.photos[: int(last)])
+    assert {3, 9} <= set(engine.photos[int(last) :])
+    assert trained.stopped == "the budget is spent"
+
+
+def test_a_resumed_run_sets_the_same_photos_aside() -> None:
+    views, held_out = split()
+    course = plan(200, target_psnr=60.0, validation=2, densify=False)
+    kept: list[Snapshot] = []
+    hooks = Hooks(checkpoint=kept.append, checkpoint_seconds=0.0)
+    train(first_engine(), views, held_out, course, extent=1.1, hooks=hooks)
+    middle = next(snapshot for snapshot in kept if snapshot.step == 100)
+    late = next(snapshot for snapshot in kept if snapshot.step == 170)
+    for snapshot, aside in ((middle, True), (late, False)):
+        engine = Seen(first_engine())
+        resumed = train(engine, views, held_out, course, extent=1.1, resume_from=snapshot)
+        assert resumed.validation == tuple(views[index].name for index in (3, 9))
+        assert bool({3, 9} & set(engine.photos[:30])) is not aside
 
 
 class Sabotaged:

@@ -14,6 +14,7 @@ from splatmill_worker.splat.plan.photos import (
     decide_background,
     decide_exposure,
     decide_image_size,
+    decide_validation,
     explain_undistortion,
 )
 from splatmill_worker.splat.plan.plan import Kernels, Plan
@@ -45,6 +46,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
     densify = decide_densification(options, capacity, reasons, initial=initial)
     schedule = _schedule(facts, options, capacity, needs, densify, image_size, reasons)
     explain_undistortion(facts, reasons)
+    validation = decide_validation(facts, options, reasons)
     return Plan(
         schedule=schedule,
         image_size=image_size,
@@ -57,11 +59,12 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         antialias=decide_antialias(facts, options, reasons),
         target_psnr=options.target_psnr,
         max_memory=options.max_memory,
-        stops_when_flat=options.steps is None and options.time_budget is None,
+        stops_when_flat=validation is not None and options.steps is None and options.time_budget is None,
         seed=options.seed,
         far_shell=needs.far_shell,
         gaps=needs.gaps,
         pose_refinement=needs.pose_refinement,
+        validation=validation,
         reasons=reasons.chosen,
         left_out=reasons.left_out,
         forced=tuple(reasons.forced),

@@ -1,4 +1,4 @@
-"""Decisions on the photos: their size, what lies behind them, exposures, anti-aliasing."""
+"""Decisions on the photos: their size, what lies behind them, exposures, anti-aliasing, validation."""
 
 from __future__ import annotations
 
@@ -29,6 +29,13 @@ out (decisions: LIGHT_DEPARTS)."""
 
 CERTAIN = 3.0
 """Standard errors of an exposure that a departure exceeds at least, to be one."""
+
+PHOTOS_PER_VALIDATION = 12
+"""Training photos for each one that is set aside: fewer than are held out, since training misses them, and none where
+training can spare none (FEW_VIEWS)."""
+
+MOST_VALIDATION = 8
+"""Photos that are set aside at most: they are measured whole at every point of the curve."""
 
 DISTANCES_DIFFER = 4.0
 """Ratio of the distances from which the same point is seen, above which Gaussians are anti-aliased."""
@@ -143,6 +150,40 @@ def _antialias(facts: Facts) -> tuple[bool, str]:
         f"Nine points in ten are seen from distances that differ by a factor of {ratio:.1f} at most; anti-aliasing is "
         f"used above {DISTANCES_DIFFER:.0f}."
     )
+
+
+def decide_validation(facts: Facts, options: TrainOptions, reasons: Reasons) -> int | None:
+    """Number of training photos that are set aside for decisions made while training; None where none is needed.
+
+    Held-out photos are for the report alone: a run that stopped by them would be judged by photos that it was chosen
+    by. Raises ValueError where a target is asked for and no photo can be spared.
+    """
+    count = min(MOST_VALIDATION, facts.views // PHOTOS_PER_VALIDATION)
+    if options.target_psnr is not None:
+        if facts.views < 2:
+            raise ValueError(
+                "target_psnr is measured on photos that are not trained on, and the only photo is needed for training. "
+                "Leave out target_psnr, or add photos."
+            )
+        count = max(1, count)
+        what = f"the training ends when their mean PSNR reaches {options.target_psnr:g} dB"
+    elif options.steps is not None or options.time_budget is not None:
+        reasons.left_out["validation"] = (
+            f"The budget alone ends the training, so that no decision needs any of the {facts.views} photos."
+        )
+        return None
+    elif count == 0:
+        reasons.left_out["validation"] = (
+            f"{facts.views} photos are too few to set one aside, which is done from {PHOTOS_PER_VALIDATION} photos on, "
+            "so the training does not end before its budget."
+        )
+        return None
+    else:
+        what = "the training ends when their PSNR no longer rises"
+    reasons.chosen["validation"] = (
+        f"{count} of {facts.views} training photos are set aside until the last decision: {what}."
+    )
+    return count
 
 
 def explain_undistortion(facts: Facts, reasons: Reasons) -> None:

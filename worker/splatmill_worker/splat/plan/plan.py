@@ -32,13 +32,14 @@ class Plan:
     background: colour behind Gaussians and transparent photos in training.
     exposure: training photos are brought to the light that the photos around them have.
     antialias: opacities are compensated for the 0.3 pixels by which projection widens every Gaussian.
-    target_psnr: PSNR of the held-out photos at which training ends, dB; None: none.
+    target_psnr: PSNR of the validation photos at which training ends, dB; None: none.
     max_memory: limit of the memory in use, bytes; None: none.
-    stops_when_flat: training ends early once the held-out PSNR no longer rises.
+    stops_when_flat: training ends early once the PSNR of the validation photos no longer rises.
     seed: of all random numbers.
     far_shell: Gaussians stand behind the scene, wherever photos look.
     gaps: Gaussians are added where photos show something that no point describes.
     pose_refinement: the cameras of training photos are corrected.
+    validation: number of training photos that are set aside for these two decisions; None: neither is made.
     reasons: a sentence for each field of the plan.
     left_out: a sentence for each thing that this scene does not need.
     forced: names of what an option fixed.
@@ -60,6 +61,7 @@ class Plan:
     far_shell: bool = False
     gaps: bool = False
     pose_refinement: bool = False
+    validation: int | None = None
     reasons: dict[str, str] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     forced: tuple[str, ...] = ()

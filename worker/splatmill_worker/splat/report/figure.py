@@ -15,7 +15,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from splatmill.files import replacing
 
-ERROR, TRAINING, GAUSSIANS, MEMORY = "#1f6f8b", "#9aa5ad", "#c97b3d", "#7a5c99"
+ERROR, TRAINING, VALIDATION, GAUSSIANS, MEMORY = "#1f6f8b", "#9aa5ad", "#8ab87c", "#c97b3d", "#7a5c99"
 """Colours of the lines."""
 
 
@@ -30,7 +30,7 @@ def draw_curve(
 
     path: the PNG file to write.
     curve: points as in report.json. Where they have train_psnr and train_ssim, training photos get a line of their
-        own, and over-fitting shows as a rise of that line alone.
+        own, and over-fitting shows as a rise of that line alone. So do validation photos, by validation_psnr.
     seconds: by stage, for the title.
     evaluated: label of the line of psnr and ssim.
     """
@@ -40,6 +40,7 @@ def draw_curve(
     for axes, name in ((psnr, "psnr"), (ssim, "ssim")):
         _line(axes, *_course(curve, f"train_{name}"), TRAINING, label="training photos")
         _line(axes, *_course(curve, name), label=evaluated)
+    _line(psnr, *_course(curve, "validation_psnr"), VALIDATION, label="validation photos")
     psnr.set_ylabel("PSNR (dB)")
     ssim.set_ylabel("SSIM")
     if len(psnr.lines) > 1:

@@ -157,6 +157,7 @@ def _result(trained: Trained, written: int) -> dict[str, Any]:
         "gaussians": written,
         "steps": trained.steps,
         "stopped": trained.stopped,
+        "validation": trained.validation,
         "recoveries": trained.recoveries,
         "cameras_moved_pixels": trained.cameras_moved,
         "failure": None if trained.failure is None else trained.failure.name.value,

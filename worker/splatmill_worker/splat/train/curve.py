@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 FLAT_GAIN = 0.02
-"""dB on the held-out views: a smaller gain over FLAT_SHARE of the training time counts as none."""
+"""dB on the validation photos: a smaller gain over FLAT_SHARE of the training time counts as none."""
 
 FLAT_SHARE = 0.4
 """Share of the training time so far over which the gain is looked at."""
@@ -33,6 +33,7 @@ class CurvePoint:
     train_psnr: dB, mean over a few training views.
     train_ssim: mean over the same training views, 0 to 1.
     views: number of held-out views that were evaluated; None where there are none. The last point shows all of them.
+    validation_psnr: dB, mean over the photos that are set aside; None where none are, or they are trained on again.
     """
 
     seconds: float
@@ -45,11 +46,12 @@ class CurvePoint:
     train_psnr: float | None = None
     train_ssim: float | None = None
     views: int | None = None
+    validation_psnr: float | None = None
 
 
 def is_flat(curve: Sequence[CurvePoint]) -> bool:
     """Whether every point in the last FLAT_SHARE of the time is less than FLAT_GAIN above the best one before it."""
-    scores = [(point.seconds, point.psnr) for point in curve if point.psnr is not None]
+    scores = [(point.seconds, point.validation_psnr) for point in curve if point.validation_psnr is not None]
     if not scores or curve[-1].step < FLAT_FROM:
         return False
     since = (1.0 - FLAT_SHARE) * scores[-1][0]

@@ -50,18 +50,19 @@ class CurveViews(NamedTuple):
     training: int
 
 
-def curve_views(held_out: int, training: int, steps: int) -> CurveViews:
-    """The points of the curve of a run of `steps` steps that has so many held-out and training views.
+def curve_views(held_out: int, training: int, steps: int, validation: int = 0) -> CurveViews:
+    """The points of the curve of a run of `steps` steps that has so many held-out, training and validation views.
 
-    It depends on these numbers alone, so that runs of one plan have the same points.
+    All validation views are evaluated at each point but the last: decisions compare them from point to point. The
+    points depend on these numbers alone, so that runs of one plan have the same ones.
     """
     finally_ = held_out + len(finally_evaluated(range(training)))
     affordable = SHARE * steps / VIEW_STEPS - finally_
-    least = min(held_out, LEAST_HELD_OUT) + 1
+    least = min(held_out, LEAST_HELD_OUT) + 1 + validation
     shares = EVALUATED_AT if affordable >= least * (len(EVALUATED_AT) - 1) else SHORT_EVALUATED_AT
-    each = max(least, int(affordable / (len(shares) - 1)))
+    each = max(least, int(affordable / (len(shares) - 1))) - validation
     also = min(ALSO_EVALUATED, training, max(1, each // 3))
-    return CurveViews(shares, min(held_out, max(least - 1, each - also)), also)
+    return CurveViews(shares, min(held_out, max(min(held_out, LEAST_HELD_OUT), each - also)), also)
 
 
 def finally_evaluated(views: Sequence[View]) -> Sequence[View]:
@@ -93,7 +94,10 @@ class Evaluations:
 
     def __init__(self, run: TrainingRun, held_out: Sequence[TrainingView]) -> None:
         self._run, self._held_out = run, held_out
-        self._chosen = curve_views(len(held_out), len(run.views), run.plan.schedule.expected_steps)
+        aside = len(run.set_aside)
+        self._chosen = curve_views(
+            len(held_out), len(run.views) - aside, run.plan.schedule.expected_steps, aside
+        )
         self.seconds = 0.0
         self.final: FinalScores | None = None
         # A resumed run is evaluated at the end again: an attempt may die after its last step and before its export.
@@ -105,6 +109,11 @@ class Evaluations:
         """Whether the next share of the budget is reached."""
         return self._run.progress >= self._chosen.shares[self._next]
 
+    @property
+    def last_is_next(self) -> bool:
+        """Whether the only evaluation to come is that at the end of the budget."""
+        return self._next >= len(self._chosen.shares) - 1
+
     def evaluate(self) -> CurvePoint:
         """Evaluate now; the point is added to the curve of the run."""
         started = time.perf_counter()
@@ -115,7 +124,8 @@ class Evaluations:
             self._all()
             if run.progress >= 1.0
             else self._of(
-                evenly(self._held_out, self._chosen.held_out), evenly(corrected(run), self._chosen.training)
+                evenly(self._held_out, self._chosen.held_out),
+                evenly(trained_on(run), self._chosen.training),
             )
         )
         self.final = scores if run.progress >= 1.0 else None
@@ -131,6 +141,7 @@ class Evaluations:
             train_psnr=scores.on_training.psnr,
             train_ssim=scores.on_training.ssim,
             views=None if held_out is None else len(held_out.views),
+            validation_psnr=self._validation(),
         )
         run.curve.append(point)
         self.seconds += time.perf_counter() - started
@@ -145,7 +156,14 @@ class Evaluations:
         return self.final
 
     def _all(self) -> FinalScores:
-        return self._of(self._held_out, finally_evaluated(corrected(self._run)))
+        return self._of(self._held_out, finally_evaluated(trained_on(self._run)))
+
+    def _validation(self) -> float | None:
+        """Mean PSNR of the views that are set aside, with their cameras as given; None where there are none."""
+        run = self._run
+        aside = [run.views[index] for index in sorted(run.set_aside)]
+        background = evaluation_background(run.plan, run.views)
+        return evaluate(renderer(run.engine, run.plan), aside, background).psnr if aside else None
 
     def _of(self, held_out: Sequence[TrainingView], training: Sequence[TrainingView]) -> FinalScores:
         run = self._run
@@ -154,6 +172,11 @@ class Evaluations:
             evaluate(render, held_out, background) if held_out else None,
             evaluate(render, training, background),
         )
+
+
+def trained_on(run: TrainingRun) -> list[TrainingView]:
+    """The training views that are not set aside, with their cameras as they are now."""
+    return [view for index, view in enumerate(corrected(run)) if index not in run.set_aside]
 
 
 def corrected(run: TrainingRun) -> tuple[TrainingView, ...]:

@@ -102,6 +102,7 @@ class Trained:
     recoveries: roll-backs.
     views: the training views with their cameras as the run left them.
     cameras_moved: median correction of the cameras, pixels; None where they are not refined.
+    validation: names of the training views that were set aside for decisions.
     """
 
     gaussians: Gaussians
@@ -116,6 +117,7 @@ class Trained:
     recoveries: int
     views: tuple[TrainingView, ...]
     cameras_moved: float | None
+    validation: tuple[str, ...] = ()
 
 
 def train(
@@ -130,7 +132,7 @@ def train(
 ) -> Trained:
     """Optimise the scene that `engine` holds until it shows `views`, as `plan` says.
 
-    held_out: views to evaluate on, which may be none.
+    held_out: views to evaluate on for the curve and the result, which may be none. No decision reads them.
     extent: radius of the cameras in the training world, the unit of the position rate.
     resume_from: what `hooks.checkpoint` was given in an earlier attempt with the same views and plan.
 
@@ -146,10 +148,13 @@ def train(
     run = TrainingRun(engine, plan, views, extent, poses=poses, warn=hooks.warn)
     if resume_from is not None:
         run.resume(resume_from)
+    validation = tuple(run.views[index].name for index in sorted(run.set_aside))
     evaluations = Evaluations(run, held_out)
     stopped, failure = "", None
     last_progress = last_checkpoint = time.monotonic()
     while not stopped:
+        if run.set_aside and (run.shortened or evaluations.last_is_next):
+            run.train_on_all()
         if hooks.cancelled():
             if hooks.checkpoint is not None and run.step > 0:
                 hooks.checkpoint(run.snapshot())
@@ -179,7 +184,7 @@ def train(
             with run.clock.stopped():
                 hooks.checkpoint(run.snapshot())
             last_checkpoint = time.monotonic()
-    return _result(run, evaluations, stopped, failure)
+    return _result(run, evaluations, stopped, failure, validation)
 
 
 def _result(
@@ -187,6 +192,7 @@ def _result(
     evaluations: Evaluations,
     stopped: str,
     failure: TrainingFailed | None,
+    validation: tuple[str, ...],
 ) -> Trained:
     """What the run ends with. After a failure, the scene is not that of the last point, and is evaluated anew."""
     seconds = run.clock.seconds
@@ -207,6 +213,7 @@ def _result(
         recoveries=run.recoveries,
         views=corrected(run),
         cameras_moved=None if run.poses is None else run.poses.pixels_moved(),
+        validation=validation,
     )
 
 
@@ -231,10 +238,10 @@ def _reason_to_stop(run: TrainingRun) -> str:
     """Why the run ends after its last evaluation; empty where it goes on. Cuts the budget where the curve is flat."""
     plan = run.plan
     if run.progress >= 1.0:
-        return "the held-out curve became flat" if run.shortened else "the budget is spent"
-    reached = run.curve[-1].psnr
+        return "the curve of the validation photos became flat" if run.shortened else "the budget is spent"
+    reached = run.curve[-1].validation_psnr
     if plan.target_psnr is not None and reached is not None and reached >= plan.target_psnr:
-        return f"{run.curve[-1].views} held-out views reached {reached:.2f} dB"
+        return f"the validation photos ({len(run.set_aside)}) reached {reached:.2f} dB"
     if plan.stops_when_flat and not run.shortened and is_flat(run.curve):
         run.shorten(FLAT_TAIL)
     return ""

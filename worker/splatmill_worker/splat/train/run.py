@@ -22,6 +22,7 @@ from splatmill_worker.splat.train.pace import Pace
 from splatmill_worker.splat.train.poses import Poses
 from splatmill_worker.splat.train.renderer import fixed_background
 from splatmill_worker.splat.train.snapshot import Snapshot
+from splatmill_worker.splat.train.validation import validation_indices
 from splatmill_worker.splat.views import TrainingView
 
 SNAPSHOT_SHARE = 0.04
@@ -37,6 +38,7 @@ class TrainingRun:
     engine: the scene, its optimiser and the kernels.
     plan: what was decided before training.
     views: the training views; `poses` and `upcoming` hold their indices.
+    set_aside: indices of the views that decisions are made by, and which no step is taken on meanwhile.
     extent: radius of the cameras in the training world, the unit of the position rate.
     poses: corrections of the cameras; None where they are taken as given.
     warn: gets a sentence at each roll-back.
@@ -68,6 +70,7 @@ class TrainingRun:
         warn: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.engine, self.plan, self.views, self.extent = engine, plan, views, extent
+        self.set_aside = frozenset(validation_indices(len(views), plan.validation or 0))
         self.poses, self.warn = poses, warn
         self.budget = plan.schedule.budget
         self.clock = Clock()
@@ -134,6 +137,10 @@ class TrainingRun:
         """End after another `tail` of what was spent so far: rates fall to their ends in that time."""
         self.budget = self.budget.ending_at(self.progress, tail)
         self.shortened = True
+
+    def train_on_all(self) -> None:
+        """Take steps on the photos that were set aside too: no decision is made by them any more."""
+        self.set_aside = frozenset()
 
     def roll_back(self, failure: TrainingFailed) -> None:
         """Restore the last good snapshot and go on with half the learning rates, or with fewer Gaussians where
@@ -241,9 +248,10 @@ class TrainingRun:
         return fixed_background(self.plan)
 
     def _next_view(self) -> int:
-        """The index of the next photo: all photos once in random order, then all of them again."""
+        """The index of the next photo: all that are not set aside once in random order, then all of them again."""
         if not self.upcoming:
-            self.upcoming = torch.randperm(len(self.views), generator=self._random).tolist()
+            order = torch.randperm(len(self.views), generator=self._random).tolist()
+            self.upcoming = [index for index in order if index not in self.set_aside]
         return self.upcoming.pop()
 
     def _densify(self) -> None:
