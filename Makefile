@@ -18,7 +18,7 @@ WORKERS ?= 2
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-.PHONY: help install demo quick test coverage check wheels docs screenshots bench serve sanitize clean
+.PHONY: help install demo quick test coverage check wheels docs screenshots bench soak serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -57,6 +57,9 @@ screenshots: $(VENV)/.installed-dev ## make the documentation's pictures of the 
 
 bench: install ## error against run time: kernels, functions, stability, worst inputs, stiffness, SfM, training, formats (long)
 	for name in kernels functions stability worst stiffness sfm train live formats; do $(BIN)/splatmill bench $$name || exit 1; done
+
+soak: $(VENV)/.installed-dev ## faults at random moments against the whole service (STORAGE=s3, SOAK_ARGS="--faults 30"; half an hour)
+	$(BIN)/splatmill bench soak --storage $(or $(STORAGE),folder) $(SOAK_ARGS)
 
 serve: install ## the whole service on this machine; Ctrl-C ends it
 	@$(BIN)/splatmill up

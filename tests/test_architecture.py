@@ -23,7 +23,7 @@ OPS = ("project", "bin", "composite", "loss", "adam", "knn")
 
 
 def sources() -> list[Path]:
-    folders = [*PARTS.values(), ROOT / "worker" / "bench", ROOT / "tests"]
+    folders = [*PARTS.values(), ROOT / "worker" / "bench", ROOT / "server" / "bench", ROOT / "tests"]
     return [p for f in folders for p in f.rglob("*") if p.suffix in {".py", ".cpp", ".hpp", ".html"}]
 
 

@@ -6,6 +6,7 @@ import signal
 import socket
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
@@ -121,6 +122,16 @@ def _listen_unix(path: Path) -> socket.socket:
     return listener
 
 
+class _LineLog(structlog.PrintLogger):
+    """A log of lines. One that cannot be written is left out: a full disk of the log must not fail every request."""
+
+    def msg(self, message: str) -> None:
+        with suppress(OSError):
+            super().msg(message)
+
+    log = debug = info = warn = warning = fatal = failure = err = error = critical = exception = msg
+
+
 def configure_logging(level: int = logging.INFO) -> None:
     """Log readable lines on a terminal and JSON otherwise, also for uvicorn's messages."""
     shared: list[structlog.types.Processor] = [
@@ -139,7 +150,7 @@ def configure_logging(level: int = logging.INFO) -> None:
     structlog.configure(
         processors=[*shared, *errors, renderer],
         wrapper_class=structlog.make_filtering_bound_logger(level),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        logger_factory=lambda *_: _LineLog(sys.stderr),
     )
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(

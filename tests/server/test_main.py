@@ -62,9 +62,9 @@ def test_reasons_not_to_start_are_sentences(tmp_path: Path, redis_url: str) -> N
 
 @contextmanager
 def served(uds: Path, **options: Any) -> Iterator[tuple[subprocess.Popen[str], httpx.Client]]:
-    """A server process on a unix socket."""
+    """A server process on a unix socket. `log`: the file for its log, by default beside the socket."""
     env = options.pop("env")
-    with uds.with_suffix(".log").open("w") as log:
+    with options.pop("log", uds.with_suffix(".log")).open("w") as log:
         process = subprocess.Popen(**command(SPLATMILL_UDS=str(uds), **env), **options, stderr=log)
     transport = httpx.HTTPTransport(uds=str(uds))
     try:
@@ -102,6 +102,15 @@ def test_one_signal_ends_it_with_a_stream_open(tmp_path: Path, redis_url: str) -
         assert not uds.exists()
         log = uds.with_suffix(".log").read_text()
         assert json.loads(log.splitlines()[0])["event"] == "serving"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_log_on_a_full_disk_fails_no_request(tmp_path: Path, redis_url: str) -> None:
+    env = {"REDIS_URL": redis_url, "SPLATMILL_DATA": str(tmp_path / "data")}
+    with served(tmp_path / "s", env=env, log=Path("/dev/full")) as (_, http):
+        capture_id = http.post("/v1/captures", json={}).json()["id"]
+        assert http.get(f"/v1/captures/{capture_id}").status_code == 200
+        assert http.get("/v1/captures/none").status_code == 404
 
 
 def limit_files() -> None:

@@ -21,8 +21,9 @@ Row = dict[str, Any]
 
 
 @cache
-def origin() -> Row:
-    """Commit, machine and versions. A + behind the commit says that the tree had changes that were not committed."""
+def origin(*parts: str) -> Row:
+    """Commit, machine and versions. A + behind the commit says that the tree had changes that were not committed: that
+    of the worker, and of the other `parts` of the repository that are measured."""
 
     def git(*arguments: str) -> str:
         return subprocess.run(
@@ -30,7 +31,8 @@ def origin() -> Row:
         ).stdout.strip()
 
     # Rows and what is drawn from them are the outcome, not what is measured.
-    sources = ("..", ":!results", ":!figures", ":!*.md")
+    sources = ("..", *(f"../../{part}" for part in parts), ":(exclude,glob,top)**/bench/results/**")
+    sources += (":(exclude,glob,top)**/bench/figures/**", ":(exclude,top)*.md")
     commit = git("rev-parse", "--short", "HEAD") + (
         "+" if git("status", "--porcelain", "--", *sources) else ""
     )

@@ -58,7 +58,9 @@ def main(argv: list[str] | None = None) -> int:
     fit_image.add_argument("--options", default="{}", help="FitImageOptions as JSON")
     doctor = programs.add_parser("doctor", help="check whether Splatmill runs on this machine")
     doctor.add_argument("--json", action="store_true", help="print one JSON document instead of lines")
-    bench = programs.add_parser("bench", help="run worker/bench/NAME.py (source tree only)")
+    bench = programs.add_parser(
+        "bench", help="run worker/bench/NAME.py or server/bench/NAME.py (source tree only)"
+    )
     bench.add_argument("name")
     bench.add_argument("arguments", nargs=argparse.REMAINDER)
     chosen = parser.parse_args(argv)
@@ -106,10 +108,12 @@ def return_freed_memory() -> None:
 
 
 def _bench(name: str, arguments: list[str]) -> int:
-    folder = Path(__file__).resolve().parent.parent / "bench"
-    script = folder / f"{name}.py"
-    if not script.is_file():
-        known = sorted(path.stem for path in folder.glob("*.py") if not path.stem.startswith("_"))
+    parts = Path(__file__).resolve().parent.parent.parent
+    folders = [parts / part / "bench" for part in ("worker", "server")]
+    script = next((path for folder in folders if (path := folder / f"{name}.py").is_file()), None)
+    if script is None:
+        found = (path.stem for folder in folders for path in folder.glob("*.py"))
+        known = sorted(stem for stem in found if not stem.startswith("_"))
         print(
             f"There is no benchmark {name!r}. The benchmarks are {', '.join(known)}."
             if known
@@ -117,7 +121,7 @@ def _bench(name: str, arguments: list[str]) -> int:
             file=sys.stderr,
         )
         return 2
-    sys.path.insert(0, str(folder))
+    sys.path[:0] = map(str, folders)
     spec = importlib.util.spec_from_file_location(f"bench_{name}", script)
     assert spec is not None
     assert spec.loader is not None

@@ -22,7 +22,8 @@ def doctor(context: typer.Context) -> None:
 
 
 def bench(context: typer.Context) -> None:
-    """Measure errors and times: kernels, functions, stability, worst, stiffness, sfm, train, live, formats."""
+    """Measure errors and times: kernels, functions, stability, worst, stiffness, sfm, train, live, formats; and the
+    service: soak."""
     require("splatmill_worker", "`splatmill bench`")
     exec_module("splatmill_worker", "bench", *context.args)
 

@@ -10,6 +10,7 @@ import os
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn, Protocol, cast
 
@@ -233,7 +234,8 @@ def _forward(event: Event, folder: JobFolder, outbox: Outbox) -> None:
 def _report_failure(error: Exception, outbox: Outbox, can_retry: bool) -> None:
     """Report the failure of the job, or raise a transient one again while the queue can retry."""
     trace = "".join(traceback.format_exception(error))
-    print(trace, flush=True)
+    with suppress(OSError):  # the disk of the worker's log may be full, which may be the failure
+        print(trace, flush=True)
     problem = problem_of(error)
     if is_transient(error):
         if not outbox.flush():  # waits until Redis is back, if its absence was the failure

@@ -1,0 +1,229 @@
+"""The kinds of fault: what each does to the service, at a moment of its own choice, and how it heals."""
+
+import os
+import random
+import signal
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import psutil
+
+from _soak.service import Service, wait_for
+
+MAX_TRAINER_KILLS = 2
+"""Kills of the trainer of one job. A job whose process ends unexpectedly in four attempts is given up by design."""
+
+_HOLD = (
+    0.3,
+    4.0,
+)  # seconds that a stop, a cut or a stall lasts: below and above the timeout of Redis with its retries
+_AWAY = (0.0, 1.0)  # seconds before what was killed is started again
+_TARGET_SECONDS = 20.0
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A kind of fault.
+
+    name: what the table calls it.
+    weight: how often it comes in a round, beside others.
+    kills: whether it ends processes.
+    act: does it to the service and heals it.
+    needs: "s3", "folder", "disk" or "clock"; "" where every soak can have it.
+    """
+
+    name: str
+    weight: int
+    kills: bool
+    act: Callable[["Target"], None]
+    needs: str = ""
+
+
+class Target:
+    """The service as the faults reach it.
+
+    killed: kills of trainers by job.
+    healed: monotonic time at which the newest fault was over: its kill, or the beginning of what takes it back.
+    """
+
+    def __init__(self, service: Service, rng: random.Random) -> None:
+        self.service = service
+        self.rng = rng
+        self.killed: dict[str, int] = {}
+        self.healed = 0.0
+
+    def trainer(self, *, spare: bool = False) -> int:
+        """Return the process of the attempt that runs. With `spare`, not of a job whose trainers were killed often."""
+
+        def find() -> int | None:
+            ended = set()
+            for line in reversed(self.service.records()):
+                if line["what"] == "end":
+                    ended.add(line["pid"])
+                elif line["what"] == "begin" and line["pid"] not in ended:
+                    if not psutil.pid_exists(line["pid"]):
+                        return None
+                    if spare and self.killed.get(line["job"], 0) >= MAX_TRAINER_KILLS:
+                        return None
+                    self.killed[line["job"]] = self.killed.get(line["job"], 0) + spare
+                    return int(line["pid"])
+                elif line["what"] == "begin":
+                    return None
+            return None
+
+        return int(wait_for(find, _TARGET_SECONDS, "an attempt runs"))
+
+    def last(self, bounds: tuple[float, float]) -> None:
+        """Let the fault last for some seconds, after which it is taken back."""
+        time.sleep(self.rng.uniform(*bounds))
+        self.healed = time.monotonic()
+
+    def kill(self, pid: int) -> None:
+        """Kill a process that the service starts again by itself."""
+        self.healed = time.monotonic()
+        self.service.kill(pid)
+
+
+def _kill_trainer(target: Target) -> None:
+    target.kill(target.trainer(spare=True))
+
+
+def _kill_part(name: str) -> Callable[[Target], None]:
+    def act(target: Target) -> None:
+        target.kill(target.service.part(name))
+
+    return act
+
+
+def _kill_up(target: Target) -> None:
+    target.service.kill_up()
+    target.last(_AWAY)
+    target.service.start()
+
+
+def _kill_all(target: Target) -> None:
+    target.service.kill_all()
+    target.last(_AWAY)
+    target.service.start_redis()
+    target.service.start()
+
+
+def _kill_redis(target: Target) -> None:
+    target.service.kill_redis()
+    target.last(_AWAY)
+    target.service.start_redis()
+
+
+def _empty_redis(target: Target) -> None:
+    target.service.kill_redis(empty=True)
+    target.last(_AWAY)
+    target.service.start_redis()
+
+
+def _stop(find: Callable[[Target], int]) -> Callable[[Target], None]:
+    def act(target: Target) -> None:
+        pid = find(target)
+        os.kill(pid, signal.SIGSTOP)
+        target.last(_HOLD)
+        if psutil.pid_exists(pid):
+            os.kill(pid, signal.SIGCONT)
+
+    return act
+
+
+def _cut_redis(target: Target) -> None:
+    target.service.redis_proxy.cut()
+    target.last(_HOLD)
+    target.service.redis_proxy.heal()
+
+
+def _stall_redis(target: Target) -> None:
+    target.service.redis_proxy.stall()
+    target.last(_HOLD)
+    target.service.redis_proxy.heal()
+
+
+def _s3(what: str) -> Callable[[Target], None]:
+    def act(target: Target) -> None:
+        proxy = target.service.s3_proxy
+        assert proxy is not None
+        getattr(proxy, what)()
+        target.last(_HOLD)
+        proxy.heal()
+
+    return act
+
+
+def _full_disk(target: Target) -> None:
+    target.service.fill_disk()
+    target.last(_HOLD)
+    target.service.empty_disk()
+
+
+def _jump(target: Target) -> None:
+    """Forward by up to half an hour, or back to where the clock was, and the other way round."""
+    clock = target.service.clock
+    target.healed = time.monotonic()
+    clock.jump(-clock.offset if clock.offset else target.rng.choice((-1, 1)) * target.rng.randint(20, 1800))
+
+
+FAULTS = (
+    Fault("trainer killed", 4, True, _kill_trainer),
+    Fault("worker killed", 4, True, _kill_part("worker")),
+    Fault("API killed", 3, True, _kill_part("api")),
+    Fault("renderer killed", 2, True, _kill_part("renderer")),
+    Fault("Redis killed", 3, True, _kill_redis),
+    Fault("supervisor killed", 1, True, _kill_up),
+    Fault("everything killed", 2, True, _kill_all),
+    Fault("Redis emptied", 1, True, _empty_redis),
+    Fault("trainer stopped", 1, False, _stop(Target.trainer)),
+    Fault("worker stopped", 1, False, _stop(lambda target: target.service.part("worker"))),
+    Fault("API stopped", 1, False, _stop(lambda target: target.service.part("api"))),
+    Fault("renderer stopped", 1, False, _stop(lambda target: target.service.part("renderer"))),
+    Fault("Redis stopped", 1, False, _stop(lambda target: target.service.redis_pid)),
+    Fault("Redis cut off", 1, False, _cut_redis),
+    Fault("Redis stalled", 1, False, _stall_redis),
+    Fault("disk full", 1, False, _full_disk, "disk"),
+    Fault("clock set", 1, False, _jump, "clock"),
+    Fault("S3 cut off", 1, False, _s3("cut"), "s3"),
+    Fault("S3 stalled", 1, False, _s3("stall"), "s3"),
+    Fault("S3 answers 503", 1, False, _s3("fail"), "s3"),
+)
+"""All kinds. A round holds each as often as its weight, in an order of its own."""
+
+
+def possible(service: Service) -> tuple[list[Fault], dict[str, str]]:
+    """Return the faults that this soak can have, and why not for the others."""
+    missing = {}
+    if service.s3_proxy is None:
+        missing["s3"] = "storage is a folder"
+    if not service.disk:
+        missing["disk"] = "no right to mount a small disk"
+    if service.clock.missing is not None:
+        missing["clock"] = service.clock.missing
+    left_out = {fault.name: missing[fault.needs] for fault in FAULTS if fault.needs in missing}
+    return [fault for fault in FAULTS if fault.name not in left_out], left_out
+
+
+def schedule(
+    faults: list[Fault], count: int, rng: random.Random, only: Sequence[str] | None = None
+) -> list[Fault]:
+    """Return so many faults, round after round; with `only`, one of each of these names.
+
+    Raises ValueError for a name that no fault has.
+    """
+    if only is not None:
+        if unknown := set(only) - {fault.name for fault in FAULTS}:
+            raise ValueError(
+                f"There are no faults {sorted(unknown)}; the names are {[f.name for f in FAULTS]}."
+            )
+        chosen = [fault for fault in faults if fault.name in only]
+        rng.shuffle(chosen)
+        return chosen
+    found: list[Fault] = []
+    while len(found) < count:
+        deck = [fault for fault in faults for _ in range(fault.weight)]
+        rng.shuffle(deck)
+        found += deck
+    return found[:count]

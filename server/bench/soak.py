@@ -1,0 +1,264 @@
+"""Faults at random moments against the running service, and the proof that it loses nothing.
+
+    splatmill bench soak                                 # 340 faults, more than 200 of them kills; about half an hour
+    splatmill bench soak --storage s3
+    splatmill bench soak --faults 30 --seed 7
+    splatmill bench soak --plot-only
+
+`splatmill up` runs with a Redis behind a proxy, on a small disk where this user may mount one, with a clock that can be
+set. Clients upload, start jobs, cancel some and look at models, all the while. Most jobs take steps without photos
+(`_soak/pipeline.py`); every twelfth trains ten photos of the still life with the engine. After each fault the service
+must answer, and a job must get on, within 30 s; one fault in four is followed by the next at once instead. At the end
+every job that was accepted has its model or its cancellation, no two attempts at a job ran at once, no process is left,
+every file is whole, and Redis and storage tell the same. Otherwise the exit status is 1, with a sentence for each thing
+that does not hold.
+
+Rows go to results/soak.jsonl, the table to soak.md. A seed fixes the faults and their order, not the moments at which
+the machine does what.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import shutil
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from _rows import Row, append, footer, lines, origin
+from _soak import faults, verdict
+from _soak.clients import Clients
+from _soak.service import Service, wait_for
+from _still_life import posed_capture
+
+HERE = Path(__file__).resolve().parent
+
+RESUME_SECONDS = 30.0
+"""Seconds within which the service answers and a job gets on after a fault."""
+
+_AT_ONCE = 0.25
+"""Share of the faults that are followed by the next without waiting for either."""
+
+_PAUSE = (0.1, 2.0)  # seconds before a fault
+
+PHOTOS, WIDTH, HEIGHT = 10, 160, 120
+
+
+def main(argv: list[str]) -> int:
+    """Run the soak that is asked for, write its rows and the table, and return 1 if anything does not hold."""
+    parser = argparse.ArgumentParser(
+        prog="splatmill bench soak", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--faults", type=int, default=340, help="number of faults (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, help="end with the fault after so many seconds")
+    parser.add_argument(
+        "--only", nargs="+", metavar="FAULT", help="each of these once, by the names of the table"
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--storage", choices=["folder", "s3"], default="folder")
+    parser.add_argument("--no-engine", action="store_true", help="no job is trained by the engine")
+    parser.add_argument("--keep", type=Path, help="copy logs and the record of the attempts to this folder")
+    parser.add_argument("--results", type=Path, default=HERE / "results" / "soak.jsonl")
+    parser.add_argument("--plot-only", action="store_true", help="write the table of the rows that are there")
+    asked = parser.parse_args(argv)
+    table = HERE / "soak.md" if asked.results.parent == HERE / "results" else asked.results.with_suffix(".md")
+    complaints: list[str] = []
+    if not asked.plot_only:
+        photos = {} if asked.no_engine else posed_capture(PHOTOS, WIDTH, HEIGHT)
+        found = soak(
+            s3=asked.storage == "s3",
+            count=asked.faults,
+            seed=asked.seed,
+            seconds=asked.seconds,
+            only=asked.only,
+            photos=photos,
+            keep=asked.keep,
+        )
+        complaints = found[-1]["complaints"]
+        kept = [row for row in lines(asked.results) if row["storage"] != asked.storage]
+        asked.results.unlink(missing_ok=True)
+        for row in kept + [row | origin("server", "client") for row in found]:
+            append(asked.results, row)
+    rows = lines(asked.results)
+    if not rows:
+        print(f"There are no rows in {asked.results}.", file=sys.stderr)
+        return 1
+    table.write_text(document(rows))
+    print(table.read_text())
+    for complaint in complaints:
+        print(f"FAULT: {complaint}", file=sys.stderr)
+    return 1 if complaints else 0
+
+
+def soak(
+    *,
+    s3: bool,
+    count: int,
+    seed: int,
+    seconds: float | None = None,
+    only: Sequence[str] | None = None,
+    photos: dict[str, bytes] | None = None,
+    keep: Path | None = None,
+) -> list[Row]:
+    """Run one soak and return a row for each fault, and a last one for the whole.
+
+    count, seconds: the soak ends with the earlier of the two.
+    only: names of faults; each comes once if this soak can have it, and `count` says nothing.
+    photos: what a capture for the engine consists of; without it, no job is trained by the engine.
+    """
+    rng = random.Random(seed)
+    rows: list[Row] = []
+    begun = time.monotonic()
+    folder = Path(tempfile.mkdtemp(prefix="soak-"))
+    service = Service(folder, s3=s3)
+    try:
+        service.start()
+        possible, left_out = faults.possible(service)
+        clients = Clients(service, seed, photos or {})
+        clients.start()
+        target = faults.Target(service, rng)
+        same = {"bench": "soak", "storage": "s3" if s3 else "folder", "seed": seed}
+        for number, fault in enumerate(faults.schedule(possible, count, rng, only)):
+            if seconds is not None and time.monotonic() - begun > seconds:
+                break
+            time.sleep(rng.uniform(*_PAUSE))
+            row = same | {"number": number, "fault": fault.name, "kills": fault.kills}
+            row |= _one(service, target, fault, rng.random() < _AT_ONCE, begun)
+            rows.append(row)
+            _say(row)
+        complaints = [
+            f"fault {row['number']} ({row['fault']}): {row['complaint']}" for row in rows if row["complaint"]
+        ]
+        clients.submitting = False
+        complaints += verdict.settle(clients)
+        clients.stop()
+        complaints += verdict.check(service, clients)
+        service.stop()
+        complaints += verdict.check_stopped(service)
+        rows.append(same | _summary(rows, clients, time.monotonic() - begun, left_out, complaints))
+    finally:
+        if keep is not None:
+            keep.mkdir(parents=True, exist_ok=True)
+            for path in (*folder.glob("*.log"), *folder.glob("data/logs/*"), service.trace):
+                shutil.copy(path, keep)
+        service.close()
+    return rows
+
+
+def _one(service: Service, target: faults.Target, fault: faults.Fault, at_once: bool, begun: float) -> Row:
+    """Do a fault, and measure until the service answers and a job gets on again."""
+    service.family()
+    start = time.monotonic()
+    row: Row = {"at": round(start - begun, 2), "answers": None, "works": None, "complaint": None}
+    try:
+        fault.act(target)
+        healed = target.healed
+        row["lasted"] = round(healed - start, 2)
+        if not at_once:
+            wait_for(service.ready, RESUME_SECONDS, "the service is ready again")
+            row["answers"] = round(time.monotonic() - healed, 2)
+            step = wait_for(
+                lambda: _step_after(service, healed),
+                healed + RESUME_SECONDS - time.monotonic(),
+                "a job gets on",
+            )
+            row["works"] = round(step - healed, 2)
+    except AssertionError as error:
+        row["complaint"] = str(error)
+    return row
+
+
+def _step_after(service: Service, moment: float) -> float | None:
+    """Return when a job first got on after a moment, on the monotonic clock; None if none has."""
+    for line in service.records():
+        if line["what"] == "step" and line["at"] > moment:
+            return float(line["at"])
+    return None
+
+
+def _summary(
+    rows: list[Row], clients: Clients, seconds: float, left_out: dict[str, str], complaints: list[str]
+) -> Row:
+    states = [promise.state for promise in clients.promises.values()]
+    return {
+        "fault": None,
+        "seconds": round(seconds),
+        "faults": len(rows),
+        "killed": sum(row["kills"] for row in rows),
+        "jobs": len(states),
+        "succeeded": states.count("succeeded"),
+        "cancelled": states.count("cancelled"),
+        "restarts": sum(promise.restarts for promise in clients.promises.values()),
+        "views": clients.views,
+        "retries": clients.retries,
+        "left_out": left_out,
+        "complaints": complaints,
+    }
+
+
+def document(rows: list[Row]) -> str:
+    """Return the page with the table by kind of fault."""
+    storages = list(dict.fromkeys(row["storage"] for row in rows))
+    names = [f.name for f in faults.FAULTS if any(row["fault"] == f.name for row in rows)]
+    text = ["# What the service survives", ""]
+    text += [
+        "Made by `splatmill bench soak`; the head of `soak.py` says what is done and what must hold.",
+        "",
+    ]
+    for storage in storages:
+        text += _storage_part(storage, [row for row in rows if row["storage"] == storage], names)
+    text.append(footer(rows))
+    return "\n".join(text) + "\n"
+
+
+def _storage_part(storage: str, rows: list[Row], names: list[str]) -> list[str]:
+    end = next(row for row in rows if row["fault"] is None)
+    words = "a folder" if storage == "folder" else "S3"
+    text = [f"## Storage in {words}", ""]
+    text += [
+        f"{end['faults']} faults in {end['seconds']} s, {end['killed']} of them kills (seed {end['seed']}); "
+        f"{end['jobs']} jobs: {end['succeeded']} succeeded, {end['cancelled']} cancelled by a client, "
+        f"{end['restarts']} restarts by a client after a failure that advises one; {end['views']} views.",
+        "",
+    ]
+    if end["complaints"]:
+        text += ["**What did not hold:**", "", *(f"- {complaint}" for complaint in end["complaints"]), ""]
+    else:
+        text += [
+            "Nothing was lost, no two attempts at a job ran at once, no process was left, every file was whole, and "
+            "Redis and storage agreed.",
+            "",
+        ]
+    text += [f"Not run: {name}, because {why}." for name, why in end["left_out"].items()]
+    text += [""] if end["left_out"] else []
+    text += [
+        "Seconds from the kill, or from the beginning of what takes the fault back: median (longest), of the "
+        "faults that no other followed at once.",
+        "",
+        "| fault | times | waited for | answers | a job gets on |",
+        "|---|---|---|---|---|",
+    ]
+    for name in names:
+        found = [row for row in rows if row["fault"] == name]
+        if found:
+            waited = [row for row in found if row["works"] is not None]
+            cells = [_seconds([row[key] for row in waited]) for key in ("answers", "works")]
+            text.append(f"| {name} | {len(found)} | {len(waited)} | {' | '.join(cells)} |")
+    return [*text, ""]
+
+
+def _seconds(values: list[float]) -> str:
+    return f"{statistics.median(values):.1f} ({max(values):.1f})" if values else "-"
+
+
+def _say(row: Row) -> None:
+    waited = f"answers {row['answers']} s, works {row['works']} s" if row["works"] is not None else "at once"
+    print(f"{row['number'] + 1} {row['fault']}: {row['complaint'] or waited}", flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
