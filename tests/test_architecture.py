@@ -53,6 +53,8 @@ def test_every_backend_has_the_same_stems(backend: str):
         ("splatmill_server.app", {"torch", "numpy", "pycolmap", "splatmill_worker"}),
         # The queue worker forks an attempt; torch's and COLMAP's threads do not survive a fork.
         ("splatmill_worker.service.rq_worker", {"torch", "pycolmap", "splatmill_server"}),
+        # An attempt imports this before its first word; matplotlib would take a fifth of that time.
+        ("splatmill_worker.pipeline", {"matplotlib", "triton"}),
         ("splatmill_worker.kernels", {"triton", "pycolmap", "redis", "splatmill"}),
     ],
 )

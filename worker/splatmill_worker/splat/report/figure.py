@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-import matplotlib
-
-matplotlib.use("Agg")  # a worker has no display
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from typing import TYPE_CHECKING, Any
 
 from splatmill.files import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 ERROR, TRAINING, VALIDATION, GAUSSIANS, MEMORY = "#1f6f8b", "#9aa5ad", "#8ab87c", "#c97b3d", "#7a5c99"
 """Colours of the lines."""
@@ -34,6 +30,9 @@ def draw_curve(
     seconds: by stage, for the title.
     evaluated: label of the line of psnr and ssim.
     """
+    # Imported here: it takes a fifth of the time in which an attempt starts, and is needed only at its end.
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(7.2, 6.4), dpi=130, layout="constrained")
     panels: tuple[Axes, Axes, Axes] = figure.subplots(3, 1, sharex=True, height_ratios=(3, 1.5, 1.4))
     psnr, ssim, cost = panels
@@ -100,6 +99,8 @@ def _line(axes: Axes, x: Sequence[float], y: Sequence[float], color: str = ERROR
 
 def _logarithmic(axes: Axes) -> None:
     """A logarithmic time axis with plain numbers at 1, 2 and 5 of every decade."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
