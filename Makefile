@@ -65,7 +65,7 @@ soak: $(VENV)/.installed-dev ## faults at random moments against the whole servi
 serve: install ## the whole service on this machine; Ctrl-C ends it
 	@$(BIN)/splatmill up
 
-sanitize: $(VENV)/.installed-dev ## the kernels' tests under AddressSanitizer and UBSan
+sanitize: $(VENV)/.installed-dev ## the kernels' tests under AddressSanitizer and UBSan (SANITIZER=thread: ThreadSanitizer)
 	worker/sanitize/run
 
 clean: ## remove what the other targets made, except demo/ and your data
