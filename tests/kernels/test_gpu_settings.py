@@ -146,7 +146,10 @@ def use(monkeypatch: pytest.MonkeyPatch, kernel: Any, settings: Sequence[triton.
 PROJECTIONS = (
     project.project_kernel, project_backward.color_backward_kernel, project_backward.shape_backward_kernel,
 )  # fmt: skip
-LOSSES = (loss.across_kernel, loss.value_kernel, loss.down_kernel, loss.gradient_kernel)
+LOSSES = (
+    loss.row_stats_kernel, loss.stats_kernel, loss.across_kernel, loss.value_kernel, loss.down_kernel,
+    loss.gradient_kernel,
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -250,12 +253,13 @@ BRANCHES: dict[str, dict[str, set[Any]]] = {
     },
     "composite_backward_kernel": {"WITH_ALPHA": {True, False}, "WITH_DEPTH": {True, False}, "BATCH": {1, 2}},
     "over_kernel": {"BACKGROUND": {True, False}},
-    "across_kernel": {"MASK": {True, False}, "STATS": {True, False}},
-    "value_kernel": {"MASK": {True, False}, "STATS": {True, False}, "SLOPES": {True, False}},
+    "across_kernel": {"MASK": {True, False}},
+    "row_stats_kernel": {"MASK": {True, False}},
+    "value_kernel": {"MASK": {True, False}, "SLOPES": {True, False}},
     "gradient_kernel": {"MASK": {True, False}},
     "adam_kernel": {"VISIBLE": {True, False}},
-    "compact_kernel": {}, "total_kernel": {}, "down_kernel": {}, "scores_kernel": {}, "planes_kernel": {},
-    "drift_kernel": {}, "knn_kernel": {},
+    "compact_kernel": {}, "total_kernel": {}, "down_kernel": {}, "stats_kernel": {}, "scores_kernel": {},
+    "planes_kernel": {}, "drift_kernel": {}, "knn_kernel": {},
 }  # fmt: skip
 """The values of constants that choose a branch, by kernel."""
 

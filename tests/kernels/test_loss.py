@@ -95,14 +95,19 @@ def nearly_learnt(contrast: float) -> tuple[Tensor, Tensor, float, Tensor, float
     return color, photo, value, exact, float(torch.stack(moved).square().mean().sqrt())
 
 
-@pytest.mark.parametrize("build", isa.supported())
+@pytest.mark.parametrize(
+    "backend", [*(f"cpu:{build}" for build in isa.supported()), "gpu"]
+)  # or its interpreter
 @pytest.mark.parametrize("contrast", [0, 1, 20])
-def test_bright_pictures_keep_the_digits_of_their_differences(contrast: float, build: str) -> None:
+def test_bright_pictures_keep_the_digits_of_their_differences(contrast: float, backend: str) -> None:
     """The variance of bright, even colours as E[x^2] - E[x]^2 has an error of 8 to 24 units of conditioning."""
+    if backend == "gpu":
+        pytest.importorskip("triton", reason="Triton comes with torch's GPU builds; pip install triton")
     color, photo, value, exact, unit = nearly_learnt(contrast)
-    with use(f"cpu:{build}") as op:
-        mine, gradient = gradient_of(color, photo, op)
-    off = (gradient - exact).abs()
+    device = "cuda" if backend == "gpu" and torch.cuda.is_available() else "cpu"
+    with use(backend) as op:
+        mine, gradient = gradient_of(color.to(device), photo.to(device), op)
+    off = (gradient.cpu() - exact).abs()
     turned = off > 0.5 * 0.8 / color.numel()  # where rounding decides the sign of |x - p|
     assert int(turned.sum()) <= 2
     # Measured: 1.0 unit, which is the rounding of x - p.

@@ -90,11 +90,12 @@ def variants() -> Iterator[Variant]:
     color_alone = {"WITH_ALPHA": False, "WITH_DEPTH": False, "d_alpha": None, "d_depth": None, "depth": None}
     for back in (color_alone, {"WITH_ALPHA": True, "WITH_DEPTH": True}):
         yield Variant(composite_backward.composite_backward_kernel, {**back, "SEGMENT": SEGMENT})
-    bare, photo = {"MASK": False, "mask": None}, {"mean": None, "variance": None}
-    yield Variant(loss.across_kernel, {**bare, "STATS": True})
-    yield Variant(loss.across_kernel, {"MASK": True, "STATS": False})
-    yield Variant(loss.value_kernel, {**bare, "STATS": True, "SLOPES": True})
-    yield Variant(loss.value_kernel, {**photo, "MASK": True, "STATS": False, "SLOPES": True})
+    bare = {"MASK": False, "mask": None}
+    for masked in (bare, {"MASK": True}):
+        yield Variant(loss.row_stats_kernel, masked)
+        yield Variant(loss.across_kernel, masked)
+        yield Variant(loss.value_kernel, {**masked, "SLOPES": True})
+    yield Variant(loss.stats_kernel, {})
     yield Variant(loss.down_kernel, {})
     yield Variant(loss.gradient_kernel, bare)
     yield Variant(loss.total_kernel, {"BLOCK": loss.TOTAL_BLOCK}, settings=warps)

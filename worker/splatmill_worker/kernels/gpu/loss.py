@@ -1,8 +1,9 @@
-"""L1 plus D-SSIM against an 8-bit photo, value and gradient in four kernels.
+"""L1 plus D-SSIM against an 8-bit photo, value and gradient in four kernels, and the photo's statistics in two.
 
 The window of SSIM is separable: two kernels apply it to the moments, across and then down, and two to the derivatives.
 Its eleven shifted reads hit the first-level cache; between the kernels, three planes per channel go through memory.
-Everything is float32, since a variance is a difference of nearly equal moments and SSIM divides by it plus 9e-4.
+Moments are those of the rendering's difference from the photo, and the photo's variance is taken about a centre nearby:
+bright, even colours keep the digits of their contrast. The formulas stand at the head of `cpu/loss.cpp`.
 """
 
 from __future__ import annotations
@@ -29,57 +30,55 @@ S1, S2 = constant(C1), constant(C2)
 TOTAL_BLOCK = 1024
 """Rows of sums that the one program of `total_kernel` reads at a time."""
 
-# First of the three planes, one per channel, of each windowed moment: of x, x^2, x y, y and y^2 (rendered x, photo y).
-# The derivatives of SSIM by the first three, its slopes, have the same places.
-X, XX, XY, Y, YY = (constant(3 * number) for number in range(5))
+# First of the three planes, one per channel, of each windowed moment: of d, d^2 and d y (photo y, rendered y + d). The
+# derivatives of SSIM by them, its slopes, have the same places.
+D, DD, DY = (constant(3 * number) for number in range(3))
+MEAN, VARIANCE = constant(0), constant(3)
+"""First of the three planes of what `row_stats_kernel` leaves."""
+
+
+@triton.jit
+def load_photo(photo, mask, place, channel, inside, MASK: tl.constexpr):
+    """Values of one channel of the photo, and where they are used: `inside`, and under the mask if any. Elsewhere 0."""
+    used = inside
+    if MASK:
+        used = inside & (tl.load(mask + place, mask=inside, other=0) != 0)
+    return tl.load(photo + place * 3 + channel, mask=used, other=0).to(tl.float32) / 255.0, used
 
 
 @triton.jit
 def load_pair(color, photo, mask, place, channel, inside, MASK: tl.constexpr):
-    """Rendered and photographed values of one channel, and where they are used: `inside`, and under the mask if any.
-
-    Both are 0 elsewhere.
-    """
-    used = inside
-    if MASK:
-        used = inside & (tl.load(mask + place, mask=inside, other=0) != 0)
-    x = tl.load(color + place * 3 + channel, mask=used, other=0.0)
-    y = tl.load(photo + place * 3 + channel, mask=used, other=0).to(tl.float32) / 255.0
-    return x, y, used
+    """The rendering's difference from the photo, the photo, and where they are used. Elsewhere both are 0."""
+    y, used = load_photo(photo, mask, place, channel, inside, MASK)
+    return tl.load(color + place * 3 + channel, mask=used, other=0.0) - y, y, used
 
 
-@autotune(LOSS, key=["MASK", "STATS"])
+@autotune(LOSS, key=["MASK"])
 @triton.jit
 def across_kernel(
     color: Floats, photo: Bytes, mask: Bytes, taps: Floats, planes: Floats, width: Int, height: Int,
-    MASK: tl.constexpr, STATS: tl.constexpr, BLOCK: tl.constexpr,
+    MASK: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The moments windowed along rows, planes [3 or 5, 3, H, W]; those of y alone only without kept STATS."""
+    """The moments windowed along rows, planes [3, 3, H, W]."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     channel = tl.program_id(1)
     plane = width * height
     here = p < plane
     column = p % width
-    x1 = tl.zeros([BLOCK], tl.float32)
-    xx, xy, y1, yy = x1, x1, x1, x1
+    by_d = tl.zeros([BLOCK], tl.float32)
+    by_dd, by_dy = by_d, by_d
     for k in tl.static_range(TAPS):
         shift = k - REACH
-        tap = tl.load(taps + k)
         inside = here & (column + shift >= 0) & (column + shift < width)
-        x, y, _ = load_pair(color, photo, mask, p + shift, channel, inside, MASK)
-        x1 += tap * x
-        xx += tap * x * x
-        xy += tap * x * y
-        if not STATS:
-            y1 += tap * y
-            yy += tap * y * y
+        d, y, _ = load_pair(color, photo, mask, p + shift, channel, inside, MASK)
+        weighted = tl.load(taps + k) * d
+        by_d += weighted
+        by_dd += weighted * d
+        by_dy += weighted * y
     out = planes + channel * plane + p
-    tl.store(out + X * plane, x1, mask=here)
-    tl.store(out + XX * plane, xx, mask=here)
-    tl.store(out + XY * plane, xy, mask=here)
-    if not STATS:
-        tl.store(out + Y * plane, y1, mask=here)
-        tl.store(out + YY * plane, yy, mask=here)
+    tl.store(out + D * plane, by_d, mask=here)
+    tl.store(out + DD * plane, by_dd, mask=here)
+    tl.store(out + DY * plane, by_dy, mask=here)
 
 
 @triton.jit
@@ -93,14 +92,14 @@ def down(planes, taps, p, row, here, width, height):
     return total
 
 
-@autotune(LOSS, key=["MASK", "STATS"])
+@autotune(LOSS, key=["MASK"])
 @triton.jit
 def value_kernel(
     color: Floats, photo: Bytes, mask: Bytes, mean: Floats, variance: Floats, taps: Floats, planes: Floats,
     slopes: Floats, sums: Floats, width: Int, height: Int,
-    MASK: tl.constexpr, STATS: tl.constexpr, SLOPES: tl.constexpr, BLOCK: tl.constexpr,
+    MASK: tl.constexpr, SLOPES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Per program the sums of |x - y| and of SSIM; with SLOPES also SSIM's derivatives by the windowed x, x^2 and x y.
+    """Per program the sums of |d| and of SSIM; with SLOPES also SSIM's derivatives by the windowed d, d^2 and d y.
 
     slopes [3, 3, H, W]; sums [programs * 3, 2].
     """
@@ -110,30 +109,30 @@ def value_kernel(
     here = p < plane
     row = p // width
     source = planes + channel * plane
-    mu1 = down(source + X * plane, taps, p, row, here, width, height)
-    var1 = down(source + XX * plane, taps, p, row, here, width, height) - mu1 * mu1
-    both = down(source + XY * plane, taps, p, row, here, width, height)
-    if STATS:
-        mu2 = tl.load(mean + p * 3 + channel, mask=here, other=0.0)
-        var2 = tl.load(variance + p * 3 + channel, mask=here, other=0.0)
-    else:
-        mu2 = down(source + Y * plane, taps, p, row, here, width, height)
-        var2 = down(source + YY * plane, taps, p, row, here, width, height) - mu2 * mu2
-    x, y, used = load_pair(color, photo, mask, p, channel, here, MASK)
-    a1, a2 = 2.0 * mu1 * mu2 + S1, 2.0 * (both - mu1 * mu2) + S2
+    mean_d = down(source + D * plane, taps, p, row, here, width, height)
+    # Exactly, a variance is never negative; rounded, it can be, and would let the denominator near zero.
+    spread = tl.maximum(down(source + DD * plane, taps, p, row, here, width, height) - mean_d * mean_d, 0.0)
+    mu2 = tl.load(mean + p * 3 + channel, mask=here, other=0.0)
+    var2 = tl.load(variance + p * 3 + channel, mask=here, other=0.0)
+    mu1 = mu2 + mean_d
+    covariance = down(source + DY * plane, taps, p, row, here, width, height) - mean_d * mu2
+    var1 = tl.maximum(var2 + spread + 2.0 * covariance, 0.0)
     b1, b2 = mu1 * mu1 + mu2 * mu2 + S1, var1 + var2 + S2
-    ssim = (a1 * a2) / (b1 * b2)
+    shift, part = mean_d / b1, spread / b2
+    light, structure = 1.0 - mean_d * shift, 1.0 - part
+    ssim = light * structure
+    d, _, used = load_pair(color, photo, mask, p, channel, here, MASK)
     if SLOPES:
-        by_variance = -ssim / b2
-        by_covariance = 2.0 * a1 / (b1 * b2)
-        by_mean = 2.0 * mu2 * a2 / (b1 * b2) - 2.0 * mu1 * ssim / b1
-        by_mean = by_mean - mu2 * by_covariance - 2.0 * mu1 * by_variance
+        by_square = -ssim / b2
+        by_product = 2.0 * light * part / b2
+        direct = structure * shift * (1.0 - mu1 * shift)
+        by_mean = -2.0 * (mean_d * by_square + direct) - mu2 * by_product
         out = slopes + channel * plane + p
-        tl.store(out + X * plane, tl.where(used, by_mean, 0.0), mask=here)
-        tl.store(out + XX * plane, tl.where(used, by_variance, 0.0), mask=here)
-        tl.store(out + XY * plane, tl.where(used, by_covariance, 0.0), mask=here)
+        tl.store(out + D * plane, tl.where(used, by_mean, 0.0), mask=here)
+        tl.store(out + DD * plane, tl.where(used, by_square, 0.0), mask=here)
+        tl.store(out + DY * plane, tl.where(used, by_product, 0.0), mask=here)
     place = sums + 2 * (tl.program_id(0) * 3 + channel)
-    tl.store(place, tl.sum(tl.where(used, tl.abs(x - y), 0.0), axis=0))
+    tl.store(place, tl.sum(tl.where(used, tl.abs(d), 0.0), axis=0))
     tl.store(place + 1, tl.sum(tl.where(used, ssim, 0.0), axis=0))
 
 
@@ -167,21 +166,78 @@ def gradient_kernel(
     here = p < plane
     column = p % width
     by_mean = tl.zeros([BLOCK], tl.float32)
-    by_variance, by_covariance = by_mean, by_mean
+    by_square, by_product = by_mean, by_mean
     for k in tl.static_range(TAPS):
         shift = k - REACH
         tap = tl.load(taps + k)
         inside = here & (column + shift >= 0) & (column + shift < width)
         source = planes + channel * plane + p + shift
-        by_mean += tap * tl.load(source + X * plane, mask=inside, other=0.0)
-        by_variance += tap * tl.load(source + XX * plane, mask=inside, other=0.0)
-        by_covariance += tap * tl.load(source + XY * plane, mask=inside, other=0.0)
-    x, y, used = load_pair(color, photo, mask, p, channel, here, MASK)
+        by_mean += tap * tl.load(source + D * plane, mask=inside, other=0.0)
+        by_square += tap * tl.load(source + DD * plane, mask=inside, other=0.0)
+        by_product += tap * tl.load(source + DY * plane, mask=inside, other=0.0)
+    d, y, used = load_pair(color, photo, mask, p, channel, here, MASK)
     share = 1.0 / (3.0 * tl.maximum(tl.load(used_pixels), 1.0))
-    slope = by_mean + 2.0 * x * by_variance + y * by_covariance
-    sign = tl.where(x > y, 1.0, tl.where(x < y, -1.0, 0.0))
+    slope = by_mean + 2.0 * d * by_square + y * by_product
+    sign = tl.where(d > 0.0, 1.0, tl.where(d < 0.0, -1.0, 0.0))
     value = share * ((1.0 - weight) * sign - weight * slope)
     tl.store(d_color + p * 3 + channel, tl.where(used, value, 0.0), mask=here)
+
+
+@autotune(LOSS, key=["MASK"])
+@triton.jit
+def row_stats_kernel(
+    photo: Bytes, mask: Bytes, taps: Floats, rows: Floats, width: Int, height: Int,
+    MASK: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Mean and variance of the window along rows, rows [2, 3, H, W], about the pixel in its middle."""
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    channel = tl.program_id(1)
+    plane = width * height
+    here = p < plane
+    column = p % width
+    middle, _ = load_photo(photo, mask, p, channel, here, MASK)
+    first = tl.zeros([BLOCK], tl.float32)
+    second = first
+    for k in tl.static_range(TAPS):
+        shift = k - REACH
+        inside = here & (column + shift >= 0) & (column + shift < width)
+        y, _ = load_photo(photo, mask, p + shift, channel, inside, MASK)
+        off = y - middle
+        weighted = tl.load(taps + k) * off
+        first += weighted
+        second += weighted * off
+    out = rows + channel * plane + p
+    tl.store(out + MEAN * plane, middle + first, mask=here)
+    tl.store(out + VARIANCE * plane, second - first * first, mask=here)
+
+
+@autotune(LOSS, key=[])
+@triton.jit
+def stats_kernel(
+    rows: Floats, taps: Floats, mean: Floats, variance: Floats, width: Int, height: Int, BLOCK: tl.constexpr
+):  # fmt: skip
+    """Mean and variance [H, W, 3] of the whole window, from those of its rows.
+
+    The variance is the mean of the rows' variances and the variance of their means.
+    """
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    channel = tl.program_id(1)
+    plane = width * height
+    here = p < plane
+    row = p // width
+    means, variances = rows + (MEAN + channel) * plane, rows + (VARIANCE + channel) * plane
+    center = tl.load(means + p, mask=here, other=0.0)
+    first = tl.zeros([BLOCK], tl.float32)
+    second = first
+    for k in tl.static_range(TAPS):
+        shift = k - REACH
+        inside = here & (row + shift >= 0) & (row + shift < height)
+        tap = tl.load(taps + k)
+        off = tl.load(means + p + shift * width, mask=inside, other=0.0) - center
+        first += tap * off
+        second += tap * (off * off + tl.load(variances + p + shift * width, mask=inside, other=0.0))
+    tl.store(mean + p * 3 + channel, center + first, mask=here)
+    tl.store(variance + p * 3 + channel, tl.maximum(second - first * first, 0.0), mask=here)
 
 
 @triton.jit
@@ -244,8 +300,10 @@ def loss_and_gradient(
             if mask is None
             else torch.count_nonzero(mask).to(torch.float32)
         )
+    if stats is None:
+        stats = photo_stats(photo, mask=mask)
     taps = window_taps(color.device)
-    planes = torch.empty(3 if stats is not None else 5, 3, height, width, **like)
+    planes = torch.empty(3, 3, height, width, **like)
     slopes = torch.empty(3, 3, height, width, **like) if gradient else None
     sums = torch.zeros(triton.cdiv(pixels, SMALLEST_LOSS_BLOCK) * 3, 2, **like)
     masked = mask is not None
@@ -253,11 +311,10 @@ def loss_and_gradient(
     def grid(meta: dict[str, Any]) -> tuple[int, int]:
         return triton.cdiv(pixels, meta["BLOCK"]), 3
 
-    across_kernel[grid](color, photo, mask, taps, planes, width, height, MASK=masked, STATS=stats is not None)
-    mean, variance = (None, None) if stats is None else (stats.mean.contiguous(), stats.variance.contiguous())
+    across_kernel[grid](color, photo, mask, taps, planes, width, height, MASK=masked)
     value_kernel[grid](
-        color, photo, mask, mean, variance, taps, planes, slopes, sums, width, height,
-        MASK=masked, STATS=stats is not None, SLOPES=gradient,
+        color, photo, mask, stats.mean.contiguous(), stats.variance.contiguous(), taps, planes, slopes, sums,
+        width, height, MASK=masked, SLOPES=gradient,
     )  # fmt: skip
     losses = torch.empty(3, **like)
     total_kernel[(1,)](sums, count, losses, sums.shape[0], dssim_weight, BLOCK=TOTAL_BLOCK)
@@ -314,20 +371,16 @@ def photo_stats(photo: Tensor, *, mask: Tensor | None = None) -> PhotoStats:
     """Return the windowed mean and variance of a photo (uint8 [H,W,3]) under a mask, each [H,W,3]: 24 bytes a pixel."""
     device.require(photo)
     height, width = photo.shape[:2]
+    photo = photo.contiguous()
     mask = None if mask is None else mask.to(torch.uint8).contiguous()
-    seen = photo.to(torch.float32) / 255
     taps = window_taps(photo.device)
-    planes = torch.empty(3, 3, height, width, device=photo.device)
-    windowed = torch.empty_like(planes)
+    rows = torch.empty(2, 3, height, width, device=photo.device)
+    mean = torch.empty(height, width, 3, device=photo.device)
+    variance = torch.empty_like(mean)
 
     def grid(meta: dict[str, Any]) -> tuple[int, int]:
         return triton.cdiv(height * width, meta["BLOCK"]), 3
 
-    across_kernel[grid](
-        seen, photo.contiguous(), mask, taps, planes, width, height, MASK=mask is not None, STATS=True
-    )
-    down_kernel[lambda meta: (triton.cdiv(height * width, meta["BLOCK"]), 6)](
-        planes, taps, windowed, width, height
-    )
-    mean, square = windowed[0].permute(1, 2, 0), windowed[1].permute(1, 2, 0)
-    return PhotoStats(mean.contiguous(), (square - mean * mean).contiguous())
+    row_stats_kernel[grid](photo, mask, taps, rows, width, height, MASK=mask is not None)
+    stats_kernel[grid](rows, taps, mean, variance, width, height)
+    return PhotoStats(mean, variance)
