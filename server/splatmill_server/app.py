@@ -7,11 +7,9 @@ from collections.abc import AsyncIterator
 import structlog
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
-from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 
 import splatmill
-from splatmill.backplane.storage import StorageError
 from splatmill.schema import CreateJob, EventRecord, Problem
 from splatmill_server import problems
 from splatmill_server.access.exposure import check_exposure
@@ -65,7 +63,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         loops = (service.reaper.run, service.imports.run, service.deliveries.run, service.sweeper.run)
         tasks = [asyncio.create_task(loop()) for loop in loops]
-        clean_up = asyncio.create_task(run_in_threadpool(_clean_up, service))
         try:
             yield
         finally:
@@ -73,7 +70,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            await clean_up
             await service.close()
 
     app = FastAPI(
@@ -110,14 +106,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.include_router(pages.router)
     _describe(app, keyless=settings.local and settings.api_key is None)
     return app
-
-
-def _clean_up(service: Service) -> None:
-    try:
-        if deleted := service.captures.delete_abandoned_uploads():
-            log.info("deleted abandoned uploads", files=deleted)
-    except StorageError as error:
-        log.warning("could not look for abandoned uploads", error=str(error))
 
 
 def _describe(app: FastAPI, *, keyless: bool) -> None:

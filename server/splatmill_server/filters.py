@@ -37,11 +37,6 @@ class JobFilter(Filter):
     capture: str | None = None
     states: frozenset[JobState] | None = None
 
-    @property
-    def by_row(self) -> bool:
-        """Whether fields of the row decide, so that the states of most jobs need not be read."""
-        return self.owner is not None or self.name is not None or self.capture is not None
-
     def admits_row(self, row: Mapping[str, bytes | None]) -> bool:
         """Return whether a job with these fields of its row may be listed; its state decides then."""
         if row["id"] is None or not (self.capture is None or _text(row["capture"]) == self.capture):

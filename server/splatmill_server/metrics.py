@@ -47,6 +47,14 @@ class Metrics:
         )
         self.workers = Gauge("splatmill_workers", "Registered workers.", ["state"], registry=self.registry)
         self.redis_up = Gauge("splatmill_redis_up", "1 if Redis answers, else 0.", registry=self.registry)
+        self.redis_memory = Gauge(
+            "splatmill_redis_memory_bytes", "Bytes of memory that Redis uses.", registry=self.registry
+        )
+        self.redis_limit = Gauge(
+            "splatmill_redis_memory_limit_bytes",
+            "Bytes of memory at which Redis takes no more writes; 0 if there is no limit.",
+            registry=self.registry,
+        )
 
     def text(self) -> bytes:
         """Return the metrics in the text format of Prometheus."""

@@ -1,19 +1,31 @@
-"""Finished models. They are read from storage only, so they stay available if Redis loses its data."""
+"""Finished models. They are read from storage, so each stays available while Redis is away; only lists need Redis."""
 
-import itertools
 import json
 import re
+import zlib
+from collections.abc import Sequence
 from typing import Any
 
 from pydantic import ValidationError
 
-from splatmill.backplane import layout
+from splatmill.backplane import layout, lists
 from splatmill.backplane.records import UnreadableRecord, warn
 from splatmill.backplane.storage import Entry, Storage
-from splatmill.schema import JobState, Model, ModelCameras, ModelFile, ModelPage, Report
+from splatmill.schema import (
+    DEFAULT_OWNER,
+    Job,
+    JobState,
+    Model,
+    ModelCameras,
+    ModelFile,
+    ModelPage,
+    Report,
+    Response,
+    StoredKind,
+)
 from splatmill_server.filters import Filter
 from splatmill_server.jobs.records import Jobs, read_record
-from splatmill_server.paging import read_cursor, write_cursor
+from splatmill_server.lists import Lists, each
 from splatmill_server.problems import ProblemError
 
 _HEADER_BYTES = 8192
@@ -24,12 +36,22 @@ _DEGREE = {0: 0, 9: 1, 24: 2, 45: 3}
 """Degree of the spherical harmonics by number of `f_rest` properties, which is 3 ((degree + 1)^2 - 1)."""
 
 
+_LISTED_TOGETHER = 500
+
+
+class _Named(Response):
+    """What lists keep of a model before it is first asked for."""
+
+    name: str | None
+
+
 class Models:
     """All operations on models. A model exists if its `job.json` does, which the worker writes last."""
 
-    def __init__(self, storage: Storage, jobs: Jobs) -> None:
+    def __init__(self, storage: Storage, jobs: Jobs, listed: Lists) -> None:
         self.storage = storage
         self.jobs = jobs
+        self.lists = listed
 
     def check(self, model_id: str) -> None:
         """Raise a problem if there is no such model (404) or if its job has not ended (409)."""
@@ -86,7 +108,6 @@ class Models:
                 f"The stored model {model_id} cannot be read: {error}.",
                 advice=f"Restart its job with POST /v1/jobs/{model_id}/restart.",
             ) from error
-        base = f"/v1/models/{model_id}"
         psnr, ssim = self._quality(model_id)
         return Model(
             id=model_id,
@@ -109,52 +130,80 @@ class Models:
                 for name, entry in sorted(files.items())
                 if (media_type := layout.model_media_type(name)) is not None
             ],
-            links={
-                "self": base,
-                "job": f"/v1/jobs/{model_id}",
-                "cameras": f"{base}/cameras",
-                "render": f"{base}/render",
-                "orbit": f"{base}/orbit",
-                "formats": f"{base}/formats",
-                "html": f"{base}/download/html",
-                "ply": f"{base}/files/model.ply",
-                "report": f"{base}/files/report.html",
-            },
+            links=_links(model_id),
         )
 
     def page(self, cursor: str | None, limit: int, wanted: Filter | None = None) -> ModelPage:
-        """Return a page of the models that `wanted` admits, the most recently stored first."""
-        records = [
-            entry for entry in self.storage.entries(layout.models()) if entry.path.endswith("/job.json")
-        ]
-        keyed = sorted(
-            ((int(entry.modified.timestamp() * 1000), entry.path.split("/")[1]) for entry in records),
-            reverse=True,
+        """Return a page of the models that `wanted` admits, the newest first. Raises the problems of `Lists.page`."""
+        wanted = wanted or Filter()
+        names, narrowed = [lists.name("models", owner=wanted.owner)], wanted.name is not None
+        found, following = self.lists.page(
+            names, cursor, limit, lambda ids: self._listed(ids, wanted), narrowed=narrowed
         )
-        if cursor is not None:
-            after = read_cursor(cursor)
-            keyed = [entry for entry in keyed if entry < after]
-        admitted = (entry for entry in keyed if wanted is None or self._admits(wanted, entry[1]))
-        found = list(itertools.islice(admitted, limit + 1))
-        page, models = found[:limit], []
-        for _, model_id in page:
-            try:
-                models.append(self.get(model_id))
-            except (
-                ProblemError
-            ) as error:  # deleted meanwhile or corrupt, which must not hide the other models
-                if error.problem.code == "model_corrupt":
-                    warn(f"model {model_id} is not listed", error.problem.detail)
-        return ModelPage(models=models, cursor=write_cursor(*page[-1]) if len(found) > limit else None)
+        return ModelPage(models=found, cursor=following)
 
-    def _admits(self, wanted: Filter, model_id: str) -> bool:
-        if wanted == Filter():
-            return True
+    def _listed(self, model_ids: Sequence[str], wanted: Filter) -> dict[str, Model]:
+        """Return those of these models that `wanted` admits, by id. What storage tells of one is kept for lists."""
+        known = {name: _kept(kept) for name, kept in self.lists.records("models", model_ids).items()}
+        asked = [
+            name
+            for name, found in known.items()
+            if not isinstance(found, Model)
+            and (found is None or wanted.admits(wanted.owner or "", found.name))
+        ]
+        read = dict(zip(asked, each(self._found, asked), strict=True))
+        self.lists.keep("models", {name: _keep(found) for name, found in read.items() if found is not None})
+        models = {name: found for name, found in (known | read).items() if isinstance(found, Model)}
+        return {
+            name: found.model_copy(update={"links": _links(name)})
+            for name, found in models.items()
+            if wanted.admits(found.owner or DEFAULT_OWNER, found.name)
+        }
+
+    def _found(self, model_id: str) -> Model | None:
+        """Return a model, or None for one that was deleted or is corrupt, which must not hide the others."""
         try:
-            record = read_record(self.storage, model_id)
-        except (FileNotFoundError, UnreadableRecord):
-            return False  # deleted meanwhile or corrupt
-        return wanted.admits(record.owner, record.name)
+            return self.get(model_id)
+        except ProblemError as error:
+            if error.problem.code == "model_corrupt":
+                warn(f"model {model_id} is not listed", error.problem.detail)
+            return None
+
+    def list_new(self, model_id: str) -> None:
+        """List a model that was just stored."""
+        record = read_record(self.storage, model_id)
+        moment = record.finished_at or record.created_at
+        lists.add_model(self.lists.connection, model_id, moment, record.owner or DEFAULT_OWNER)
+
+    def make_lists(self) -> int:
+        """List all models in storage, and return their number. Their files are read when they are first asked for."""
+        connection, count = self.lists.connection, 0
+        lists.clear(connection, "models")
+        ids = [name for name in self.storage.children(layout.models()) if layout.is_id(name)]
+        for start in range(0, len(ids), _LISTED_TOGETHER):
+            batch = ids[start : start + _LISTED_TOGETHER]
+            found = {record.id: record for record in each(self._record, batch) if record is not None}
+            with connection.pipeline() as pipe:
+                for model_id, record in found.items():
+                    moment = lists.milliseconds(record.finished_at or record.created_at)
+                    lists.add(pipe, "models", model_id, moment, record.owner or DEFAULT_OWNER)
+                pipe.execute()
+            names = {model_id: _Named(name=record.name) for model_id, record in found.items()}
+            self.lists.keep("models", {model_id: _keep(named) for model_id, named in names.items()})
+            for model_id in self.lists.deleted(StoredKind.model, list(found)):
+                if not self.storage.exists(layout.job_record(model_id)):
+                    lists.remove_model(connection, model_id, found[model_id].owner)
+            count += len(found)
+        return count
+
+    def _record(self, model_id: str) -> Job | None:
+        try:
+            return read_record(self.storage, model_id).model_copy(update={"id": model_id})
+        except FileNotFoundError:
+            return None
+        except UnreadableRecord as error:
+            warn(f"model {model_id} is not listed", str(error))
+            return None
 
     def file(self, model_id: str, name: str) -> Entry:
         """Return the entry of a file of a model. Raises 404 and 409 problems."""
@@ -217,6 +266,37 @@ class Models:
             return None, None
         measured = [point for point in report.curve if point.psnr is not None]
         return (measured[-1].psnr, measured[-1].ssim) if measured else (None, None)
+
+
+def _links(model_id: str) -> dict[str, str]:
+    base = f"/v1/models/{model_id}"
+    return {
+        "self": base,
+        "job": f"/v1/jobs/{model_id}",
+        "cameras": f"{base}/cameras",
+        "render": f"{base}/render",
+        "orbit": f"{base}/orbit",
+        "formats": f"{base}/formats",
+        "html": f"{base}/download/html",
+        "ply": f"{base}/files/model.ply",
+        "report": f"{base}/files/report.html",
+    }
+
+
+def _keep(found: Model | _Named) -> bytes:
+    """Return what Redis keeps of a model for lists: digests and names of files, in a third of their bytes."""
+    return zlib.compress(found.model_dump_json(exclude={"links"}).encode())
+
+
+def _kept(stored: bytes | None) -> Model | _Named | None:
+    """Return what was kept of a model, or None if nothing was that this version reads."""
+    if stored is None:
+        return None
+    fields = json.loads(zlib.decompress(stored))
+    try:
+        return (Model if "files" in fields else _Named).model_validate(fields)
+    except ValidationError:
+        return None
 
 
 def model_not_found(model_id: str) -> ProblemError:

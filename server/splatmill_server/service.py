@@ -25,6 +25,7 @@ from splatmill_server.conversions import Conversions
 from splatmill_server.jobs.finished import Finished
 from splatmill_server.jobs.reaper import Reaper
 from splatmill_server.jobs.records import Jobs
+from splatmill_server.lists import Lists
 from splatmill_server.metrics import Metrics
 from splatmill_server.models import Models
 from splatmill_server.outgoing import Outgoing
@@ -83,6 +84,7 @@ class Service:
     webhooks: Webhooks
     deliveries: Deliveries
     jobs: Jobs
+    lists: Lists
     finished: Finished
     models: Models
     shares: Shares
@@ -106,9 +108,11 @@ class Service:
         redis_async = connect_async(settings.redis_url)
         connection = connect(settings.redis_url, timeout=settings.redis_timeout, retries=1)
         metrics = Metrics()
-        jobs = Jobs(connection, storage, metrics)
-        models = Models(storage, jobs)
-        captures = Captures(storage, settings, metrics)
+        lists = Lists(connection)
+        jobs = Jobs(connection, storage, metrics, lists)
+        models = Models(storage, jobs, lists)
+        captures = Captures(storage, settings, metrics, lists)
+        lists.makers += [captures.make_lists, jobs.make_lists, models.make_lists]
         usage = Usage(storage, Ledger(connection))
         quota = Quota(usage, captures, settings.quota)
         deletion = Deletion(connection, storage, captures, jobs, usage.ledger)
@@ -132,7 +136,8 @@ class Service:
             webhooks=webhooks,
             deliveries=Deliveries(connection, webhooks, outgoing),
             jobs=jobs,
-            finished=Finished(storage),
+            lists=lists,
+            finished=Finished(storage, lists),
             models=models,
             shares=Shares(storage, models),
             conversions=Conversions(storage, connection, models, renderer, settings.orbit_timeout),

@@ -26,7 +26,7 @@ def test_stored_things_outlast_redis(serve: Serve, tmp_path: Path) -> None:
         with served_app(settings, client) as app:
             store_model(app.service, MODEL, "fox")
             capture_id = app.capture()
-            app.job(capture_id)
+            waiting = app.job(capture_id)
             app.redis = client
     with served_app(settings, client) as app:
         answer = app.http.post("/v1/jobs", json={"capture": capture_id})
@@ -38,21 +38,26 @@ def test_stored_things_outlast_redis(serve: Serve, tmp_path: Path) -> None:
         assert ready.json()["checks"]["storage"] == "ok"
         assert app.http.get("/healthz").status_code == 200
         assert "splatmill_redis_up 0.0" in app.http.get("/metrics").text
+        problem(app.http.get("/v1/models"), 503, "queue_unavailable")
         # Nothing of these needs Redis.
-        assert [m["id"] for m in app.http.get("/v1/models").json()["models"]] == [MODEL]
+        assert app.http.get(f"/v1/models/{MODEL}").json()["id"] == MODEL
         assert app.http.get(f"/v1/models/{MODEL}/files/model.ply").status_code == 200
         assert app.http.get(f"/v1/captures/{capture_id}").json()["id"] == capture_id
         put = app.http.put(f"/v1/captures/{capture_id}/images/c.jpg", content=b"c")
         assert put.status_code == 201
         with empty_redis(folder):
-            check_after_return(app, capture_id)
+            check_after_return(app, capture_id, waiting)
     client.close()
 
 
-def check_after_return(app: ServedApp, capture_id: str) -> None:
-    """The same address, an empty Redis: the server needs no restart."""
+def check_after_return(app: ServedApp, capture_id: str, waiting: str) -> None:
+    """The same address, an empty Redis: the server needs no restart, and its lists are made from storage."""
     assert app.http.get("/readyz").status_code == 200
-    assert app.http.get("/v1/jobs").json()["jobs"] == []
+    assert [(job["id"], job["state"]) for job in app.http.get("/v1/jobs").json()["jobs"]] == [
+        (waiting, "queued")
+    ]
+    assert [model["id"] for model in app.http.get("/v1/models").json()["models"]] == [MODEL]
+    assert [found["id"] for found in app.http.get("/v1/captures").json()["captures"]] == [capture_id]
     job = app.http.get(f"/v1/jobs/{MODEL}").json()
     assert (job["state"], job["name"], job["model"]) == ("succeeded", "fox", MODEL)
     assert brief(follow(app, MODEL)) == ["succeeded"]

@@ -29,7 +29,7 @@ def test_health_readiness_and_info(app: ServedApp) -> None:
     ready = app.http.get("/readyz")
     assert (ready.status_code, ready.json()["checks"]) == (
         200,
-        {"redis": "ok", "storage": "ok", "renderer": "none is configured"},
+        {"redis": "ok", "redis_memory": "ok", "storage": "ok", "renderer": "none is configured"},
     )
     app.job()
     info = app.http.get("/v1/info").json()

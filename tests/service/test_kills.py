@@ -10,7 +10,7 @@ import signal
 import httpx
 import pytest
 
-from splatmill.backplane import entries, leases
+from splatmill.backplane import entries, layout, leases
 from tests.support.up import Up
 from tests.support.waiting import gone, wait_for
 
@@ -91,6 +91,30 @@ def test_a_killed_service_leaves_nothing_and_goes_on_when_started_again(
     assert own_service.ended(waiting)["state"] == "succeeded"
     assert own_service.job(done)["state"] == "succeeded"
     assert own_service.http.get(f"/v1/models/{done}").status_code == 200
+
+
+def test_a_redis_that_comes_back_empty_loses_no_job_and_no_attempt(own_service: Up) -> None:
+    own_service.start()
+    done = own_service.submit(steps=1)
+    own_service.ended(done)
+    running = own_service.submit(steps=150, pause=0.05)  # more than a heartbeat beyond the loss
+    waiting = own_service.submit(steps=1)
+    own_service.reached(running, 6)
+
+    def noted() -> bool:
+        return own_service.data.joinpath("storage", layout.job_log(done)).is_file()
+
+    wait_for(noted, 30)
+    with own_service.redis() as connection:
+        connection.flushall()
+    listed = own_service.http.get("/v1/jobs").json()["jobs"]
+    assert {job["id"] for job in listed} == {done, running, waiting}
+    assert own_service.job(done)["state"] == "succeeded"
+    job = own_service.ended(running)
+    assert (job["state"], job["attempt"], len(own_service.diary(running))) == ("succeeded", 1, 1)
+    assert own_service.ended(waiting)["state"] == "succeeded"
+    models = own_service.http.get("/v1/models").json()["models"]
+    assert {model["id"] for model in models} == {done, running, waiting}
 
 
 def test_a_stopped_service_saves_its_job_and_spends_no_try(own_service: Up) -> None:

@@ -14,8 +14,8 @@ import redis
 import uvicorn
 from fastapi import FastAPI
 
-from splatmill.backplane import events, layout, row
-from splatmill.schema import Event, JobState, StateEvent, TrainOptions
+from splatmill.backplane import events, layout, lists, row
+from splatmill.schema import DEFAULT_OWNER, Event, JobState, StateEvent, TrainOptions
 from splatmill_server.app import create_app
 from splatmill_server.service import Service
 from splatmill_server.settings import Settings
@@ -128,6 +128,7 @@ def store_model(service: Service, job_id: str, name: str | None = None) -> None:
         "model": job_id,
     }
     storage.put(layout.job_record(job_id), json.dumps(record).encode())
+    lists.add_model(service.redis, job_id, row.now(), DEFAULT_OWNER)
 
 
 def problem(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:

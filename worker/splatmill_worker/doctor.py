@@ -188,18 +188,22 @@ def _decoders() -> Iterator[Finding]:
 def _redis() -> Iterator[Finding]:
     import redis
 
+    from splatmill.backplane import memory
     from splatmill.backplane.connection import connect
     from splatmill.backplane.redact import redacted
 
     if os.environ.get("REDIS_URL"):
         url = settings.redis_url()
         try:
-            version = connect(url, timeout=3, retries=0).info("server")["redis_version"]
+            connection = connect(url, timeout=3, retries=0)
+            version, trouble = connection.info("server")["redis_version"], memory.read(connection).trouble()
         except redis.RedisError as error:
             advice = "Start Redis there, or unset REDIS_URL, so that `splatmill up` starts its own."
             yield Finding("redis", "bad", f"Redis at {redacted(url)} cannot be reached: {error}", advice)
         else:
             yield Finding("redis", "ok", f"{version} at {redacted(url)}")
+            if trouble is not None:
+                yield Finding("redis", "warning", *trouble)
         return
     for name in ("redis-server", "valkey-server"):
         if path := shutil.which(name):

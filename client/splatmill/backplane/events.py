@@ -9,12 +9,13 @@ machines share one clock.
 
 import heapq
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, cast
 
 import redis
+from redis.client import Pipeline
 
 from splatmill.backplane import keys
 from splatmill.backplane.records import FORMAT, check_format, reason, warn
@@ -46,6 +47,22 @@ order of the time that their entries are reported with, where that is the same m
 
 START = "0-0"
 """The position before the first entry of a stream."""
+
+LATEST: dict[type, str] = {ProgressEvent: "progress", PreviewEvent: "preview"}
+"""The types of events whose newest entry is in the hash `keys.latest` too, each with its field. So no reader looks for
+them in a stream of thousands of entries."""
+
+# KEYS: stream, hash of the newest entries. ARGV: generation, attempt, event, format, bound or "", field or "".
+_APPEND = """
+local bound = ARGV[5] == '' and {} or {'MAXLEN', '~', ARGV[5]}
+local entry = {'*', 'g', ARGV[1], 'a', ARGV[2], 'e', ARGV[3], 'format', ARGV[4]}
+for _, part in ipairs(entry) do bound[#bound + 1] = part end
+local id = redis.call('XADD', KEYS[1], unpack(bound))
+if ARGV[6] ~= '' then
+  redis.call('HSET', KEYS[2], ARGV[6], table.concat({id, ARGV[1], ARGV[2], ARGV[4], ARGV[3]}, ' '))
+end
+return id
+"""
 
 _PAGE = 100  # entries per read
 _PAGES = 10
@@ -107,8 +124,11 @@ def begin_attempt(connection: redis.Redis, job_id: str) -> int:
 def append(connection: redis.Redis, job_id: str, generation: int, attempt: int, event: Event) -> str:
     """Append an event to its stream and return the id of the entry. For workers."""
     stream = stream_of(event)
-    fields = {"g": generation, "a": attempt, "e": event.model_dump_json(exclude_none=True), "format": FORMAT}
-    return cast(bytes, connection.xadd(stream(job_id), cast(Any, fields), maxlen=BOUNDS[stream])).decode()
+    bound, field = BOUNDS[stream], LATEST.get(type(event), "")
+    entry = generation, attempt, event.model_dump_json(exclude_none=True), FORMAT
+    script = connection.register_script(_APPEND)
+    found = script(keys=[stream(job_id), keys.latest(job_id)], args=[*entry, bound or "", field])
+    return cast(bytes, found).decode()
 
 
 Entries = Iterable[tuple[bytes, Mapping[bytes, bytes]]]
@@ -159,14 +179,22 @@ def read_log(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
 
 
 def read_curve(connection: redis.Redis, job_id: str) -> list[CurveRow]:
-    """Return the curve of a job, by step. An attempt that resumed replaces the rows that came after its checkpoint."""
+    """Return the curve of a job as far as Redis has it, by step (see `joined`)."""
+    found = _read(connection, job_id, keys.progress, keys.curve)
+    metrics = (stored.event for stored in found if isinstance(stored.event, MetricEvent))
+    return joined(CurveRow.model_validate(event.model_dump(exclude={"type"})) for event in metrics)
+
+
+def joined(measured: Iterable[CurveRow]) -> list[CurveRow]:
+    """Return rows of a curve by step. An attempt that resumed replaces the rows that came after its checkpoint.
+
+    measured: rows in the order in which they were measured.
+    """
     rows: list[CurveRow] = []
-    for stored in _read(connection, job_id, keys.progress, keys.curve):
-        if isinstance(stored.event, MetricEvent):
-            row = CurveRow.model_validate(stored.event.model_dump(exclude={"type"}))
-            while rows and rows[-1].step >= row.step:
-                rows.pop()
-            rows.append(row)
+    for row in measured:
+        while rows and rows[-1].step >= row.step:
+            rows.pop()
+        rows.append(row)
     return rows
 
 
@@ -191,7 +219,55 @@ def _read(connection: redis.Redis, job_id: str, *streams: Callable[[str], str]) 
 
 
 def last_progress(connection: redis.Redis, job_id: str) -> StoredEvent | None:
-    """Return the newest `ProgressEvent` among the last 1000 entries of the progress stream, or None."""
+    """Return the newest `ProgressEvent` of a job, or None."""
+    with connection.pipeline(transaction=False) as pipe:
+        ask_progress(pipe, job_id)
+        replies = pipe.execute()
+    return answered_progress(connection, job_id, replies)
+
+
+PROGRESS_REPLIES = 2
+"""Number of the replies to `ask_progress`."""
+
+
+def ask_progress(pipe: Pipeline, job_id: str) -> None:
+    """Add the commands to a pipeline whose replies `answered_progress` reads."""
+    pipe.hget(keys.latest(job_id), LATEST[ProgressEvent])
+    pipe.xlen(keys.progress(job_id))
+
+
+def answered_progress(connection: redis.Redis, job_id: str, replies: Sequence[Any]) -> StoredEvent | None:
+    """Return the newest `ProgressEvent` of a job that replies to `ask_progress` tell of, or None.
+
+    Workers of earlier versions wrote it to the stream alone; for their jobs the last 1000 entries are read.
+    """
+    stored, length = replies
+    if stored is not None:
+        return _latest(stored, job_id)
+    return _progress_in_stream(connection, job_id) if length else None
+
+
+def newest_entry(entry_id: str, generation: int, attempt: int, event: Event) -> tuple[str, str]:
+    """Return the field of `keys.latest` for an event of one of the types in LATEST, and its value."""
+    stored = f"{entry_id} {generation} {attempt} {FORMAT} {event.model_dump_json(exclude_none=True)}"
+    return LATEST[type(event)], stored
+
+
+def last_preview(connection: redis.Redis, job_id: str) -> PreviewEvent | None:
+    """Return the newest `PreviewEvent` of a job, or None if its worker noted none."""
+    stored = cast(bytes | None, connection.hget(keys.latest(job_id), LATEST[PreviewEvent]))
+    found = _latest(stored, job_id) if stored is not None else None
+    return found.event if found is not None and isinstance(found.event, PreviewEvent) else None
+
+
+def _latest(stored: bytes, job_id: str) -> StoredEvent | None:
+    """Return the event in a field of `keys.latest`, or None if it cannot be read."""
+    entry_id, generation, attempt, version, event = (*stored.split(b" ", 4), *[b""] * 4)[:5]
+    fields = {b"g": generation, b"a": attempt, b"format": version, b"e": event}
+    return next(iter(decode([(entry_id, fields)], keys.latest(job_id))), None)
+
+
+def _progress_in_stream(connection: redis.Redis, job_id: str) -> StoredEvent | None:
     key, end = keys.progress(job_id), "+"
     for _ in range(_PAGES):
         page = cast(Any, connection.xrevrange(key, max=end, count=_PAGE))

@@ -11,6 +11,19 @@ JOBS = PREFIX + "jobs"
 ACTIVE = PREFIX + "active"
 """Set of the ids of unfinished jobs, which the reaper checks. It may still hold jobs that have ended."""
 
+LISTED = PREFIX + "listed"
+"""String that exists while the lists hold all records of storage (see `lists`). Only the server writes it."""
+
+LISTING = PREFIX + "listing"
+"""Lock of the API process that makes the lists anew."""
+
+RESTORED = PREFIX + "restored"
+"""Set of the jobs that were restored from storage and may still have a process that runs them. It expires."""
+
+WHOLE = PREFIX + "whole"
+"""Sorted set of ended jobs whose streams still hold all events, scored by the time in milliseconds from which their
+log, curve and progress are deleted. These are in storage by then. Only the server writes it."""
+
 WRITABLE = PREFIX + "writable"
 """String that is written to find out whether Redis takes writes; it expires."""
 
@@ -37,6 +50,16 @@ def bell(name: str) -> str:
 def durations(name: str) -> str:
     """Return the key of a list with the seconds that the last attempts of a line took, newest first."""
     return f"{PREFIX}queue:durations:{name}"
+
+
+def listed(kind: str, group: str, owner: str | None) -> str:
+    """Return the key of a list of records (see `lists`): a sorted set of ids, scored by time in milliseconds."""
+    return f"{PREFIX}list:{kind}:{group}" + (f":of:{owner}" if owner is not None else "")
+
+
+def records(kind: str) -> str:
+    """Return the key of a hash with what lists show of captures or models, by id. Only the server writes it."""
+    return f"{PREFIX}records:{kind}"
 
 
 def job(job_id: str) -> str:
@@ -70,6 +93,18 @@ def warnings(job_id: str) -> str:
 def curve(job_id: str) -> str:
     """Return the key of the stream of metrics, which is trimmed. Only workers append."""
     return f"{PREFIX}job:{job_id}:curve"
+
+
+def latest(job_id: str) -> str:
+    """Return the key of a hash with the newest entries of some types of events, and what became of the streams.
+
+    Workers write the fields of `events.LATEST`, and the server the field SHRUNK.
+    """
+    return f"{PREFIX}job:{job_id}:latest"
+
+
+SHRUNK = "shrunk"
+"""Field of `latest`: the job has ended before, and its log and curve from then are in storage alone."""
 
 
 def attempts(job_id: str) -> str:
@@ -177,7 +212,15 @@ def begun_jobs(owner: str) -> str:
 def of_job(job_id: str) -> tuple[str, ...]:
     """Return all keys of a job, for deletion."""
     streams = states(job_id), progress(job_id), log(job_id), warnings(job_id), curve(job_id)
-    return job(job_id), *streams, attempts(job_id), lock(job_id), watched(job_id), snapshot(job_id)
+    return (
+        job(job_id),
+        *streams,
+        latest(job_id),
+        attempts(job_id),
+        lock(job_id),
+        watched(job_id),
+        snapshot(job_id),
+    )
 
 
 def lease(kind: str, name: str) -> str:

@@ -13,9 +13,10 @@ imports/{capture}.{import}                  mark of an import that has not ended
 webhooks/{id}/webhook.json                  record of a webhook, with its secrets
 webhooks/{id}/deliveries/{delivery}.json    one event for this webhook, and the attempts to deliver it
 due/{time}.{webhook}.{delivery}             mark of a delivery that is pending: Unix time of its next attempt
-watched/{job}.json                          row of an unfinished job whose owner has webhooks
+watched/{job}.json                          row of an unfinished job, from which it is restored if Redis is lost
 jobs/{id}/work/...                          checkpoints and other files from which another machine can resume
 jobs/{id}/log.jsonl                         the job as it ended, then the lines of its log
+jobs/{id}/curve.jsonl                       the curve of the job, a row per line; written when it has ended
 jobs/{id}/cameras.json                      cameras and points as structure from motion placed them
 models/{id}/{file}                          model.ply, report.json, report.png, report.html, cameras.json, ...
 models/{id}/held_out/{n}.webp               held-out photo, as the renderings were compared with it
@@ -169,6 +170,10 @@ def capture_sfm(capture_id: str) -> str:
     return f"captures/{capture_id}/sfm"
 
 
+def jobs() -> str:
+    return "jobs"
+
+
 def job(job_id: str) -> str:
     return f"jobs/{job_id}"
 
@@ -180,6 +185,11 @@ def job_work(job_id: str) -> str:
 def job_log(job_id: str) -> str:
     """Return the path of the log of a job that has ended. Only the server writes it."""
     return f"jobs/{job_id}/log.jsonl"
+
+
+def job_curve(job_id: str) -> str:
+    """Return the path of the curve of a job that has ended. Only the server writes it."""
+    return f"jobs/{job_id}/curve.jsonl"
 
 
 def job_cameras(job_id: str) -> str:
@@ -267,7 +277,7 @@ def due_delivery(seconds: int, webhook_id: str, delivery_id: str) -> str:
 
 
 def watched_jobs() -> str:
-    """Return the folder of the rows of unfinished jobs whose owners have webhooks."""
+    """Return the folder of the rows of unfinished jobs."""
     return "watched"
 
 

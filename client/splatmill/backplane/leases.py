@@ -8,6 +8,7 @@ here is that of Redis, read in the same step.
 
 import logging
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
@@ -38,6 +39,20 @@ _PROLONG = """
 if not redis.call('ZSCORE', KEYS[1], ARGV[1]) then return 0 end
 redis.call('ZADD', KEYS[1], tonumber(redis.call('TIME')[1]) + ARGV[2], ARGV[1])
 if redis.call('EXISTS', KEYS[2]) == 1 then redis.call('EXPIRE', KEYS[2], ARGV[2]) end
+return 1
+"""
+
+# KEYS: leases, RQ's record of the execution, RQ's record of the entry, places of the entries that wait.
+# ARGV: member, seconds of the lease, entry, execution, worker, then fields and values of the entry's record.
+_REJOIN = """
+if redis.call('ZSCORE', KEYS[1], ARGV[1]) then return 1 end
+if redis.call('EXISTS', KEYS[3]) == 1 or redis.call('HEXISTS', KEYS[4], ARGV[3]) == 1 then return 0 end
+local now = tonumber(redis.call('TIME')[1])
+for index = 6, #ARGV, 2 do redis.call('HSET', KEYS[3], ARGV[index], ARGV[index + 1]) end
+redis.call('HSET', KEYS[3], 'status', 'started', 'worker_name', ARGV[5])
+redis.call('HSET', KEYS[2], 'id', ARGV[4], 'created_at', now, 'last_heartbeat', now, 'worker_name', ARGV[5])
+redis.call('EXPIRE', KEYS[2], ARGV[2])
+redis.call('ZADD', KEYS[1], now + ARGV[2], ARGV[1])
 return 1
 """
 
@@ -88,6 +103,20 @@ def prolong(connection: redis.Redis, lease: Lease) -> bool:
     """Prolong a lease by a heartbeat. Return False if it is not held any more: another worker may run the entry."""
     execution = f"rq:execution:{lease.member}"
     return bool(connection.eval(_PROLONG, 2, key(), execution, lease.member, LEASE))
+
+
+def rejoin(connection: redis.Redis, lease: Lease, worker: str, record: Mapping[Any, Any]) -> bool:
+    """Take a lease again that is not held any more because Redis has lost its data. Return whether it is held.
+
+    worker: the name of the worker that runs the entry.
+    record: RQ's record of the entry, as the worker knows it.
+
+    It is not taken again from another worker, nor while the entry waits: Redis then knows the entry.
+    """
+    fields = [part for field in record.items() for part in field]
+    execution, entry = f"rq:execution:{lease.member}", f"rq:job:{lease.entry}"
+    arguments = lease.member, LEASE, lease.entry, lease.execution, worker, *fields
+    return bool(connection.eval(_REJOIN, 4, key(), execution, entry, keys.PLACES, *arguments))
 
 
 def advanced(connection: redis.Redis, entry: str) -> None:

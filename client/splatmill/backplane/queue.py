@@ -4,6 +4,7 @@ RQ keeps the record of each entry (`entries`) and starts attempts. `lines` decid
 its worker is alive.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -88,6 +89,16 @@ def status(connection: redis.Redis, job_id: str, generation: int) -> QueueStatus
         result = job.latest_result()
         return QueueStatus(state, reason=_last_line(result.exc_string if result else None))
     return QueueStatus(state, worker=job.worker_name or None)
+
+
+def states(connection: redis.Redis, generations: Sequence[tuple[str, int]]) -> list[QueueState]:
+    """Return the states in the queue of these jobs and generations, in one round trip."""
+    with connection.pipeline(transaction=False) as pipe:
+        for job_id, generation in generations:
+            pipe.hget(QueueEntry.key_for(rq_id(job_id, generation)), "status")
+        replies = pipe.execute()
+    known = {status.value.encode(): state for status, state in _STATES.items()}
+    return ["absent" if reply is None else known.get(reply, "waiting") for reply in replies]
 
 
 def withdraw(connection: redis.Redis, job_id: str, generation: int) -> bool:

@@ -12,15 +12,17 @@ from pathlib import PurePosixPath
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import layout
+from splatmill.backplane import keys, layout, lists
 from splatmill.backplane.records import FORMAT, UnreadableRecord, check_format, reason, warn
 from splatmill.backplane.storage import Entry, Storage, StorageError
 from splatmill.schema import (
+    DEFAULT_OWNER,
     PHOTO_SUFFIXES,
     Capture,
     CaptureFile,
     CapturePage,
     Role,
+    StoredKind,
     UnsafeName,
     format_bytes,
     may_be_empty,
@@ -29,8 +31,8 @@ from splatmill.schema import (
 from splatmill.schema.formats import is_model_file
 from splatmill.schema.tolerant import keep_readable
 from splatmill_server.filters import Filter
+from splatmill_server.lists import Lists, each
 from splatmill_server.metrics import Metrics
-from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError, problem_of_storage
 from splatmill_server.settings import Settings
 
@@ -38,6 +40,7 @@ log = structlog.get_logger()
 
 _CONCURRENT_READS = 32
 _COUNTED_CAPTURES = 1000
+_LISTED_TOGETHER = 500
 STALE_SECONDS = 24 * 3600
 """Age at which an unfinished upload counts as abandoned."""
 
@@ -51,8 +54,9 @@ _CLAIM_SECONDS = 60
 class Captures:
     """All operations on captures. Captures exist in storage only, independently of Redis."""
 
-    def __init__(self, storage: Storage, settings: Settings, metrics: Metrics) -> None:
+    def __init__(self, storage: Storage, settings: Settings, metrics: Metrics, listed: Lists) -> None:
         self.storage = storage
+        self.lists = listed
         self.settings = settings
         self.metrics = metrics
         # Number of files per capture, as last seen: listing the folder at each upload would take quadratic time.
@@ -72,7 +76,10 @@ class Captures:
             capture_id = next((known for known in ids if not self._is_leftover(known)), capture_id)
         capture = Capture(id=capture_id, name=name, owner=owner, created_at=datetime.now(UTC))
         record = json.dumps(capture.model_dump(mode="json", exclude={"files"}) | {"format": FORMAT}).encode()
+        # Listed first: a crash in between leaves an entry of the list that readers skip, and no capture without one.
+        self._list([capture])
         if self.storage.put_new(layout.capture_record(capture.id), record):
+            self.lists.keep("captures", {capture.id: record})
             return capture, True
         return self.record(capture.id), False
 
@@ -113,39 +120,79 @@ class Captures:
         return capture.model_copy(update={"files": [file for file in files if file is not None]})
 
     def page(self, cursor: str | None, limit: int, wanted: Filter | None = None) -> CapturePage:
-        """Return a page of the captures that `wanted` admits, newest first.
+        """Return a page of the captures that `wanted` admits, newest first. Raises the problems of `Lists.page`."""
+        wanted = wanted or Filter()
 
-        Raises a 422 problem for a cursor that is not valid.
-        """
-        wanted, records = wanted or Filter(), []
-        for capture_id in self.storage.children(layout.captures()):
+        def read(capture_ids: Sequence[str]) -> dict[str, Capture]:
+            found = self._listed(capture_ids)
+            return {
+                name: capture for name, capture in found.items() if wanted.admits(capture.owner, capture.name)
+            }
+
+        names, narrowed = [lists.name("captures", owner=wanted.owner)], wanted.name is not None
+        captures, following = self.lists.page(names, cursor, limit, read, narrowed=narrowed)
+        return CapturePage(captures=captures, cursor=following)
+
+    def _listed(self, capture_ids: Sequence[str]) -> dict[str, Capture]:
+        """Return the records of those of these captures that exist and can be read, by id."""
+        kept = self.lists.records("captures", capture_ids)
+        missing = [name for name, record in kept.items() if record is None]
+        stored = dict(zip(missing, each(self._stored, missing), strict=True))
+        self.lists.keep("captures", {name: record for name, record in stored.items() if record is not None})
+        found = {}
+        for capture_id, record in (kept | stored).items():
             try:
-                records.append(self.record(capture_id))
-            except ProblemError:
-                continue  # it is being created or deleted
+                if record is not None:  # else it is being made or deleted
+                    found[capture_id] = _read(record, capture_id)
             except UnreadableRecord as error:
                 warn(f"capture {capture_id} is not listed", str(error))
-        keyed = sorted(
-            (
-                (int(c.created_at.timestamp() * 1000), c.id, c)
-                for c in records
-                if wanted.admits(c.owner, c.name)
-            ),
-            reverse=True,
-        )
-        if cursor is not None:
-            after = read_cursor(cursor)
-            keyed = [entry for entry in keyed if entry[:2] < after]
-        page = keyed[:limit]
-        following = write_cursor(*page[-1][:2]) if len(keyed) > limit else None
-        return CapturePage(captures=[capture for _, _, capture in page], cursor=following)
+        return found
+
+    def _stored(self, capture_id: str) -> bytes | None:
+        try:
+            return self.storage.get(layout.capture_record(capture_id))
+        except FileNotFoundError:
+            return None
+
+    def _list(self, captures: Sequence[Capture]) -> None:
+        with self.lists.connection.pipeline() as pipe:
+            for capture in captures:
+                moment = lists.milliseconds(capture.created_at)
+                lists.add(pipe, "captures", capture.id, moment, capture.owner or DEFAULT_OWNER)
+            pipe.execute()
+
+    def unlist(self, capture_id: str, owner: str | None) -> None:
+        """Remove a capture from the lists, from that of its owner only if that is known."""
+        with self.lists.connection.pipeline() as pipe:
+            lists.remove(pipe, "captures", capture_id, owner)
+            pipe.hdel(keys.records("captures"), capture_id)
+            pipe.execute()
+
+    def make_lists(self) -> int:
+        """List all captures in storage, and return their number."""
+        connection = self.lists.connection
+        lists.clear(connection, "captures")
+        ids = self.storage.children(layout.captures())
+        count = 0
+        for start in range(0, len(ids), _LISTED_TOGETHER):
+            found = self._listed(ids[start : start + _LISTED_TOGETHER])
+            self._list(list(found.values()))
+            for capture_id in self.lists.deleted(StoredKind.capture, list(found)):
+                if not self.storage.exists(layout.capture_record(capture_id)):
+                    self.unlist(capture_id, found[capture_id].owner)
+            count += len(found)
+        return count
 
     def delete(self, capture_id: str) -> None:
         """Delete a capture and its files. The record goes first, so that no incomplete capture is visible."""
-        self.record(capture_id)
+        try:
+            owner = self.record(capture_id).owner
+        except UnreadableRecord:
+            owner = None
         self.storage.delete(layout.capture_record(capture_id))
         self.storage.delete_prefix(layout.capture(capture_id))
         self._counts.pop(capture_id, None)
+        self.unlist(capture_id, owner)
 
     def delete_abandoned_uploads(self) -> int:
         """Delete the files of uploads that nobody has gone on with for STALE_SECONDS, and return their number."""

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Entry, Storage
+from splatmill.backplane import layout, lists
+from splatmill.backplane.storage import Storage
+from splatmill_server.lists import Lists
 
 NEWEST = 40
 """Number of the newest models that are looked at. Older ones tell of earlier versions and machines."""
@@ -51,32 +52,27 @@ class Figures:
 class Finished:
     """The figures of the newest models. Each report is read once."""
 
-    def __init__(self, storage: Storage) -> None:
+    def __init__(self, storage: Storage, listed: Lists) -> None:
         self._storage = storage
+        self._lists = listed
         self._lock = threading.Lock()
-        self._known: dict[tuple[str, float], Figures | None] = {}
+        self._known: dict[tuple[int, str], Figures | None] = {}
 
     def newest(self) -> list[Figures]:
         """Return the figures of the newest models, newest first, without those that cannot be read.
 
-        Raises StorageError if storage cannot be read.
+        Raises StorageError if storage cannot be read, redis.RedisError, and a 503 problem while lists are being made.
         """
-        records = (
-            entry for entry in self._storage.entries(layout.models()) if entry.path.endswith("/job.json")
-        )
-        newest = sorted(records, key=lambda entry: entry.modified, reverse=True)[:NEWEST]
+        newest = self._lists.newest([lists.name("models")], None, NEWEST)
         with self._lock:
             self._known = {
-                key: self._known[key] if key in self._known else self._read(entry)
-                for entry in newest
-                for key in [(entry.path, entry.modified.timestamp())]
+                key: self._known[key] if key in self._known else self._read(key[1]) for key in newest
             }
             return [found for found in self._known.values() if found is not None]
 
-    def _read(self, entry: Entry) -> Figures | None:
-        model_id = entry.path.split("/")[1]
+    def _read(self, model_id: str) -> Figures | None:
         try:
-            job = json.loads(self._storage.get(entry.path))
+            job = json.loads(self._storage.get(layout.job_record(model_id)))
             report = json.loads(self._storage.get(layout.model_file(model_id, "report.json")))
             return figures(job, report)
         except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):

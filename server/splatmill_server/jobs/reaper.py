@@ -1,28 +1,37 @@
 """The reaper, which repairs what workers and the queue cannot.
 
-It requeues the attempts of crashed workers, fails jobs whose attempts are used up, enqueues jobs again that the queue
-has lost (Redis may restart without its last second of writes), and repeats the cancellation of a job until no process
-is left. Its actions are idempotent, so every API process may run one.
+It restores what Redis has lost, requeues the attempts of crashed workers, fails jobs whose attempts are used up,
+enqueues jobs again that the queue has lost (Redis may restart without its last second of writes), and repeats the
+cancellation of a job until no process is left. Its actions are idempotent, so every API process may run one. It takes a
+few round trips however many jobs wait or run, and some more for each job that needs its attention.
 """
 
 import asyncio
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import redis
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import entries, leases, lines, queue
+from splatmill.backplane import entries, keys, leases, lines, queue
 from splatmill.backplane.row import JobRow
+from splatmill.backplane.storage import StorageError
 from splatmill.schema import Problem
+from splatmill_server.jobs import requests, shrinking
 from splatmill_server.jobs.records import Jobs, last_stage
+from splatmill_server.jobs.restoring import without_row
 from splatmill_server.metrics import Metrics
+from splatmill_server.problems import ProblemError
 from splatmill_server.settings import Settings
 
 log = structlog.get_logger()
 
 T = TypeVar("T")
+
+_LOST_SECONDS = 60.0
+"""Seconds between two looks for single jobs that Redis has lost."""
 
 _ENDED = {"finished", "failed", "stopped"}
 
@@ -40,6 +49,9 @@ class Reaper:
         self._wake = asyncio.Event()
         # Jobs whose attempt had ended without a final state at the last check: the state may still arrive.
         self._unreported: set[tuple[str, int]] = set()
+        # Jobs that are in storage and had no row at the last look.
+        self._missing: set[str] = set()
+        self._looked_at = float("-inf")
 
     def wake(self) -> None:
         """Check now, because a job is to be cancelled."""
@@ -64,13 +76,34 @@ class Reaper:
 
     def tick(self) -> bool:
         """Check every unfinished job once; return True while one is being cancelled."""
+        self._restore()
         if self.leases.run():
             lines.sort(self.connection)
         active = self.jobs.active()
         cancelling = [row for row in active if row.cancel_requested_at is not None]
         unfinished = [row for row in cancelling if not _safely(self.cancel, row, True)]
-        self._check(row for row in active if row.cancel_requested_at is None)
+        self._check([row for row in active if row.cancel_requested_at is None])
+        shrinking.shrink_due(self.connection)
         return bool(unfinished)
+
+    def _restore(self) -> None:
+        """Make the lists where Redis has lost them, and restore single jobs that it has lost.
+
+        A job counts as lost if two looks do not find its row, because one is stored before it is inserted.
+        """
+        try:
+            self.jobs.lists.ensure(wait=0.0)
+            if time.monotonic() - self._looked_at < _LOST_SECONDS:
+                return
+            self._looked_at = time.monotonic()
+            missing = set(without_row(self.connection, requests.names(self.jobs.storage)))
+        except ProblemError:
+            return  # another process makes the lists
+        except StorageError as error:
+            log.warning("storage cannot be searched for lost jobs", error=str(error))
+            return
+        self.jobs.restore(sorted(missing & self._missing))
+        self._missing = missing
 
     def cancel(self, row: JobRow) -> bool:
         """Take the next step of a cancellation; return True once no process is left and the job has ended."""
@@ -78,21 +111,32 @@ class Reaper:
         withdrawn = queue.withdraw(
             self.connection, row.id, row.generation
         )  # from its line even without a record
-        if withdrawn or found.state in _ENDED or found.state == "absent":
+        absent = found.state == "absent" and not self._is_restored(row.id)
+        if withdrawn or found.state in _ENDED or absent:
             self.jobs.give_verdict(row, "cancelled")
             log.info("job cancelled", job=row.id)
             return True
         queue.stop(self.connection, row.id, row.generation)
         return False
 
-    def _check(self, rows: Iterable[JobRow]) -> None:
-        self._unreported = {mark for row in rows if (mark := _safely(self._check_one, row, None)) is not None}
+    def _is_restored(self, job_id: str) -> bool:
+        """Return whether a job was restored so lately that a process may run it which the queue does not know."""
+        return bool(self.connection.sismember(keys.RESTORED, job_id))
+
+    def _check(self, rows: Sequence[JobRow]) -> None:
+        # In the order in which they were queued, since that becomes their order in the queue.
+        rows = sorted(rows, key=lambda row: row.queued_at)
+        states = queue.states(self.connection, [(row.id, row.generation) for row in rows])
+        looked = [row for row, state in zip(rows, states, strict=True) if state not in ("waiting", "running")]
+        self._unreported = {
+            mark for row in looked if (mark := _safely(self._check_one, row, None)) is not None
+        }
 
     def _check_one(self, row: JobRow) -> tuple[str, int] | None:
         """Repair one job. Return its mark if its attempt has ended and its final state may still arrive."""
         found = queue.status(self.connection, row.id, row.generation)
         if found.state == "absent":
-            if queue.enqueue(self.connection, row.id, row.generation):
+            if not self._is_restored(row.id) and queue.enqueue(self.connection, row.id, row.generation):
                 self.metrics.requeued.inc()
                 log.warning("job was lost by the queue, enqueued again", job=row.id)
         elif found.state in _ENDED:

@@ -13,8 +13,7 @@ from typing import Any, cast
 import redis
 import structlog
 
-from splatmill.backplane import events, keys, layout, queue, row
-from splatmill.backplane.events import StoredEvent
+from splatmill.backplane import events, keys, layout, lists, queue, row
 from splatmill.backplane.fold import fold
 from splatmill.backplane.records import UnreadableRecord, check_format, reason, warn
 from splatmill.backplane.row import JobRow, Verdict
@@ -22,38 +21,32 @@ from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import DEFAULT_OWNER, CreateJob, Job, JobPage, JobState, Problem, StoredKind
 from splatmill.schema.tolerant import keep_readable
 from splatmill_server.filters import JobFilter
+from splatmill_server.jobs import curve as job_curve
+from splatmill_server.jobs import listing, requests, restoring, shrinking
 from splatmill_server.jobs import log as job_log
+from splatmill_server.jobs.links import with_links
 from splatmill_server.jobs.queue_places import with_places
+from splatmill_server.jobs.reading import read_jobs
+from splatmill_server.lists import Lists
 from splatmill_server.metrics import Metrics
-from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError
 from splatmill_server.space.marks import DELETING, check_marks, mark_keys, needs_of
 
 log = structlog.get_logger()
 
 IDEMPOTENCY_DAYS = 7
-SCANNED = 2000
-"""Largest number of jobs that are looked at for one page of a list."""
-
-_BATCH = 200
-"""Number of jobs that are looked at together for a list that does not hold all of them."""
-
-_TIES = 16
-"""Number of jobs that may be created in one millisecond without being lost between two pages."""
-
-_Read = tuple[JobRow, list[StoredEvent]]
-"""The row and the states of a job."""
+_TOGETHER = 500
+"""Number of unfinished jobs that are read in one round trip."""
 
 
 class Jobs:
     """All operations on jobs. Methods raise ProblemError, and redis.RedisError if Redis cannot be reached."""
 
-    def __init__(self, connection: redis.Redis, storage: Storage, metrics: Metrics) -> None:
+    def __init__(self, connection: redis.Redis, storage: Storage, metrics: Metrics, listed: Lists) -> None:
         self.connection = connection
         self.storage = storage
         self.metrics = metrics
-        self.on_begin: list[Callable[[JobRow], None]] = []
-        """Called with the row of a job that is new or restarted."""
+        self.lists = listed
         self.on_end: list[Callable[[Job, int], None]] = []
         """Called with a job that has ended, and its generation, before it is forgotten that it was unfinished.
 
@@ -90,7 +83,8 @@ class Jobs:
             created_at=moment,
             queued_at=moment,
         )
-        known: JobRow | None = None
+        if (known := row.read(self.connection, job_id)) is not None:
+            return self._placed(known), False
         needs = needs_of(request.capture, request.options)
 
         def insert(pipe: Any) -> None:
@@ -103,18 +97,22 @@ class Jobs:
             if known is None:
                 pipe.incr(keys.begun_jobs(owner))
                 pipe.hset(keys.job(job_id), mapping=new.fields())
-                pipe.zadd(keys.JOBS, {job_id: int(moment.timestamp() * 1000)})
+                created = lists.milliseconds(moment)
+                lists.put_job(pipe, job_id, created, owner, request.capture, lists.UNFINISHED)
                 pipe.sadd(keys.ACTIVE, job_id)
 
-        # Of two concurrent requests with the same key, only one inserts the job. No job is inserted whose capture is
-        # being deleted.
-        self.connection.transaction(insert, keys.job(job_id), keys.begun_jobs(owner), *mark_keys(needs))
+        requests.keep(self.storage, new)
+        try:
+            # Of two concurrent requests with the same key, only one inserts the job. No job is inserted whose capture
+            # is being deleted.
+            self.connection.transaction(insert, keys.job(job_id), keys.begun_jobs(owner), *mark_keys(needs))
+        except BaseException:
+            self.storage.delete(layout.watched_job(job_id))
+            raise
         if known is not None:
             return self._placed(known), False
         # A crash here leaves a row that is not in the queue; the reaper enqueues it.
         queue.enqueue(self.connection, job_id, new.generation)
-        for begun in self.on_begin:
-            begun(new)
         self.metrics.created.inc()
         return self._placed(new), True
 
@@ -178,100 +176,82 @@ class Jobs:
             pass
         except UnreadableRecord as error:
             warn(layout.job_record(job_id), str(error))
-        ended = job_log.stored_job(self.storage, job_id)
-        return with_links(ended) if ended is not None else None
+        ended = job_log.stored_end(self.storage, job_id)
+        return with_links(ended.job) if ended is not None else None
 
     def page(self, cursor: str | None, limit: int, wanted: JobFilter | None = None) -> JobPage:
-        """Return a page of the jobs that `wanted` admits, newest first.
+        """Return a page of the jobs that `wanted` admits, newest first (see `Lists.page`)."""
+        return listing.page(self.connection, self.lists, cursor, limit, wanted or JobFilter())
 
-        At most SCANNED jobs are looked at; a page then holds fewer than `limit`, and has a cursor all the same.
-        """
-        wanted = wanted or JobFilter()
-        found: list[tuple[int, _Read]] = []
-        after = read_cursor(cursor) if cursor is not None else None
-        scanned, ended = 0, False
-        while len(found) <= limit and scanned < SCANNED and not ended:
-            size = limit + 1 if wanted == JobFilter() else max(limit + 1, _BATCH)
-            batch = self._ids(after, size)
-            ended = len(batch) < size
-            scanned += len(batch)
-            after = batch[-1] if batch else after
-            admitted = self._admitted([job_id for _, job_id in batch], wanted)
-            found += [(moment, admitted[job_id]) for moment, job_id in batch if job_id in admitted]
-        page = found[:limit]
-        following = None
-        if len(found) > limit:
-            following = write_cursor(page[-1][0], page[-1][1][0].id)
-        elif not ended and after is not None:
-            following = write_cursor(*after)
-        listed = [(self._job(read, states), read.generation) for _, (read, states) in page]
-        return JobPage(jobs=with_places(self.connection, listed), cursor=following)
+    def make_lists(self) -> int:
+        """List all jobs, restore those that storage alone knows, and return their number."""
+        return restoring.make_lists(self.connection, self.storage, self.lists)
 
-    def _admitted(self, job_ids: Sequence[str], wanted: JobFilter) -> dict[str, _Read]:
-        """Return the rows and states of those jobs that `wanted` admits, by id.
-
-        Jobs whose row is not readable are left out.
-        """
-        if wanted.by_row:
-            with self.connection.pipeline(transaction=False) as pipe:
-                for job_id in job_ids:
-                    pipe.hmget(keys.job(job_id), *JobFilter.FIELDS)
-                rows = [dict(zip(JobFilter.FIELDS, reply, strict=True)) for reply in pipe.execute()]
-            job_ids = [job_id for job_id, row in zip(job_ids, rows, strict=True) if wanted.admits_row(row)]
-        with self.connection.pipeline(transaction=False) as pipe:
-            for job_id in job_ids:
-                pipe.hgetall(keys.job(job_id))
-                pipe.xrange(keys.states(job_id))
-            replies = pipe.execute()
-        admitted = {}
-        for index, job_id in enumerate(job_ids):
-            try:
-                found = JobRow.of(replies[2 * index])
-            except UnreadableRecord as error:
-                warn(f"job {job_id} is not listed", str(error))
-                continue
-            states = events.decode(replies[2 * index + 1], keys.states(job_id))
-            if found is not None and (wanted.states is None or fold(found, states).state in wanted.states):
-                admitted[job_id] = (found, states)
-        return admitted
+    def restore(self, job_ids: Sequence[str]) -> int:
+        """Restore those of these unfinished jobs that Redis has lost, and return their number."""
+        return restoring.restore_unfinished(self.connection, self.storage, job_ids)
 
     def active(self) -> list[JobRow]:
-        """Return the rows of all unfinished jobs. A job whose row is not readable stays active, but is left out."""
+        """Return the rows of all unfinished jobs, and retire those that have ended.
+
+        A job whose row is not readable stays active, but is left out.
+        """
         ids = sorted(entry.decode() for entry in cast(set[bytes], self.connection.smembers(keys.ACTIVE)))
         found = []
-        for job_id in ids:
-            try:
-                known = row.read(self.connection, job_id)
-            except UnreadableRecord as error:
-                warn(f"job {job_id} is not looked after", str(error))
-                continue
-            if known is not None and not fold(known, events.read_states(self.connection, job_id)).state.final:
-                found.append(known)
-            else:
-                self._retire(job_id)
+        for start in range(0, len(ids), _TOGETHER):
+            batch = ids[start : start + _TOGETHER]
+            held = read_jobs(self.connection, batch)
+            for job_id in batch:
+                if job_id in held and not held[job_id].state.final:
+                    found.append(held[job_id].row)
+                elif job_id in held or not self.connection.exists(keys.job(job_id)):
+                    self._retire(job_id)
         return found
 
     def _retire(self, job_id: str) -> None:
         """Store the log of a job that has ended, announce its end, and remove it from the set of active ones.
 
-        It stays there if either cannot be stored, so that this is tried again, and if it was restarted meanwhile.
+        It stays there if either cannot be stored, so that this is tried again, and if it was restarted meanwhile. The
+        request of a job whose row is lost is kept.
         """
         try:
-            if (known := row.read(self.connection, job_id)) is not None:
-                job_log.store(self.connection, self.storage, self._job(known))
+            if (known := row.read(self.connection, job_id)) is not None and (
+                job := self._job(known)
+            ).state.final:
+                job_log.store(self.connection, self.storage, job, known.generation)
+                job_curve.store(self.connection, self.storage, job_id)
+                if (
+                    job.state is JobState.succeeded
+                    and self.connection.zscore(lists.name("models"), job_id) is None
+                ):
+                    # Its worker was killed between the model and the list, or is of an earlier version.
+                    lists.add_model(self.connection, job_id, job.finished_at or job.created_at, known.owner)
                 self._announce_end(known)
         except StorageError as error:
             log.warning("the end of a job cannot be stored", job=job_id, error=str(error))
             return
+        retired: JobRow | None = None
+        moment = self.connection.time()[0]
 
         def remove(pipe: Any) -> None:
+            nonlocal retired
             known = row.read(self.connection, job_id)
-            ended = known is None or fold(known, events.read_states(self.connection, job_id)).state.final
+            state = fold(known, events.read_states(self.connection, job_id)).state if known else None
+            retired = known if state is not None and state.final else None
             pipe.multi()
-            if ended:
+            if known is None or retired is not None:
                 pipe.srem(keys.ACTIVE, job_id)
+            if known is not None and state is not None and state.final:
+                created = lists.milliseconds(known.created_at)
+                lists.put_job(pipe, job_id, created, known.owner, known.capture, state.value)
+                shrinking.note(pipe, job_id, moment)
 
-        self.connection.transaction(remove, keys.job(job_id))
+        self.connection.transaction(remove, keys.job(job_id), keys.states(job_id))
+        if retired is not None:
+            try:
+                requests.forget(self.connection, self.storage, retired)
+            except StorageError as error:  # what is left says nothing: the log in storage tells of the end
+                log.warning("the request of an ended job cannot be deleted", job=job_id, error=str(error))
 
     def _announce_end(self, found: JobRow) -> None:
         """Tell that a job has ended, if it has. Raises StorageError if that cannot be stored."""
@@ -292,18 +272,10 @@ class Jobs:
             self._announce_end(self.row(job_id))
 
     def unfinished_of(self, owner: str) -> int:
-        """Return the number of unfinished jobs of an owner."""
-        ids = [entry.decode() for entry in cast(set[bytes], self.connection.smembers(keys.ACTIVE))]
-        own = [job_id for job_id, found in zip(ids, self._owners(ids), strict=True) if found == (True, owner)]
-        return sum(1 for job_id in own if not self._ended(job_id))
-
-    def _ended(self, job_id: str) -> bool:
-        """Return whether a job has ended or was deleted. A job whose row is not readable has not."""
-        try:
-            known = row.read(self.connection, job_id)
-        except UnreadableRecord:
-            return False
-        return known is None or fold(known, events.read_states(self.connection, job_id)).state.final
+        """Return the number of unfinished jobs of an owner. A job whose row is not readable is one of them."""
+        named = lists.name("jobs", owner=owner, group=lists.UNFINISHED)
+        own = [entry.decode() for entry in cast(list[bytes], self.connection.zrange(named, 0, -1))]
+        return len(own) - sum(held.state.final for held in read_jobs(self.connection, own).values())
 
     def _check_room(self, owner: str, most: int | None) -> None:
         """Raise a 429 problem if the owner has `most` unfinished jobs. The caller watches `begun_jobs` of the owner."""
@@ -360,9 +332,11 @@ class Jobs:
             if self.connection.get(mark_keys(needs)[-1]) == DELETING:
                 raise job_not_found(job_id)
             self._check_room(found.owner, most)
+            moment = row.now()
+            requests.keep(self.storage, requests.next_generation(found, moment))
             return {
                 "generation": str(found.generation + 1),
-                "queued_at": row.now().isoformat(),
+                "queued_at": moment.isoformat(),
                 "cancel_requested_at": "",
                 "verdict": "",
             }
@@ -370,21 +344,24 @@ class Jobs:
         self._announce_unretired(job_id)
         self._change(job_id, begin_generation, *mark_keys(needs), begun=keys.begun_jobs(known.owner))
         begun = self.row(job_id)
+        requests.keep(self.storage, begun)  # again: the end of the former generation may just have removed it
         queue.enqueue(self.connection, job_id, begun.generation)
-        for begin in self.on_begin:
-            begin(begun)
         return self._placed(begun)
 
     def delete(self, job_id: str) -> None:
         """Delete a job that has ended, its work files and its model. Raises 404 and 409 problems."""
+        owner, capture = self.owner(job_id), None
         try:
             found = self.row(job_id)
         except ProblemError as error:
             if error.problem.code == "job_corrupt":
                 self._withdraw_unreadable(job_id)
-            elif self.stored(job_id) is None:
+            elif (ended := self.stored(job_id)) is None:
                 raise
+            else:
+                capture = ended.capture
         else:
+            capture = found.capture
             job = self._job(found)
             if not job.state.final:
                 raise ProblemError(
@@ -403,8 +380,11 @@ class Jobs:
         self.storage.delete_prefix(layout.job(job_id))
         with self.connection.pipeline(transaction=True) as pipe:
             pipe.delete(*keys.of_job(job_id))
-            pipe.zrem(keys.JOBS, job_id)
+            lists.remove_job(pipe, job_id, owner, capture)
+            lists.remove(pipe, "models", job_id, owner)
+            pipe.hdel(keys.records("models"), job_id)
             pipe.srem(keys.ACTIVE, job_id)
+            pipe.zrem(keys.WHOLE, job_id)
             pipe.execute()
 
     def _withdraw_unreadable(self, job_id: str) -> None:
@@ -437,8 +417,8 @@ class Jobs:
         self._change(expected.id, verdict)
         return given
 
-    def _job(self, found: JobRow, states: list[StoredEvent] | None = None) -> Job:
-        states = events.read_states(self.connection, found.id) if states is None else states
+    def _job(self, found: JobRow) -> Job:
+        states = events.read_states(self.connection, found.id)
         return with_links(fold(found, states, events.last_progress(self.connection, found.id)))
 
     def _placed(self, found: JobRow) -> Job:
@@ -470,21 +450,15 @@ class Jobs:
             pipe.hset(keys.job(job_id), mapping=kept)
             if "generation" in kept:
                 pipe.sadd(keys.ACTIVE, job_id)
+                pipe.zrem(keys.WHOLE, job_id)
+                created = lists.milliseconds(found.created_at)
+                lists.put_job(pipe, job_id, created, found.owner, found.capture, lists.UNFINISHED)
             if deleted:
                 pipe.hdel(keys.job(job_id), *deleted)
 
         seen = [keys.job(job_id), keys.states(job_id), *watched, *([begun] if begun is not None else [])]
         self.connection.transaction(apply, *seen)
         return self._placed(self.row(job_id))
-
-    def _ids(self, after: tuple[int, str] | None, count: int) -> list[tuple[int, str]]:
-        """Return up to `count` pairs (time of creation in milliseconds, id) of jobs after `after`, newest first."""
-        top = "+inf" if after is None else str(after[0])
-        reply = self.connection.zrevrangebyscore(
-            keys.JOBS, top, "-inf", start=0, num=count + _TIES, withscores=True
-        )
-        pairs = [(int(score), member.decode()) for member, score in cast(list[tuple[bytes, float]], reply)]
-        return [pair for pair in pairs if after is None or pair < after][:count]
 
     def _claim_key(self, owner: str, key: str, body: str, job_id: str) -> str:
         name = keys.idempotency(_digest(owner, key))
@@ -516,20 +490,6 @@ def read_record(storage: Storage, job_id: str) -> Job:
     if left_out:
         warn(layout.job_record(job_id), f"left out what cannot be read: {'; '.join(left_out)[:300]}")
     return job
-
-
-def with_links(job: Job) -> Job:
-    """Return the job with the addresses of what belongs to it."""
-    base = f"/v1/jobs/{job.id}"
-    links = {"self": base, "events": f"{base}/events", "logs": f"{base}/logs", "preview": f"{base}/preview"}
-    links |= {"cameras": f"{base}/cameras", "capture": f"/v1/captures/{job.capture}"}
-    if job.state.final:
-        links["restart"] = f"{base}/restart"
-    else:
-        links |= {"cancel": f"{base}/cancel", "watch": f"{base}/watch", "snapshot": f"{base}/snapshot"}
-    if job.model is not None:
-        links |= {"report": f"{base}/report", "model": f"/v1/models/{job.model}"}
-    return job.model_copy(update={"links": links})
 
 
 def last_stage(job: Job) -> str | None:

@@ -61,7 +61,7 @@ async def create_capture(
     return capture
 
 
-@router.get("", responses=problems("cursor_invalid"))
+@router.get("", responses=problems("cursor_invalid", "lists_not_ready"))
 def list_captures(
     service: Shared,
     owner: ListedOwner,

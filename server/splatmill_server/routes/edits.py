@@ -65,6 +65,7 @@ async def edit_model(
         edited = Edited.model_validate_json(found.headers[EDIT_HEADER])
         if not body.preview:
             new_id = await store_edited(service.storage, model_id, body, edited, found.aiter_raw())
+            await run_in_threadpool(service.models.list_new, new_id)
             edited = edited.model_copy(update={"model": new_id})
     except httpx.TransportError as error:
         raise ProblemError(

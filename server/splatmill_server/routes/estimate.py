@@ -25,6 +25,7 @@ _EXAMPLE = {"photos": 24, "options": {"preset": "draft"}}
         "unknown_option",
         "option_out_of_range",
         "storage_unavailable",
+        "lists_not_ready",
     ),
     dependencies=[JSON_ONLY],
 )

@@ -10,9 +10,10 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response, Strea
 
 from splatmill.backplane import events, layout
 from splatmill.backplane.records import check_format
-from splatmill.schema import Curve, LogPage, PreviewEvent, Report
+from splatmill.schema import Curve, LogPage, Report
 from splatmill_server.answers.files import file_response
 from splatmill_server.answers.sse import Follower, Position, event_stream, stored_stream
+from splatmill_server.jobs import curve as job_curve
 from splatmill_server.jobs import log as job_log
 from splatmill_server.problems import ProblemError
 from splatmill_server.routes.openapi import answer, binary, problems
@@ -99,7 +100,7 @@ def get_logs(
 def get_curve(service: Shared, job_id: JobId) -> Curve:
     """Get the error against run time that was measured so far, from the first measurement on."""
     service.jobs.get(job_id)
-    if rows := events.read_curve(service.redis, job_id):
+    if rows := job_curve.read(service.redis, service.storage, job_id):
         return Curve(rows=rows)
     report = _report(service, job_id)
     return Curve(rows=report.curve if report is not None else [])
@@ -155,13 +156,9 @@ def _report(service: Service, job_id: str) -> Report | None:
 
 def _preview_path(service: Service, job_id: str) -> str | None:
     """Return the path of the newest preview: that of the last event, else that of the finished model, else None."""
-    announced = [
-        stored.event.path
-        for stored in events.read_progress(service.redis, job_id)
-        if isinstance(stored.event, PreviewEvent)
-    ]
+    announced = events.last_preview(service.redis, job_id)
     work, model = layout.job_work(job_id), layout.model(job_id)
-    for name in [*reversed(announced[-2:]), layout.model_file(job_id, "preview.jpg")]:
+    for name in [*([announced.path] if announced else []), layout.model_file(job_id, "preview.jpg")]:
         # A path is relative to storage or to the work folder; only files of this job are opened.
         for path in (name, f"{work}/{name}"):
             inside = path.startswith((f"{work}/", f"{model}/")) and ".." not in path.split("/")

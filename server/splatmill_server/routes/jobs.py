@@ -133,7 +133,7 @@ def _located(error: ValidationError) -> list[Any]:
     return [{**found, "loc": ("body", *found["loc"])} for found in error.errors()]
 
 
-@router.get("", responses=problems("cursor_invalid"))
+@router.get("", responses=problems("cursor_invalid", "lists_not_ready"))
 def list_jobs(
     service: Shared,
     owner: ListedOwner,

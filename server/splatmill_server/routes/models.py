@@ -71,7 +71,7 @@ CAMERA_QUERY = [
 ]
 
 
-@router.get("", responses=problems("cursor_invalid"))
+@router.get("", responses=problems("cursor_invalid", "lists_not_ready"))
 def list_models(
     service: Shared,
     owner: ListedOwner,

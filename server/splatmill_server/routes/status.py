@@ -8,7 +8,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
 import splatmill
-from splatmill.backplane import entries, lines, rendering, workers
+from splatmill.backplane import entries, lines, memory, rendering, workers
 from splatmill.backplane.lines import Waiting
 from splatmill.backplane.workers import WorkerRecord
 from splatmill.schema import (
@@ -94,13 +94,18 @@ async def healthz() -> Health:
     responses={503: {"model": Ready, "description": "A part that jobs need is not available"}},
 )
 async def readyz(service: Shared) -> Response:
-    """Check that jobs can be accepted and run. A missing renderer is reported, but jobs do not need it."""
+    """Check that jobs can be accepted and run.
+
+    A missing renderer and a Redis whose memory is nearly full are reported, but jobs can still be taken.
+    """
+    redis_check, memory_check, full = await run_in_threadpool(_redis_checks, service)
     checks = {
-        "redis": await run_in_threadpool(_redis_check, service),
+        "redis": redis_check,
+        "redis_memory": memory_check,
         "storage": await run_in_threadpool(service.storage_check.result),
         "renderer": await _renderer_check(service),
     }
-    ready = checks["redis"] == checks["storage"] == "ok"
+    ready = checks["redis"] == checks["storage"] == "ok" and not full
     return JSONResponse(Ready(ready=ready, checks=checks).model_dump(), 200 if ready else 503)
 
 
@@ -120,6 +125,9 @@ def get_metrics(service: Shared) -> Response:
         gauges.workers.clear()
         for worker in listening:
             gauges.workers.labels(worker.state).inc()
+        used = memory.read(service.redis)
+        gauges.redis_memory.set(used.used)
+        gauges.redis_limit.set(used.limit or 0)
         gauges.redis_up.set(1)
     except redis.RedisError:
         gauges.redis_up.set(0)
@@ -157,12 +165,13 @@ def _job_of(rq_id: str | None) -> str | None:
         return rq_id
 
 
-def _redis_check(service: Service) -> str:
+def _redis_checks(service: Service) -> tuple[str, str, bool]:
+    """Return what is to say of Redis and of its memory, and whether that is full."""
     try:
-        service.redis.ping()
+        found = memory.read(service.redis)
     except redis.RedisError as error:
-        return f"Redis cannot be reached: {error}"
-    return "ok"
+        return f"Redis cannot be reached: {error}", "not known", False
+    return "ok", " ".join(found.trouble() or ["ok"]), found.full
 
 
 async def _renderer_check(service: Service) -> str:

@@ -11,7 +11,7 @@ from typing import cast
 
 import redis
 
-from splatmill.backplane import keys, layout
+from splatmill.backplane import keys, layout, lists
 from splatmill.backplane.records import UnreadableRecord
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Capture, StoredKind
@@ -112,8 +112,10 @@ class Deletion:
 
     def unused_capture(self, capture: Capture) -> None:
         """Delete a capture that nobody else knows yet, also while Redis cannot be reached."""
-        self.captures.delete(capture.id)
-        with suppress(redis.RedisError):  # the next scan corrects the figures
+        with suppress(
+            redis.RedisError
+        ):  # it is not listed without its record, and the next scan corrects the figures
+            self.captures.delete(capture.id)
             self.ledger.deleted(StoredKind.capture, capture.id, capture.owner)
 
     def finish(self) -> list[str]:
@@ -128,7 +130,13 @@ class Deletion:
             try:
                 (self.capture if is_capture else self.job)(record_id)
             except ProblemError as error:
-                if error.problem.status == 404:  # its record was deleted, and files may be left
+                if (
+                    error.problem.status == 404
+                ):  # its record was deleted, and files and entries of lists may be left
+                    if is_capture:
+                        self.captures.unlist(record_id, None)
+                    else:
+                        lists.remove_model(self.connection, record_id, None)
                     for path in (
                         (layout.capture(record_id),)
                         if is_capture

@@ -1,4 +1,4 @@
-"""Which captures and models the jobs use, and until when, read from all rows without folding each."""
+"""Which captures and models the jobs use, and until when, read from all rows; only unfinished jobs are folded."""
 
 import json
 from collections.abc import Iterable, Mapping
@@ -8,11 +8,10 @@ from typing import Any, cast
 
 import redis
 
-from splatmill.backplane import events, keys, row
-from splatmill.backplane.fold import fold
-from splatmill.backplane.records import UnreadableRecord
+from splatmill.backplane import keys
 from splatmill.schema import DEFAULT_OWNER, StoredKind
 from splatmill.schema.formats import is_model_file
+from splatmill_server.jobs.reading import read_jobs
 from splatmill_server.space.holdings import Holding
 
 _BATCH = 500
@@ -75,21 +74,14 @@ def _read(connection: redis.Redis, job_ids: Iterable[str], active: set[str]) -> 
             pipe.hmget(keys.job(job_id), *_FIELDS)
             pipe.xrevrange(keys.states(job_id), count=1)
         replies = pipe.execute()
+    held = read_jobs(connection, [job_id for job_id in wanted if job_id in active])
     uses = {}
     for index, job_id in enumerate(wanted):
         fields = dict(zip(_FIELDS, replies[2 * index], strict=True))
         if fields["id"] is not None or fields["options"] is not None:
-            unfinished = job_id in active and _is_unfinished(connection, job_id)
-            uses[job_id] = _use(job_id, fields, replies[2 * index + 1], unfinished)
+            ended = job_id in held and held[job_id].state.final
+            uses[job_id] = _use(job_id, fields, replies[2 * index + 1], job_id in active and not ended)
     return uses
-
-
-def _is_unfinished(connection: redis.Redis, job_id: str) -> bool:
-    try:
-        found = row.read(connection, job_id)
-    except UnreadableRecord:
-        return True
-    return found is not None and not fold(found, events.read_states(connection, job_id)).state.final
 
 
 def _use(job_id: str, fields: Mapping[str, bytes | None], states: Any, unfinished: bool) -> JobUse:

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import redis
 
-from splatmill.backplane import keys, layout
+from splatmill.backplane import keys, layout, lists
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Role
 
@@ -88,6 +88,7 @@ def _list_again(connection: redis.Redis, job_id: str) -> int:
         known = pipe.exists(keys.job(job_id))
         pipe.multi()
         if known:
+            # The reaper sorts it into the lists when it has ended.
             pipe.zadd(keys.JOBS, {job_id: _milliseconds(created)}, nx=True)
             pipe.sadd(keys.ACTIVE, job_id)
 
@@ -111,7 +112,7 @@ def _unlist(connection: redis.Redis, job_id: str) -> int:
         removed = 0 if pipe.exists(keys.job(job_id)) else 1
         pipe.multi()
         if removed:
-            pipe.zrem(keys.JOBS, job_id)
+            lists.remove_job(pipe, job_id, None, None)
             pipe.srem(keys.ACTIVE, job_id)
 
     connection.transaction(remove, keys.job(job_id))

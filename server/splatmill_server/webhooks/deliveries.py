@@ -43,9 +43,6 @@ LONGEST_RETRY_AFTER = 86400
 _LOOK_SECONDS = 5.0
 """Seconds between two looks for deliveries that are due. Each is a request to a bucket."""
 
-_LOST_SECONDS = 60.0
-"""Seconds between two looks for jobs that Redis has lost."""
-
 _OLD_SECONDS = 3600.0
 """Seconds between two looks for old records of deliveries."""
 
@@ -63,7 +60,7 @@ class Deliveries:
         self.storage = webhooks.storage
         self.outgoing = outgoing
         self._running: dict[tuple[str, str], asyncio.Task[None]] = {}
-        self._looked = {"lost": float("-inf"), "old": float("-inf")}
+        self._looked_at = float("-inf")
         self._wake = asyncio.Event()
 
     def wake(self) -> None:
@@ -90,9 +87,8 @@ class Deliveries:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _look(self) -> None:
-        if self._is_time("lost", _LOST_SECONDS):
-            await run_in_threadpool(self.webhooks.announce_lost)
-        if self._is_time("old", _OLD_SECONDS):
+        if time.monotonic() - self._looked_at >= _OLD_SECONDS:
+            self._looked_at = time.monotonic()
             await run_in_threadpool(self.webhooks.delete_old)
         marks = await run_in_threadpool(lambda: list(self.storage.entries(layout.due_deliveries())))
         for entry in marks:  # sorted by the time at which they are due
@@ -106,13 +102,6 @@ class Deliveries:
             each = sum(running[0] == webhook_id for running in self._running)
             if key not in self._running and each < _CONCURRENT_EACH:
                 self._running[key] = asyncio.create_task(self._work(key, entry.path))
-
-    def _is_time(self, what: str, seconds: float) -> bool:
-        now = time.monotonic()
-        if now - self._looked[what] < seconds:
-            return False
-        self._looked[what] = now
-        return True
 
     async def _work(self, key: tuple[str, str], mark: str) -> None:
         try:

@@ -3,9 +3,6 @@
 Everything is in storage, so that nothing is skipped when a process or Redis is lost. A job that has ended leaves the
 set of unfinished jobs only after its deliveries are recorded (`Jobs.on_end`), by whichever API process comes first: the
 id of a delivery follows from the job and its generation, and only one process creates it.
-
-The rows of unfinished jobs are kept in storage as well, if their owner has a webhook. If Redis loses such a job, its
-webhooks are told so (`announce_lost`).
 """
 
 import base64
@@ -14,23 +11,18 @@ import json
 import math
 import secrets
 import time
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 
 import structlog
 
-from splatmill.backplane import layout, row
-from splatmill.backplane.fold import fold
+from splatmill.backplane import layout
 from splatmill.backplane.records import FORMAT, warn
-from splatmill.backplane.row import JobRow
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.storage import Storage
 from splatmill.schema import (
     CreateWebhook,
     Delivery,
     DeliveryState,
     Job,
-    JobState,
-    Problem,
     Response,
     Time,
     Webhook,
@@ -39,7 +31,7 @@ from splatmill.schema import (
     WebhookWithSecret,
 )
 from splatmill.webhook_signature import SECRET_PREFIX
-from splatmill_server.jobs.records import Jobs, with_links
+from splatmill_server.jobs.records import Jobs
 from splatmill_server.problems import ProblemError
 
 log = structlog.get_logger()
@@ -99,8 +91,6 @@ class Webhooks:
     def __init__(self, storage: Storage, jobs: Jobs) -> None:
         self.storage = storage
         self.jobs = jobs
-        self._missing: set[str] = set()
-        jobs.on_begin.append(self.watch)
         jobs.on_end.append(self.announce)
 
     def create(self, request: CreateWebhook, owner: str) -> WebhookWithSecret:
@@ -221,16 +211,6 @@ class Webhooks:
         """Mark a pending delivery as due at its next time."""
         self.storage.put(mark_of(record), b"{}")
 
-    def watch(self, found: JobRow) -> None:
-        """Keep the row of a job that begins, if its owner has webhooks."""
-        try:
-            if self.of_owner(found.owner):
-                self.storage.put(
-                    layout.watched_job(found.id), found.model_dump_json(exclude_none=True).encode()
-                )
-        except StorageError as error:  # the job has begun; only a loss of Redis would go unnoticed
-            log.warning("a job is not watched", job=found.id, error=str(error))
-
     def announce(self, job: Job, generation: int) -> None:
         """Record the deliveries of a job that has ended. Repeated calls for the same end have no further effect."""
         event = WebhookEvent(f"job.{job.state.value}")
@@ -265,33 +245,6 @@ class Webhooks:
                     )  # another process has just made it
             if known.state is DeliveryState.pending and not known.attempts:
                 self.mark(known)  # the process that made it may have died before it did
-        self.storage.delete(layout.watched_job(job.id))
-
-    def announce_lost(self) -> None:
-        """Tell webhooks of jobs that Redis has lost: their end if a model was stored, else that they are lost.
-
-        A job counts as lost if two successive calls do not find it. Raises redis.RedisError.
-        """
-        missing = set()
-        for found in self._watched():
-            if row.read(self.jobs.connection, found.id) is not None:
-                continue
-            if found.id not in self._missing:
-                missing.add(found.id)
-                continue
-            job = self.jobs.stored(found.id) or _lost(found)
-            log.warning("a job is unknown to Redis", job=found.id, state=job.state.value)
-            self.announce(job, found.generation)
-        self._missing = missing
-
-    def _watched(self) -> Iterator[JobRow]:
-        for entry in self.storage.entries(layout.watched_jobs()):
-            try:
-                yield JobRow.model_validate_json(self.storage.get(entry.path))
-            except FileNotFoundError:
-                continue
-            except ValueError as error:
-                warn(entry.path, str(error).splitlines()[0])
 
     def delete_old(self) -> int:
         """Delete the records of deliveries that were over KEPT_DAYS ago, and return their number."""
@@ -331,14 +284,3 @@ def _new_secret() -> Secret:
 
 def _with_secret(record: WebhookRecord) -> WebhookWithSecret:
     return WebhookWithSecret(**record.public().model_dump(), secret=record.secrets[0].value)
-
-
-def _lost(found: JobRow) -> Job:
-    """Return a job that Redis has lost before its end was known."""
-    problem = Problem.of(
-        "job_lost",
-        "The record of the job was lost with the Redis that held it, before its end was known.",
-        advice="Start the job again; its capture is in storage.",
-    )
-    update = {"state": JobState.failed, "finished_at": datetime.now(UTC), "problem": problem}
-    return with_links(fold(found, []).model_copy(update=update))

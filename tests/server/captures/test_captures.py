@@ -222,7 +222,8 @@ def test_what_a_killed_server_left_of_an_upload_is_removed_by_the_next(serve: Se
         (folder / name).write_bytes(b"half an upload")
         os.utime(folder / name, (time.time() - age,) * 2)
     again = serve()
-    wait_for(lambda: set(stored(again)) - set(before) == {f"{layout.capture_incoming(capture_id)}/new#1"})
+    again.service.sweeper.search()
+    assert set(stored(again)) - set(before) == {f"{layout.capture_incoming(capture_id)}/new#1"}
 
 
 def test_an_upload_into_a_capture_that_is_deleted_meanwhile_leaves_nothing(app: ServedApp) -> None:

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import layout
+from splatmill.backplane import layout, lists
+from splatmill.backplane.row import now
 from splatmill.schema import EstimateJob
 from splatmill_server.jobs.estimate import estimate
 from splatmill_server.jobs.finished import Figures, figures
@@ -150,6 +151,8 @@ def test_the_endpoint_estimates_from_stored_models_and_creates_nothing(app: Serv
     broken = "0123456789abcdef"
     app.service.storage.put(layout.model_file(broken, "report.json"), b"{}")
     app.service.storage.put(layout.job_record(broken), b'{"attempt": 1}')
+    for model_id in (STORED.name, broken):
+        lists.add_model(app.redis, model_id, now(), "default")
     found = app.http.post("/v1/estimate", json=body).json()
     assert found["jobs"] == 1  # the one that cannot be read is left out
     assert found["stages"][1]["seconds"] == pytest.approx(2 * 0.0662, abs=0.1)

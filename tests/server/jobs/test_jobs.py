@@ -12,7 +12,7 @@ import pytest
 
 from splatmill.backplane import keys, layout, queue, row
 from splatmill.schema import JobState, Problem, ProgressEvent, StateEvent
-from splatmill_server.jobs import records as jobs
+from splatmill_server import lists
 from tests.support.served_app import ServedApp, problem, raw, stored
 
 PHOTO = b"\xff\xd8\xff a photo"
@@ -168,8 +168,8 @@ def pages(app: ServedApp, **params: Any) -> list[str]:
 def test_a_page_of_a_narrowed_list_looks_at_a_limited_number_of_jobs(
     app: ServedApp, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(jobs, "SCANNED", 3)
-    monkeypatch.setattr(jobs, "_BATCH", 2)
+    monkeypatch.setattr(lists, "SCANNED", 3)
+    monkeypatch.setattr(lists, "BATCH", 2)
     capture_id = app.capture()
     made = [app.job(capture_id) for _ in range(9)]
     oldest = sorted(made, key=lambda i: created(app, i))[0]

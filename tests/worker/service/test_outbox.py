@@ -6,7 +6,7 @@ Does not prove how the server reads them: tests/server does.
 import redis
 
 from splatmill.backplane import events
-from splatmill.schema import JobState, LogEvent, ProgressEvent, StateEvent
+from splatmill.schema import Event, JobState, LogEvent, PlanEvent, ProgressEvent, StateEvent
 from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.lock import JobLock
 from splatmill_worker.service.outbox import Outbox
@@ -32,6 +32,31 @@ def test_events_keep_their_order_and_progress_is_thinned(connection: redis.Redis
         "training",
         "exporting",
     ]
+
+
+def test_a_redis_that_comes_back_empty_is_told_again_that_the_job_runs(connection: redis.Redis) -> None:
+    this = Attempt(connection, "job00001", 2, 3, JobLock(connection, "job00001", "a"))
+    outbox = Outbox(this)
+    said: list[Event] = [
+        StateEvent(state=JobState.sfm),
+        StateEvent(state=JobState.training),
+        PlanEvent(plan={"sh": 3}),
+    ]
+    for event in (*said, ProgressEvent(stage="training", step=1)):
+        outbox.put(event)
+    assert outbox.flush()
+    connection.flushall()
+    outbox.put(ProgressEvent(stage="training", step=2))
+    assert outbox.flush()
+    outbox.put(StateEvent(state=JobState.exporting))
+    outbox.close()
+    told = events.read_states(connection, "job00001")
+    assert [stored.event for stored in told] == [*said, StateEvent(state=JobState.exporting)]
+    assert {(stored.generation, stored.attempt) for stored in told} == {(2, 3)}
+    assert events.begin_attempt(connection, "job00001") == 4, "later attempts supersede it"
+    holder = this.lock.holder()
+    assert holder is not None
+    assert (holder.token, holder.attempt, holder.gone()) == ("a", 3, False)
 
 
 def test_what_is_said_while_redis_is_away_arrives_when_it_is_back(redis_server: RedisServer) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import redis
 
-from splatmill.backplane import events
+from splatmill.backplane import events, keys
 from splatmill.backplane.entries import split_rq_id
 from splatmill.backplane.process import ProcessIdentity
 from splatmill.schema import Event, JobState, LogEvent, Problem, StateEvent
@@ -40,6 +40,15 @@ class Attempt:
     def report(self, event: Event) -> None:
         """Append an event to the job's streams under the number of this attempt."""
         events.append(self.connection, self.job_id, self.generation, self.number, event)
+
+    def is_known(self) -> bool:
+        """Return whether Redis still has the states of the job; it has not if it lost its data."""
+        return bool(self.connection.exists(keys.states(self.job_id)))
+
+    def rejoin(self) -> None:
+        """Take the lock and the number of this attempt again, in a Redis that has lost both."""
+        self.connection.set(keys.attempts(self.job_id), self.number, nx=True)
+        self.lock.take(ProcessIdentity.of(os.getpid()), self.number)
 
     def report_requeued(self, reason: str) -> None:
         """Report that the attempt is over and that the job waits in the queue again."""

@@ -42,6 +42,7 @@ class Outbox:
         self._sending = False
         self._closed = False
         self._progress_at = 0.0
+        self._states: list[StateEvent | PlanEvent] = []
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
 
@@ -112,10 +113,20 @@ class Outbox:
                     self._changed.wait()
             return None
 
+    def _send_states_again(self) -> None:
+        """Tell a Redis that has come back empty what this attempt has told before, so that its job is seen to run."""
+        self._attempt.rejoin()
+        for told in self._states:
+            self._attempt.report(told)
+
     def _sent(self, event: Event) -> bool:
         """Send an event; return False if Redis did not take it. One that cannot be written at all is given up."""
         try:
+            if self._states and not self._attempt.is_known():
+                self._send_states_again()
             self._attempt.report(event)
+            if isinstance(event, StateEvent | PlanEvent):
+                self._states.append(event)
         except redis.RedisError as error:
             self.trouble = f"{type(error).__name__}: {error}"
             return False

@@ -4,7 +4,7 @@ import hashlib
 import json
 from pathlib import Path
 
-from splatmill.backplane import events, layout
+from splatmill.backplane import events, layout, lists
 from splatmill.backplane.fold import fold
 from splatmill.backplane.records import FORMAT
 from splatmill.backplane.row import JobRow, now
@@ -41,6 +41,7 @@ def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path) -> None:
     if not (out / "model.ply").is_file():
         raise FileNotFoundError(f"The pipeline ended without writing {out / 'model.ply'}.")
     storage.delete(layout.job_record(attempt.job_id))
+    patiently(lambda: lists.remove_model(attempt.connection, attempt.job_id, row.owner))
     digests: dict[str, str] = {}
     names = [*layout.MODEL_FILES, *_in_folders(out)]
     for entry in storage.entries(layout.model(attempt.job_id)):
@@ -62,10 +63,11 @@ def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path) -> None:
             events.last_progress(attempt.connection, attempt.job_id),
         )
     )
+    finished_at = now()
     ended = job.model_copy(
         update={
             "state": JobState.succeeded,
-            "finished_at": now(),
+            "finished_at": finished_at,
             "model": attempt.job_id,
             "attempt": attempt.number,
         }
@@ -76,3 +78,5 @@ def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path) -> None:
         "sha256": digests,
     }
     storage.put(layout.job_record(attempt.job_id), json.dumps(record, indent=1).encode())
+    # A worker that is killed here leaves it to the server, which sees the end of the job.
+    patiently(lambda: lists.add_model(attempt.connection, attempt.job_id, finished_at, row.owner))

@@ -203,7 +203,7 @@ class AttemptWorker(Worker):
         """Send the heartbeats of an attempt; kill it if another attempt has taken its queue entry or its lock."""
         try:
             self.heartbeat()
-            holds = leases.prolong(self.connection, self._lease)
+            holds = leases.prolong(self.connection, self._lease) or self._rejoin(job)
             lock = self._lock.refresh() if self._lock else LockState.held
             if self._saved is not None and self._saved.advanced():
                 leases.advanced(self.connection, job.id)
@@ -217,6 +217,15 @@ class AttemptWorker(Worker):
             )
             self._superseded = True
             self.kill_horse()
+
+    def _rejoin(self, job: Job) -> bool:
+        """Take the lease of the running attempt again if Redis has come back empty. Return whether it is held."""
+        if not leases.rejoin(self.connection, self._lease, self.name, job.to_dict(include_meta=False)):
+            return False
+        self.log.warning(
+            "Worker %s: Redis has lost its data; the attempt at job %s goes on", self.name, job.id
+        )
+        return True
 
     # Stop requests
 

@@ -1,0 +1,58 @@
+"""Jobs as Redis has them: row, states and newest progress of any number of jobs in one round trip."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import redis
+
+from splatmill.backplane import events, keys
+from splatmill.backplane.events import PROGRESS_REPLIES, StoredEvent
+from splatmill.backplane.fold import fold
+from splatmill.backplane.records import UnreadableRecord, warn
+from splatmill.backplane.row import JobRow
+from splatmill.schema import Job, JobState
+
+_REPLIES = 2 + PROGRESS_REPLIES
+
+
+@dataclass(frozen=True)
+class Held:
+    """What Redis holds of a job: its row, its states and its newest progress."""
+
+    row: JobRow
+    states: Sequence[StoredEvent]
+    progress: StoredEvent | None
+
+    @property
+    def state(self) -> JobState:
+        """The state of the job."""
+        return fold(self.row, self.states).state
+
+    def job(self) -> Job:
+        """Return the job as clients see it, without links and its place in the queue."""
+        return fold(self.row, self.states, self.progress)
+
+
+def read_jobs(connection: redis.Redis, job_ids: Sequence[str]) -> dict[str, Held]:
+    """Return what Redis holds of these jobs, by id, in their order.
+
+    Jobs without a row, or whose row is not readable, are left out; the latter are logged.
+    """
+    with connection.pipeline(transaction=False) as pipe:
+        for job_id in job_ids:
+            pipe.hgetall(keys.job(job_id))
+            pipe.xrange(keys.states(job_id))
+            events.ask_progress(pipe, job_id)
+        replies = pipe.execute()
+    found = {}
+    for index, job_id in enumerate(job_ids):
+        stored, states, *progress = replies[index * _REPLIES : (index + 1) * _REPLIES]
+        try:
+            row = JobRow.of(stored)
+        except UnreadableRecord as error:
+            warn(f"job {job_id} is not listed", str(error))
+            continue
+        if row is not None:
+            newest = events.answered_progress(connection, job_id, progress)
+            found[job_id] = Held(row, events.decode(states, keys.states(job_id)), newest)
+    return found

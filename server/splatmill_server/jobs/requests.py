@@ -1,0 +1,56 @@
+"""The rows of unfinished jobs in storage, from which they are restored where Redis has come back empty.
+
+    watched/{job}.json: the row of the job as it began its generation
+
+A row is stored before the job is inserted into Redis, and deleted when its end is stored.
+"""
+
+from datetime import datetime
+
+import redis
+
+from splatmill.backplane import layout, row
+from splatmill.backplane.records import UnreadableRecord, reason, warn
+from splatmill.backplane.row import JobRow
+from splatmill.backplane.storage import Storage
+
+
+def keep(storage: Storage, begun: JobRow) -> None:
+    """Store the row of a job that begins. Raises StorageError."""
+    storage.put(layout.watched_job(begun.id), begun.model_dump_json(exclude_none=True).encode())
+
+
+def next_generation(found: JobRow, moment: datetime) -> JobRow:
+    """Return the row of a job as its restart at this time makes it."""
+    changes = {"generation": found.generation + 1, "queued_at": moment}
+    return found.model_copy(update=changes | {"cancel_requested_at": None, "verdict": None})
+
+
+def read(storage: Storage, job_id: str) -> JobRow | None:
+    """Return the row of an unfinished job, or None if there is none that can be read."""
+    path = layout.watched_job(job_id)
+    try:
+        return JobRow.model_validate_json(storage.get(path))
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        warn(path, reason(error))
+        return None
+
+
+def names(storage: Storage) -> list[str]:
+    """Return the ids of all jobs whose rows are stored."""
+    paths = (entry.path.rpartition("/")[2] for entry in storage.walk(layout.watched_jobs()))
+    found = (path.removesuffix(".json") for path in paths if path.endswith(".json"))
+    return sorted(job_id for job_id in found if layout.is_id(job_id))
+
+
+def forget(connection: redis.Redis, storage: Storage, ended: JobRow) -> None:
+    """Delete the row of a job whose end is stored, unless it was restarted meanwhile."""
+    storage.delete(layout.watched_job(ended.id))
+    try:
+        found = row.read(connection, ended.id)
+    except UnreadableRecord:
+        return
+    if found is not None and found.generation != ended.generation:
+        keep(storage, found)

@@ -1,0 +1,174 @@
+"""A Redis that comes back empty is filled from storage: jobs wait again, ended ones are as they were.
+
+Not proved here: that a worker takes its lease again (tests/worker/service/test_rejoin), and both together with real
+processes (tests/service/test_kills).
+"""
+
+from typing import Any
+
+import pytest
+
+from splatmill.backplane import entries, keys, layout, leases, lists, queue, row
+from splatmill.schema import (
+    CreateJob,
+    JobState,
+    LogEvent,
+    MetricEvent,
+    PlanEvent,
+    Problem,
+    ProgressEvent,
+    StateEvent,
+)
+from splatmill_server.problems import ProblemError
+from tests.support.queue_entries import take, waiting
+from tests.support.served_app import ServedApp, problem
+from tests.support.server_events import brief, follow
+
+
+def listed(app: ServedApp, path: str = "/v1/jobs") -> dict[str, Any]:
+    name = path.partition("?")[0].rpartition("/")[2]
+    return {found["id"]: found for found in app.http.get(path).json()[name]}
+
+
+def emptied(app: ServedApp) -> None:
+    """Redis loses everything, and the reaper looks."""
+    app.redis.flushall()
+    app.service.reaper.tick()
+
+
+def grace_over(app: ServedApp) -> None:
+    """The time in which workers take their leases again has passed, and the reaper looks."""
+    assert 0 < app.redis.ttl(keys.RESTORED) <= leases.LEASE
+    app.redis.delete(keys.RESTORED)
+    app.service.reaper.tick()
+
+
+def test_queued_jobs_wait_again_when_no_worker_claims_them(app: ServedApp) -> None:
+    jobs = [app.job() for _ in range(3)]
+    before = listed(app)
+    emptied(app)
+    after = listed(app)
+    assert set(after) == set(jobs)
+    assert waiting(app.redis) == 0, "a worker that runs one of them has time to say so"
+    grace_over(app)
+    assert waiting(app.redis) == 3
+    assert listed(app) == before
+
+
+def test_ended_jobs_are_as_they_were(app: ServedApp) -> None:
+    capture_id = app.capture()
+    ends = [JobState.succeeded, JobState.failed, JobState.cancelled]
+    jobs = [app.job(capture_id) for _ in ends]
+    for job_id, end in zip(jobs, ends, strict=True):
+        app.begin(job_id)
+        app.say(
+            job_id, StateEvent(state=JobState.training), PlanEvent(plan={"sh": 3}), LogEvent(message="said")
+        )
+        app.say(job_id, ProgressEvent(stage="training", done=3))
+        app.say(job_id, MetricEvent(seconds=1, step=3, psnr=20.0, gaussians=5))
+        if end is JobState.succeeded:
+            app.finish(job_id)
+        elif end is JobState.failed:
+            app.say(job_id, StateEvent(state=end, problem=Problem.of("diverged", "It diverged.")))
+        else:
+            app.http.post(f"/v1/jobs/{job_id}/cancel")
+    app.service.reaper.tick()
+    paths = [f"/v1/jobs/{job_id}{name}" for job_id in jobs for name in ("", "/logs", "/curve")]
+    before, models = [app.http.get(path).json() for path in paths], listed(app, "/v1/models")
+    order = list(listed(app))
+    emptied(app)
+    assert [app.http.get(path).json() for path in paths] == before
+    assert list(listed(app)) == order
+    assert listed(app, "/v1/models") == models
+    assert list(listed(app, "/v1/captures")) == [capture_id]
+    for job_id, end in zip(jobs, ends, strict=True):
+        assert list(listed(app, f"/v1/jobs?state={end}")) == [job_id]
+        assert brief(follow(app, job_id))[-1] == end
+        again = app.http.post(f"/v1/jobs/{job_id}/restart")
+        assert (again.status_code, again.json()["state"]) == (202, "queued")
+        found = row.read(app.redis, job_id)
+        assert found is not None
+        assert found.generation == 2
+    assert not any(app.redis.sismember(keys.RESTORED, job_id) for job_id in jobs)
+
+
+def test_a_job_that_a_worker_still_runs_is_neither_queued_nor_called_cancelled(app: ServedApp) -> None:
+    job_id = app.job()
+    lease = take(app.redis)
+    entry = entries.QueueEntry.fetch(lease.entry, connection=app.redis, serializer=entries.SERIALIZER)
+    emptied(app)
+    answer = app.http.post(f"/v1/jobs/{job_id}/cancel").json()
+    assert (answer["state"], answer["cancel_requested"]) == ("queued", True)
+    # Its worker says that it runs: the queue knows it, and the worker is asked to stop.
+    assert leases.rejoin(app.redis, lease, "worker", entry.to_dict(include_meta=False))
+    app.redis.delete(keys.RESTORED)
+    app.service.reaper.tick()
+    assert queue.status(app.redis, job_id, 1).state == "running"
+    assert app.state(job_id) == "queued"
+
+
+def test_a_deleted_job_does_not_come_back(app: ServedApp) -> None:
+    kept, gone = app.job(), app.job()
+    for job_id in (kept, gone):
+        app.begin(job_id)
+        app.finish(job_id)
+    app.service.reaper.tick()
+    app.http.delete(f"/v1/jobs/{gone}")
+    emptied(app)
+    assert set(listed(app)) == set(listed(app, "/v1/models")) == {kept}
+    assert not any(gone in entry.path for entry in app.service.storage.walk(""))
+
+
+def test_a_job_that_ended_is_not_begun_again_where_its_request_was_left(app: ServedApp) -> None:
+    job_id = app.job()
+    request = app.service.storage.get(layout.watched_job(job_id))
+    app.begin(job_id)
+    app.say(job_id, StateEvent(state=JobState.failed))
+    app.service.reaper.tick()
+    assert not app.service.storage.exists(layout.watched_job(job_id))
+    app.service.storage.put(layout.watched_job(job_id), request)
+    emptied(app)
+    assert app.state(job_id) == "failed"
+    assert not app.service.storage.exists(layout.watched_job(job_id))
+    # Its second generation has not ended.
+    app.http.post(f"/v1/jobs/{job_id}/restart").raise_for_status()
+    emptied(app)
+    assert app.state(job_id) == "queued"
+    found = row.read(app.redis, job_id)
+    assert found is not None
+    assert found.generation == 2
+
+
+def test_a_single_lost_row_is_restored_at_the_second_look(app: ServedApp) -> None:
+    job_id = app.job()
+    app.redis.delete(keys.job(job_id))
+    reaper = app.service.reaper
+    for expected in (False, True):
+        reaper._looked_at = float("-inf")
+        reaper.tick()
+        assert bool(app.redis.exists(keys.job(job_id))) is expected
+    assert app.state(job_id) == "queued"
+
+
+def test_a_refused_job_leaves_no_request(app: ServedApp) -> None:
+    asked = CreateJob(capture=app.capture())
+    with pytest.raises(ProblemError, match="permits 0 at once"):
+        app.service.jobs.create(asked, owner="default", most=0)
+    assert list(app.service.storage.walk(layout.watched_jobs())) == []
+
+
+def test_those_who_ask_while_lists_are_made_are_told_to_come_again(
+    app: ServedApp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("splatmill_server.lists.LONGEST_WAIT", 0.0)
+    job_id = app.job()
+    app.redis.delete(keys.LISTED)
+    app.redis.set(keys.LISTING, "another process")
+    for path in ("/v1/jobs", "/v1/captures", "/v1/models"):
+        answer = app.http.get(path)
+        assert problem(answer, 503, "lists_not_ready")["advice"]
+        assert answer.headers["retry-after"]
+    assert app.state(job_id) == "queued"
+    app.redis.delete(keys.LISTING)
+    assert list(listed(app)) == [job_id]
+    assert app.redis.get(keys.LISTED) == lists.VERSION
