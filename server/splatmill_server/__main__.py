@@ -2,6 +2,7 @@
 
 import argparse
 import logging
+import resource
 import signal
 import socket
 import sys
@@ -27,6 +28,9 @@ log = structlog.get_logger()
 GRACE_SECONDS = 5
 """Seconds for which running requests may continue after a signal to stop."""
 
+_OPEN_FILES = 65536
+"""Number of files that the server opens at most, where the machine permits it."""
+
 
 class Server(uvicorn.Server):
     """A server that informs the app of the first signal, so that event streams end before the grace period does."""
@@ -46,6 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until a signal arrives. Return the exit status: 0, 1 if the start failed, 2 for invalid settings."""
     given = vars(_options().parse_args(arguments))
     configure_logging()
+    allow_open_files()
     try:
         settings = Settings(**{name: value for name, value in given.items() if value is not None})
         app = create_app(settings)
@@ -130,6 +135,14 @@ class _LineLog(structlog.PrintLogger):
             super().msg(message)
 
     log = debug = info = warn = warning = fatal = failure = err = error = critical = exception = msg
+
+
+def allow_open_files() -> None:
+    """Let this process open as many files as it may: each client that follows events holds a connection."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, _OPEN_FILES)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def configure_logging(level: int = logging.INFO) -> None:

@@ -22,6 +22,7 @@ from splatmill_server.captures.imports import Imports
 from splatmill_server.captures.partial_uploads import PartialUploads
 from splatmill_server.captures.records import Captures
 from splatmill_server.conversions import Conversions
+from splatmill_server.feed import Feed
 from splatmill_server.jobs.finished import Finished
 from splatmill_server.jobs.reaper import Reaper
 from splatmill_server.jobs.records import Jobs
@@ -73,6 +74,7 @@ class Service:
     settings: Settings
     redis: Redis
     redis_async: AsyncRedis
+    feed: Feed
     storage: Storage
     storage_check: StorageCheck
     renderer: httpx.AsyncClient | None
@@ -125,6 +127,7 @@ class Service:
             settings=settings,
             redis=connection,
             redis_async=redis_async,
+            feed=Feed(redis_async),
             storage=storage,
             storage_check=StorageCheck(storage),
             renderer=renderer,
@@ -154,6 +157,7 @@ class Service:
 
     async def close(self) -> None:
         """Close every connection."""
+        await self.feed.stop()
         await self.redis_async.aclose()
         self.redis.close()
         if self.renderer is not None:

@@ -139,6 +139,12 @@ class Settings(BaseSettings):
         default=15.0, gt=0, description="Seconds of silence in an event stream after which a comment is sent."
     )
 
+    max_event_streams: int = Field(
+        default=2000,
+        gt=0,
+        description="Largest number of clients that follow events on one API process. Each holds a connection.",
+    )
+
     @model_validator(mode="after")
     def _complete(self) -> Self:
         if not self.storage:

@@ -14,6 +14,13 @@ from splatmill.backplane.refusal import RefusalAwareRedis
 DEFAULT_URL = "redis://127.0.0.1:6379/0"
 
 
+ASYNC_CONNECTIONS = 32
+"""Largest number of connections of an asyncio client. Those who follow events share one."""
+
+_FREE_SECONDS = 20
+"""Seconds that a command waits for a free connection, after which it fails as if Redis could not be reached."""
+
+
 class InvalidRedisUrl(ValueError):
     """The address of Redis is not valid. The message shows it without its password."""
 
@@ -50,15 +57,20 @@ def connect(url: str = DEFAULT_URL, *, timeout: float | None = None, retries: in
 def connect_async(url: str = DEFAULT_URL) -> redis.asyncio.Redis:
     """Return an asyncio client for reading streams. It has no timeout, because `XREAD BLOCK` waits by design.
 
+    It opens at most ASYNC_CONNECTIONS; a command waits for a free one.
+
     Raises InvalidRedisUrl.
     """
     try:
-        return redis.asyncio.Redis.from_url(
+        pool = redis.asyncio.BlockingConnectionPool.from_url(
             url,
+            max_connections=ASYNC_CONNECTIONS,
+            timeout=_FREE_SECONDS,
             health_check_interval=15,
             retry=AsyncRetry(ExponentialBackoff(cap=2, base=0.1), 1),
             **_connect_timeout(url),
         )
+        return redis.asyncio.Redis.from_pool(pool)
     except ValueError:
         raise InvalidRedisUrl(url) from None
 

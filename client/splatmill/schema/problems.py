@@ -112,6 +112,7 @@ PROBLEMS: dict[str, Kind] = {
     "job_corrupt": Kind(500, "The stored record of the job cannot be read"),
     "model_corrupt": Kind(500, "The stored model cannot be read"),
     "internal_error": Kind(500, "The service failed to handle the request"),
+    "too_many_followers": Kind(503, "Too many clients follow events"),
     "lists_not_ready": Kind(503, "The lists are being made"),
     "queue_unavailable": Kind(503, "The job queue cannot be reached"),
     "storage_unavailable": Kind(503, "The storage cannot be reached"),

@@ -6,9 +6,8 @@ in each generation of a job.
 """
 
 import asyncio
-import heapq
 import re
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -16,18 +15,19 @@ import redis
 from prometheus_client import Gauge
 
 from splatmill.backplane import events, keys
-from splatmill.backplane.events import START, StoredEvent, stream_order
+from splatmill.backplane.events import START, stream_order
 from splatmill.backplane.fold import Fold
 from splatmill.backplane.records import UnreadableRecord, warn
 from splatmill.backplane.row import JobRow
 from splatmill.schema import EventRecord, Job, JobState, StateEvent, Time
+from splatmill_server.feed import Batch, Row
 from splatmill_server.service import Service
 
 _ENTRY = r"\d{1,19}-\d{1,19}"
 _POSITION = re.compile(rf"({_ENTRY})_({_ENTRY})_(\d{{1,9}})((?:_{_ENTRY}){{3}})?")
 _LINE_ENDS = {0x85: "\\u0085", 0x2028: "\\u2028", 0x2029: "\\u2029"}
-_BLOCK_MS = 500
-"""Milliseconds that a read waits for new entries, after which the row is read again."""
+_LOOK_SECONDS = 1.0
+"""Seconds without an event after which a follower looks whether it may go on."""
 
 
 @dataclass
@@ -74,6 +74,7 @@ class Follower:
     ) -> None:
         self.permitted = permitted
         self.redis = service.redis_async
+        self.feed = service.feed
         self.closing = service.closing
         self.job_id = job_id
         self.position = position
@@ -81,65 +82,74 @@ class Follower:
     async def begin(self, row: JobRow) -> bool:
         """Apply the events that the client has already seen; return False if the job had ended by then."""
         self.fold = Fold(row)
-        seen = await self._reply(self.redis.xrange(keys.states(self.job_id), max=self.position.states))
-        for stored in events.decode(seen, keys.states(self.job_id)):
-            self.fold.apply(stored)
+        self._stored: Row = {}
+        if self.position.states != START:
+            seen = await cast(Any, self.redis.xrange(keys.states(self.job_id), max=self.position.states))
+            for stored in events.decode(seen, keys.states(self.job_id)):
+                self.fold.apply(stored)
         if self.position.row_events > 2 * row.generation:
             self.fold.close()
         return not self.fold.final
 
     async def records(self) -> AsyncIterator[EventRecord]:
         """Yield the events that count, until the job ends, the server stops or the reader may not go on."""
-        while not self.closing.is_set() and await self.permitted():
-            try:
-                row = JobRow.of(await self._reply(self.redis.hgetall(keys.job(self.job_id))))
-            except UnreadableRecord as error:
-                warn(f"the events of job {self.job_id} end", str(error))
-                return
-            if row is None:
-                return  # the job was deleted
-            if row.generation != self.fold.row.generation:
-                self.fold = Fold(row)
-            self.fold.row = row
-            if self.position.row_events < 2 * row.generation:
-                yield self._row_event(2 * row.generation, row.queued_at, StateEvent(state=JobState.queued))
-            found, end = await self._read()
-            for stored, stream in found:
-                self.position.entries[stream] = stored.id
-                if self.fold.apply(stored):
-                    yield stored.record(str(self.position))
-            self.position.entries = end  # also after entries that are not readable
-            if self.fold.final:
-                return
-            verdict = row.verdict
-            if verdict is not None and stream_order(self.position.states) >= stream_order(verdict.after):
-                event = StateEvent(state=JobState(verdict.state), problem=verdict.problem)
-                yield self._row_event(2 * row.generation + 1, verdict.at, event)
-                return
+        subscription = self.feed.subscribe(self.job_id)
+        try:
+            live = False
+            while not self.closing.is_set() and await self.permitted():
+                if live and not subscription.missed:
+                    batch = await subscription.next(_LOOK_SECONDS)
+                    if batch is None:
+                        continue
+                else:
+                    subscription.missed = False
+                    batch, live = await self.feed.catch_up(subscription, self.position.entries)
+                for record in self._told(batch):
+                    yield record
+                if self._over:
+                    return
+        finally:
+            self.feed.close(subscription)
+
+    def _told(self, batch: Batch) -> Iterator[EventRecord]:
+        """Yield what counts of a batch and was not told before, and note whether anything can follow."""
+        self._over = True
+        try:
+            row = self.fold.row if batch.row == self._stored else JobRow.of(batch.row)
+        except UnreadableRecord as error:
+            warn(f"the events of job {self.job_id} end", str(error))
+            return
+        if row is None:
+            return  # the job was deleted
+        self._stored = batch.row
+        if row.generation != self.fold.row.generation:
+            self.fold = Fold(row)
+        self.fold.row = row
+        if self.position.row_events < 2 * row.generation:
+            yield self._row_event(2 * row.generation, row.queued_at, StateEvent(state=JobState.queued))
+        for stored, stream in batch.found:
+            if stored.order <= stream_order(self.position.entries[stream]):
+                continue  # read before it came by the feed
+            self.position.entries[stream] = stored.id
+            if self.fold.apply(stored):
+                yield stored.record(str(self.position))
+        # Also after entries that are not readable.
+        self.position.entries = [
+            max(known, read, key=stream_order)
+            for known, read in zip(self.position.entries, batch.end, strict=True)
+        ]
+        if self.fold.final:
+            return
+        verdict = row.verdict
+        if verdict is not None and stream_order(self.position.states) >= stream_order(verdict.after):
+            event = StateEvent(state=JobState(verdict.state), problem=verdict.problem)
+            yield self._row_event(2 * row.generation + 1, verdict.at, event)
+            return
+        self._over = False
 
     def _row_event(self, number: int, at: Time, event: StateEvent) -> EventRecord:
         self.position.row_events = number
         return EventRecord(id=str(self.position), attempt=0, at=at, event=event)
-
-    async def _read(self) -> tuple[list[tuple[StoredEvent, int]], list[str]]:
-        """Return new events, each with the number of its stream, sorted by time, and the last entry of each stream.
-
-        Waits briefly if there are none.
-        """
-        streams = [stream(self.job_id) for stream in events.BOUNDS]
-        positions: Any = dict(zip(streams, self.position.entries, strict=True))
-        reply = await self._reply(self.redis.xread(positions, block=_BLOCK_MS))
-        entries = {name.decode(): found for name, found in reply or []}
-        end = [entries[name][-1][0].decode() if name in entries else positions[name] for name in streams]
-        read = [
-            [(stored, number) for stored in events.decode(entries.get(name, []), name)]
-            for number, name in enumerate(streams)
-        ]
-        # The order within each stream is kept.
-        return list(heapq.merge(*read, key=lambda found: events.time_order(found[0]))), end
-
-    async def _reply(self, pending: Any) -> Any:
-        return await pending
 
 
 async def event_stream(follower: Follower, heartbeat: float, open_streams: Gauge) -> AsyncIterator[bytes]:

@@ -32,7 +32,7 @@ router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
         content={"text/event-stream": {"schema": {"$ref": "#/components/schemas/EventRecord"}}},
     )
     | answer(204, "No events follow `Last-Event-ID`; do not reconnect.")
-    | problems("job_not_found", "cursor_invalid"),
+    | problems("job_not_found", "cursor_invalid", "too_many_followers"),
 )
 async def follow_events(
     service: Shared,
@@ -50,6 +50,16 @@ async def follow_events(
             "The Last-Event-ID is not one that this service has issued.",
             advice="Send the id of an event unchanged, or leave the header out to begin with the first "
             "event.",
+        )
+    most = service.settings.max_event_streams
+    if (count := service.feed.followers) >= most:
+        raise ProblemError(
+            "too_many_followers",
+            f"{count} clients follow events on this server process, and it takes {most} at most "
+            "(SPLATMILL_MAX_EVENT_STREAMS).",
+            advice="Ask for the job with GET /v1/jobs/{id} every few seconds instead, or start another API process.",
+            facts={"followers": count, "limit": most},
+            headers={"Retry-After": "10"},
         )
     headers = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
     try:

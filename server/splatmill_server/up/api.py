@@ -8,7 +8,7 @@ import sys
 
 import uvicorn
 
-from splatmill_server.__main__ import Server, configure_logging
+from splatmill_server.__main__ import Server, allow_open_files, configure_logging
 from splatmill_server.app import create_app
 from splatmill_server.settings import Settings
 
@@ -19,6 +19,7 @@ STOP_SECONDS = 3
 def main(descriptor: int) -> None:
     """Serve on the listening socket with this file descriptor until a signal arrives."""
     configure_logging()
+    allow_open_files()
     listener = socket.socket(fileno=descriptor)
     address = listener.getsockname()
     # The supervisor has opened the socket; whether other machines reach it does not follow from SPLATMILL_HOST.
