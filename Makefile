@@ -19,7 +19,7 @@ WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 1)))
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: help install demo quick test coverage check wheels docs screenshots bench soak serve sanitize clean
+.PHONY: help install demo quick test coverage check wheels docs screenshots bench soak capacity serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -61,6 +61,9 @@ bench: install ## error against run time: kernels, functions, stability, worst i
 
 soak: $(VENV)/.installed-dev ## faults at random moments against the whole service (STORAGE=s3, SOAK_ARGS="--faults 30"; half an hour)
 	$(BIN)/splatmill bench soak --storage $(or $(STORAGE),folder) $(SOAK_ARGS)
+
+capacity: $(VENV)/.installed-dev ## pages, memory and start of a service with a hundred thousand records (CAPACITY_ARGS="--records 2000")
+	$(BIN)/splatmill bench capacity $(CAPACITY_ARGS)
 
 serve: install ## the whole service on this machine; Ctrl-C ends it
 	@$(BIN)/splatmill up

@@ -1,0 +1,55 @@
+"""The table of `bench capacity`, from its rows."""
+
+from pathlib import Path
+
+from _rows import Row, footer, lines
+
+HEAD = """# Capacity
+
+What captures, jobs and models cost the service in their thousands, and clients that follow events. `splatmill bench
+capacity` writes the rows (`results/capacity.jsonl`) and this page. Storage is a folder, Redis and the API are
+processes on the machine named below. Operations of storage are calls: a listing counts once.
+"""
+
+
+def write_table(rows_at: Path, page: Path) -> None:
+    """Write the page for the newest rows of the largest number of records."""
+    rows = lines(rows_at)
+    if not rows:
+        return
+    largest = max(row["records"] for row in rows)
+    newest: dict[tuple[str, ...], Row] = {}
+    for row in rows:
+        if row["records"] == largest:
+            newest[row["what"], row.get("list", ""), row.get("where", "")] = row
+    chosen = list(newest.values())
+    text = [HEAD, f"{largest} captures, {largest} jobs, about {0.89 * largest:.0f} models.", ""]
+    text += ["| a page of 50 | ms | round trips | storage | found | ms at first | storage at first |"]
+    text += ["|---|---:|---:|---:|---:|---:|---:|"]
+    text += [
+        f"| {row['list']}: {row['where']} | {1000 * row['seconds']:.0f} | {row['round_trips']} | {row['storage']} "
+        f"| {row['found']} | {1000 * row['first_seconds']:.0f} | {row['first_storage']} |"
+        for row in chosen
+        if row["what"] == "page"
+    ]
+    text += ["", "| what | seconds | round trips | storage |", "|---|---:|---:|---:|"]
+    text += [
+        f"| {row['what']} | {row['seconds']:.2f} | {row.get('round_trips', '')} | {row.get('storage', '')} |"
+        for row in chosen
+        if row["what"] != "page" and "seconds" in row and "followers" not in row
+    ]
+    text += ["", "| Redis | MB | bytes for each job, with its capture and model |", "|---|---:|---:|"]
+    text += [
+        f"| {row['what']} | {row['bytes'] / 1e6:.0f} | {row['bytes'] / largest:.0f} |"
+        for row in chosen
+        if "bytes" in row
+    ]
+    text += [
+        f"\n{row['followers']} clients followed one job: {row['told_everything']} were told everything. The "
+        f"{row['event_seconds']:.0f} seconds of events took {row['seconds']:.1f} s with connecting, "
+        f"{row['cpu_seconds']:.1f} CPU seconds of the API process and {row['bytes_each'] / 1000:.0f} kB for each "
+        f"client; Redis had {row['redis_connections']} connections."
+        for row in chosen
+        if "followers" in row
+    ]
+    page.write_text("\n".join([*text, "", footer(chosen), ""]))

@@ -1,0 +1,208 @@
+"""What a hundred thousand captures, jobs and models cost: pages of lists, memory of Redis, start-up, followers.
+
+    splatmill bench capacity                     # a hundred thousand of each, a thousand followers; some ten minutes
+    splatmill bench capacity --records 2000 --followers 100
+    splatmill bench capacity --table             # the table again, from the rows
+
+Records are seeded as the service stores them (`_capacity/seed.py`). Redis is a process of its own, storage a folder. A
+page is asked of the app in this process, where its operations are counted; the rest is measured on a server process.
+Rows go to results/capacity.jsonl, the table to capacity.md.
+
+Expected before it was measured: a page takes 2 to 3 round trips and under 100 ms anywhere in a list; an ended job and
+its model take under 10 kB; lists are made at some thousand records a second, bound by the parsing of records.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import httpx
+import psutil
+from _capacity.followers import Served, follow_all
+from _capacity.operations import counted
+from _capacity.seed import FIRST, Seeded, seed
+from _capacity.table import write_table
+from _rows import Row, append, origin
+
+from splatmill.backplane import keys, memory
+from splatmill.backplane.connection import connect
+from splatmill.backplane.storage import Storage
+from splatmill_server.app import create_app
+from splatmill_server.paging import write_cursor
+from splatmill_server.service import Service
+from splatmill_server.settings import Settings
+from splatmill_server.up.redis_server import find
+
+HERE = Path(__file__).resolve().parent
+ROWS = HERE / "results" / "capacity.jsonl"
+
+PAGE = 50
+REPEATS = 5
+
+
+def main(argv: list[str]) -> int:
+    """Measure, and write rows and table."""
+    parser = argparse.ArgumentParser(
+        prog="splatmill bench capacity",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--records", type=int, default=100_000, help="of each kind (default: 100000)")
+    parser.add_argument("--followers", type=int, default=1000, help="of events (default: 1000)")
+    parser.add_argument("--table", action="store_true", help="write the table from the rows")
+    asked = parser.parse_args(argv)
+    if not asked.table:
+        with tempfile.TemporaryDirectory(prefix="capacity") as name, _redis(Path(name)) as url:
+            for row in measure(Path(name), url, asked.records, asked.followers):
+                print(row, flush=True)
+                append(ROWS, {**row, **origin("server", "client")})
+    write_table(ROWS, HERE / "capacity.md")
+    return 0
+
+
+def measure(folder: Path, redis_url: str, records: int, followers: int) -> Iterator[Row]:
+    """Yield a row for each thing that is measured, over `records` captures, jobs and models in an empty folder."""
+    settings = Settings(redis_url=redis_url, data=folder, access_log=False)
+    began = time.perf_counter()
+    seeded = seed(Storage(settings.storage), records)
+    about = {"records": records}
+    yield {**about, "what": "seeding", "seconds": time.perf_counter() - began}
+    app = create_app(settings)
+    service: Service = app.state.service
+    yield {**about, **_timed("lists made from storage", service, lambda: service.lists.ensure(0.0))}
+    yield {**about, **_memory("after the lists were made", service)}
+    service.redis.delete(keys.RESTORED)  # no worker claims them
+    yield {**about, **_timed("first look of the reaper", service, service.reaper.tick)}
+    yield {**about, **_timed("each later look of the reaper", service, service.reaper.tick)}
+    for row in asyncio.run(_pages(app, service, seeded)):
+        yield {**about, **row}
+    yield {**about, **_memory("after each model was listed", service)}
+    service.redis.close()
+    for what, emptied in (("start with its lists", False), ("start with an empty Redis", True)):
+        with connect(redis_url) as connection:
+            if emptied:
+                connection.flushall()
+        began = time.perf_counter()
+        with _server(settings) as served:
+            ready = time.perf_counter() - began
+            while served.http.get("/v1/jobs", params={"limit": PAGE}).status_code != 200:
+                time.sleep(0.05)
+            row = {"seconds": ready, "first_page": time.perf_counter() - began}
+            yield {**about, "what": what, **row}
+    with _server(settings) as served:
+        yield {**about, "what": "followers", **follow_all(served, redis_url, followers)}
+
+
+async def _pages(app: Any, service: Service, seeded: Seeded) -> list[Row]:
+    """Time and count pages at the beginning, in the middle and at the end of each list."""
+    count = len(seeded.captures)
+    rows = []
+    transport = httpx.ASGITransport(app=app)
+    async with httpx.AsyncClient(transport=transport, base_url="http://localhost", timeout=600) as http:
+        for kind in ("captures", "jobs", "models"):
+            for where, after in (("first", None), ("middle", count // 2), ("last", PAGE)):
+                rows.append(await _page(http, service, kind, where, {}, after))
+            rows.append(await _page(http, service, kind, "of an owner", {"owner": "owner3"}, None))
+            rows.append(await _page(http, service, kind, "of a rare name", {"name": f" {count - 7}"}, None))
+        for state in ("queued", "failed", "succeeded", "training"):
+            rows.append(await _page(http, service, "jobs", state, {"state": state}, None))
+        capture = {"capture": seeded.captures[count // 3]}
+        rows.append(await _page(http, service, "jobs", "on a capture", capture, None))
+    return rows
+
+
+async def _page(
+    http: httpx.AsyncClient, service: Service, kind: str, where: str, asked: dict[str, str], after: int | None
+) -> Row:
+    """Ask for a page once for its first reading, and several times for its time and its operations."""
+    params: dict[str, Any] = {"limit": PAGE, **asked}
+    if after is not None:
+        params["cursor"] = write_cursor(int((FIRST.timestamp() + after) * 1000), f"{after:016x}")
+    with counted(service.storage) as cold:
+        began = time.perf_counter()
+        (await http.get(f"/v1/{kind}", params=params)).raise_for_status()
+        first = time.perf_counter() - began
+    seconds = []
+    for _ in range(REPEATS):
+        with counted(service.storage) as operations:
+            began = time.perf_counter()
+            answer = (await http.get(f"/v1/{kind}", params=params)).raise_for_status().json()
+            seconds.append(time.perf_counter() - began)
+    return {
+        "what": "page",
+        "list": kind,
+        "where": where,
+        "found": len(answer[kind]),
+        "seconds": median(seconds),
+        "round_trips": operations.round_trips,
+        "storage": sum(operations.storage.values()),
+        "first_seconds": first,
+        "first_storage": sum(cold.storage.values()),
+    }
+
+
+def _timed(what: str, service: Service, act: Any) -> Row:
+    """Time something, and count its operations."""
+    with counted(service.storage) as operations:
+        began = time.perf_counter()
+        act()
+        seconds = time.perf_counter() - began
+    found = {"round_trips": operations.round_trips, "storage": sum(operations.storage.values())}
+    return {"what": what, "seconds": seconds, **found}
+
+
+def _memory(when: str, service: Service) -> Row:
+    """Return the memory of Redis."""
+    return {"what": f"memory {when}", "bytes": memory.read(service.redis).used}
+
+
+@contextmanager
+def _redis(folder: Path) -> Iterator[str]:
+    """Run a Redis in a folder."""
+    path = folder / "r.sock"
+    command = [str(find()[0]), "--port", "0", "--unixsocket", str(path), "--save", "", "--dir", str(folder)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    try:
+        while not path.exists():
+            time.sleep(0.02)
+        yield f"unix://{path}"
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+@contextmanager
+def _server(settings: Settings) -> Iterator[Served]:
+    """Run an API process until it is ready."""
+    environment = os.environ | {"REDIS_URL": settings.redis_url, "SPLATMILL_DATA": str(settings.data)}
+    path = settings.data / "api.sock"
+    command = [sys.executable, "-m", "splatmill_server", "--uds", str(path)]
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
+    transport = httpx.HTTPTransport(uds=str(path))
+    try:
+        with httpx.Client(transport=transport, base_url="http://localhost", timeout=600) as http:
+            while not _listens(path) or http.get("/readyz").status_code != 200:
+                if process.poll() is not None:
+                    raise RuntimeError(f"The API process ended with status {process.returncode}.")
+                time.sleep(0.02)
+            yield Served(http, path, psutil.Process(process.pid))
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+def _listens(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX) as probe:
+        return probe.connect_ex(str(path)) == 0

@@ -1,0 +1,33 @@
+"""`bench capacity` with few records: every row is measured on the real service, and the table holds them.
+
+Not proved here: seconds and bytes at a hundred thousand records (server/bench/capacity.md has them).
+"""
+
+from pathlib import Path
+
+import capacity
+import pytest
+from _capacity import followers, table
+from _rows import append
+
+pytestmark = pytest.mark.slow
+
+
+def test_every_row_is_measured_and_written(
+    redis_url: str, connection: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(followers, "EVENTS", 3)
+    origin = {"commit": "c", "machine": "m", "versions": {"python": "3"}}
+    rows = [{**row, **origin} for row in capacity.measure(tmp_path, redis_url, 60, 20)]
+    pages = [row for row in rows if row["what"] == "page"]
+    assert len(pages) == 20
+    assert {row["storage"] for row in pages} == {0}
+    assert max(row["round_trips"] for row in pages) <= 10
+    (followed,) = (row for row in rows if row["what"] == "followers")
+    assert (followed["followers"], followed["told_everything"]) == (20, 20)
+    for row in rows:
+        append(tmp_path / "rows.jsonl", row)
+    table.write_table(tmp_path / "rows.jsonl", tmp_path / "capacity.md")
+    text = (tmp_path / "capacity.md").read_text()
+    assert "| jobs: of an owner |" in text
+    assert "20 clients followed one job: 20 were told everything." in text
