@@ -44,6 +44,9 @@ from splatmill_server.webhooks.records import Webhooks
 CHECK_SECONDS = 5.0
 """Seconds for which a check of storage holds: everybody may request `/readyz`, and each check writes a file."""
 
+_CHECK_WAIT = 1.0
+"""Seconds that a request waits for the check of another one, which a storage that does not answer may hold up."""
+
 
 class StorageCheck:
     """Checks by a write whether storage can be used, at most once in CHECK_SECONDS."""
@@ -56,7 +59,9 @@ class StorageCheck:
 
     def result(self) -> str:
         """Return "ok" or what is wrong, as of the last check."""
-        with self._lock:
+        if not self._lock.acquire(timeout=_CHECK_WAIT):
+            return "Storage does not answer: a check of it has not ended."
+        try:
             if time.monotonic() - self._checked >= CHECK_SECONDS:
                 try:
                     self._storage.check()
@@ -65,6 +70,8 @@ class StorageCheck:
                     self._result = str(error)
                 self._checked = time.monotonic()
             return self._result
+        finally:
+            self._lock.release()
 
 
 @dataclass

@@ -1,4 +1,5 @@
-"""What docker-compose.yml promises: no rights, no secret where none is needed, and no way in but the API's port."""
+"""What docker-compose.yml promises: no rights, no secret where none is needed, and no way in but the API's port; and
+what docker-compose.s3.yml adds to it. Not proved here: that Docker reads them."""
 
 from __future__ import annotations
 
@@ -8,10 +9,13 @@ from typing import Any
 import pytest
 import yaml
 
+from splatmill.schema.quantities import parse_duration
+from splatmill_worker.service.rq_worker import STOP_GRACE
 from tests.support.wheels import ROOT
 
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
+BUCKET: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.s3.yml").read_text())
 
 
 @pytest.mark.parametrize("name", SERVICES)
@@ -56,3 +60,34 @@ def test_what_reads_strangers_files_has_no_way_out() -> None:
 
 def test_the_renderer_cannot_write_to_the_data() -> None:
     assert SERVICES["renderer"]["volumes"] == ["data:/data:ro"]
+
+
+@pytest.mark.parametrize("name", ["worker", "worker-cuda"])
+def test_a_worker_has_the_time_that_it_gives_a_job_to_store_its_checkpoint(name: str) -> None:
+    granted = parse_duration(SERVICES[name]["stop_grace_period"])
+    assert granted >= STOP_GRACE + 10
+    said = f"{STOP_GRACE:.0f} seconds"
+    assert f"gives its job {said} to store a checkpoint" in (ROOT / "docker-compose.yml").read_text()
+    assert f"for which it has {said}" in (ROOT / "docs/serving.md").read_text()
+
+
+def test_a_bucket_is_known_to_all_who_use_storage_and_reached_by_a_network_of_its_own() -> None:
+    using = {
+        name for name, service in SERVICES.items() if "SPLATMILL_STORAGE" in service.get("environment", {})
+    }
+    assert using == {"server", "worker", "worker-cuda", "renderer"}
+    assert set(BUCKET["services"]) == using
+    for name, added in BUCKET["services"].items():
+        environment = added["environment"]
+        assert environment["SPLATMILL_STORAGE"].startswith("${SPLATMILL_STORAGE:?")
+        # Without a value here, those of .env or the shell are passed on, if there are any.
+        assert [environment[key] for key in ("AWS_REGION", "AWS_ENDPOINT_URL", "AWS_SESSION_TOKEN")] == [
+            None
+        ] * 3
+        assert {"AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"} <= set(environment)
+        assert "REDIS" not in json.dumps(environment)
+        assert added.get("networks", ["bucket"]) == ["bucket"]
+        open_already = "public" in SERVICES[name]["networks"]
+        assert ("networks" in added) is not open_already
+    assert list(BUCKET["networks"]) == ["bucket"]
+    assert BUCKET["networks"]["bucket"] is None, "it is not internal"

@@ -1,28 +1,45 @@
-"""Storage on a local folder: atomic writes, ranges, listing, and errors as sentences.
+"""Storage in a folder and in a bucket (moto's server): atomic writes, ranges, listing, and errors as sentences.
 
-Not proved here: S3. A bucket runs in test_partial_uploads.
+Not proved here: a bucket that fails (test_bucket), and other servers of the S3 protocol than moto's.
 """
 
 import asyncio
 import os
+import secrets
 import subprocess
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage, StorageError
+from tests.support.bucket import bucket
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[str]:
+    with bucket() as url:
+        yield url
 
 
 @pytest.fixture
-def storage(tmp_path: Path) -> Storage:
+def folder(tmp_path: Path) -> Storage:
     return Storage((tmp_path / "s").as_uri())
 
 
+@pytest.fixture(params=["folder", "bucket"])
+def storage(request: pytest.FixtureRequest) -> Storage:
+    """An empty storage of each kind."""
+    if request.param == "folder":
+        return request.getfixturevalue("folder")  # type: ignore[no-any-return]  # pytest leaves it untyped
+    return Storage(f"{request.getfixturevalue('s3')}/{secrets.token_hex(8)}")
+
+
 def files(storage: Storage) -> list[str]:
-    assert storage.root is not None
+    if storage.root is None:
+        return [entry.path for entry in storage.entries("")]
     return sorted(str(p.relative_to(storage.root)) for p in storage.root.rglob("*") if p.is_file())
 
 
@@ -54,6 +71,26 @@ def test_only_the_first_of_two_new_files_is_stored(storage: Storage) -> None:
     assert storage.put_new("x", b"1")
     assert not storage.put_new("x", b"2")
     assert storage.get("x") == b"1"
+
+
+def test_a_file_moves_with_its_bytes(storage: Storage) -> None:
+    storage.put("incoming/token", b"bytes")
+    storage.rename("incoming/token", "files/images/ü b.jpg")
+    assert files(storage) == ["files/images/ü b.jpg"]
+    assert storage.get("files/images/ü b.jpg") == b"bytes"
+    with pytest.raises(FileNotFoundError):
+        storage.rename("incoming/token", "other")
+
+
+def test_a_walk_and_children_see_what_a_listing_sees(storage: Storage) -> None:
+    paths = [f"captures/{'abc'[i % 3]}/files/{i:02}" for i in range(9)]
+    for path in paths:
+        storage.put(path, b"x")
+    assert [entry.path for entry in storage.entries("captures")] == sorted(paths)
+    assert {entry.path for entry in storage.walk("")} == set(paths)
+    assert storage.children("captures") == ["a", "b", "c"]
+    storage.check()
+    assert len(files(storage)) == 9
 
 
 def test_a_stream_that_breaks_leaves_nothing(storage: Storage) -> None:
@@ -96,15 +133,15 @@ def test_a_failed_download_leaves_nothing(storage: Storage, tmp_path: Path) -> N
     assert list((tmp_path / "folder").iterdir()) == []
 
 
-def test_errors_are_sentences_without_a_dump(storage: Storage) -> None:
-    storage.put("file", b"x")
+def test_errors_are_sentences_without_a_dump(folder: Storage) -> None:
+    folder.put("file", b"x")
     with pytest.raises(StorageError) as caught:
-        storage.put("file/below", b"x")
+        folder.put("file/below", b"x")
     text = str(caught.value)
     assert "could not write file/below" in text
     assert "\n" not in text
     assert "Debug source" not in text
-    assert storage.get("file") == b"x"
+    assert folder.get("file") == b"x"
 
 
 @pytest.mark.parametrize(
@@ -116,12 +153,12 @@ def test_only_ids_reach_paths(text: str) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become a user without the right to write")
-def test_what_only_reads_needs_no_right_to_write(storage: Storage, tmp_path: Path) -> None:
-    storage.put("models/a.ply", b"bytes")
-    assert storage.root is not None
-    for folder in (tmp_path, *tmp_path.parents):
-        if folder.stat().st_mode & 0o077 == 0:
-            folder.chmod(0o755)  # pytest makes the folders that hold it for its user alone
+def test_what_only_reads_needs_no_right_to_write(folder: Storage, tmp_path: Path) -> None:
+    folder.put("models/a.ply", b"bytes")
+    assert folder.root is not None
+    for above in (tmp_path, *tmp_path.parents):
+        if above.stat().st_mode & 0o077 == 0:
+            above.chmod(0o755)  # pytest makes the folders that hold it for its user alone
     program = """
 import os, sys
 from splatmill.backplane.storage import Storage, StorageError
@@ -133,7 +170,7 @@ except StorageError as error:
 print(Storage(sys.argv[1], read_only=True).get("models/a.ply"))
 """
     told = subprocess.run(
-        [sys.executable, "-c", program, storage.url], capture_output=True, text=True, check=True
+        [sys.executable, "-c", program, folder.url], capture_output=True, text=True, check=True
     )
-    assert f"{storage.root} is not writable by this user" in told.stdout
+    assert f"{folder.root} is not writable by this user" in told.stdout
     assert told.stdout.splitlines()[-1] == "b'bytes'"

@@ -3,6 +3,7 @@
 captures/{id}/capture.json                  record of the capture
 captures/{id}/files/{role}/{name}           uploaded file; role is images, masks or poses, name a `safe_name`
 captures/{id}/sha256/{role}/{name}          hex digest of that file; written first, so that it claims the name
+captures/{id}/manifest.json                 the digests of all files, in one file; it can be made again
 captures/{id}/incoming/{token}              upload in progress; renamed into files/ when complete
 captures/{id}/uploads/{upload}/record.json  upload that arrives in several requests: what it will be
 captures/{id}/uploads/{upload}/part         its bytes so far, in a local folder
@@ -56,6 +57,10 @@ MODEL_FOLDERS = {
 """The folders that a model may have: the names of the files in them, and their media type."""
 
 
+MANIFEST = "manifest.json"
+"""The name of the file with the digests of all files of a capture."""
+
+
 def model_media_type(name: str) -> str | None:
     """Return the media type of a file that a model may have, as "model.ply" or "held_out/000.webp"; None for any other
     name, which must not become part of a path."""
@@ -80,9 +85,14 @@ def folder_of(path: str) -> tuple[str, str, str] | None:
 
 
 def is_derived(kind: str, inside: str) -> bool:
-    """Return whether a path inside of a folder can be made again: a capture's reconstruction, a job's work files, or a
-    model's conversions to other formats."""
-    return (kind, inside.partition("/")[0]) in (("captures", "sfm"), ("jobs", "work"), ("models", "formats"))
+    """Return whether a path inside of a folder can be made again: a capture's reconstruction and manifest, a job's work
+    files, or a model's conversions to other formats."""
+    return (kind, inside.partition("/")[0]) in (
+        ("captures", "sfm"),
+        ("captures", MANIFEST),
+        ("jobs", "work"),
+        ("models", "formats"),
+    )
 
 
 def digest_of(path: str) -> tuple[str, str] | None:
@@ -119,6 +129,10 @@ def capture_file(capture_id: str, role: Role, name: str) -> str:
 
 def capture_digest(capture_id: str, role: Role, name: str) -> str:
     return f"captures/{capture_id}/sha256/{role}/{name}"
+
+
+def capture_manifest(capture_id: str) -> str:
+    return f"captures/{capture_id}/{MANIFEST}"
 
 
 def capture_incoming(capture_id: str, token: str | None = None) -> str:

@@ -14,7 +14,8 @@ from collections.abc import AsyncIterator, Iterator
 from typing import Protocol
 
 from splatmill.backplane import layout
-from splatmill.backplane.storage import CHUNK, Storage, storage_errors
+from splatmill.backplane.storage import CHUNK, Storage
+from splatmill.backplane.storage_errors import storage_errors
 from splatmill.files import sync_to_disk
 
 

@@ -1,48 +1,47 @@
 """Storage of captures, checkpoints and models through obstore: a local folder or an S3-compatible bucket.
 
 Every write is atomic: a reader sees the old file, the new one, or none. Paths are those of
-`splatmill.backplane.layout`. The synchronous methods are for workers and threads. The asynchronous ones (`stream_*`)
-let the API pass files through without holding them in memory.
+`splatmill.backplane.layout`. The synchronous methods are for workers and threads; at most SLOTS of these wait for a
+bucket. The asynchronous ones (`stream_*`) let the API pass files through without holding them in memory, and hold no
+thread.
 """
 
+import asyncio
 import os
 import re
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
 import obstore
-from obstore.exceptions import AlreadyExistsError, BaseError
-from obstore.store import LocalStore, ObjectStore, from_url
+from obstore.exceptions import AlreadyExistsError
+from obstore.store import LocalStore, ObjectStore
 
+from splatmill.backplane.bucket import BLOCK, Patience, Resumption, open_bucket
 from splatmill.backplane.redact import redacted
+from splatmill.backplane.slots import NoSlot, Slots
+from splatmill.backplane.storage_errors import StorageBusyError, StorageStalledError, storage_errors
+from splatmill.backplane.storage_errors import StorageError as StorageError
+from splatmill.backplane.storage_errors import StorageFullError as StorageFullError
 from splatmill.files import replacing
-
-if TYPE_CHECKING:  # These names exist in its stubs alone.
-    from obstore.store import ClientConfig, RetryConfig
 
 CHUNK = 1 << 20
 """Bytes per piece of a streamed file. A transfer holds a few of them in memory."""
 
-_S3_RETRY: "RetryConfig" = {"max_retries": 4, "retry_timeout": timedelta(seconds=20)}
-"""By default, obstore retries for three minutes, which is longer than a client of the API waits."""
+SLOTS = 24
+"""Threads of a process that may wait for a bucket. The API has 40, so that 16 are left for what needs no storage."""
 
-_FULL = ("os error 28", "os error 122", "os error 27", "No space left", "QuotaExceeded", "StorageFull")
+_SMALL = 256 * 1024
+"""Bytes up to which a file is written with the patience for small requests."""
 
+_CONCURRENT_BLOCKS = 4
+_DELETED_AT_ONCE = 1000
 
 _STAGED = re.compile(r"#\d+\Z", re.ASCII)
-
-
-class StorageError(Exception):
-    """Storage cannot be read or written. The message says what was tried, and the reason."""
-
-
-class StorageFullError(StorageError):
-    """Storage is full (disk, quota or file size limit). Nothing was stored."""
 
 
 @dataclass(frozen=True)
@@ -68,23 +67,44 @@ class Storage:
     environment variables. Raises StorageError if it cannot be opened.
 
     read_only: for a process that only reads, and need not have the right to write to the folder.
+    patience: how long a bucket may take.
     """
 
-    def __init__(self, url: str, *, read_only: bool = False) -> None:
+    def __init__(self, url: str, *, read_only: bool = False, patience: Patience | None = None) -> None:
         self.url = url
         self.root: Path | None = None
+        self._patience = patience or Patience()
+        self._slots: Slots | None = None
         parts = urlsplit(url)
         if parts.scheme in ("", "file"):
             self.root = Path(unquote(parts.path)).expanduser().absolute()
             _check_folder(self.root, read_only)
             # A folder is removed with its last file, so that a deleted capture leaves no empty folders.
             self.store: ObjectStore = LocalStore(self.root, automatic_cleanup=True)
+            self.bulk: ObjectStore = self.store
         elif parts.scheme == "s3":
-            self.store = from_url(url, client_options=_s3_client(), retry_config=_S3_RETRY)
+            self.store, self.bulk = open_bucket(url, self._patience)
+            self._slots = Slots(SLOTS, self._patience.slot)
         else:
             raise StorageError(
                 f"SPLATMILL_STORAGE={redacted(url)!r} is neither file:///folder nor s3://bucket/prefix; set it to one."
             )
+
+    @contextmanager
+    def _operation(self, verb: str, path: str) -> Iterator[None]:
+        """Hold a slot of the bucket, and convert the errors of an operation."""
+        if self._slots is None:
+            with storage_errors(verb, path):
+                yield
+            return
+        try:
+            with self._slots.taken(), storage_errors(verb, path):
+                yield
+        except NoSlot:
+            raise StorageBusyError(
+                f"Storage does not answer: {self._slots.count} operations wait for it, so it was not asked to {verb} "
+                f"{path}. Try again in some seconds."
+            ) from None
 
     def local_path(self, path: str) -> Path | None:
         """Return the local path of `path`, or None if storage is remote. The file need not exist."""
@@ -92,7 +112,7 @@ class Storage:
 
     def head(self, path: str) -> Entry | None:
         """Return the entry at `path`, or None if there is none."""
-        with storage_errors("read", path):
+        with self._operation("read", path):
             try:
                 return _entry(obstore.head(self.store, path))
             except FileNotFoundError:
@@ -103,51 +123,81 @@ class Storage:
 
     def get(self, path: str, start: int = 0, end: int | None = None) -> bytes:
         """Return the bytes [start, end) of a file, all in memory. Raises FileNotFoundError."""
-        with storage_errors("read", path):
+        with self._operation("read", path):
             if start == 0 and end is None:
                 return bytes(obstore.get(self.store, path).bytes())
             stop = end if end is not None else obstore.head(self.store, path)["size"]
             return bytes(obstore.get_range(self.store, path, start=start, end=stop))
 
     def put(self, path: str, data: bytes | Path) -> None:
-        """Store bytes, or a local file, which is streamed. An existing file is replaced."""
-        with storage_errors("write", path):
-            obstore.put(self.store, path, data)
+        """Store bytes, or a local file, which is streamed, in blocks if it is large. An existing file is replaced."""
+        small = isinstance(data, bytes) and len(data) <= _SMALL
+        with self._operation("write", path):
+            obstore.put(
+                self.store if small else self.bulk,
+                path,
+                data,
+                chunk_size=BLOCK,
+                max_concurrency=_CONCURRENT_BLOCKS,
+            )
 
     def put_new(self, path: str, data: bytes) -> bool:
-        """Store bytes if `path` is free; return False if it is not. Of several writers, exactly one succeeds."""
-        with storage_errors("write", path):
+        """Store bytes if `path` is free; return False if it is not. Of several writers, at most one succeeds.
+
+        Where a bucket stores the bytes and breaks the connection before its answer, the repetition finds them there:
+        the result is then False, and the bytes at `path` are these.
+        """
+        with self._operation("write", path):
             try:
-                obstore.put(self.store, path, data, mode="create")
+                obstore.put(self.store if len(data) <= _SMALL else self.bulk, path, data, mode="create")
             except AlreadyExistsError:
                 return False
             return True
 
     async def stream_put(self, path: str, chunks: AsyncIterator[bytes]) -> None:
-        """Store the bytes that `chunks` yields. If it raises, nothing is stored and the exception is passed on."""
+        """Store the bytes that `chunks` yields. If it raises, nothing is stored and the exception is passed on.
+
+        The file appears once `chunks` has ended. A bucket gets what fits into one block in one request.
+        """
         with storage_errors("write", path):
-            await obstore.put_async(self.store, path, chunks, chunk_size=8 * CHUNK, max_concurrency=2)
+            if self.root is None:
+                first, ended = await _first_block(chunks)
+                if ended:
+                    await obstore.put_async(self.bulk, path, first, use_multipart=False)
+                    return
+                chunks = _joined(first, chunks)
+            await obstore.put_async(self.bulk, path, chunks, chunk_size=BLOCK, max_concurrency=2)
 
     async def stream_get(self, path: str, start: int = 0, end: int | None = None) -> AsyncIterator[bytes]:
-        """Yield the bytes [start, end) in pieces of about CHUNK. Raises FileNotFoundError before the first piece."""
-        with storage_errors("read", path):
-            if end is not None:
-                result = await obstore.get_async(self.store, path, options={"range": (start, end)})
-            elif start:
-                result = await obstore.get_async(self.store, path, options={"range": {"offset": start}})
-            else:
-                result = await obstore.get_async(self.store, path)
-            async for chunk in result.stream(min_chunk_size=CHUNK):
-                yield bytes(chunk)
+        """Yield the bytes [start, end) in pieces of about CHUNK. Raises FileNotFoundError before the first piece.
+
+        A reading that breaks off goes on behind the last piece, as long as it makes progress. A reader that is slow
+        delays nothing and holds a few pieces in memory.
+        """
+        reading = Resumption(start, end, self._patience.retries)
+        while True:
+            try:
+                with storage_errors("read", path):
+                    result = await obstore.get_async(self.bulk, path, options=reading.options())
+                    reading.begun(result.meta)
+                    async for chunk in result.stream(min_chunk_size=CHUNK):
+                        reading.took(len(chunk))
+                        yield bytes(chunk)
+                return
+            except StorageError as error:
+                pause = reading.pause(error)
+            if pause is None:
+                return
+            await asyncio.sleep(pause)
 
     def rename(self, source: str, target: str) -> None:
         """Move a file. Raises FileNotFoundError."""
-        with storage_errors("write", target):
-            obstore.rename(self.store, source, target)
+        with self._operation("write", target):
+            obstore.rename(self.bulk, source, target)
 
     def entries(self, prefix: str) -> Iterator[Entry]:
         """Yield all files under the folder `prefix`, sorted by path."""
-        with storage_errors("list", prefix):
+        with self._operation("list", prefix):
             found = [_entry(meta) for page in obstore.list(self.store, prefix) for meta in page]
         yield from sorted(found, key=lambda entry: entry.path)
 
@@ -155,7 +205,7 @@ class Storage:
         """Yield all files under the folder `prefix` in any order, page by page, without holding all in memory."""
         pages = iter(obstore.list(self.store, prefix or None))
         while True:
-            with storage_errors("list", prefix):
+            with self._operation("list", prefix):
                 page = next(pages, None)
             if page is None:
                 return
@@ -164,20 +214,36 @@ class Storage:
 
     def children(self, prefix: str) -> list[str]:
         """Return the names of the folders directly under `prefix`, sorted."""
-        with storage_errors("list", prefix):
+        with self._operation("list", prefix):
             result = obstore.list_with_delimiter(self.store, prefix)
         return sorted(folder.rsplit("/", 1)[-1] for folder in result["common_prefixes"])
 
     def delete(self, path: str) -> None:
         """Delete a file, if it exists."""
-        with storage_errors("delete", path), suppress(FileNotFoundError):
-            obstore.delete(self.store, path)
+        self._delete([path])
 
     def delete_prefix(self, prefix: str) -> int:
         """Delete all files under a folder, and return their number."""
-        paths = [entry.path for entry in self.entries(prefix)]
-        for path in paths:
-            self.delete(path)
+        return self._delete([entry.path for entry in self.entries(prefix)])
+
+    def _delete(self, paths: list[str]) -> int:
+        """Delete files, if they exist, and return how many were named. A bucket deletes a thousand in a request."""
+        if self.root is not None:
+            for path in paths:
+                with self._operation("delete", path), suppress(FileNotFoundError):
+                    obstore.delete(self.store, path)
+            return len(paths)
+        for start in range(0, len(paths), _DELETED_AT_ONCE):
+            some, failures = paths[start : start + _DELETED_AT_ONCE], 0
+            while True:
+                try:
+                    with self._operation("delete", some[0]), suppress(FileNotFoundError):
+                        obstore.delete(self.store, some)
+                    break
+                except StorageStalledError:  # obstore does not know that a deletion may be repeated
+                    failures += 1
+                    if failures > 1:
+                        raise
         return len(paths)
 
     def delete_stale(self, prefix: str, seconds: float) -> int:
@@ -188,8 +254,7 @@ class Storage:
         """
         before = datetime.now(UTC).timestamp() - seconds
         stale = [entry.path for entry in self.entries(prefix) if entry.modified.timestamp() < before]
-        for path in stale:
-            self.delete(path)
+        self._delete(stale)
         staged = [] if self.root is None else (self.root / prefix).glob("*#*")
         left = [path for path in staged if path.stat().st_mtime < before]
         for file in left:
@@ -202,9 +267,7 @@ class Storage:
         entries = list(self.entries(prefix))
         if any(entry.modified.timestamp() >= before for entry in entries):
             return 0
-        for entry in entries:
-            self.delete(entry.path)
-        return len(entries)
+        return self._delete([entry.path for entry in entries])
 
     def delete_staged(self, seconds: float) -> int:
         """Delete the files of all writes that a killed process left unfinished longer ago, and return their number.
@@ -220,10 +283,26 @@ class Storage:
         return deleted
 
     def download(self, path: str, target: Path) -> None:
-        """Copy a stored file to a local path, atomically. Raises FileNotFoundError."""
-        with storage_errors("read", path), replacing(target) as part, part.open("wb") as file:
-            for chunk in obstore.get(self.store, path).stream(min_chunk_size=CHUNK):
-                file.write(chunk)
+        """Copy a stored file to a local path, atomically. Raises FileNotFoundError.
+
+        It goes on after a break, as `stream_get` does.
+        """
+        reading = Resumption(0, None, self._patience.retries)
+        with replacing(target) as part, part.open("wb") as file:
+            while True:
+                try:
+                    with self._operation("read", path):
+                        result = obstore.get(self.bulk, path, options=reading.options())
+                        reading.begun(result.meta)
+                        for chunk in result.stream(min_chunk_size=CHUNK):
+                            file.write(chunk)
+                            reading.took(len(chunk))
+                    return
+                except StorageError as error:
+                    pause = reading.pause(error)
+                if pause is None:
+                    return
+                time.sleep(pause)
 
     def download_prefix(self, prefix: str, folder: Path) -> list[str]:
         """Copy all files under `prefix` to `folder`, except those of the same size already there; return the names."""
@@ -256,25 +335,20 @@ def _check_folder(root: Path, read_only: bool) -> None:
         )
 
 
-@contextmanager
-def storage_errors(verb: str, path: str) -> Iterator[None]:
-    """Convert errors of obstore, which contain Rust debug output, into a StorageError with one sentence."""
-    try:
-        yield
-    except FileNotFoundError:
-        raise
-    except (BaseError, OSError) as error:
-        text = str(error)
-        fact = text.split("\n\nDebug source")[0].strip()
-        if any(sign in text for sign in _FULL):
-            raise StorageFullError(f"Storage is full: it could not {verb} {path} ({fact}).") from error
-        raise StorageError(f"Storage could not {verb} {path}: {fact}.") from error
+async def _first_block(chunks: AsyncIterator[bytes]) -> tuple[bytes, bool]:
+    """Return the first bytes of a stream, BLOCK or more, or all; and whether these are all."""
+    first = bytearray()
+    async for chunk in chunks:
+        first += chunk
+        if len(first) >= BLOCK:
+            return bytes(first), False
+    return bytes(first), True
 
 
-def _s3_client() -> "ClientConfig":
-    """Return options for S3. obstore's default timeout of 30 s includes the body, which is short for a large model."""
-    endpoint = os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or ""
-    return {"connect_timeout": "5s", "timeout": "600s", "allow_http": endpoint.startswith("http://")}
+async def _joined(first: bytes, rest: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    yield first
+    async for chunk in rest:
+        yield chunk
 
 
 def _entry(meta: "obstore.ObjectMeta") -> Entry:

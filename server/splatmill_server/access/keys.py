@@ -21,11 +21,20 @@ from starlette.concurrency import run_in_threadpool
 from splatmill.backplane import layout
 from splatmill.backplane.records import FORMAT, check_format, reason, warn
 from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage_errors import StorageBusyError, StorageStalledError
 from splatmill.schema import CreateKey, Key, KeyWithSecret, Scope, Time
 from splatmill_server.problems import ProblemError
 
 CACHE_SECONDS = 2.0
 """Seconds after which every API process knows of a change to the keys, and so the longest life of a revoked key."""
+
+STALLED_SECONDS = 60.0
+"""Seconds for which the last copy of the keys counts while storage does not answer. Then no key is accepted."""
+
+_WAIT = 1.0
+"""Seconds that requests wait for a reading of the keys, while there is a copy that counts."""
+
+_NO_ANSWER = (StorageStalledError, StorageBusyError)
 
 _SECRET = re.compile(r"smk_([0-9a-f]{16})_[0-9a-f]{64}", re.ASCII)
 
@@ -71,17 +80,31 @@ class Keys:
         self.storage = storage
         self.bootstrap = bootstrap
         self._lock = threading.Lock()
-        self._reading = asyncio.Lock()
+        self._reading: asyncio.Task[None] | None = None
+        self._began = float("-inf")
         self._read_at = float("-inf")
         self._known: dict[str, tuple[str, StoredKey | None]] = {}
 
     async def current(self) -> None:
-        """Read the keys again if the copy is older than CACHE_SECONDS, and raise StorageError where that fails."""
+        """Read the keys again if the copy is older than CACHE_SECONDS, and raise StorageError where that fails.
+
+        While storage does not answer, the copy counts for STALLED_SECONDS: jobs are listed and cancelled without
+        storage.
+        """
         if not self._stale():
             return
-        async with self._reading:
-            if self._stale():
-                await run_in_threadpool(self.read)
+        if self._reading is None or self._reading.done():
+            self._began = time.monotonic()
+            self._reading = asyncio.create_task(run_in_threadpool(self.read))
+            # Nobody may wait for it any more when it fails.
+            self._reading.add_done_callback(lambda task: task.cancelled() or task.exception())
+        counts_for = self._read_at + STALLED_SECONDS - time.monotonic()
+        wait = max(0.0, self._began + _WAIT - time.monotonic()) if counts_for > 0 else None
+        done, _ = await asyncio.wait({self._reading}, timeout=wait)
+        for ended in done:
+            error = ended.exception()
+            if error is not None and not (counts_for > 0 and isinstance(error, _NO_ANSWER)):
+                raise error
 
     def _stale(self) -> bool:
         return time.monotonic() - self._read_at > CACHE_SECONDS

@@ -92,7 +92,7 @@ class PartialUploads:
         self, capture_id: str, role: Role, name: str, length: int | None, sha256: str | None
     ) -> Standing | CaptureFile:
         self.captures.record(capture_id)
-        taken = self.captures.digest_of(capture_id, role, name)
+        taken = self.captures.digests.of(capture_id, role, name)
         if taken is not None and sha256 is not None:
             if taken != sha256:
                 raise name_taken(role, name, taken, sha256)
@@ -238,7 +238,7 @@ class PartialUploads:
         digest, size = await run_in_threadpool(_digest, part)
         try:
             check_whole(digest, size, record.sha256, record.length)
-            taken = await run_in_threadpool(self.captures.digest_of, capture_id, record.role, record.name)
+            taken = await run_in_threadpool(self.captures.digests.of, capture_id, record.role, record.name)
             if taken not in (None, digest):
                 raise name_taken(record.role, record.name, taken, digest)
             file = CaptureFile(role=record.role, name=record.name, size=size, sha256=digest)

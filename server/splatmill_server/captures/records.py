@@ -1,10 +1,10 @@
 """Captures: their records and files. The first bytes stored under a name keep it."""
 
-import asyncio
 import hashlib
 import json
 import secrets
 import shutil
+import time
 from collections.abc import AsyncIterator, Sequence
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
@@ -13,8 +13,9 @@ import structlog
 from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane import keys, layout, lists
+from splatmill.backplane.bucket import BLOCK
 from splatmill.backplane.records import FORMAT, UnreadableRecord, check_format, reason, warn
-from splatmill.backplane.storage import Entry, Storage, StorageError
+from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import (
     DEFAULT_OWNER,
     PHOTO_SUFFIXES,
@@ -30,6 +31,7 @@ from splatmill.schema import (
 )
 from splatmill.schema.formats import is_model_file
 from splatmill.schema.tolerant import keep_readable
+from splatmill_server.captures.digests import Digests
 from splatmill_server.filters import Filter
 from splatmill_server.lists import Lists, each
 from splatmill_server.metrics import Metrics
@@ -38,17 +40,17 @@ from splatmill_server.settings import Settings
 
 log = structlog.get_logger()
 
-_CONCURRENT_READS = 32
 _COUNTED_CAPTURES = 1000
 _LISTED_TOGETHER = 500
+
+_RECENT_SECONDS = 5.0
+"""Seconds for which uploads use a record that was read before. Their end looks whether the capture is still there."""
+
 STALE_SECONDS = 24 * 3600
 """Age at which an unfinished upload counts as abandoned."""
 
 _IDS_OF_KEY = 3
 """Number of ids that the capture of a key may have."""
-
-_CLAIM_SECONDS = 60
-"""Seconds for which a digest without a file counts as an upload that is about to be renamed into place."""
 
 
 class Captures:
@@ -59,6 +61,8 @@ class Captures:
         self.lists = listed
         self.settings = settings
         self.metrics = metrics
+        self.digests = Digests(storage)
+        self._recent: dict[str, tuple[float, Capture]] = {}
         # Number of files per capture, as last seen: listing the folder at each upload would take quadratic time.
         self._counts: dict[str, int] = {}
 
@@ -98,26 +102,25 @@ class Captures:
                 pass
         raise capture_not_found(capture_id)
 
+    def recent(self, capture_id: str) -> Capture:
+        """Return the record as it was at most some seconds ago. Raises as `record` does.
+
+        Nothing in a record changes; the capture may have been deleted since.
+        """
+        read_at, capture = self._recent.get(capture_id, (float("-inf"), None))
+        if capture is None or time.monotonic() - read_at > _RECENT_SECONDS:
+            capture = self.record(capture_id)
+            if len(self._recent) >= _COUNTED_CAPTURES:
+                self._recent.clear()
+            self._recent[capture_id] = time.monotonic(), capture
+        return capture
+
     async def read(self, capture_id: str) -> Capture:
         """Return the record with all files and their digests. Raises a 404 problem."""
         capture = await run_in_threadpool(self.record, capture_id)
         folder = layout.capture_files(capture_id)
         found = await run_in_threadpool(lambda: list(self.storage.entries(folder)))
-        gate = asyncio.Semaphore(_CONCURRENT_READS)
-
-        async def describe(entry: Entry) -> CaptureFile | None:
-            role, _, name = entry.path[len(folder) + 1 :].partition("/")
-            try:
-                async with gate:
-                    digest = await run_in_threadpool(self._digest, capture_id, Role(role), name)
-                if digest:
-                    return CaptureFile(role=Role(role), name=name, size=entry.size, sha256=digest)
-            except ValueError as error:
-                warn(f"{entry.path} is not listed", reason(error))
-            return None
-
-        files = await asyncio.gather(*(describe(entry) for entry in found))
-        return capture.model_copy(update={"files": [file for file in files if file is not None]})
+        return capture.model_copy(update={"files": await self.digests.of_all(capture, found)})
 
     def page(self, cursor: str | None, limit: int, wanted: Filter | None = None) -> CapturePage:
         """Return a page of the captures that `wanted` admits, newest first. Raises the problems of `Lists.page`."""
@@ -189,9 +192,11 @@ class Captures:
             owner = self.record(capture_id).owner
         except UnreadableRecord:
             owner = None
+        self._recent.pop(capture_id, None)
         self.storage.delete(layout.capture_record(capture_id))
         self.storage.delete_prefix(layout.capture(capture_id))
         self._counts.pop(capture_id, None)
+        self._recent.pop(capture_id, None)
         self.unlist(capture_id, owner)
 
     def delete_abandoned_uploads(self) -> int:
@@ -284,43 +289,73 @@ class Captures:
         announced_size: int | None,
     ) -> tuple[CaptureFile, bool]:
         await run_in_threadpool(self.check_room, capture_id, announced_size)
-        taken = await run_in_threadpool(self.digest_of, capture_id, role, name)
+        taken = None
+        if announced_size is None or announced_size > BLOCK:
+            # A smaller body is read before storage gets any of it, and then finds out whether its name is free.
+            taken = await run_in_threadpool(self.digests.of, capture_id, role, name)
         body = _Counted(chunks, self.settings.max_file_bytes)
-        incoming = layout.capture_incoming(capture_id, secrets.token_hex(8))
         empty_allowed = may_be_empty(role, name)
-        begun = await body.begin()
-        if not begun:
-            check_whole(body.digest.hexdigest(), 0, announced_sha256, announced_size, empty_allowed)
+
+        def checked() -> CaptureFile:
+            digest = body.digest.hexdigest()
+            check_whole(digest, body.size, announced_sha256, announced_size, empty_allowed)
+            return CaptureFile(role=role, name=name, size=body.size, sha256=digest)
+
+        if taken is not None:
+            async for _ in body:
+                pass
+            return self._same(checked(), taken), False
+
+        async def claimed() -> AsyncIterator[bytes]:
+            """Pass the bytes on, and claim the name once they are whole: storage shows the file after that."""
+            async for chunk in body:
+                yield chunk
+            if not await run_in_threadpool(self.digests.claim, capture_id, checked()):
+                raise _NameClaimed
+
+        target = layout.capture_file(capture_id, role, name)
         try:
-            if taken is not None:
-                async for _ in body:
-                    pass
-            elif begun:
-                await self.storage.stream_put(incoming, body)
+            if await body.begin():
+                await self.storage.stream_put(target, claimed())
             else:
-                await run_in_threadpool(self.storage.put, incoming, b"")
-            check_whole(body.digest.hexdigest(), body.size, announced_sha256, announced_size, empty_allowed)
-            file = CaptureFile(role=role, name=name, size=body.size, sha256=body.digest.hexdigest())
-            return file, await self.adopt(capture_id, file, incoming, taken)
-        finally:
-            if taken is None:
-                await run_in_threadpool(self.storage.delete, incoming)
+                async for _ in claimed():
+                    pass
+                await run_in_threadpool(self.storage.put, target, b"")
+        except _NameClaimed:
+            taken = await run_in_threadpool(self.digests.claimed, capture_id, role, name)
+            return self._same(checked(), taken), False
+        file = checked()
+        await run_in_threadpool(self._arrived, capture_id, file)
+        return file, True
+
+    def _same(self, file: CaptureFile, taken: str | None) -> CaptureFile:
+        """Return a file whose name is taken by the same bytes. Raises a 409 problem for other bytes."""
+        if taken != file.sha256:
+            raise name_taken(file.role, file.name, taken, file.sha256)
+        return file
 
     async def adopt(self, capture_id: str, file: CaptureFile, incoming: str, taken: str | None) -> bool:
         """Give the bytes at `incoming` their name; return False if the same bytes already have it.
 
         `taken` is the digest of the file that had the name before, or None. Raises a 409 problem for other bytes.
         """
-        new = taken is None and await run_in_threadpool(self._claim, capture_id, file, incoming)
-        stored = (
-            file.sha256 if new else await run_in_threadpool(self._digest, capture_id, file.role, file.name)
-        )
-        if stored != file.sha256:
-            raise name_taken(file.role, file.name, stored, file.sha256)
-        if new:
-            self.metrics.uploaded.inc(file.size)
-            self._counts[capture_id] = self._counts.get(capture_id, 0) + 1
-        return new
+        if taken is None and await run_in_threadpool(self.digests.claim, capture_id, file):
+            target = layout.capture_file(capture_id, file.role, file.name)
+            await run_in_threadpool(self.storage.rename, incoming, target)
+            await run_in_threadpool(self._arrived, capture_id, file)
+            return True
+        self._same(file, await run_in_threadpool(self.digests.claimed, capture_id, file.role, file.name))
+        return False
+
+    def _arrived(self, capture_id: str, file: CaptureFile) -> None:
+        """Count a new file, unless the capture was deleted during the upload: then delete the file, too."""
+        if not self.storage.exists(layout.capture_record(capture_id)):
+            self._recent.pop(capture_id, None)
+            self.storage.delete_prefix(layout.capture(capture_id))
+            raise capture_not_found(capture_id)
+        self.digests.remember(self.recent(capture_id), file)
+        self.metrics.uploaded.inc(file.size)
+        self._counts[capture_id] = self._counts.get(capture_id, 0) + 1
 
     def _in_the_way(self, capture_id: str, role: Role, name: str) -> str | None:
         """Return the name of a stored file that lies above `name` in the folders, or below it."""
@@ -331,50 +366,13 @@ class Captures:
         below = next(iter(self.storage.entries(layout.capture_file(capture_id, role, name))), None)
         return None if below is None else below.path[len(root) + 1 :]
 
-    def _claim(self, capture_id: str, file: CaptureFile, incoming: str) -> bool:
-        """Give an upload its name; return False if another upload has the name.
-
-        The digest is written first, with `put_new`, so that exactly one of two concurrent uploads gets the name. A
-        digest without its file belongs to an upload that is about to be renamed, or was left by a server that died.
-        """
-        path = layout.capture_digest(capture_id, file.role, file.name)
-        target = layout.capture_file(capture_id, file.role, file.name)
-        if not self.storage.put_new(path, file.sha256.encode()):
-            claim = self.storage.head(path)
-            if self.storage.exists(target):
-                return False
-            if self._digest(capture_id, file.role, file.name) != file.sha256:
-                if (
-                    claim is not None
-                    and (datetime.now(UTC) - claim.modified).total_seconds() < _CLAIM_SECONDS
-                ):
-                    return False
-                self.storage.put(path, file.sha256.encode())
-        self.storage.rename(incoming, target)
-        if not self.storage.exists(layout.capture_record(capture_id)):
-            # The capture was deleted during the upload; delete this file too.
-            self.storage.delete_prefix(layout.capture(capture_id))
-            self.record(capture_id)
-        return True
-
-    def digest_of(self, capture_id: str, role: Role, name: str) -> str | None:
-        """Return the digest of the file with this name, or None if the name is free."""
-        digest = self._digest(capture_id, role, name)
-        return digest if digest and self.storage.exists(layout.capture_file(capture_id, role, name)) else None
-
-    def _digest(self, capture_id: str, role: Role, name: str) -> str | None:
-        try:
-            return self.storage.get(layout.capture_digest(capture_id, role, name)).decode()
-        except FileNotFoundError:
-            return None
-
     def check_room(self, capture_id: str, announced_size: int | None, held: int = 0) -> None:
         """Raise a problem if the capture does not exist (404), is full (413), or cannot take a file of this size.
 
         A file may be larger than the limit (413), or than what the disk has left (507). `held` is the number of its
         bytes that are stored already.
         """
-        self.record(capture_id)
+        self.recent(capture_id)
         limit = self.settings.max_files_per_capture
         if capture_id not in self._counts:
             if len(self._counts) >= _COUNTED_CAPTURES:
@@ -399,6 +397,10 @@ class Captures:
                     advice="Delete captures or jobs that are no longer needed, or extend the storage.",
                     facts={"free": free, "needed": needed},
                 )
+
+
+class _NameClaimed(Exception):
+    """Another file has the name of an upload."""
 
 
 class _Counted:

@@ -1,7 +1,6 @@
 """What the jobs that ended with a model took: seconds by stage, read from the reports of the newest models."""
 
 import json
-import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -55,7 +54,6 @@ class Finished:
     def __init__(self, storage: Storage, listed: Lists) -> None:
         self._storage = storage
         self._lists = listed
-        self._lock = threading.Lock()
         self._known: dict[tuple[int, str], Figures | None] = {}
 
     def newest(self) -> list[Figures]:
@@ -64,11 +62,10 @@ class Finished:
         Raises StorageError if storage cannot be read, redis.RedisError, and a 503 problem while lists are being made.
         """
         newest = self._lists.newest([lists.name("models")], None, NEWEST)
-        with self._lock:
-            self._known = {
-                key: self._known[key] if key in self._known else self._read(key[1]) for key in newest
-            }
-            return [found for found in self._known.values() if found is not None]
+        # Without a lock, which a storage that does not answer would hold: two threads may read the same report.
+        known = self._known
+        self._known = read = {key: known[key] if key in known else self._read(key[1]) for key in newest}
+        return [found for found in read.values() if found is not None]
 
     def _read(self, model_id: str) -> Figures | None:
         try:

@@ -167,7 +167,7 @@ async def put_file(
         capture_id,
         size,
         file=f"{role.value}/{name}",
-        is_stored=lambda: service.captures.digest_of(capture_id, role, name) is not None,
+        is_stored=lambda: service.captures.digests.of(capture_id, role, name) is not None,
     ) as arrival:
         file, new = await service.captures.store(
             capture_id,

@@ -21,7 +21,7 @@ def check_capture(service: Service, who: Who, capture_id: str) -> None:
     if who.admin:
         return
     try:
-        owner = service.captures.record(capture_id).owner
+        owner = service.captures.recent(capture_id).owner
     except UnreadableRecord:
         owner = None
     if not who.may_see(owner):

@@ -25,7 +25,8 @@ class Holding(BaseModel):
     bytes: size of all files but `derived`.
     derived: size of what can be made again: a capture's reconstruction, a job's checkpoints, or a model's conversions.
     files: number of files.
-    modified: time of the last write of any file, in seconds since 1970; conversions make a model no younger.
+    modified: time of the last write of any file, in seconds since 1970; conversions make a model no younger, and
+        manifests no capture.
     whole: whether the record is there: `capture.json`, which is written first; `job.json` of a model, which is written
         last; the log of a job that has ended.
     owner: None if nothing says whose it is.
@@ -76,7 +77,7 @@ class _Sums:
         else:
             self.bytes += entry.size
         self.files += 1
-        if not (derived and kind is StoredKind.model):
+        if not (derived and (kind is StoredKind.model or inside == layout.MANIFEST)):
             self.modified = max(self.modified, entry.modified.timestamp())
         self.whole = self.whole or inside == _RECORDS[kind]
 

@@ -106,7 +106,7 @@ class Quota:
         Raises a 404 problem without a capture, and a 507 problem where the quota does not suffice.
         """
         try:
-            owner = (await run_in_threadpool(self.captures.record, capture_id)).owner
+            owner = (await run_in_threadpool(self.captures.recent, capture_id)).owner
         except ProblemError as error:
             raise (error.about_file(file) if file is not None else error) from error
         limit = await run_in_threadpool(self._begin, who, owner)

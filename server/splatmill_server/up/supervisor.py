@@ -23,7 +23,8 @@ WORKER = "splatmill_worker"
 READY_SECONDS = 60.0
 """Time for the service to become ready; a first start may read several hundred megabytes of libraries from disk."""
 
-_WORKER_STOP_SECONDS = 20.0  # a worker writes a checkpoint before it ends
+_STOP_GRACE = 15.0  # seconds for an attempt to write a checkpoint: to this machine, and while somebody waits
+_WORKER_STOP_SECONDS = _STOP_GRACE + 5.0
 _POLL_SECONDS = 0.02  # between two checks whether the service is ready
 _MAX_DEATHS = 5  # of one child before the service is ready
 
@@ -58,7 +59,8 @@ class Supervisor:
             return Child(name, command, environment, lambda: folder.log(name), stop_seconds, **more)
 
         python = sys.executable
-        self.worker = child("worker", [python, "-m", WORKER, "train"], _WORKER_STOP_SECONDS)
+        worker = [python, "-m", WORKER, "train", "--stop-grace", str(_STOP_GRACE)]
+        self.worker = child("worker", worker, _WORKER_STOP_SECONDS)
         renderer = [python, "-m", WORKER, "renderer", "--uds", str(folder.renderer_socket)]
         self.renderer = child("renderer", renderer, 3.0)
         api = [python, "-m", "splatmill_server.up.api", str(listener.fileno())]

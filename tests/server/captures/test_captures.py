@@ -1,7 +1,6 @@
 """Captures over real HTTP into a real folder: names, digests, limits, and what is left after each refusal.
 
-Not proved here: an S3 bucket as storage (the same calls of obstore, but no bucket runs in these tests), and what a
-worker makes of the files.
+Not proved here: a bucket as storage (test_digests), and what a worker makes of the files.
 """
 
 import hashlib
@@ -274,7 +273,7 @@ def test_every_error_of_an_upload_names_its_file(serve: Serve, tmp_path: Path) -
 
     # So it does where storage fails.
     other = app.http.post("/v1/captures", json={}).json()["id"]
-    (tmp_path / "data" / "storage" / "captures" / other / "incoming").write_text("in the way")
+    (tmp_path / "data" / "storage" / "captures" / other / "sha256").write_text("in the way")
     answer = app.http.put(f"/v1/captures/{other}/images/d.jpg", content=PHOTO)
     named(answer, 503, "storage_unavailable", "images/d.jpg")
 

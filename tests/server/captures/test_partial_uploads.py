@@ -86,7 +86,7 @@ def file_of(app: ServedApp, capture_id: str, name: str = "a.mp4") -> bytes:
 def leftovers(app: ServedApp, capture_id: str) -> list[str]:
     """What storage holds of the capture beside its files and the records of complete uploads."""
     entries = app.service.storage.entries(layout.capture(capture_id))
-    kept = ("capture.json", "files", "sha256")
+    kept = ("capture.json", "manifest.json", "files", "sha256")
     paths = [entry.path.removeprefix(layout.capture(capture_id) + "/") for entry in entries]
     return [p for p in paths if p.split("/")[0] not in kept and not p.endswith("/record.json")]
 

@@ -94,4 +94,5 @@ def people(request: pytest.FixtureRequest, serve_people: ServePeople) -> Iterato
 
 def as_object_store(storage: Storage) -> None:
     """Let a storage lie in an object store in memory, which has no folders and no local paths, as a bucket."""
-    storage.store, storage.root = MemoryStore(), None
+    storage.store = storage.bulk = MemoryStore()
+    storage.root = None

@@ -189,20 +189,22 @@ def test_a_deletion_that_is_cut_off_is_finished_by_the_next_sweep(
     app: ServedApp, monkeypatch: pytest.MonkeyPatch, files_left: int
 ) -> None:
     capture, model = app.capture("a.jpg", "b.jpg", "c.jpg"), ended(app)
-    delete, left = app.service.storage.delete, [0]
+    delete, left = app.service.storage._delete, [0]
 
-    def dying(path: str) -> None:
-        left[0] += 1
-        if left[0] > files_left:
-            raise StorageError("the process was killed here")
-        delete(path)
+    def dying(paths: list[str]) -> int:
+        for path in paths:
+            left[0] += 1
+            if left[0] > files_left:
+                raise StorageError("the process was killed here")
+            delete([path])
+        return len(paths)
 
     for target in (app.service.deletion.capture, app.service.deletion.job):
         left[0] = 0
-        monkeypatch.setattr(app.service.storage, "delete", dying)
+        monkeypatch.setattr(app.service.storage, "_delete", dying)
         with pytest.raises(StorageError):
             target(capture if target == app.service.deletion.capture else model)
-        monkeypatch.setattr(app.service.storage, "delete", delete)
+        monkeypatch.setattr(app.service.storage, "_delete", delete)
     assert any(capture in path for path in stored(app))
     assert app.service.deletion.finish() == []  # another process may still be at it
     app.redis.delete(keys.deleting(f"capture/{capture}"), keys.deleting(f"model/{model}"))

@@ -20,7 +20,7 @@ from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow  # a server for each case
 
-OVERHEAD = 300
+OVERHEAD = 600
 """Bytes that records and digests of a small capture take at most."""
 
 

@@ -1,23 +1,30 @@
 """Proves what a job's folder holds: the staged capture, and what an attempt elsewhere needs. One process has it.
 
-Does not prove that S3 works: tests/server/test_storage does where there is a bucket.
+The storage is a folder, the same folder as if it were a bucket, and a bucket (moto's server). Not proved here: the
+bucket's own failures (tests/server/test_bucket).
 """
 
 import os
 import shutil
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from splatmill.backplane import layout
+from splatmill.backplane.bucket import Patience
 from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.storage_errors import StorageUnreachableError
 from splatmill.schema import Role
 from splatmill_worker.errors import CaptureIncomplete, FolderInUse, StartNotStored
-from splatmill_worker.service import job_folder
+from splatmill_worker.service import job_folder, mirror
+from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.job_folder import JobFolder, hold
 from splatmill_worker.service.mirror import Mirror
 from splatmill_worker.service.problems import is_transient, problem_of
+from splatmill_worker.service.staging import DOWNLOADS
+from tests.support.faulty_s3 import FaultyS3, faulty_s3
 from tests.support.jobs import CAPTURE
 from tests.support.waiting import wait_for
 
@@ -44,6 +51,84 @@ def test_a_remote_capture_is_copied(remote: Storage) -> None:
     folder = JobFolder(remote, JOB, CAPTURE)
     folder.stage_capture()
     assert staged(folder) == EXPECTED
+
+
+PHOTOS = 3 * DOWNLOADS
+
+
+@pytest.fixture
+def bucket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[FaultyS3, Storage]]:
+    """Storage in a bucket, with photos in CAPTURE, and the proxy before it."""
+    monkeypatch.setenv("SPLATMILL_DATA", str(tmp_path / "data"))
+    with faulty_s3() as s3:
+        storage = Storage(s3.storage, patience=Patience(answer=20.0, block=20.0, retries=0))
+        for number in range(PHOTOS):
+            storage.put(layout.capture_file(CAPTURE, Role.images, f"{number:02}.jpg"), b"%d" % number)
+        yield s3, storage
+        s3.release()
+
+
+def test_files_come_from_a_bucket_several_at_a_time_and_their_number_is_told(
+    bucket: tuple[FaultyS3, Storage],
+) -> None:
+    s3, storage = bucket
+    folder, told = JobFolder(storage, JOB, CAPTURE), list[tuple[int, int]]()
+    s3.fault = lambda request: "wait" if "/files/images" in request.path else None
+    with ThreadPoolExecutor(1) as pool:
+        staging = pool.submit(folder.stage_capture, lambda done, total: told.append((done, total)))
+        wait_for(lambda: s3.stalled == DOWNLOADS)
+        s3.fault = lambda _: None
+        s3.release()
+        assert staging.result(20) == PHOTOS
+    assert staged(folder) == {f"images/{number:02}.jpg": b"%d" % number for number in range(PHOTOS)}
+    assert told == [(done, PHOTOS) for done in range(1, PHOTOS + 1)]
+    s3.seen.clear()
+    folder.stage_capture()
+    assert [seen.path for seen in s3.seen if "/files/images/" in seen.path] == [], (
+        "what is there is not fetched"
+    )
+
+
+def test_a_staging_that_is_stopped_fetches_no_more_files(bucket: tuple[FaultyS3, Storage]) -> None:
+    _, storage = bucket
+    folder = JobFolder(storage, JOB, CAPTURE)
+
+    def stop(done: int, total: int) -> None:
+        raise HandedBack
+
+    with pytest.raises(HandedBack):
+        folder.stage_capture(stop)
+    assert 1 <= len(staged(folder)) <= DOWNLOADS
+
+
+def test_a_file_that_the_bucket_does_not_give_ends_the_staging_by_name(
+    bucket: tuple[FaultyS3, Storage],
+) -> None:
+    s3, storage = bucket
+    s3.fault = lambda request: 503 if request.path.endswith("/03.jpg") else None
+    with pytest.raises(StorageUnreachableError, match=r"could not read .*/03\.jpg"):
+        JobFolder(storage, JOB, CAPTURE).stage_capture()
+
+
+def test_the_checkpoint_is_copied_less_often_than_small_files_and_at_a_stop(
+    remote: Storage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mirror, "INTERVAL", 0.01)
+    folder = JobFolder(remote, JOB, CAPTURE)
+    work = layout.job_work(JOB)
+    (folder.run / "checkpoints").mkdir(parents=True)
+    (folder.run / "checkpoints/checkpoint.pt").write_text("1")
+    copying = Mirror(folder, lambda _: None)
+    wait_for(lambda: remote.exists(f"{work}/checkpoints/checkpoint.pt"))
+    (folder.run / "checkpoints/checkpoint.pt").write_text("of later")
+    # One after the other, so that a whole look lies between.
+    (folder.run / "plan.json").write_text("{}")
+    wait_for(lambda: remote.exists(f"{work}/plan.json"))
+    (folder.run / "stages.json").write_text("{}")
+    wait_for(lambda: remote.exists(f"{work}/stages.json"))
+    assert remote.get(f"{work}/checkpoints/checkpoint.pt") == b"1"
+    copying.close(copy=True)
+    assert remote.get(f"{work}/checkpoints/checkpoint.pt") == b"of later"
 
 
 def test_what_left_the_capture_leaves_the_folder(local: Storage) -> None:
@@ -84,7 +169,7 @@ def test_a_checkpoint_that_storage_refuses_is_reported_and_copied_later(
     folder.run.mkdir()
     (folder.run / "plan.json").write_text("{}")
     warnings: list[str] = []
-    mirror = Mirror(folder, warnings.append)
+    copying = Mirror(folder, warnings.append)
     stored = f"{layout.job_work(JOB)}/plan.json"
 
     def refuse(path: str, data: object) -> None:
@@ -92,11 +177,11 @@ def test_a_checkpoint_that_storage_refuses_is_reported_and_copied_later(
 
     with monkeypatch.context() as away:
         away.setattr(remote, "put", refuse)
-        mirror.close(copy=True)
+        copying.close(copy=True)
     assert len(warnings) == 1
     assert "plan.json" in warnings[0]
     assert not remote.exists(stored)
-    mirror.close(copy=True)
+    copying.close(copy=True)
     assert len(warnings) == 1
     assert remote.get(stored) == b"{}"
 

@@ -22,6 +22,7 @@ from splatmill.schema import TIME_LAPSE
 from splatmill_worker.errors import CaptureIncomplete, FolderInUse, StartNotStored
 from splatmill_worker.service.disk_reserve import shortage
 from splatmill_worker.service.own_copy import link_or_copy
+from splatmill_worker.service.staging import Report, is_whole, stage
 from splatmill_worker.settings import work_folder
 
 LOCK_SECONDS = 10.0
@@ -54,43 +55,36 @@ class JobFolder:
         self.run = self.path / "run"
         self._lock = _locked_folder(self.path)
 
-    def stage_capture(self) -> int:
+    def stage_capture(self, report: Report = lambda done, total: None) -> int:
         """Make the capture folder equal to the stored capture; return the number of its files.
 
-        Files of a local storage are linked, or copied where it lies on another file system. Raises CaptureIncomplete
-        when a stored file is not in the folder afterwards.
+        Raises CaptureIncomplete when a stored file is not in the folder afterwards, and as `staging.stage`, which calls
+        `report`.
         """
         prefix = layout.capture_files(self.capture_id)
-        entries = list(self.storage.entries(prefix))
-        wanted = {entry.path[len(prefix) + 1 :]: entry for entry in entries}
+        entries = {
+            self.capture / entry.path[len(prefix) + 1 :]: entry for entry in self.storage.entries(prefix)
+        }
         for path in self.capture.rglob("*") if self.capture.is_dir() else ():
-            if not path.is_dir() and path.relative_to(self.capture).as_posix() not in wanted:
+            if not path.is_dir() and path not in entries:
                 path.unlink()
-        self._check_space(wanted)
-        for name, entry in wanted.items():
-            target = self.capture / name
-            if _is_whole(target, entry):
-                continue
-            source = self.storage.local_path(entry.path)
-            # Deleted meanwhile, or both a file and a folder, which buckets allow: it is missed below.
-            with suppress(FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError):
-                if source is None:
-                    self.storage.download(entry.path, target)
-                else:
-                    link_or_copy(source, target)
-        missing = [name for name, entry in wanted.items() if not _is_whole(self.capture / name, entry)]
+        self._check_space(entries)
+        stage(self.storage, entries, report)
+        missing = [
+            path.relative_to(self.capture).as_posix()
+            for path, entry in entries.items()
+            if not is_whole(path, entry)
+        ]
         if missing:
             raise CaptureIncomplete(self.capture_id, missing, len(entries))
         return len(entries)
 
-    def _check_space(self, wanted: Mapping[str, Entry]) -> None:
+    def _check_space(self, wanted: Mapping[Path, Entry]) -> None:
         """Raise DiskReserveReached if copies of the files that are missing would not fit beside the reserve."""
         root = self.storage.root
         if root is not None and root.stat().st_dev == self.path.stat().st_dev:
             return  # they are linked
-        missing = sum(
-            entry.size for name, entry in wanted.items() if not _is_whole(self.capture / name, entry)
-        )
+        missing = sum(entry.size for path, entry in wanted.items() if not is_whole(path, entry))
         if missing and (short := shortage(missing)) is not None:
             raise short
 
@@ -165,11 +159,6 @@ def hold(folder: Path) -> Iterator[bool]:
             yield True
     finally:
         os.close(descriptor)
-
-
-def _is_whole(path: Path, entry: Entry) -> bool:
-    """Whether `path` is a file of its own, not a symbolic link, with the size of the stored one."""
-    return path.is_file() and not path.is_symlink() and path.stat().st_size == entry.size
 
 
 def _locked_folder(folder: Path) -> int:

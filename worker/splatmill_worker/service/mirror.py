@@ -1,6 +1,7 @@
 """Copies the checkpoints of a running job to storage, for an attempt that may follow on another machine."""
 
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +10,14 @@ from splatmill.backplane.storage import StorageError
 from splatmill_worker.service.job_folder import CHECKPOINTS, FILM, SNAPSHOTS, START, JobFolder
 
 INTERVAL = 15.0
-"""Seconds between two copies. A checkpoint written less than this before the machine fails may be lost."""
+"""Seconds between two looks for new files. Those are small, or never change, but the checkpoint."""
+
+CHECKPOINT_INTERVAL = 60.0
+"""Least seconds between the beginnings of two copies of the checkpoint, which changes as a whole: parameters, and
+moments of Adam. Training that was done since the last copy is lost if the machine fails; a stop copies it at once."""
+
+CHECKPOINT_SHARE = 0.1
+"""Largest share of the time that goes into copies of the checkpoint: a gigabyte over a slow line takes minutes."""
 
 MIRRORED = (START, CHECKPOINTS, "plan.json", "stages.json", FILM, SNAPSHOTS)
 """Files and folders of `run` that are copied. The recovered cameras are not among them: `sfm_cache` stores those."""
@@ -25,6 +33,7 @@ class Mirror:
         self._folder = folder
         self._warn = warn
         self._copied: dict[Path, tuple[int, int]] = {}
+        self._checkpoint_at = float("-inf")
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         if folder.storage.root is None:
@@ -37,15 +46,26 @@ class Mirror:
         if self._thread is not None:
             self._thread.join()
             if copy:
-                self._copy()
+                self._copy(all_files=True)
 
     def _loop(self) -> None:
         while not self._stop.wait(INTERVAL):
-            self._copy()
+            self._copy(all_files=False)
 
-    def _copy(self) -> None:
-        run, storage = self._folder.run, self._folder.storage
-        for path in _files_in([run / name for name in MIRRORED]):
+    def _copy(self, *, all_files: bool) -> None:
+        """Copy the new files. Unless `all_files`, the checkpoint is left out if its time has not come."""
+        run = self._folder.run
+        names = [name for name in MIRRORED if name != CHECKPOINTS]
+        self._copy_files([run / name for name in names])
+        began = time.monotonic()
+        if (all_files or began >= self._checkpoint_at) and self._copy_files([run / CHECKPOINTS]):
+            took = time.monotonic() - began
+            self._checkpoint_at = began + max(CHECKPOINT_INTERVAL, took / CHECKPOINT_SHARE)
+
+    def _copy_files(self, places: list[Path]) -> int:
+        """Copy what has changed in files and folders, and return the number of files copied."""
+        run, storage, copied = self._folder.run, self._folder.storage, 0
+        for path in _files_in(places):
             try:
                 state = path.stat()
             except FileNotFoundError:
@@ -60,6 +80,8 @@ class Mirror:
                 self._warn(f"{name} could not be copied to storage and will be tried again: {error}")
             else:
                 self._copied[path] = version
+                copied += 1
+        return copied
 
 
 def _files_in(paths: list[Path]) -> list[Path]:

@@ -47,9 +47,10 @@ from splatmill_worker.service.process_exit import (
 from splatmill_worker.service.run_attempt import run_attempt
 from splatmill_worker.service.saved_progress import SavedProgress
 
-STOP_GRACE = 15.0
-"""Seconds that an attempt has to save its state when the worker is told to stop. Then it is killed, and the next
-attempt resumes from the last checkpoint that was stored."""
+STOP_GRACE = 50.0
+"""Seconds that an attempt has to save its state, in storage too, when the worker is told to stop. Then it is killed,
+and the next attempt resumes from the last checkpoint that was stored. docker-compose.yml grants ten seconds more, for
+the return of the job to the queue."""
 
 T = TypeVar("T")
 

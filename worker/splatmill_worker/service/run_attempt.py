@@ -21,7 +21,16 @@ from splatmill.backplane import row as rows
 from splatmill.backplane.fold import fold
 from splatmill.backplane.row import JobRow
 from splatmill.backplane.storage import Storage, StorageError
-from splatmill.schema import CamerasEvent, Event, JobState, LogEvent, PreviewEvent, StateEvent, TrainOptions
+from splatmill.schema import (
+    CamerasEvent,
+    Event,
+    JobState,
+    LogEvent,
+    PreviewEvent,
+    ProgressEvent,
+    StateEvent,
+    TrainOptions,
+)
 from splatmill_worker.errors import EmptyCapture
 from splatmill_worker.service import hand_back, publish, sfm_cache
 from splatmill_worker.service.attempt import LONGEST_MESSAGE, Attempt
@@ -42,6 +51,12 @@ PIPELINE = os.environ.get("SPLATMILL_PIPELINE", "splatmill_worker.pipeline")
 
 RETRY_SECONDS = 5.0
 """Seconds between a transient failure and the end of its attempt, after which the queue tries again."""
+
+STAGING = "staging"
+"""The stage in which the files of a capture come from storage, as progress events name it."""
+
+SILENT_SECONDS = 0.5
+"""Seconds before the first of these events. A capture that is linked, or small, has none."""
 
 FLUSH_SECONDS = 5.0
 """Seconds that an attempt which is handed back may spend on sending its last events."""
@@ -159,7 +174,7 @@ def _train(attempt: Attempt, row: JobRow, folder: JobFolder, disk: DiskWatch, ou
     restored = folder.restore()
     if restored:
         log.info("Resuming from %d files that an attempt on another machine stored.", len(restored))
-    if not folder.stage_capture():
+    if not folder.stage_capture(_StagingProgress(outbox)):
         raise EmptyCapture(row.capture)
     if sfm_cache.fetch(storage, row.capture, folder.run):
         log.info("Using the cameras that an earlier job recovered from this capture.")
@@ -271,6 +286,22 @@ def _exit_superseded() -> NoReturn:
     """End without publishing: another attempt has the job's lock. The parent notices at its next heartbeat too."""
     print("Another attempt holds the job's lock; this one ends without storing its model.", flush=True)
     os._exit(1)
+
+
+class _StagingProgress:
+    """Sends the progress of the staging of a capture as events. Raises HandedBack once the worker stops."""
+
+    def __init__(self, outbox: Outbox) -> None:
+        self._outbox = outbox
+        self._first = time.monotonic() + SILENT_SECONDS
+
+    def __call__(self, done: int, total: int) -> None:
+        if hand_back.requested():
+            raise HandedBack
+        if time.monotonic() >= self._first:
+            self._outbox.put(
+                ProgressEvent(stage=STAGING, done=done, total=total, note="files of the capture")
+            )
 
 
 class _LogEventHandler(logging.Handler):

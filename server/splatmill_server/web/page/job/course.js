@@ -4,6 +4,7 @@ import { FINAL } from "../job_states.js";
 
 /** Names of the stages that progress is reported of. */
 export const STAGES = new Map(Object.entries({
+  staging: "Fetching the photos",
   images: "Examining the photos",
   features: "Finding features",
   pairs: "Choosing pairs of photos",

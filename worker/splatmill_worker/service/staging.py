@@ -1,0 +1,62 @@
+"""Copies the files of a stored capture into a job's folder, several at a time from a bucket, and says how far it is."""
+
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from contextlib import suppress
+from pathlib import Path
+
+from splatmill.backplane.storage import Entry, Storage
+from splatmill_worker.service.own_copy import link_or_copy
+
+DOWNLOADS = 8
+"""Files that are downloaded at a time: most of the time of a small one is the wait for the bucket's answer."""
+
+Report = Callable[[int, int], None]
+"""Told the numbers of files that are there and of all files. May be called by several threads, one at a time. Its
+errors end the staging."""
+
+
+def is_whole(path: Path, entry: Entry) -> bool:
+    """Return whether `path` is a file of its own, not a symbolic link, with the size of the stored one."""
+    return path.is_file() and not path.is_symlink() and path.stat().st_size == entry.size
+
+
+def stage(storage: Storage, wanted: Mapping[Path, Entry], report: Report) -> None:
+    """Make each path a file with the bytes of its entry, unless it is one already.
+
+    Files of a local storage are linked, or copied where it lies on another file system. One that is deleted from
+    storage meanwhile, or is both a file and a folder, which buckets allow, is left out. Raises StorageError, OSError,
+    and what `report` raises; files that are under way then are finished first.
+    """
+    missing = {path: entry for path, entry in wanted.items() if not is_whole(path, entry)}
+    done = len(wanted) - len(missing)
+    lock, stopped = threading.Lock(), threading.Event()
+
+    def bring(path: Path, entry: Entry) -> None:
+        nonlocal done
+        if stopped.is_set():
+            return
+        source = storage.local_path(entry.path)
+        try:
+            with suppress(FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError):
+                if source is None:
+                    storage.download(entry.path, path)
+                else:
+                    link_or_copy(source, path)
+            with lock:
+                done += 1
+                report(done, len(wanted))
+        except BaseException:
+            stopped.set()
+            raise
+
+    if storage.root is not None:
+        for path, entry in missing.items():
+            bring(path, entry)
+        return
+    with ThreadPoolExecutor(DOWNLOADS, thread_name_prefix="staging") as pool:
+        tasks = [pool.submit(bring, path, entry) for path, entry in missing.items()]
+        wait(tasks, return_when=FIRST_EXCEPTION)
+    for task in tasks:
+        task.result()
