@@ -6,6 +6,9 @@ only forwards them. The renderer computes ETags and answers `If-None-Match` itse
 
 HEALTH = "/healthz"
 
+CLIENT_HEADER = "Splatmill-Client"
+"""Header of a request to the renderer: a text that is the same for all requests of one client, who take turns."""
+
 
 def render_path(model_id: str) -> str:
     """Return the path to which a `RenderRequest` is posted; the response is the image."""

@@ -1,6 +1,7 @@
 """Forwards render requests to the renderer process, and streams its responses back."""
 
 import asyncio
+import hashlib
 from collections.abc import AsyncIterator, Coroutine
 from typing import Any, TypeVar
 
@@ -9,6 +10,8 @@ from pydantic import BaseModel
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
+from splatmill.backplane import rendering
+from splatmill_server.access.caller import Caller
 from splatmill_server.renderer import post
 
 _PASSED_BACK = (
@@ -37,7 +40,7 @@ async def forward(
 
     Raises a 503 problem if there is no renderer, and a 504 problem if it does not answer within `seconds`.
     """
-    headers = {"Content-Type": "application/json"}
+    headers = {"Content-Type": "application/json", rendering.CLIENT_HEADER: _client(request)}
     if (known := request.headers.get("if-none-match")) is not None:
         headers["If-None-Match"] = known
     content = body.model_dump_json(exclude_none=True)
@@ -53,6 +56,14 @@ async def forward(
         await answer.aclose()
         return Response(status_code=answer.status_code, headers=passed)
     return StreamingResponse(_pass(answer), answer.status_code, passed)
+
+
+def _client(request: Request) -> str:
+    """Return a text for the caller and the machine of a request, without telling who they are."""
+    caller = getattr(request.state, "caller", None)
+    owner = caller.owner if isinstance(caller, Caller) else ""
+    host = request.client.host if request.client is not None else ""
+    return hashlib.sha256(f"{owner}\0{host}".encode()).hexdigest()[:16]
 
 
 async def while_connected(request: Request, pending: Coroutine[Any, Any, T]) -> T | None:

@@ -1,8 +1,9 @@
-"""Proves that requests run one at a time, and that those beyond the bound are sent away at once; and that nothing runs
-for a client that has left."""
+"""Proves that requests run one at a time, clients in turn, and that those beyond the bounds are sent away at once; and
+that nothing runs for a client that has left, which frees its place before its turn."""
 
 import asyncio
 import threading
+from functools import partial
 
 import pytest
 
@@ -58,3 +59,97 @@ def test_work_of_a_client_that_left_while_it_waited_is_not_done() -> None:
         return done
 
     assert asyncio.run(wait_in_vain()) is False
+
+
+def test_clients_take_turns() -> None:
+    async def mixed() -> list[str]:
+        queue, release, order = RenderQueue(max_waiting=20), threading.Event(), list[str]()
+        first = asyncio.create_task(queue.run(lambda: release.wait(10), client="ann"))
+        await asyncio.sleep(0)
+        waiting = [
+            asyncio.create_task(queue.run(partial(order.append, name), client=name[:3]))
+            for name in ("ann1", "ann2", "ann3", "bob1", "bob2", "eve1")
+        ]
+        await asyncio.sleep(0)
+        release.set()
+        await asyncio.gather(first, *waiting)
+        return order
+
+    assert asyncio.run(mixed()) == ["ann1", "bob1", "eve1", "ann2", "bob2", "ann3"]
+
+
+def test_a_video_leaves_room_for_a_picture_after_each_frame() -> None:
+    async def mixed() -> list[str]:
+        queue, begun, order = RenderQueue(max_waiting=20), asyncio.Event(), list[str]()
+        loop = asyncio.get_running_loop()
+
+        def frame() -> None:
+            order.append("frame")
+            loop.call_soon_threadsafe(begun.set)
+
+        async def video() -> None:
+            for _ in range(50):
+                await queue.run(frame, client="ann")
+
+        async def pictures() -> None:
+            await begun.wait()
+            for _ in range(3):
+                await queue.run(lambda: order.append("picture"), client="bob")
+
+        await asyncio.gather(video(), pictures())
+        return order
+
+    order = asyncio.run(mixed())
+    assert sorted(order) == ["frame"] * 50 + ["picture"] * 3
+    assert order.index("picture") <= 3, (
+        "the first picture waits for the frame that is rendered, not for the video"
+    )
+
+
+def test_one_client_cannot_take_all_places() -> None:
+    async def crowd() -> tuple[int, bool]:
+        queue, refused = RenderQueue(max_waiting=5, max_of_client=2), 0
+        async with queue.admitted("ann"), queue.admitted("ann"):
+            try:
+                async with queue.admitted("ann"):
+                    pass
+            except QueueFull:
+                refused += 1
+            async with queue.admitted("bob"):
+                pass
+        async with queue.admitted("ann"):
+            return refused, True
+
+    assert asyncio.run(crowd()) == (1, True)
+
+
+def test_a_client_that_leaves_while_it_waits_frees_its_place_at_once() -> None:
+    """Not only when its turn comes: a picture before it may take long."""
+
+    async def leave() -> tuple[bool, bool, list[str]]:
+        queue, release, done = RenderQueue(max_waiting=2), threading.Event(), list[str]()
+
+        async def gone() -> bool:
+            return True
+
+        before = asyncio.create_task(queue.run(lambda: release.wait(10)))
+        await asyncio.sleep(0)
+
+        async def visit(name: str, left: bool) -> None:
+            async with queue.admitted(name):
+                await queue.run(lambda: done.append(name), gone if left else None, name)
+
+        leaving = asyncio.create_task(visit("ann", True))
+        staying = asyncio.create_task(visit("bob", False))
+        cancelled = asyncio.create_task(visit("eve", False))
+        await asyncio.sleep(0)
+        cancelled.cancel()
+        with pytest.raises(ClientGone):
+            await leaving
+        still = not before.done()
+        release.set()
+        await asyncio.gather(before, staying, cancelled, return_exceptions=True)
+        await queue.run(lambda: done.append("later"))
+        return still, cancelled.cancelled(), done
+
+    assert asyncio.run(leave()) == (True, True, ["bob", "later"])

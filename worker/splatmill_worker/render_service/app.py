@@ -42,9 +42,11 @@ from splatmill_worker.render_service.model_cache import LoadedModel, ModelCache
 from splatmill_worker.render_service.render_queue import ClientGone, QueueFull, RenderQueue
 from splatmill_worker.scene import Camera
 
-MAX_WAITING = 8
-"""Number of requests that may wait while one is rendered. An image takes a fraction of a second, and a browser requests
-a few at a time."""
+MAX_WAITING = 32
+"""Number of requests that may wait while one is rendered. An image takes a fraction of a second."""
+
+MAX_OF_CLIENT = 9
+"""Number of requests of one client among them, with the one that is rendered. A browser requests a few at a time."""
 
 RETRY_AFTER = 2
 """Seconds after which a client may repeat a request that found the queue full."""
@@ -77,7 +79,7 @@ class RenderApp:
         self._storage = storage
         self._backend = backend
         self._cache = ModelCache(storage, cache_bytes, backend)
-        self._queue = RenderQueue(MAX_WAITING)
+        self._queue = RenderQueue(MAX_WAITING, MAX_OF_CLIENT)
 
     def asgi(self) -> Starlette:
         """Return the ASGI application."""
@@ -125,7 +127,7 @@ class RenderApp:
             headers = {"ETag": etag, "Cache-Control": "private, max-age=0, must-revalidate"}
             if _matches(request.headers.get("if-none-match"), etag):
                 return Response(status_code=304, headers=headers)
-            async with self._queue.admitted():
+            async with self._queue.admitted(_client(request)):
                 return await make(request, model_id, body, headers)
         except ValidationError as error:
             return _problem_response(_problem_of_validation(error))
@@ -141,7 +143,7 @@ class RenderApp:
         except QueueFull:
             problem = Problem.of(
                 "renderer_unavailable",
-                f"The renderer is busy, and {MAX_WAITING} requests are already waiting.",
+                f"The renderer is busy: {MAX_WAITING} requests wait already, or {MAX_OF_CLIENT} of this client.",
                 advice=f"Try again in {RETRY_AFTER} seconds.",
             )
             return _problem_response(problem, {"Retry-After": str(RETRY_AFTER)})
@@ -168,7 +170,7 @@ class RenderApp:
             image = render_image(self._cache.get(model_id), body)
             return Response(image.data, media_type=image.media_type, headers=headers | dict(image.headers))
 
-        return await self._queue.run(work, request.is_disconnected)
+        return await self._queue.run(work, request.is_disconnected, _client(request))
 
     async def _video(
         self, request: Request, model_id: str, body: OrbitRequest, headers: dict[str, str]
@@ -178,7 +180,9 @@ class RenderApp:
         from splatmill_worker.film import Film
         from splatmill_worker.render_service.encoding import render_frame
 
-        model = await self._queue.run(lambda: self._cache.get(model_id))
+        model = await self._queue.run(
+            lambda: self._cache.get(model_id), request.is_disconnected, _client(request)
+        )
         cameras = await run_in_threadpool(self._orbit_cameras, model, body)
         descriptor, name = tempfile.mkstemp(prefix="splatmill-orbit-", suffix=".mp4")
         os.close(descriptor)
@@ -191,7 +195,7 @@ class RenderApp:
 
             try:
                 for camera in cameras:
-                    await self._queue.run(partial(add, camera), request.is_disconnected)
+                    await self._queue.run(partial(add, camera), request.is_disconnected, _client(request))
             finally:
                 await run_in_threadpool(film.close)
         except BaseException:
@@ -209,11 +213,13 @@ class RenderApp:
         form = DOWNLOADS.get(body.format)
         if form is None:
             raise FormatUnknown(body.format)
-        model = await self._queue.run(lambda: self._cache.get(model_id), request.is_disconnected)
+        model = await self._queue.run(
+            lambda: self._cache.get(model_id), request.is_disconnected, _client(request)
+        )
         folder = Path(await run_in_threadpool(tempfile.mkdtemp, prefix="splatmill-convert-"))
         try:
             path, back, record = await self._queue.run(
-                partial(conversion.convert, model, form, folder), request.is_disconnected
+                partial(conversion.convert, model, form, folder), request.is_disconnected, _client(request)
             )
             views, what = await run_in_threadpool(conversion.pictures_of, self._storage, model_id)
             behind = await run_in_threadpool(conversion.background_of, self._storage, model_id)
@@ -221,6 +227,7 @@ class RenderApp:
                 await self._queue.run(
                     partial(conversion.score, self._storage, model, back, view, behind),
                     request.is_disconnected,
+                    _client(request),
                 )
                 for view in (views if form.readable else [])
             ]
@@ -243,7 +250,9 @@ class RenderApp:
 
         try:
             edited, path = await self._queue.run(
-                lambda: edit(self._storage, model_id, body, self._backend), request.is_disconnected
+                lambda: edit(self._storage, model_id, body, self._backend),
+                request.is_disconnected,
+                _client(request),
             )
         except NothingLeft:
             problem = Problem.of(
@@ -267,6 +276,11 @@ class RenderApp:
         except (FileNotFoundError, ValidationError):
             stored = None
         return list(orbit_cameras(stored, model.gaussians.means.double().cpu().numpy(), body))
+
+
+def _client(request: Request) -> str:
+    """Return who takes turns with others: the client of the API, or all who do not come through it."""
+    return request.headers.get(rendering.CLIENT_HEADER, "")
 
 
 def _matches(header: str | None, etag: str) -> bool:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import Entry, Storage
 from splatmill_worker.errors import ModelNotFound
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class ModelCache:
     """The models that were used last, by id. A model that has changed in storage is read again.
 
     storage: where the models are.
-    max_bytes: bound on the memory of all models; a single larger one is kept nevertheless.
+    max_bytes: bound on the memory of all models. A larger one is rendered, too, alone: it is kept until the next model.
     backend: the kernels that the models are loaded for, as in LoadedModel.
     """
 
@@ -62,26 +62,35 @@ class ModelCache:
 
     def etag(self, model_id: str) -> str:
         """Return storage's present tag of a model, without reading it. Raises ModelNotFound."""
+        return self._entry(model_id).etag
+
+    def _entry(self, model_id: str) -> Entry:
         entry = None
         if layout.is_id(model_id) and self._storage.exists(layout.job_record(model_id)):
             entry = self._storage.head(layout.model_file(model_id, "model.ply"))
         if entry is None:
             raise ModelNotFound(model_id)
-        return entry.etag
+        return entry
 
     def get(self, model_id: str) -> LoadedModel:
         """Return the model as it is stored now. Raises ModelNotFound, and ModelUnreadable for a damaged file."""
-        etag = self.etag(model_id)
+        entry = self._entry(model_id)
         with self._lock:
             model = self._models.get(model_id)
-            if model is None or model.etag != etag:
+            if model is None or model.etag != entry.etag:
                 self._models.pop(model_id, None)
-                model = self._load(model_id, etag)
+                # Before it is read, so that old and new never are in memory together; a file is a little larger.
+                self._make_room(entry.size)
+                model = self._load(model_id, entry.etag)
+                self._make_room(model.bytes)
                 self._models[model_id] = model
-                while self.bytes > self._max_bytes and len(self._models) > 1:
-                    self._models.popitem(last=False)
             self._models.move_to_end(model_id)
             return model
+
+    def _make_room(self, size: int) -> None:
+        """Drop the models that were not used for longest until one of `size` bytes fits beside the others."""
+        while self._models and self.bytes + size > self._max_bytes:
+            self._models.popitem(last=False)
 
     def _load(self, model_id: str, etag: str) -> LoadedModel:
         from splatmill_worker.splat.formats import ply
