@@ -35,6 +35,9 @@ BATCH = 200
 LONGEST_WAIT = 10.0
 """Seconds that a request waits for lists that are being made."""
 
+_TOGETHER = 1000
+"""Number of records that are asked for in one round trip."""
+
 _AT_A_TIME = 16
 """Number of records that are read from storage together."""
 
@@ -146,6 +149,15 @@ class Lists:
         names = [keys.deleting(f"{kind.value}/{record_id}") for record_id in record_ids]
         marks = cast(list[bytes | None], self.connection.mget(names))
         return [record_id for record_id, mark in zip(record_ids, marks, strict=True) if mark is not None]
+
+    def missing(self, kind: lists.Kind, record_ids: Sequence[str]) -> list[str]:
+        """Return those of the records that are not listed."""
+        found = []
+        for start in range(0, len(record_ids), _TOGETHER):
+            batch = record_ids[start : start + _TOGETHER]
+            scores = self.connection.zmscore(lists.name(kind), list(batch))
+            found += [name for name, score in zip(batch, scores, strict=True) if score is None]
+        return found
 
     def records(self, kind: lists.Kind, record_ids: Sequence[str]) -> dict[str, bytes | None]:
         """Return what is kept of these records for lists, by id."""

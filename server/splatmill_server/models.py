@@ -175,6 +175,15 @@ class Models:
         moment = record.finished_at or record.created_at
         lists.add_model(self.lists.connection, model_id, moment, record.owner or DEFAULT_OWNER)
 
+    def list_missing(self, model_ids: Sequence[str]) -> int:
+        """List those of these models that no list holds, as one that was copied into storage; return their number."""
+        missing = self.lists.missing("models", model_ids)
+        found = [record for record in each(self._record, missing) if record is not None]
+        for record in found:
+            moment = record.finished_at or record.created_at
+            lists.add_model(self.lists.connection, record.id, moment, record.owner or DEFAULT_OWNER)
+        return len(found)
+
     def make_lists(self) -> int:
         """List all models in storage, and return their number. Their files are read when they are first asked for."""
         connection, count = self.lists.connection, 0

@@ -159,7 +159,7 @@ class Service:
             usage=usage,
             quota=quota,
             deletion=deletion,
-            sweeper=Sweeper(usage, deletion, captures, _ages(settings), settings.sweep_interval),
+            sweeper=Sweeper(usage, deletion, captures, models, _ages(settings), settings.sweep_interval),
         )
 
     async def close(self) -> None:

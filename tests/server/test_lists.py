@@ -181,3 +181,18 @@ def test_a_new_record_is_on_the_first_page_at_once_and_a_deleted_one_is_not(
         assert captures(service, wanted)(None)[0][0] != made.id
     assert service.redis.zscore(lists.name("captures"), made.id) is None
     assert not service.redis.hexists(keys.records("captures"), made.id)
+
+
+def test_what_was_stored_while_redis_was_away_is_listed_by_the_next_sweep(
+    seeded: tuple[Service, Seeded],
+) -> None:
+    service, records = seeded
+    service.lists.ensure(0.0)
+    newest, model = records.captures[-1], records.succeeded[-1]
+    for kind, name in (("captures", newest), ("models", model)):
+        owner = f"owner{int(name, 16) % OWNERS}"
+        lists.remove(service.redis, kind, name, owner)  # type: ignore[arg-type]  # one of two kinds
+    assert captures(service)(None)[0][0] != newest
+    service.sweeper.sweep()
+    assert all_pages(captures(service))[0] == sorted(records.captures, reverse=True)
+    assert all_pages(models(service, Filter(owner=f"owner{int(model, 16) % OWNERS}")))[0][0] == model

@@ -116,11 +116,14 @@ def store_model(service: Service, job_id: str, name: str | None = None) -> None:
     storage.put(layout.model_file(job_id, "report.html"), b"<!doctype html><title>report</title>")
     storage.put(layout.model_file(job_id, "cameras.json"), b'{"cameras": []}')
     storage.put(layout.model_file(job_id, "preview.jpg"), b"\xff\xd8\xff preview")
+    job = row.read(service.redis, job_id)
+    owner = job.owner if job is not None else DEFAULT_OWNER
     moment = row.now().isoformat()
     record = {
         "id": job_id,
         "capture": "0" * 16,
         "name": name,
+        "owner": owner,
         "state": "succeeded",
         "options": TrainOptions().model_dump(mode="json"),
         "created_at": moment,
@@ -128,7 +131,7 @@ def store_model(service: Service, job_id: str, name: str | None = None) -> None:
         "model": job_id,
     }
     storage.put(layout.job_record(job_id), json.dumps(record).encode())
-    lists.add_model(service.redis, job_id, row.now(), DEFAULT_OWNER)
+    lists.add_model(service.redis, job_id, row.now(), owner)
 
 
 def problem(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:

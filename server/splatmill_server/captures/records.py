@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Sequence
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
 
+import redis
 import structlog
 from starlette.concurrency import run_in_threadpool
 
@@ -81,9 +82,13 @@ class Captures:
         capture = Capture(id=capture_id, name=name, owner=owner, created_at=datetime.now(UTC))
         record = json.dumps(capture.model_dump(mode="json", exclude={"files"}) | {"format": FORMAT}).encode()
         # Listed first: a crash in between leaves an entry of the list that readers skip, and no capture without one.
-        self._list([capture])
+        try:
+            self._list([capture])
+        except (
+            redis.RedisError
+        ) as error:  # captures can be made and filled without Redis; the sweeper lists this one
+            log.warning("a capture is not listed yet", capture=capture.id, error=str(error))
         if self.storage.put_new(layout.capture_record(capture.id), record):
-            self.lists.keep("captures", {capture.id: record})
             return capture, True
         return self.record(capture.id), False
 
@@ -170,6 +175,13 @@ class Captures:
             lists.remove(pipe, "captures", capture_id, owner)
             pipe.hdel(keys.records("captures"), capture_id)
             pipe.execute()
+
+    def list_missing(self, capture_ids: Sequence[str]) -> int:
+        """List those of these captures that no list holds, because Redis was away, and return their number."""
+        missing = self.lists.missing("captures", capture_ids)
+        found = self._listed(missing)
+        self._list(list(found.values()))
+        return len(found)
 
     def make_lists(self) -> int:
         """List all captures in storage, and return their number."""

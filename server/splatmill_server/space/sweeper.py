@@ -13,6 +13,7 @@ from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import StoredKind
 from splatmill_server.captures.records import Captures
 from splatmill_server.leases import lease
+from splatmill_server.models import Models
 from splatmill_server.problems import ProblemError
 from splatmill_server.space import leftovers
 from splatmill_server.space.deletion import Deletion
@@ -42,12 +43,14 @@ class Sweeper:
         usage: Usage,
         deletion: Deletion,
         captures: Captures,
+        models: Models,
         ages: Ages,
         interval: float,
     ) -> None:
         self.usage = usage
         self.deletion = deletion
         self.captures = captures
+        self.models = models
         self.ages = ages
         self.interval = interval
         self._search_at = 0.0
@@ -87,6 +90,7 @@ class Sweeper:
             log.info("finished a deletion that was cut off", record=record)
         self.usage.refresh(self.interval / 2)
         snapshot = self.usage.snapshot()
+        self._list_missing(snapshot)
         deleted = []
         for found in plan(snapshot, self.ages, self.usage.ledger.clock())[:MOST]:
             if _safely(found, lambda found=found: self._delete(snapshot, found)):  # type: ignore[misc]  # bound at once
@@ -103,6 +107,16 @@ class Sweeper:
             self._search_at = time.monotonic() + _LEFTOVERS_SECONDS
             self.search()
         return deleted
+
+    def _list_missing(self, snapshot: Snapshot) -> None:
+        """List what was stored while Redis was away, or by somebody else."""
+        for kind, listing in (
+            (StoredKind.capture, self.captures.list_missing),
+            (StoredKind.model, self.models.list_missing),
+        ):
+            whole = [held.id for held in snapshot.holdings.values() if held.kind is kind and held.whole]
+            if listed := listing(sorted(whole)):
+                log.info("listed", kind=kind.value, records=listed)
 
     def search(self) -> None:
         """Delete leftovers that are no records: of broken uploads and writes, and keys in Redis without their job."""
