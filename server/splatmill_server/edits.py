@@ -12,6 +12,9 @@ from splatmill.backplane.row import now
 from splatmill.backplane.storage import Storage
 from splatmill.schema import HELD_OUT, Edited, EditModel
 
+STALE = ("time_lapse", "views", "disagreement", "warnings")
+"""Parts of a training's report that an edited model has not."""
+
 
 async def store_edited(
     storage: Storage, model_id: str, request: EditModel, edited: Edited, ply: AsyncIterator[bytes]
@@ -73,7 +76,7 @@ def _edited_report(
     last = (report.get("curve") or [{"seconds": 0.0, "step": 0}])[-1]
     done = request.model_dump(mode="json", exclude_none=True, exclude={"name", "preview"})
     return {
-        **{name: value for name, value in report.items() if name not in ("time_lapse", "views", "warnings")},
+        **{name: value for name, value in report.items() if name not in STALE},
         "seconds": report.get("seconds") or {},
         "curve": [last | measured],
         "result": (report.get("result") or {}) | measured,

@@ -11,13 +11,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.__main__ import main
 from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.train.disagreement import Disagreement
 from tests.support import still_life
 from tests.support.paths import BENCH
 
@@ -63,6 +66,7 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> Any:
                 "ablation",
                 "budgets",
                 "configurations",
+                "outliers",
                 "rows",
                 "scenes",
                 "spread",
@@ -335,3 +339,26 @@ def test_a_reworded_comment_leaves_measured_rows_as_they_are(parts: Any) -> None
     assert said == computing('def f(x):\n    return x + 1\n\n\nY = "text"\n')
     assert said != computing('def f(x):\n    return x + 2\n\n\nY = "text"\n')
     assert said != computing('def f(x):\n    return x + 1\n\n\nY = "other"\n')
+
+
+def test_outliers_are_judged_by_pixels_where_movers_were_planted(parts: Any, tmp_path: Path) -> None:
+    judged = parts["_train.outliers"].judged
+    half, elsewhere = (torch.zeros(20, 30, dtype=torch.bool) for _ in range(2))
+    half[5:15, 10:15] = True
+    elsewhere[:5, :10] = True
+    photos = [
+        Disagreement(name, 3.0, float(outliers.float().mean()), None, outliers)
+        for name, outliers in (("a.jpg", half), ("b.jpg", elsewhere))
+    ]
+    assert judged(tmp_path / "truth", photos) is None
+    (tmp_path / "truth").mkdir()
+    planted = np.zeros((40, 60), bool)
+    planted[10:30, 20:40] = True
+    Image.fromarray(planted).save(tmp_path / "truth" / "a.png")
+    assert judged(tmp_path / "truth", photos) == {
+        "precision": pytest.approx(0.5),
+        "recall": pytest.approx(0.5),
+        "planted": pytest.approx(1 / 12),
+    }
+    nothing = photos[0]._replace(share=0.0, outliers=torch.zeros(20, 30, dtype=torch.bool))
+    assert judged(tmp_path / "truth", [nothing])["precision"] is None

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from _train import bare
 from _train.configurations import revised
+from _train.outliers import judged
 from _train.rows import code_version
 from _train.scenes import MADE
 from splatmill.schema import TrainOptions
@@ -49,6 +50,9 @@ RESULT = (
     "recoveries",
     "stopped",
 )
+
+TRUTH = "truth"
+"""Folder beside the photos of a built-in scene, with the pixels that movers changed."""
 
 PHOTOS = 40
 """Photos of the still life, as `make demo` takes them (640 x 480 pixels)."""
@@ -93,6 +97,7 @@ def measure(job: Row) -> Row:
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         others = max(0.0, worked() - machine - cpu)
         report = json.loads((outcome.out / "report.json").read_text())
+        found = None if outcome.trained is None else judged(capture / TRUTH, outcome.trained.disagreements)
     result, seconds = report["result"], report["seconds"]
     recovered = report["sfm"].get("seconds", {})
     values = {
@@ -108,6 +113,7 @@ def measure(job: Row) -> Row:
         "size": [report["facts"]["width"], report["facts"]["height"]],
         "plan": {name: value for name, value in report["plan"].items() if name != "reasons"},
         "warnings": report["warnings"],
+        "disagreement": found,
         "curve": report["curve"],
     }  # fmt: skip
     measured: Row = rounded(values)
@@ -185,7 +191,7 @@ def _posed(job: Row, options: TrainOptions) -> Scene:
             bare.make(job["made"], capture, PHOTOS)
     elif job["made"] and not (capture / "images").is_dir():
         part = capture / "images.part"
-        synthetic.capture(part, PHOTOS, light=MADE[job["made"]])
+        synthetic.capture(part, PHOTOS, **MADE[job["made"]], truth=capture / TRUTH)
         part.rename(capture / "images")
     with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
         return posed_scene(capture, _with_cameras(Path(folder), job), options, _quiet, lambda: False)

@@ -9,7 +9,7 @@ from typing import Any
 from _data import FOLDERS, SHARED
 
 from _train import bare
-from splatmill_worker.synthetic import Light
+from splatmill_worker.synthetic import Light, Movers
 
 SIDE = 480
 """Longest side of the photos in pixels, small enough for a run of one minute to converge."""
@@ -30,16 +30,17 @@ class Scene:
 KNOWN = ("fox", "lego", "lund", "kermit", "synthetic", "beer", "snowmiku")
 """Trained by default. fox, lego and beer bring their cameras; the others' are recovered once, then kept."""
 
-PLANTED = {
-    "unequal": Light(exposures=0.3),
-    "vignetted": Light(vignetting=0.4),
-    "tone-mapped": Light(exposures=0.1, tone=0.5),
+PLANTED: dict[str, dict[str, Any]] = {
+    "unequal": {"light": Light(exposures=0.3)},
+    "vignetted": {"light": Light(vignetting=0.4)},
+    "tone-mapped": {"light": Light(exposures=0.1, tone=0.5)},
+    "passed-by": {"movers": Movers()},
 }
 """The built-in still life as cameras show it that change its light: with a random exposure for each training photo,
-with darker corners, and with local tone mapping."""
+with darker corners, and with local tone mapping. And with things that stand in the way of single training photos."""
 
-MADE = {"synthetic": None, **PLANTED}
-"""What the camera of each built-in scene makes of its light."""
+MADE: dict[str, dict[str, Any]] = {"synthetic": {}, **PLANTED}
+"""What is planted in the photos of each built-in scene: arguments of `synthetic.capture`."""
 
 ALL = (*KNOWN, *PLANTED, *bare.SCENES)
 

@@ -8,16 +8,12 @@ half the width of the table; cameras have OpenCV axes (x right, y down, z forwar
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 
 from splatmill_worker.scene import Camera, viewmat_of
-from splatmill_worker.synthetic.light import Light
 from splatmill_worker.synthetic.textures import MipMap, painted, planks, sky
 
 Tensor = torch.Tensor
@@ -253,47 +249,6 @@ def photograph(scene: StillLife, camera: Camera, samples: int = 2) -> tuple[np.n
         rgb[rows] = (shaded.mean(0).clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
         depth[rows] = _cast(scene, camera, rows, 0.5, 0.5, shade=False)[1].numpy()
     return rgb, depth
-
-
-def capture(
-    directory: Path,
-    count: int = 40,
-    width: int = 640,
-    height: int = 480,
-    seed: int = 0,
-    samples: int = 2,
-    light: Light | None = None,
-) -> dict[str, Camera]:
-    """Write `count` photos of the still life to `directory`, as JPEGs with EXIF; returns the true camera of each name.
-
-    width, height: in pixels. seed: of the scene and of the cameras. samples: rays per pixel along each axis.
-    light: what the camera makes of the scene's colours; None where it keeps them.
-    """
-    directory.mkdir(parents=True, exist_ok=True)
-    scene = still_life(seed)
-    cameras = {f"still_{k + 1:04d}.jpg": c for k, c in enumerate(orbit(count, width, height, seed))}
-    gains = None if light is None else dict(zip(cameras, light.gains(count, seed), strict=True))
-
-    def shoot(name: str) -> None:
-        camera = cameras[name]
-        rgb, _ = photograph(scene, camera, samples)
-        if light is not None and gains is not None:
-            rgb = light.falling_on(rgb, gains[name])
-        exif = Image.Exif()
-        exif[0x010F], exif[0x0110] = "Splatmill", "Ray caster"
-        # 35 mm equivalent over the longer side, which is how SfM reads it back into pixels.
-        exif.get_ifd(0x8769)[0xA405] = round(35 * camera.fx / max(width, height))
-        Image.fromarray(rgb).save(directory / name, quality=95, exif=exif)
-
-    # One photo per thread: bands are too small for torch's own threads.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(shoot, cameras))
-    finally:
-        torch.set_num_threads(threads)
-    return cameras
 
 
 def _cast(

@@ -21,6 +21,7 @@ from splatmill_worker.splat.plan import facts
 from splatmill_worker.splat.report.export import Exported, ExportWorld
 from splatmill_worker.splat.report.report import FinishedTraining, PlannedScene, plain, write_report
 from splatmill_worker.splat.train.curve import CurvePoint
+from splatmill_worker.splat.train.disagreement import Disagreement
 from splatmill_worker.splat.train.loop import Trained
 from tests.support import still_life
 from tests.support.training import plan
@@ -102,6 +103,37 @@ def test_light_is_told_apart_from_shape(tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text()
     assert "30.00 dB on held-out photos (32.00 dB with colours fitted, SSIM 0.900)" in page
     assert "<td class=n>30.00</td><td class=n>32.00</td>" in page
+
+
+def test_photos_that_disagree_are_ranked_with_the_reason(tmp_path: Path) -> None:
+    nowhere = torch.zeros(36, 48, dtype=torch.bool)
+    patch = nowhere.clone()
+    patch[5:15, 10:30] = True
+    found = (
+        Disagreement("01.png", 9.5, 0.116, "moving things", patch),
+        Disagreement("02.png", 4.0, 0.0, "other light", nowhere),
+        Disagreement("00.png", 0.1, 0.0, None, nowhere),
+    )
+    result = replace(trained([30.0, 20.0, 30.0, 30.0, 29.0], True), disagreements=found)
+    report = report_of(tmp_path, result)
+    assert report["disagreement"][0] == {
+        "photo": "01.png",
+        "decibels": 9.5,
+        "share": 0.116,
+        "reason": "moving things",
+    }
+    assert len(report["disagreement"]) == 3
+    assert report["warnings"][1].endswith("Mask them, or leave the photo out.")
+    page = (tmp_path / "report.html").read_text()
+    assert "<td>02.png</td><td>other light</td><td class=n>4.0</td>" in page
+    assert page.count("<figcaption>01.png: moving things</figcaption>") == 1
+    assert "02.png: other light" not in page
+
+
+def test_photos_that_all_agree_are_said_to(tmp_path: Path) -> None:
+    report_of(tmp_path, trained([30.0], held_out=True))
+    page = (tmp_path / "report.html").read_text()
+    assert "<h2>Photos that disagree with the others</h2>\n<p>None does.</p>" in page
 
 
 def test_json_gets_plain_values() -> None:

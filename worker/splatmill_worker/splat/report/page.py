@@ -14,6 +14,8 @@ from torch import Tensor
 from splatmill.schema import format_bytes
 from splatmill_worker.splat.evaluate import ViewScore
 from splatmill_worker.splat.picture import data_uri
+from splatmill_worker.splat.report.disagreeing import MarkedPhoto
+from splatmill_worker.splat.train.disagreement import Disagreement
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
@@ -46,8 +48,22 @@ class ViewComparison:
     photo: Tensor
 
 
-def render(report: dict[str, Any], figure: Path, comparisons: Sequence[ViewComparison]) -> str:
-    """The page as text, with the picture `figure` of the curve and the `comparisons` embedded."""
+@dataclass(frozen=True)
+class Disagreeing:
+    """The photos that disagree with the others.
+
+    named: the photos of the table.
+    marked: those that are shown.
+    """
+
+    named: Sequence[Disagreement]
+    marked: Sequence[MarkedPhoto]
+
+
+def render(
+    report: dict[str, Any], figure: Path, comparisons: Sequence[ViewComparison], disagreeing: Disagreeing
+) -> str:
+    """The page as text, with the picture `figure` of the curve and the pictures of `comparisons` embedded."""
     curve = base64.b64encode(figure.read_bytes()).decode()
     parts = [
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
@@ -73,6 +89,8 @@ def render(report: dict[str, Any], figure: Path, comparisons: Sequence[ViewCompa
         "<div class=pairs>",
         *(_comparison(comparison) for comparison in comparisons),
         "</div>",
+        "<h2>Photos that disagree with the others</h2>",
+        *_disagreeing(disagreeing),
         "<h2>All evaluated views</h2>",
         _table(
             ["photo", "split", "PSNR (dB)", "PSNR, colours fitted (dB)", "SSIM"],
@@ -89,6 +107,23 @@ def render(report: dict[str, Any], figure: Path, comparisons: Sequence[ViewCompa
         f"<p class=dim>{html.escape(_footer(report))}</p></html>",
     ]
     return "\n".join(parts)
+
+
+def _disagreeing(found: Disagreeing) -> list[str]:
+    if not found.named:
+        return ["<p>None does.</p>"]
+    rows = [
+        [each.name, each.reason, f"{each.decibels:.1f}", f"{100 * each.share:.1f}"] for each in found.named
+    ]
+    lines = [_table(["photo", "looks like", "worse by (dB)", "of its pixels (%)"], rows, 2)]
+    lines.append("<div class=pairs>")
+    for photo in found.marked:
+        caption = html.escape(photo.caption)
+        lines.append(
+            f"<div class=pair><figure><img alt='photo' src='{data_uri(photo.picture, 480)}'>"
+            f"<figcaption>{caption}</figcaption></figure></div>"
+        )
+    return [*lines, "</div>"]
 
 
 def _headline(result: dict[str, Any]) -> str:

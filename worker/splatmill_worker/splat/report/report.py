@@ -18,15 +18,24 @@ from splatmill_worker.splat.evaluate import Renderer, Score
 from splatmill_worker.splat.machine import machine, peak_memory, versions
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.plan import Plan
-from splatmill_worker.splat.report import page
+from splatmill_worker.splat.report import disagreeing, page
 from splatmill_worker.splat.report.export import Exported
 from splatmill_worker.splat.report.figure import draw_curve
+from splatmill_worker.splat.train.disagreement import Reason
 from splatmill_worker.splat.train.loop import Trained
 from splatmill_worker.splat.train.renderer import evaluation_background
 from splatmill_worker.splat.views import Target, TrainingView
 
 MISFIT = 6.0
 """A training photo whose PSNR is more than this below the median, dB, is named in a warning."""
+
+ADVICE: dict[Reason | None, str] = {
+    "moving things": "It shows things that no other photo shows there. Mask them, or leave the photo out.",
+    "other light": "Its light differs. Leave it out, or set exposure to on.",
+    "wrong camera or blur": "Most of it disagrees. Leave it out if it is blurred or has a wrong camera.",
+    None: "Leave it out if it is blurred, shows something that moved, or has a wrong camera.",
+}
+"""What to do about a photo that does not fit the others, by the reason that was found."""
 
 WORST = 4
 """Views shown beside their photos."""
@@ -92,6 +101,7 @@ def write_report(
                 "evaluate": trained.evaluate_seconds,
             },
             "views": _view_rows(trained),
+            "disagreement": disagreeing.rows(trained),
             "plan": plan.as_dict(),
             "left_out": [
                 *({"what": name, "why": reason} for name, reason in plan.left_out.items()),
@@ -115,7 +125,8 @@ def write_report(
     atomic_write(out / "report.json", json.dumps(report, indent=1, allow_nan=False))
     draw_curve(out / "report.png", report["curve"], report["seconds"])
     worst = _worst_views(planned, trained, render)
-    atomic_write(out / "report.html", page.render(report, out / "report.png", worst))
+    named = page.Disagreeing(disagreeing.named(trained), disagreeing.marked(trained))
+    atomic_write(out / "report.html", page.render(report, out / "report.png", worst, named))
     return report
 
 
@@ -197,9 +208,10 @@ def _misfits(trained: Trained) -> list[str]:
     if len(ordered) < 5:
         return []
     median = ordered[len(ordered) // 2].psnr
+    reasons = {each.name: each.reason for each in trained.disagreements}
     return [
         f"{view.name} does not fit the other photos: its PSNR is {view.psnr:.1f} dB, the median {median:.1f} dB. "
-        "Leave it out if it is blurred, shows something that moved, or has a wrong camera."
+        + ADVICE[reasons.get(view.name)]
         for view in ordered
         if view.psnr < median - MISFIT
     ]

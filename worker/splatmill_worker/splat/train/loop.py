@@ -14,6 +14,7 @@ from splatmill_worker.splat.evaluate import Score
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.curve import CurvePoint, is_flat
+from splatmill_worker.splat.train.disagreement import Disagreement, disagreements
 from splatmill_worker.splat.train.evaluations import Evaluations, corrected
 from splatmill_worker.splat.train.poses import Poses, mean_depth
 from splatmill_worker.splat.train.renderer import render_view
@@ -103,6 +104,7 @@ class Trained:
     views: the training views with their cameras as the run left them.
     cameras_moved: median correction of the cameras, pixels; None where they are not refined.
     validation: names of the training views that were set aside for decisions.
+    disagreements: how far each training photo disagrees with those around it, the largest first.
     """
 
     gaussians: Gaussians
@@ -118,6 +120,7 @@ class Trained:
     views: tuple[TrainingView, ...]
     cameras_moved: float | None
     validation: tuple[str, ...] = ()
+    disagreements: tuple[Disagreement, ...] = ()
 
 
 def train(
@@ -200,6 +203,9 @@ def _result(
     if failure is not None:
         evaluations.final = None
     final = evaluations.finish()
+    started = time.perf_counter()
+    found = disagreements(run)
+    evaluations.seconds += time.perf_counter() - started
     return Trained(
         gaussians=gaussians_of(run.engine).padded(run.plan.schedule.degree),
         curve=tuple(run.curve),
@@ -214,6 +220,7 @@ def _result(
         views=corrected(run),
         cameras_moved=None if run.poses is None else run.poses.pixels_moved(),
         validation=validation,
+        disagreements=found,
     )
 
 

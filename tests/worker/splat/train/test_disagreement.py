@@ -1,0 +1,46 @@
+"""Proves that photos which disagree with the others come first, with the reason and the pixels, at the end of a run.
+
+Does not prove how much is found in photos of real size: `splatmill bench train --scenes passed-by` measures that.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from splatmill_worker.splat.train.disagreement import Disagreement
+from splatmill_worker.splat.train.loop import train
+from splatmill_worker.splat.views import TrainingView
+from tests.support import still_life
+from tests.support.training import first_engine, plan
+
+
+def judged(views: list[TrainingView]) -> tuple[Disagreement, ...]:
+    return train(first_engine(), views, [], plan(200), extent=1.1).disagreements
+
+
+def test_what_passes_by_is_found_in_the_photos_that_show_it() -> None:
+    views = still_life.training_views()
+    for number in (3, 8):
+        views[number].full.rgb[30:50, 36:60] = torch.tensor([250, 20, 220], dtype=torch.uint8)
+    found = judged(views)
+    assert len(found) == len(views)
+    assert {each.name for each in found[:2]} == {views[number].name for number in (3, 8)}
+    for each in found[:2]:
+        assert each.reason == "moving things"
+        assert float(each.outliers[32:48, 38:58].float().mean()) > 0.8
+    assert [each.decibels for each in found] == sorted((each.decibels for each in found), reverse=True)
+
+
+def test_other_light_is_told_from_another_camera() -> None:
+    views = still_life.training_views()
+    views[6].full.rgb.copy_((views[6].full.rgb.float() * 0.5).to(torch.uint8))
+    views[10].full.rgb.copy_(views[0].full.rgb)  # the photo of another camera
+    reasons = {each.name: each.reason for each in judged(views)}
+    assert reasons[views[6].name] == "other light"
+    assert reasons[views[10].name] == "wrong camera or blur"
+
+
+def test_too_few_photos_are_not_compared() -> None:
+    assert (
+        train(first_engine(), still_life.training_views()[:2], [], plan(10), extent=1.1).disagreements == ()
+    )
