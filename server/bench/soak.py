@@ -175,7 +175,7 @@ def _one(service: Service, target: faults.Target, fault: faults.Fault, at_once: 
 def _step_after(service: Service, moment: float) -> float | None:
     """Return when a job first got on after a moment, on the monotonic clock; None if none has."""
     for line in service.records():
-        if line["what"] == "step" and line["at"] > moment:
+        if line["what"] in ("begin", "step") and line["at"] > moment:
             return float(line["at"])
     return None
 

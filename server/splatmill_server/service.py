@@ -190,7 +190,7 @@ def _renderer(settings: Settings) -> httpx.AsyncClient | None:
     return httpx.AsyncClient(base_url=base, transport=transport, trust_env=False)
 
 
-def _service(request: Request) -> Service:
+async def _service(request: Request) -> Service:  # as a coroutine, it takes no thread of the pool
     return cast(Service, request.app.state.service)
 
 

@@ -4,7 +4,7 @@ It runs in the attempt's process (SPLATMILL_PIPELINE). The record is one file of
 line for each of
 
     begin: the process, the job, the step that it resumes from, and whether another attempt at the job runs beside it;
-    step: a step whose checkpoint is stored;
+    step: a step whose checkpoint is stored, or any event of the engine;
     end: the pipeline has returned with a whole model.
 
 Times are those of the machine's monotonic clock, which all processes share and no fault of a soak sets.
@@ -60,8 +60,7 @@ def run(
         record(job, "begin", overlap=overlap, step=None)
 
         def noted(event: Event) -> None:
-            if isinstance(event, ProgressEvent):
-                record(job, "step", step=event.step)
+            record(job, "step", step=event.step if isinstance(event, ProgressEvent) else None)
             emit(event)
 
         from splatmill_worker import pipeline

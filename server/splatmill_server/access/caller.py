@@ -72,7 +72,7 @@ BOOTSTRAP = Caller(DEFAULT_OWNER, key_name="SPLATMILL_API_KEY")
 """The caller that sends the key of the setting SPLATMILL_API_KEY."""
 
 
-def _caller(request: Request) -> Caller:
+async def _caller(request: Request) -> Caller:  # as a coroutine, it takes no thread of the pool
     return cast(Caller, request.state.caller)
 
 

@@ -49,7 +49,7 @@ def check_scope(who: Caller, needed: Scope) -> None:
         )
 
 
-def _permitted(request: Request, who: Who) -> None:
+async def _permitted(request: Request, who: Who) -> None:  # as a coroutine, it takes no thread of the pool
     if is_open(request.scope["path"]):
         return
     endpoint = getattr(request.scope.get("route"), "endpoint", None)

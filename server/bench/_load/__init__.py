@@ -1,0 +1,1 @@
+"""The parts of `bench load`: the clients, which are locust's."""

@@ -1,0 +1,306 @@
+"""How fast the service answers, against the number of its clients, while a training runs.
+
+    splatmill bench load                            # 10 to 400 clients, twenty seconds each
+    splatmill bench load --clients 200 --label "with uvloop"
+    splatmill bench load --profile                  # what the API spends its time with, at the last number of clients
+    splatmill bench load --plot-only
+
+One `splatmill up` on this machine, whose cores the clients, the training and the renderer share. The clients are
+described in `_load/clients.py`. Each number of clients gets rows with p50 and p99 by kind of request, the CPU seconds a
+second and the memory of each process. Rows go to results/load.jsonl, the table to load.md and figures/load.png.
+
+The CPU time that the API takes for an answer is told too, because other programs on the machine disturb it least.
+
+Expected before it was measured: one process with one event loop is the knee, and most of a request is spent in Python
+around it: thread hops of dependencies that do nothing, and the HTTP parser. At 200 clients, p99 under 50 ms for a job
+and under 100 ms for a view of 640x480.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+from _rows import Row, append, footer, lines, origin, worked
+from _still_life import posed_capture
+from _up import served
+
+HERE = Path(__file__).resolve().parent
+
+COUNTS = (10, 50, 100, 200, 400)
+WIDTH, HEIGHT = 640, 480
+PHOTOS = 24
+BUDGET = "20s"
+"""Training of the model that clients look at."""
+
+_COUNTER = "splatmill_http_requests_total{"
+
+_PROCESSES = {
+    "api": "splatmill_server.up.api",
+    "redis": "redis-server",
+    "renderer": "splatmill_worker renderer",
+    "worker": "splatmill_worker train",
+}
+
+
+def main(argv: list[str]) -> int:
+    """Measure the numbers of clients that were asked for, and write table and figure."""
+    parser = argparse.ArgumentParser(
+        prog="splatmill bench load", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--clients", type=int, nargs="+", default=list(COUNTS))
+    parser.add_argument("--seconds", type=float, default=20.0, help="seconds of each number (default: 20)")
+    parser.add_argument("--label", default="", help="what is compared: a name of this state of the code")
+    parser.add_argument("--idle", action="store_true", help="no training runs meanwhile")
+    parser.add_argument("--profile", action="store_true", help="print where the API process spends its time")
+    parser.add_argument("--results", type=Path, default=HERE / "results" / "load.jsonl")
+    parser.add_argument("--plot-only", action="store_true", help="draw the rows that are there")
+    asked = parser.parse_args(argv)
+    if not asked.plot_only:
+        _measure(asked)
+    rows = lines(asked.results)
+    if not rows:
+        print(f"There are no rows in {asked.results}.", file=sys.stderr)
+        return 1
+    own = asked.results.parent == HERE / "results"
+    table = HERE / "load.md" if own else asked.results.with_suffix(".md")
+    table.write_text(document(rows))
+    _draw(rows, HERE / "figures" / "load.png" if own else asked.results.with_suffix(".png"))
+    print(table.read_text())
+    return 0
+
+
+def _measure(asked: argparse.Namespace) -> None:
+    with tempfile.TemporaryDirectory(prefix="splatmill-load-") as folder, served(Path(folder)) as (url, up):
+        http = httpx.Client(base_url=url, timeout=60, trust_env=False)
+        capture = _upload(http)
+        model = _job(http, capture, {"time_budget": BUDGET})
+        _wait(lambda: http.get(f"/v1/jobs/{model}").json()["state"] == "succeeded", 300)
+        camera = http.get(f"/v1/models/{model}/cameras").json()["cameras"][0]["camera"]
+        camera = {**camera, "width": WIDTH, "height": HEIGHT}
+        for name in ("fx", "fy", "cx", "cy"):
+            camera.pop(name, None)
+        camera |= {"fov_y_deg": 50}
+        job = _job(http, capture, {"steps": 200_000})
+        _wait(lambda: http.get(f"/v1/jobs/{job}").json()["state"] == "training", 120)
+        if asked.idle:
+            http.post(f"/v1/jobs/{job}/cancel")
+        for count in asked.clients:
+            found = _with_clients(url, up, count, asked, job, model, camera)
+            for row in found["requests"]:
+                row = {
+                    "bench": "load",
+                    "label": asked.label,
+                    "clients": count,
+                    "seconds": asked.seconds,
+                    "training": not asked.idle,
+                    **row,
+                    "processes": found["processes"],
+                }
+                append(asked.results, row | origin("server", "client"))
+                print(
+                    {key: row[key] for key in ("clients", "what", "requests", "errors", "p50_ms", "p99_ms")}
+                )
+            print(found["processes"], found["errors"][:5], flush=True)
+        http.post(f"/v1/jobs/{job}/cancel")
+        http.close()
+
+
+def _with_clients(
+    url: str, up: psutil.Process, count: int, asked: argparse.Namespace, job: str, model: str, camera: Row
+) -> Row:
+    """Return what the clients met, and what the processes took meanwhile."""
+    given = {
+        "url": url,
+        "clients": count,
+        "seconds": asked.seconds,
+        "job": job,
+        "model": model,
+        "camera": camera,
+    }
+    environment = os.environ | {"PYTHONPATH": str(HERE)}
+    clients = subprocess.Popen(
+        [sys.executable, "-m", "_load.clients", json.dumps(given)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    api = _child(up, _PROCESSES["api"])
+    before, cpu, all_before, begun = _answered(url), _cpu(api), worked(), time.monotonic()
+    with _watched(up, clients.pid) as taken:
+        if asked.profile and count == asked.clients[-1]:
+            _profile(up, asked.seconds)
+        said, _ = clients.communicate(timeout=asked.seconds + 120)
+    taken["machine"] = {"cores": round((worked() - all_before) / (time.monotonic() - begun), 2)}
+    taken["api"]["ms_per_answer"] = round(1000 * (_cpu(api) - cpu) / max(1, _answered(url) - before), 2)
+    found: Row = json.loads(said.splitlines()[-1])
+    return found | {"processes": taken}
+
+
+def _answered(url: str) -> float:
+    """Return how many requests the API has answered."""
+    text = httpx.get(f"{url}/metrics", timeout=60, trust_env=False).text
+    return sum(float(line.rpartition(" ")[2]) for line in text.splitlines() if line.startswith(_COUNTER))
+
+
+@contextmanager
+def _watched(up: psutil.Process, clients: int) -> Iterator[dict[str, Any]]:
+    """Fill in the CPU seconds a second and the largest memory of each process, and the share of the clients."""
+    processes = {name: _child(up, words) for name, words in _PROCESSES.items()}
+    trainers = processes["worker"].children()
+    if trainers:
+        processes["training"] = trainers[0]
+    processes["clients"] = psutil.Process(clients)
+    memory = dict.fromkeys(processes, 0)
+    stop = threading.Event()
+
+    def look() -> None:
+        while not stop.wait(0.5):
+            for name, process in processes.items():
+                with suppress(psutil.Error):
+                    memory[name] = max(memory[name], process.memory_info().rss)
+
+    thread = threading.Thread(target=look)
+    taken: dict[str, Any] = {}
+    begun, before = time.monotonic(), {name: _cpu(process) for name, process in processes.items()}
+    last = dict(before)
+    thread.start()
+    try:
+        yield taken
+    finally:
+        seconds = time.monotonic() - begun
+        last = {name: _cpu(process) or last[name] for name, process in processes.items()}
+        stop.set()
+        thread.join()
+        for name in processes:
+            cores = round((last[name] - before[name]) / seconds, 2)
+            taken[name] = {"cores": cores if name != "clients" else None, "bytes": memory[name]}
+
+
+def _cpu(process: psutil.Process) -> float:
+    try:
+        times = process.cpu_times()
+    except psutil.Error:
+        return 0.0
+    return float(times.user + times.system)
+
+
+def _profile(up: psutil.Process, seconds: float) -> None:
+    """Print the samples of py-spy, which is no dependency: `pip install py-spy`."""
+    target = HERE / "results" / "load.profile"
+    api = _child(up, _PROCESSES["api"])
+    time.sleep(8)  # until the clients have come
+    command = [
+        "py-spy",
+        "record",
+        "-p",
+        str(api.pid),
+        "-d",
+        str(int(seconds) - 2),
+        "-f",
+        "raw",
+        "-o",
+        str(target),
+    ]
+    subprocess.run(command, check=True)
+    print(f"Stacks of the API, one line each with its samples: {target}")
+
+
+def _upload(http: httpx.Client) -> str:
+    capture = str(http.post("/v1/captures", json={}).json()["id"])
+    for name, content in posed_capture(PHOTOS, 320, 240).items():
+        http.put(f"/v1/captures/{capture}/{name}", content=content).raise_for_status()
+    return capture
+
+
+def _job(http: httpx.Client, capture: str, options: Row) -> str:
+    answer = http.post("/v1/jobs", json={"capture": capture, "options": options})
+    return str(answer.raise_for_status().json()["id"])
+
+
+def _wait(condition: Any, seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            raise SystemExit(f"The service was not where it should be after {seconds:g} s.")
+        time.sleep(0.2)
+
+
+def _child(up: psutil.Process, words: str) -> psutil.Process:
+    children: list[psutil.Process] = up.children()
+    return next(child for child in children if words in " ".join(child.cmdline()))
+
+
+def document(rows: list[Row]) -> str:
+    """Return the page with the table."""
+    text = ["# Answers against the number of clients", ""]
+    text += [
+        "Made by `splatmill bench load`; the head of `load.py` says what runs, and what was expected.",
+        "",
+    ]
+    for label in dict.fromkeys(row["label"] for row in rows):
+        of_label = [row for row in rows if row["label"] == label]
+        text += [f"## {label}", ""] if label else []
+        whats = list(dict.fromkeys(row["what"] for row in of_label))
+        text.append(
+            "| clients | " + " | ".join(f"{what}, p50 / p99 ms" for what in whats) + " | requests a second |"
+            " errors | API, CPU ms an answer |"
+            " cores: API, Redis, renderer, training, whole machine | memory: API, Redis, renderer MB |"
+        )
+        text.append("|---" * (len(whats) + 6) + "|")
+        for count in sorted({row["clients"] for row in of_label}):
+            text.append(_line([row for row in of_label if row["clients"] == count], whats, count))
+        text.append("")
+    text.append(footer(rows))
+    return "\n".join(text) + "\n"
+
+
+def _line(rows: list[Row], whats: list[str], count: int) -> str:
+    newest = {row["what"]: row for row in rows}
+    cells = []
+    for what in whats:
+        row = newest.get(what)
+        cells.append(f"{row['p50_ms']:.0f} / {row['p99_ms']:.0f}" if row and row["requests"] else "-")
+    served = sum(row["requests"] / row["seconds"] for row in newest.values() if row["what"] != "events")
+    errors = sum(row["errors"] for row in newest.values())
+    taken = rows[-1]["processes"]
+    cores = ", ".join(
+        f"{taken[n]['cores']:.2f}" for n in ("api", "redis", "renderer", "training", "machine") if n in taken
+    )
+    memory = ", ".join(f"{taken[n]['bytes'] / 1e6:.0f}" for n in ("api", "redis", "renderer"))
+    cost = f"{taken['api']['ms_per_answer']:.1f}"
+    return f"| {count} | {' | '.join(cells)} | {served:.0f} | {errors} | {cost} | {cores} | {memory} |"
+
+
+def _draw(rows: list[Row], path: Path) -> None:
+    import _plot
+
+    figure, (left, right) = _plot.axes(2)
+    for place, what in ((left, "job"), (right, "view")):
+        for label in dict.fromkeys(row["label"] for row in rows):
+            found = {row["clients"]: row for row in rows if row["what"] == what and row["label"] == label}
+            counts = sorted(found)
+            for key, style in (("p50_ms", "--"), ("p99_ms", "-")):
+                name = f"{key[:3]} {label}".strip()
+                place.plot(counts, [found[count][key] for count in counts], style, marker="o", label=name)
+        place.axhline(50 if what == "job" else 100, color="#999999", linewidth=0.8)
+        place.set(xlabel="clients", ylabel="milliseconds", xscale="log", yscale="log", title=what)
+        place.legend(fontsize=8)
+    _plot.save(figure, path, footer(rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
