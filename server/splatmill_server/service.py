@@ -121,7 +121,8 @@ class Service:
         jobs = Jobs(connection, storage, metrics, lists)
         models = Models(storage, jobs, lists)
         captures = Captures(storage, settings, metrics, lists)
-        lists.makers += [captures.make_lists, jobs.make_lists, models.make_lists]
+        # Queued jobs do not wait for the others.
+        lists.makers += [jobs.make_lists, captures.make_lists, models.make_lists]
         usage = Usage(storage, Ledger(connection))
         quota = Quota(usage, captures, settings.quota)
         deletion = Deletion(connection, storage, captures, jobs, usage.ledger)

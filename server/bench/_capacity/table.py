@@ -1,5 +1,6 @@
-"""The table of `bench capacity`, from its rows."""
+"""The tables of `bench capacity`, from its rows."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from _rows import Row, footer, lines
@@ -13,35 +14,44 @@ processes on the machine named below. Operations of storage are calls: a listing
 
 
 def write_table(rows_at: Path, page: Path) -> None:
-    """Write the page for the newest rows of the largest number of records."""
-    rows = lines(rows_at)
-    if not rows:
-        return
-    largest = max(row["records"] for row in rows)
-    newest: dict[tuple[str, ...], Row] = {}
-    for row in rows:
-        if row["records"] == largest:
-            newest[row["what"], row.get("list", ""), row.get("where", "")] = row
-    chosen = list(newest.values())
-    text = [HEAD, f"{largest} captures, {largest} jobs, about {0.89 * largest:.0f} models.", ""]
-    text += ["| a page of 50 | ms | round trips | storage | found | ms at first | storage at first |"]
-    text += ["|---|---:|---:|---:|---:|---:|---:|"]
+    """Write the page for the newest rows of each number of records, the largest number first."""
+    newest: dict[tuple[object, ...], Row] = {}
+    for row in lines(rows_at):
+        newest[row["records"], row["what"], row.get("list"), row.get("where")] = row
+    counts = sorted({row["records"] for row in newest.values()}, reverse=True)
+    if counts:
+        text = [HEAD]
+        for count in counts:
+            text += _section(count, [row for row in newest.values() if row["records"] == count])
+        page.write_text("\n".join(text))
+
+
+def _section(count: int, rows: Sequence[Row]) -> list[str]:
+    text = [f"## {count} captures, {count} jobs, about {0.89 * count:.0f} models", ""]
+    if any(row["what"] == "page" for row in rows):
+        text += ["| a page of 50 | ms | round trips | storage | found | ms at first | storage at first |"]
+        text += ["|---|---:|---:|---:|---:|---:|---:|"]
     text += [
         f"| {row['list']}: {row['where']} | {1000 * row['seconds']:.0f} | {row['round_trips']} | {row['storage']} "
         f"| {row['found']} | {1000 * row['first_seconds']:.0f} | {row['first_storage']} |"
-        for row in chosen
+        for row in rows
         if row["what"] == "page"
     ]
     text += ["", "| what | seconds | round trips | storage |", "|---|---:|---:|---:|"]
     text += [
         f"| {row['what']} | {row['seconds']:.2f} | {row.get('round_trips', '')} | {row.get('storage', '')} |"
-        for row in chosen
+        for row in rows
         if row["what"] != "page" and "seconds" in row and "followers" not in row
+    ]
+    text += [
+        f"| {row['what']}, to the first page | {row['first_page']:.2f} | | |"
+        for row in rows
+        if "first_page" in row
     ]
     text += ["", "| Redis | MB | bytes for each job, with its capture and model |", "|---|---:|---:|"]
     text += [
-        f"| {row['what']} | {row['bytes'] / 1e6:.0f} | {row['bytes'] / largest:.0f} |"
-        for row in chosen
+        f"| {row['what']} | {row['bytes'] / 1e6:.0f} | {row['bytes'] / count:.0f} |"
+        for row in rows
         if "bytes" in row
     ]
     text += [
@@ -49,7 +59,7 @@ def write_table(rows_at: Path, page: Path) -> None:
         f"{row['event_seconds']:.0f} seconds of events took {row['seconds']:.1f} s with connecting, "
         f"{row['cpu_seconds']:.1f} CPU seconds of the API process and {row['bytes_each'] / 1000:.0f} kB for each "
         f"client; Redis had {row['redis_connections']} connections."
-        for row in chosen
+        for row in rows
         if "followers" in row
     ]
-    page.write_text("\n".join([*text, "", footer(chosen), ""]))
+    return [*text, "", footer(list(rows)), ""]
