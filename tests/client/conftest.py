@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import redis
 import structlog
 import uvicorn
+from redis import Redis
 
-from splatmill.backplane import layout
+from splatmill.backplane import layout, lists
 from splatmill.backplane.connection import connect
 from splatmill.backplane.events import append, begin_attempt
 from splatmill.backplane.row import read
@@ -57,23 +57,23 @@ class Service:
     """The real server on a real socket, with a real Redis. The methods do what a worker does, through the backplane."""
 
     url: str
-    connection: redis.Redis
+    redis: Redis
     storage: Storage
     stop: Callable[[], None]
     start: Callable[[], None]
 
     def begin(self, job_id: str) -> None:
         """An attempt takes the job up."""
-        self.attempt = begin_attempt(self.connection, job_id)
+        self.attempt = begin_attempt(self.redis, job_id)
         self.say(job_id, StateEvent(state=JobState.preparing))
 
     def say(self, job_id: str, *told: Event) -> None:
         for event in told:
-            append(self.connection, job_id, 1, self.attempt, event)
+            append(self.redis, job_id, 1, self.attempt, event)
 
     def finish(self, job_id: str, model: bytes) -> None:
         """Store a model and tell that the job succeeded."""
-        row = read(self.connection, job_id)
+        row = read(self.redis, job_id)
         assert row is not None
         report = {
             "curve": [{"seconds": 1, "step": 10, "gaussians": 1, "psnr": 25.0}],
@@ -101,6 +101,7 @@ class Service:
         }
         for name, data in files.items():
             self.storage.put(layout.model_file(job_id, name), data)
+        lists.add_model(self.redis, job_id, row.created_at, row.owner)
         self.say(job_id, StateEvent(state=JobState.succeeded))
 
     def fail(self, job_id: str, problem: Problem) -> None:

@@ -67,7 +67,7 @@ def test_the_life_of_a_job(service, photos, tmp_path):
         with pytest.raises(NotFound):
             job.snapshot()
         assert job.watch() > 5
-        service.connection.hset(keys.snapshot(job.id), mapping={"ply": PLY, "tag": "1-3"})
+        service.redis.hset(keys.snapshot(job.id), mapping={"ply": PLY, "tag": "1-3"})
         assert job.snapshot() == PLY
         placed = Placement(final=True, cameras=[], points=[(0, 1, 2)], colors=[(9, 9, 9)], points_total=1)
         service.storage.put(layout.job_cameras(job.id), placed.model_dump_json().encode())

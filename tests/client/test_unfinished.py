@@ -236,7 +236,7 @@ def test_a_real_training_goes_on_at_its_checkpoint_with_its_cameras(tmp_path: Pa
         "-o",
         str(out),
         "--time-budget",
-        "20s",
+        "6s",
     ]
     environment = os.environ | {"NO_COLOR": "1", "PYTHONUNBUFFERED": "1"}
     pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "env": environment}

@@ -138,7 +138,7 @@ def test_without_redis_sessions_wait_and_keys_work(serve: Serve, tmp_path: Path)
     answer = app.http.get("/v1/models", headers=with_cookie(cookie))
     problem(answer, 503, "queue_unavailable")
     assert answer.headers["retry-after"]
-    assert app.http.get("/v1/models").status_code == 200
+    problem(app.http.get(f"/v1/captures/{'0' * 16}"), 404, "capture_not_found")
 
 
 OWN = ["localhost", "localhost:8080", "LOCALHOST.", "127.0.0.1", "127.1.2.3:9", "[::1]:80", "app.localhost"]
