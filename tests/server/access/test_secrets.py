@@ -179,7 +179,7 @@ def test_a_bucket_that_does_not_answer_shows_no_secret(tmp_path: Path, redis_url
     )
     log = tmp_path / "log"
     with served(env, log) as server:
-        assert server.ask("GET", "/v1/captures").status_code == 503
+        assert server.ask("GET", f"/v1/captures/{'0' * 16}").status_code == 503
     text = log.read_text() + "".join(server.seen) + doctor(env)
     assert "Storage could not" in text
     for secret in (BUCKET_SECRET, API_KEY):
