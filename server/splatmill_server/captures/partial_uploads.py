@@ -128,7 +128,7 @@ class PartialUploads:
         try:
             return Standing(record, open_part(self.storage, capture_id, record.id).offset(), left)
         except FileNotFoundError:
-            raise _not_found(record.id) from None
+            raise self._gone(capture_id, record.id) from None
 
     async def append(
         self,
@@ -177,7 +177,7 @@ class PartialUploads:
                     file, new = await self._complete(capture_id, record, part)
                 return Standing(record, file.size, STALE_SECONDS), file, new
             except FileNotFoundError:
-                raise _not_found(upload_id) from None
+                raise await run_in_threadpool(self._gone, capture_id, upload_id) from None
             finally:
                 if self._writers.get(upload_id) is me:
                     del self._writers[upload_id]
@@ -294,8 +294,20 @@ class PartialUploads:
         self.captures.record(capture_id)
         record = self._record(capture_id, upload_id) if layout.is_id(upload_id) else None
         if record is None:
-            raise _not_found(upload_id)
+            raise self._gone(capture_id, upload_id)
         return record
+
+    def _gone(self, capture_id: str, upload_id: str) -> ProblemError:
+        """Return the problem of an upload that is not there, or not any more: a deletion takes the capture first."""
+        try:
+            self.captures.record(capture_id)
+        except ProblemError as problem:
+            return problem
+        return ProblemError(
+            "upload_not_found",
+            f"There is no upload {upload_id[:80]!r}; it may have been cancelled, or left for longer than a day.",
+            advice="Begin again with PUT /v1/captures/{id}/{role}/{name} and the header Upload-Complete: ?0.",
+        )
 
     def _record(self, capture_id: str, upload_id: str) -> UploadRecord | None:
         try:
@@ -340,14 +352,6 @@ async def _named(file: str) -> AsyncIterator[None]:
         found = problem_of_storage(error)
         problem = ProblemError(found.code, found.detail, advice=found.advice, facts=found.facts)
         raise problem.about_file(file) from error
-
-
-def _not_found(upload_id: str) -> ProblemError:
-    return ProblemError(
-        "upload_not_found",
-        f"There is no upload {upload_id[:80]!r}; it may have been cancelled, or left for longer than a day.",
-        advice="Begin again with PUT /v1/captures/{id}/{role}/{name} and the header Upload-Complete: ?0.",
-    )
 
 
 def _wrong_offset(given: int, held: int) -> ProblemError:

@@ -401,12 +401,16 @@ class Jobs:
             queue.forget(self.connection, job_id, generation)
 
     def give_verdict(self, expected: JobRow, state: str, problem: Problem | None = None) -> bool:
-        """End a generation as `state`; return False if it has ended or was restarted meanwhile."""
+        """End a generation as `state`; return False if it has ended, was restarted, or is to be cancelled, meanwhile.
+
+        A process that is killed for a cancellation that `expected` does not know yet looks like a failure.
+        """
         given = False
 
         def verdict(found: JobRow, job: Job) -> dict[str, str] | None:
             nonlocal given
-            given = not job.state.final and found.generation == expected.generation
+            expects = expected.generation, expected.cancel_requested_at
+            given = not job.state.final and (found.generation, found.cancel_requested_at) == expects
             if not given:
                 return None
             last = cast(list[Any], self.connection.xrevrange(keys.states(found.id), count=1))

@@ -241,14 +241,26 @@ def test_the_reaper_looks_at_unfinished_jobs_alone_and_at_all_of_them(app: Serve
     assert app.redis.smembers(keys.ACTIVE) == set()
 
 
-@pytest.mark.parametrize("change", ["restart", "final"])
-def test_a_verdict_on_what_changed_meanwhile_is_not_given(app: ServedApp, change: str) -> None:
+@pytest.mark.parametrize(
+    ("change", "verdict", "state"),
+    [
+        ("restart", "cancelled", "queued"),
+        ("final", "cancelled", "succeeded"),
+        ("cancel", "failed", "preparing"),
+    ],
+)
+def test_a_verdict_on_what_changed_meanwhile_is_not_given(
+    app: ServedApp, change: str, verdict: str, state: str
+) -> None:
     job_id = app.job()
     app.begin(job_id)
     old = row.read(app.redis, job_id)
     assert old is not None
-    app.say(job_id, StateEvent(state=JobState.succeeded))
+    if change == "cancel":
+        app.service.jobs.cancel(job_id)
+    else:
+        app.say(job_id, StateEvent(state=JobState.succeeded))
     if change == "restart":
         app.http.post(f"/v1/jobs/{job_id}/restart")
-    assert app.service.jobs.give_verdict(old, "cancelled") is False
-    assert app.state(job_id) == ("queued" if change == "restart" else "succeeded")
+    assert app.service.jobs.give_verdict(old, verdict) is False
+    assert app.state(job_id) == state
