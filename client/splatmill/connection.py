@@ -13,7 +13,14 @@ from pydantic import BaseModel, ValidationError
 
 from splatmill.errors import ConnectionFailed, error_for
 from splatmill.schema.problems import PROBLEM_MEDIA_TYPE, Problem, code_for_status
-from splatmill.server_choice import API_KEY_VARIABLE, DEFAULT_SERVER, Verify, choose_server, ssl_context
+from splatmill.server_choice import (
+    API_KEY_VARIABLE,
+    CA_BUNDLE_VARIABLE,
+    DEFAULT_SERVER,
+    Verify,
+    choose_server,
+    ssl_context,
+)
 
 # A read may have to wait for a render or for Redis to restart; connecting to a running server is quick.
 TIMEOUT = httpx.Timeout(60.0, connect=10.0)
@@ -154,6 +161,11 @@ class Connection:
     def lost(self, error: httpx.TransportError) -> ConnectionFailed:
         """Return the error for a failed connection."""
         reason = str(error) or type(error).__name__
+        if "CERTIFICATE_VERIFY_FAILED" in reason:
+            return ConnectionFailed(
+                f"The certificate of {self.server} is not trusted ({reason}).",
+                f"If an authority of your own signed it, name its certificate with {CA_BUNDLE_VARIABLE} or verify=.",
+            )
         if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
             return ConnectionFailed(
                 f"No server answers at {self.server} ({reason}).",

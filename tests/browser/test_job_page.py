@@ -257,6 +257,17 @@ def test_a_lost_connection_is_shown_and_the_page_goes_on_where_it_was(
     assert asked[0] is None
 
 
+def test_an_answer_that_breaks_off_is_told_as_a_lost_connection(page: Page) -> None:
+    page.goto("/jobs")
+    told = page.evaluate("""async () => {
+      const { whole } = await import(new URL("api.js", document.querySelector("script[type=module]").src));
+      const cut = () => new Response(new ReadableStream({ start: (it) => it.error(new TypeError("network error")) }));
+      const kinds = [cut().json(), cut().arrayBuffer(), new Response("{").json()];
+      return Promise.all(kinds.map((body) => whole(body).catch((error) => error.code ?? error.name)));
+    }""")
+    assert told == ["unreachable", "unreachable", "SyntaxError"]
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_page_fits_a_phone(service: Up, model: SmallModel, open_window: Open, scheme: str) -> None:
     page = open_window(service, viewport={"width": 360, "height": 740}, color_scheme=scheme).page

@@ -88,7 +88,8 @@ def test_a_killed_service_leaves_nothing_and_goes_on_when_started_again(
 
     own_service.start()
     check_resumed(own_service, job_id)
-    assert own_service.ended(waiting)["state"] == "succeeded"
+    job = own_service.ended(waiting)
+    assert job["state"] == "succeeded", job
     assert own_service.job(done)["state"] == "succeeded"
     assert own_service.http.get(f"/v1/models/{done}").status_code == 200
 
@@ -112,7 +113,8 @@ def test_a_redis_that_comes_back_empty_loses_no_job_and_no_attempt(own_service: 
     assert own_service.job(done)["state"] == "succeeded"
     job = own_service.ended(running)
     assert (job["state"], job["attempt"], len(own_service.diary(running))) == ("succeeded", 1, 1)
-    assert own_service.ended(waiting)["state"] == "succeeded"
+    job = own_service.ended(waiting)
+    assert job["state"] == "succeeded", job
     models = own_service.http.get("/v1/models").json()["models"]
     assert {model["id"] for model in models} == {done, running, waiting}
 

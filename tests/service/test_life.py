@@ -94,7 +94,8 @@ def test_a_restarted_job_goes_on_after_a_cancel(service: Up) -> None:
     job_id = service.submit(steps=40)
     service.reached(job_id, 10)
     service.http.post(f"/v1/jobs/{job_id}/cancel")
-    assert service.ended(job_id)["state"] == "cancelled"
+    job = service.ended(job_id)
+    assert job["state"] == "cancelled", job
     assert service.http.post(f"/v1/jobs/{job_id}/restart").status_code in (200, 202)
     job = service.ended(job_id)
     assert job["state"] == "succeeded"

@@ -59,11 +59,7 @@ export async function request(method, path, { query = {}, json, body, headers = 
     });
   } catch (error) {
     if (signal?.aborted) throw error;
-    throw new Problem({
-      code: "unreachable", status: 0, title: "The server cannot be reached",
-      detail: "The server did not answer.",
-      advice: "Check that it still runs and that this device is connected, then try again.",
-    });
+    throw unreachable("The server did not answer.");
   }
   if (response.ok || response.status === 304) return response;
   const problem = await problemOf(response);
@@ -72,6 +68,28 @@ export async function request(method, path, { query = {}, json, body, headers = 
     await new Promise(() => {}); // the page is being left
   }
   throw problem;
+}
+
+/** @param {string} detail */
+function unreachable(detail) {
+  return new Problem({
+    code: "unreachable", status: 0, title: "The server cannot be reached", detail,
+    advice: "Check that it still runs and that this device is connected, then try again.",
+  });
+}
+
+/**
+ * Return the body of a response, as in `whole(response.json())`. Throws Problem where the connection ends before it does.
+ * @template T
+ * @param {Promise<T>} body
+ * @returns {Promise<T>}
+ */
+export async function whole(body) {
+  try {
+    return await body;
+  } catch (error) {
+    throw error instanceof TypeError ? unreachable("The connection ended within the answer.") : error;
+  }
 }
 
 /** Return the problem that a response carries. @param {Response} response */
@@ -102,7 +120,7 @@ export function signIn() {
  * @returns {Promise<any>}
  */
 export async function get(path, query, signal) {
-  return (await request("GET", path, { query, signal })).json();
+  return whole((await request("GET", path, { query, signal })).json());
 }
 
 /**
@@ -114,7 +132,7 @@ export async function get(path, query, signal) {
  */
 export async function send(method, path, json) {
   const response = await request(method, path, { json });
-  return response.status === 204 ? null : response.json();
+  return response.status === 204 ? null : whole(response.json());
 }
 
 /**

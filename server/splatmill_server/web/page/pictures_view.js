@@ -108,16 +108,17 @@ export class Pictures {
    * @returns {Promise<number>} milliseconds to wait before the next request
    */
   async fetch(query) {
-    let answer;
+    let answer, body;
     try {
       answer = await fetch(`${this.options.model}/render?${query}`, { signal: this.ended.signal });
+      body = await answer.blob();
     } catch (error) {
       if (this.ended.signal.aborted) throw error;
       this.options.failed("The server could not be reached for a picture; another attempt follows.");
       return RETRY;
     }
     if (!answer.ok) {
-      const problem = await answer.json().catch(() => ({}));
+      const problem = await new Response(body).json().catch(() => ({}));
       this.options.failed(problem.detail ?? `The server answered ${answer.status} in place of a picture.`);
       if (answer.status !== 503 && answer.status !== 429 && answer.status !== 504) {
         this.shown = query; // the same request would fail again
@@ -127,13 +128,13 @@ export class Pictures {
     }
     const context = this.canvas.getContext("2d");
     if (this.options.depth) {
-      const { data, shape } = readArray(await answer.arrayBuffer());
+      const { data, shape } = readArray(await body.arrayBuffer());
       const { pixels, near, far } = depthColors(data);
       const picture = await createImageBitmap(new ImageData(pixels, shape[1], shape[0]));
       context?.drawImage(picture, 0, 0, this.canvas.width, this.canvas.height);
       this.options.range?.(near, far);
     } else {
-      const picture = await createImageBitmap(await answer.blob());
+      const picture = await createImageBitmap(body);
       context?.drawImage(picture, 0, 0, this.canvas.width, this.canvas.height);
       picture.close();
     }

@@ -1,6 +1,6 @@
 // What every page has around its contents: header, navigation, theme switch, who is signed in, and notices.
 
-import { Problem, request, signIn } from "./api.js";
+import { Problem, request, signIn, whole } from "./api.js";
 import { h } from "./dom.js";
 
 const THEME = "splatmill.theme";
@@ -55,7 +55,7 @@ export async function startShell({ open = false, visitor = false, viewer = false
 /** @param {boolean} open */
 async function me(open) {
   try {
-    return await (await request("GET", "/v1/me", { stay: true })).json();
+    return await whole((await request("GET", "/v1/me", { stay: true })).json());
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
     if (error.status === 401) {

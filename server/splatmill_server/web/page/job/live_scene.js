@@ -1,6 +1,6 @@
 // What a job shows while it runs: the scene in training, its cameras and points, or the newest preview picture.
 
-import { Problem, request } from "../api.js";
+import { Problem, request, whole } from "../api.js";
 import { h } from "../dom.js";
 import { bytes, number } from "../format.js";
 import { viewerInstalled } from "../shell.js";
@@ -138,9 +138,10 @@ export class LiveScene {
 
   async fetchSnapshot() {
     const event = this.announced;
-    let answer;
+    let answer, snapshot;
     try {
       answer = await request("GET", `${this.address}/snapshot`, { headers: this.tag ? { "If-None-Match": this.tag } : {} });
+      snapshot = await whole(answer.arrayBuffer());
     } catch (error) {
       if (error instanceof Problem && [0, 404, 503].includes(error.status)) return; // it expired, or the next one follows
       throw error;
@@ -148,7 +149,7 @@ export class LiveScene {
     if (answer.status === 304) return;
     this.tag = answer.headers.get("ETag") ?? "";
     try {
-      await this.draw(await answer.arrayBuffer());
+      await this.draw(snapshot);
     } catch (error) {
       if (!(error instanceof ViewerError)) throw error;
       this.trouble = error.message;

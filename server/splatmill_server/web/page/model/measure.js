@@ -1,6 +1,6 @@
 // Measuring: two points of the scene, the distance between them, and a known distance that gives the scene its scale.
 
-import { request } from "../api.js";
+import { request, whole } from "../api.js";
 import { h } from "../dom.js";
 import { notify } from "../shell.js";
 import { add, length, poseOf, sub, times } from "../viewer/pose.js";
@@ -163,7 +163,7 @@ async function pointAt(address, view, x, y) {
   const [dx, dy] = [(x - width / 2) / focal, (y - height / 2) / focal];
   const camera = { camera_to_world, width: 1, height: 1, fx: focal, fy: focal, cx: 0.5 - dx * focal, cy: 0.5 - dy * focal };
   const answer = await request("POST", `${address}/render`, { json: { camera, output: "depth", format: "npy" } });
-  const [depth] = readArray(await answer.arrayBuffer()).data;
+  const [depth] = readArray(await whole(answer.arrayBuffer())).data;
   if (!(depth > 0)) return null;
   const pose = poseOf({ camera_to_world, width, height });
   return add(pose.position, times(add(pose.forward, add(times(pose.right, dx), times(pose.down, dy))), depth));

@@ -1,6 +1,6 @@
 // The orbit video: rendered by the server on demand, played here, and saved.
 
-import { request } from "../api.js";
+import { request, whole } from "../api.js";
 import { h } from "../dom.js";
 import { noticeOf } from "../shell.js";
 
@@ -35,7 +35,7 @@ export function showOrbit(section, { model, address, background }) {
         json: { seconds: Number(length.value), width, height, background }, signal: running.signal,
       });
       URL.revokeObjectURL(shownUrl);
-      shownUrl = URL.createObjectURL(await answer.blob());
+      shownUrl = URL.createObjectURL(await whole(answer.blob()));
       place.append(
         h("video", { src: shownUrl, controls: true, loop: true, playsinline: true, "aria-label": "Video that circles the scene" }),
         h("p", {}, h("a", { href: shownUrl, download: `${model.name || model.id}-orbit.mp4` }, "Save the video")));

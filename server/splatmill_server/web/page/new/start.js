@@ -1,6 +1,6 @@
 // From files and settings to a job: the capture is made, what it lacks is sent, the job is created once.
 
-import { get, request, send } from "../api.js";
+import { get, request, send, whole } from "../api.js";
 import { byId } from "../dom.js";
 import { number } from "../format.js";
 import { showProgress } from "./progress.js";
@@ -208,7 +208,7 @@ export class Start {
       remember(this.upload);
     }
     const headers = { "Idempotency-Key": this.job.key };
-    return (await request("POST", "/v1/jobs", { json: body, headers })).json();
+    return whole((await request("POST", "/v1/jobs", { json: body, headers })).json());
   }
 
   /** @param {string} text what is being done, for screen readers too */
