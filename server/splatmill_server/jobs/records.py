@@ -159,12 +159,12 @@ class Jobs:
 
     def get(self, job_id: str) -> Job:
         """Return the job as clients see it. A job that has ended is read from storage if Redis has lost it."""
-        try:
-            return self._placed(self.row(job_id))
-        except ProblemError:
-            if (stored := self.stored(job_id)) is not None:
-                return stored
-            raise
+        if layout.is_id(job_id) and (held := read_jobs(self.connection, [job_id]).get(job_id)) is not None:
+            return with_places(self.connection, [(with_links(held.job()), held.row.generation)])[0]
+        if (stored := self.stored(job_id)) is not None:
+            return stored
+        self.row(job_id)  # says why there is none
+        raise job_not_found(job_id)
 
     def stored(self, job_id: str) -> Job | None:
         """Return an ended job from storage: from the `job.json` of its model or the file of its log, or None."""
