@@ -226,7 +226,7 @@ def test_a_folder_without_a_record_is_emptied(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_real_training_goes_on_at_its_checkpoint_with_its_cameras(tmp_path: Path) -> None:
     photos, out = tmp_path / "photos", tmp_path / "out"
-    capture(photos, 24, 320, 240, 0)
+    capture(photos, 24, 240, 180, samples=1)
     command = [
         sys.executable,
         "-m",

@@ -23,6 +23,7 @@ from tests.support.waiting import gone, wait_for
 pytestmark = pytest.mark.slow
 
 COUNT, WIDTH, HEIGHT = 10, 160, 120
+SMALL = {"max_gaussians": 2000}
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,7 @@ def test_posed_photos_become_a_model_whose_views_match_them(
     capture = upload(up, folder)
     answer = up.http.put(f"/v1/captures/{capture}/poses/transforms.json", content=transforms(cameras))
     assert answer.status_code == 201, answer.text
-    answer = up.http.post("/v1/jobs", json={"capture": capture, "options": {"steps": 150}})
+    answer = up.http.post("/v1/jobs", json={"capture": capture, "options": {"steps": 150} | SMALL})
     job_id = answer.json()["id"]
     job = up.ended(job_id, 200)
     assert job["state"] == "succeeded", job["problem"]
@@ -98,7 +99,7 @@ def test_posed_photos_become_a_model_whose_views_match_them(
     assert video.content[4:8] == b"ftyp"
 
     # From that model, filmed.
-    further = {"steps": 40, "start": job_id, "progress_video": True}
+    further = SMALL | {"steps": 40, "start": job_id, "progress_video": True}
     answer = up.http.post("/v1/jobs", json={"capture": capture, "options": further})
     later_id = answer.json()["id"]
     later = up.ended(later_id, 200)
@@ -123,7 +124,9 @@ def test_a_colmap_model_without_points_trains(
     for name, content in files.items():
         answer = up.http.put(f"/v1/captures/{capture}/poses/sparse/0/{name}", content=content)
         assert answer.status_code == 201, answer.text
-    job_id = up.http.post("/v1/jobs", json={"capture": capture, "options": {"steps": 100}}).json()["id"]
+    job_id = up.http.post("/v1/jobs", json={"capture": capture, "options": {"steps": 100} | SMALL}).json()[
+        "id"
+    ]
     job = up.ended(job_id, 200)
     assert job["state"] == "succeeded", job["problem"]
     report = up.http.get(f"/v1/jobs/{job_id}/report").json()

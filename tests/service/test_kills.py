@@ -43,7 +43,7 @@ def test_a_killed_worker_takes_its_trainer_along_and_is_followed(service: Up) ->
     service.reached(job_id, 6)
     worker, trainer = service.worker, service.trainer(job_id)
     os.kill(worker, signal.SIGKILL)
-    wait_for(lambda: gone([worker, trainer]), 5)
+    wait_for(lambda: gone([worker, trainer]))
     check_resumed(service, job_id)
 
 
@@ -84,7 +84,7 @@ def test_a_killed_service_leaves_nothing_and_goes_on_when_started_again(
     waiting = own_service.submit(steps=2)
     own_service.reached(job_id, 6)
     family = own_service.kill(children=children)
-    wait_for(lambda: gone(family), 10)
+    wait_for(lambda: gone(family))
 
     own_service.start()
     check_resumed(own_service, job_id)

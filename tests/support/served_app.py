@@ -95,7 +95,7 @@ def served_app(settings: Settings, connection: redis.Redis) -> Iterator[ServedAp
     finally:
         app.state.service.closing.set()
         server.should_exit = True
-        thread.join(15)
+        thread.join(60)
         assert not thread.is_alive()
         listener.close()
 

@@ -80,7 +80,7 @@ class Up:
         family = [self.process.pid, *(child.pid for child in self.tree())]
         for pid in family if children else family[:1]:
             os.kill(pid, signal.SIGKILL)
-        self.process.wait(10)
+        self.process.wait(60)
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.process.stdin.close()

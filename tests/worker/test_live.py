@@ -163,7 +163,7 @@ def test_looks_are_rare_and_take_a_small_share_of_the_time(monkeypatch: pytest.M
 
 @pytest.mark.slow
 def test_cameras_are_shown_while_the_mapper_places_them(tmp_path: Path) -> None:
-    synthetic.capture(tmp_path / "images", 12, 320, 240)
+    synthetic.capture(tmp_path / "images", 12, 320, 240, samples=1)
     events: list[Event] = []
     documents: list[Placement] = []
 

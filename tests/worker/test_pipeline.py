@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 
 
 def options(**values: object) -> TrainOptions:
-    return TrainOptions.model_validate({"steps": 150, "seed": 1, **values})
+    return TrainOptions.model_validate({"steps": 150, "seed": 1, "max_gaussians": 2000, **values})
 
 
 def run(

@@ -79,7 +79,7 @@ def test_a_cancelled_job_ends_its_stream_with_the_servers_word(app: ServedApp) -
     reader = threading.Thread(target=lambda: found.extend(follow(app, job_id)))
     reader.start()
     assert app.http.post(f"/v1/jobs/{job_id}/cancel").json()["state"] == "cancelled"
-    reader.join(5)
+    reader.join(60)
     assert brief(found) == ["queued", "cancelled"]
     assert {e["attempt"] for e in found} == {0}
     assert follow(app, job_id, found[0]["id"]) == found[1:]

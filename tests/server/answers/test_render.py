@@ -74,7 +74,7 @@ def renderer(tmp_path: Path) -> Iterator[str]:
     wait_for(lambda: server.started)
     yield f"unix:{path}"
     server.should_exit = True
-    thread.join(10)
+    thread.join(60)
 
 
 @pytest.fixture

@@ -93,7 +93,7 @@ def test_a_lease_that_is_not_prolonged_expires(taken: Lease, connection: redis.R
     reclaim = Reclaim(connection)
     assert reclaim.run() == []
     assert leases.prolong(connection, taken)
-    assert wait_for(reclaim.run, 10) == [(taken, "waiting")]
+    assert wait_for(reclaim.run) == [(taken, "waiting")]
     assert waiting(connection) == 1
     assert not leases.prolong(connection, taken), "the worker must learn that it was superseded"
 
@@ -159,7 +159,7 @@ def test_after_redis_was_away_workers_get_the_time_of_a_lease(
         assert reclaim.run() == Reclaim(connection).run() == []
         assert leases.prolong(connection, lease)
         assert queue.status(connection, "job00001", 1).state == "running"
-        assert wait_for(reclaim.run, 10) == [(lease, "waiting")]
+        assert wait_for(reclaim.run) == [(lease, "waiting")]
         connection.close()
     finally:
         server.kill()

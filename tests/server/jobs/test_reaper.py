@@ -143,7 +143,7 @@ def test_a_dead_workers_attempt_is_queued_again(app: ServedApp, tmp_path: Path, 
         process.wait()
         os.kill(pid, 9)
     # Its heartbeat was good for two seconds; the reaper sees that it is over.
-    wait_for(lambda: app.service.reaper.tick() or queue.status(app.redis, job_id, 1).state == "waiting", 15)
+    wait_for(lambda: app.service.reaper.tick() or queue.status(app.redis, job_id, 1).state == "waiting")
     assert app.state(job_id) == "queued"
 
 

@@ -212,7 +212,7 @@ def test_of_two_processes_that_know_nothing_one_scans_and_the_other_waits(
     def slow(lock: object) -> None:
         scans.append("one")
         scanning.set()
-        assert go_on.wait(10)
+        assert go_on.wait(60)
         scan()
 
     monkeypatch.setattr(one, "scan", slow)
@@ -220,11 +220,11 @@ def test_of_two_processes_that_know_nothing_one_scans_and_the_other_waits(
     first = threading.Thread(target=one.refresh, args=(10.0,))
     second = threading.Thread(target=two.refresh, args=(10.0,))
     first.start()
-    assert scanning.wait(10)
+    assert scanning.wait(60)
     second.start()
     go_on.set()
-    first.join(10)
-    second.join(10)
+    first.join(60)
+    second.join(60)
     assert scans == ["one"]
 
 

@@ -132,9 +132,9 @@ def test_decoding_waits_for_room() -> None:
 
         waiting.start()
         small.start()
-        small.join(10)
+        small.join(60)
         assert order == ["small"]
-    waiting.join(10)
+    waiting.join(60)
     assert order == ["small", "large"]
 
 

@@ -18,7 +18,7 @@ def test_more_requests_than_may_wait_are_sent_away() -> None:
             nonlocal inside, most
             inside += 1
             most = max(most, inside)
-            release.wait(10)
+            release.wait(60)
             inside -= 1
 
         async def visit() -> bool:
@@ -49,7 +49,7 @@ def test_work_of_a_client_that_left_while_it_waited_is_not_done() -> None:
         async def gone() -> bool:
             return True
 
-        before = asyncio.create_task(queue.run(lambda: release.wait(10)))
+        before = asyncio.create_task(queue.run(lambda: release.wait(60)))
         waiting = asyncio.create_task(queue.run(work, gone))
         await asyncio.sleep(0)
         release.set()
@@ -64,7 +64,7 @@ def test_work_of_a_client_that_left_while_it_waited_is_not_done() -> None:
 def test_clients_take_turns() -> None:
     async def mixed() -> list[str]:
         queue, release, order = RenderQueue(max_waiting=20), threading.Event(), list[str]()
-        first = asyncio.create_task(queue.run(lambda: release.wait(10), client="ann"))
+        first = asyncio.create_task(queue.run(lambda: release.wait(60), client="ann"))
         await asyncio.sleep(0)
         waiting = [
             asyncio.create_task(queue.run(partial(order.append, name), client=name[:3]))
@@ -132,7 +132,7 @@ def test_a_client_that_leaves_while_it_waits_frees_its_place_at_once() -> None:
         async def gone() -> bool:
             return True
 
-        before = asyncio.create_task(queue.run(lambda: release.wait(10)))
+        before = asyncio.create_task(queue.run(lambda: release.wait(60)))
         await asyncio.sleep(0)
 
         async def visit(name: str, left: bool) -> None:

@@ -238,7 +238,7 @@ def test_the_memory_of_a_process_counts_what_it_started() -> None:
         alone = memory.TreeMemory(process.pid).used()
     finally:
         process.stdin.close()
-        process.wait(10)
+        process.wait(60)
         process.stdout.close()
     assert grown > 190_000_000
     assert 200_000_000 < alone < 400_000_000

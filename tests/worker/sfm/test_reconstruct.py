@@ -55,7 +55,7 @@ def errors(scene: Scene, truth: dict[str, Camera]) -> tuple[np.ndarray, np.ndarr
 @pytest.fixture(scope="module")
 def still_life(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Camera]]:
     folder = tmp_path_factory.mktemp("still") / "images"
-    return folder, synthetic.capture(folder, 16, 480, 360)
+    return folder, synthetic.capture(folder, 16, 480, 360, samples=1)
 
 
 @pytest.fixture(scope="module")

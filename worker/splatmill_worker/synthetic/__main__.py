@@ -14,8 +14,9 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--height", type=int, default=480)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--samples", type=int, default=2, help="rays per pixel along each axis")
     given = parser.parse_args()
-    capture(given.directory, given.count, given.width, given.height, given.seed)
+    capture(given.directory, given.count, given.width, given.height, given.seed, given.samples)
     print(f"{given.count} photos of the built-in still life are in {given.directory}")
 
 

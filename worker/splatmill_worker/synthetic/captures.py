@@ -12,7 +12,7 @@ from PIL import Image
 from splatmill_worker.scene import Camera
 from splatmill_worker.synthetic.light import Light
 from splatmill_worker.synthetic.movers import Movers, changed
-from splatmill_worker.synthetic.ray_caster import orbit, photograph, still_life
+from splatmill_worker.synthetic.ray_caster import orbit, picture, still_life
 
 
 def capture(
@@ -43,10 +43,10 @@ def capture(
 
     def shoot(name: str) -> None:
         camera = cameras[name]
-        rgb, _ = photograph(scene, camera, samples)
+        rgb = picture(scene, camera, samples)
         if passing.get(name):
             without = rgb
-            rgb, _ = photograph(replace(scene, solids=(*scene.solids, *passing[name])), camera, samples)
+            rgb = picture(replace(scene, solids=(*scene.solids, *passing[name])), camera, samples)
             if truth is not None:
                 Image.fromarray(changed(rgb, without)).save((truth / name).with_suffix(".png"))
         if light is not None and gains is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -179,8 +180,12 @@ class StillLife:
     light: np.ndarray
 
 
+@lru_cache(maxsize=1)
 def still_life(seed: int = 0) -> StillLife:
-    """The still life; `seed` decides textures, positions and angles."""
+    """The still life; `seed` decides textures, positions and angles.
+
+    The last one is kept (115 MB), because painting its textures takes as long as a dozen small photos of it.
+    """
     rng = np.random.default_rng(seed)
     solids: list[Solid] = [
         Disc(0.0, 1.9, MipMap(painted(rng, 1024, density=900)), 0.27),
@@ -241,14 +246,34 @@ def photograph(scene: StillLife, camera: Camera, samples: int = 2) -> tuple[np.n
     """
     rgb = np.empty((camera.height, camera.width, 3), np.uint8)
     depth = np.empty((camera.height, camera.width), np.float32)
-    offsets = [(k + 0.5) / samples for k in range(samples)]
-    band = max(1, _RAYS_PER_BAND // camera.width)
-    for top in range(0, camera.height, band):
-        rows = slice(top, min(top + band, camera.height))
-        shaded = torch.stack([_cast(scene, camera, rows, u, v)[0] for u in offsets for v in offsets])
-        rgb[rows] = (shaded.mean(0).clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
-        depth[rows] = _cast(scene, camera, rows, 0.5, 0.5, shade=False)[1].numpy()
+    for rows in _bands(camera):
+        color, centers = _sampled(scene, camera, rows, samples)
+        rgb[rows] = color
+        if centers is None:
+            centers = _cast(scene, camera, rows, 0.5, 0.5, shade=False)[1]
+        depth[rows] = centers.numpy()
     return rgb, depth
+
+
+def picture(scene: StillLife, camera: Camera, samples: int = 2) -> np.ndarray:
+    """The colours that `photograph` returns, uint8 [H, W, 3], without the rays that only measure depth."""
+    return np.concatenate([_sampled(scene, camera, rows, samples)[0] for rows in _bands(camera)])
+
+
+def _bands(camera: Camera) -> list[slice]:
+    """The rows of a photo, in bands of `_RAYS_PER_BAND` pixels."""
+    band = max(1, _RAYS_PER_BAND // camera.width)
+    return [slice(top, min(top + band, camera.height)) for top in range(0, camera.height, band)]
+
+
+def _sampled(scene: StillLife, camera: Camera, rows: slice, samples: int) -> tuple[np.ndarray, Tensor | None]:
+    """Colour uint8 [rows, W, 3], and depth [rows, W] where one of the rays goes through the pixel centres, or None."""
+    offsets = [(k + 0.5) / samples for k in range(samples)]
+    cast = {(u, v): _cast(scene, camera, rows, u, v) for u in offsets for v in offsets}
+    shaded = torch.stack([color for color, _ in cast.values()]).mean(0)
+    centers = cast.get((0.5, 0.5))
+    color = (shaded.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+    return color, None if centers is None else centers[1]
 
 
 def _cast(

@@ -14,6 +14,10 @@ _PALETTE = np.array(
 )  # fmt: skip
 
 
+_ROWS = 32
+"""Rows of a texture that are painted at a time."""
+
+
 class MipMap:
     """A square RGB texture of period 1 in both coordinates, with all its mip levels."""
 
@@ -101,13 +105,15 @@ def sky(rng: np.random.Generator, size: int) -> np.ndarray:
     # Row v, from 0 to 1, holds the latitude pi * v, wrapped to -pi/2 .. pi/2: the upper half of the dome comes first.
     up = np.where(latitude < 0.5, latitude * 2, 0.0)[..., None]
     noise = _noise(rng, size)
-    clouds = np.clip(noise, 0, 1.5)[..., None]
-    image = np.array([205.0, 220.0, 232.0]) * (1 - up) + np.array([92.0, 140.0, 200.0]) * up
-    image = image + clouds * 38
     ridge = 0.035 + 0.02 * noise[size // 3]
     hills = (latitude < ridge[None, :]) | (latitude > 0.5)
-    rock = np.array([88.0, 104.0, 92.0]) + 22 * noise[::-1, :, None]
-    dome: np.ndarray = np.where(hills[..., None], rock, image).clip(0, 255).astype(np.uint8)
+    dome = np.empty((size, size, 3), np.uint8)
+    for top in range(0, size, _ROWS):  # the temporary arrays of a few rows stay in the cache
+        rows = slice(top, top + _ROWS)
+        haze = np.array([205.0, 220.0, 232.0]) * (1 - up[rows]) + np.array([92.0, 140.0, 200.0]) * up[rows]
+        image = haze + np.clip(noise[rows], 0, 1.5)[..., None] * 38
+        rock = np.array([88.0, 104.0, 92.0]) + 22 * noise[::-1][rows, :, None]
+        dome[rows] = np.where(hills[rows, :, None], rock, image).clip(0, 255).astype(np.uint8)
     return dome
 
 

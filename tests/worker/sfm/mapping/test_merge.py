@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> pycolmap.Reconstruction:
     folder = tmp_path_factory.mktemp("merge")
-    synthetic.capture(folder / "images", 14, 320, 240)
+    synthetic.capture(folder / "images", 18, 320, 240, samples=1)
     options = sfm.SfmOptions(effort="lean", stereo=False)
     sfm.reconstruct(folder / "images", None, folder / "work", options, lambda *_: None, lambda: False)
     stored = next((folder / "work").rglob("facts.json"))
