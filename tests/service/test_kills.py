@@ -66,7 +66,7 @@ def test_a_worker_killed_again_and_again_does_not_use_up_the_tries_of_a_job_that
 def test_a_job_that_ends_its_worker_each_time_is_given_up(service: Up) -> None:
     job_id = service.submit(steps=10, do="kill worker", at=1)
     other = service.submit(steps=1)
-    job = service.ended(job_id)
+    job = service.ended(job_id, 180)
     assert job["problem"]["code"] == "attempts_exhausted"
     assert job["problem"]["facts"]["lost_workers"] == len(service.diary(job_id)) == leases.MAX_LOST
     # It went behind the job that waited, whose first attempt it would have delayed for ever.

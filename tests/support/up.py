@@ -145,7 +145,7 @@ class Up:
         assert answer.status_code == 200, answer.text
         return answer.json()
 
-    def ended(self, job_id: str, seconds: float = 60.0) -> Any:
+    def ended(self, job_id: str, seconds: float = 120.0) -> Any:
         """The job once it has ended."""
         return wait_for(lambda: (job := self.job(job_id))["state"] in FINAL and job, seconds)
 

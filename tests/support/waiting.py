@@ -8,15 +8,20 @@ from splatmill.backplane.process import start_time
 
 Value = TypeVar("Value")
 
+SHORTEST_PAUSE, LONGEST_PAUSE = 0.01, 0.1
+"""Seconds between two looks. Most conditions ask a server, which requests every 10 ms keep busy; so the pause grows to
+a tenth of the time that was waited already."""
+
 
 def wait_for(condition: Callable[[], Value | Literal[False] | None], seconds: float = 30.0) -> Value:
     """Return the first true value of `condition`. Fails the test when there is none within `seconds`."""
-    end = time.monotonic() + seconds
+    began = time.monotonic()
     while True:
         if value := condition():
             return value
-        assert time.monotonic() < end, f"nothing after {seconds} s"
-        time.sleep(0.01)
+        waited = time.monotonic() - began
+        assert waited < seconds, f"nothing after {seconds} s"
+        time.sleep(min(max(SHORTEST_PAUSE, 0.1 * waited), LONGEST_PAUSE))
 
 
 def gone(pids: list[int]) -> bool:

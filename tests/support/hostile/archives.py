@@ -7,6 +7,7 @@ import struct
 import warnings
 import zipfile
 import zlib
+from functools import cache
 
 from tests.support.hostile.pictures import photo
 
@@ -70,6 +71,7 @@ def overlapping(entries: int = 200) -> bytes:
     return data[:start] + directory + tail
 
 
+@cache
 def with_entries(count: int) -> bytes:
     """A zip of `count` empty files, made without zipfile, which would take long."""
     local = struct.pack("<4s5H3I2H", b"PK\3\4", 20, 0, 0, 0, 0, 0, 0, 0, 9, 0)
@@ -84,3 +86,17 @@ def with_entries(count: int) -> bytes:
     locator = struct.pack("<4sIQI", b"PK\6\7", 0, len(body) + len(directory), 1)
     tail = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 0xFFFF, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFF, 0)
     return body + directory + wide + locator + tail
+
+
+def gzip_of_zeros(head: bytes, zeros: int) -> bytes:
+    """`head` and so many million zeros as gzip, without a time. A million is packed once and repeated, to be quick."""
+    million = bytes(10**6)
+    packer = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
+    first = packer.compress(head) + packer.flush(zlib.Z_FULL_FLUSH)
+    block = packer.compress(million) + packer.flush(zlib.Z_FULL_FLUSH)
+    checksum = zlib.crc32(head)
+    for _ in range(zeros):
+        checksum = zlib.crc32(million, checksum)
+    size = len(head) + zeros * 10**6
+    start = b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x02\xff"
+    return start + first + zeros * block + packer.flush() + struct.pack("<II", checksum, size)

@@ -8,7 +8,7 @@ import struct
 
 from PIL import Image
 
-from tests.support.hostile import models, pictures
+from tests.support.hostile import archives, models, pictures
 from tests.support.hostile.bench import Answer, Bench
 from tests.support.hostile.entry import Hostile
 from tests.support.hostile.pictures import encoded, photo
@@ -174,7 +174,7 @@ POSES = (
     ),
     _start(
         "an .spz of 200 kB that expands to 200 MB",
-        gzip.compress(models.spz_header(10**7) + bytes(2 * 10**8), mtime=0),
+        archives.gzip_of_zeros(models.spz_header(10**7), 200),
         said="more than 100 times",
         suffix=".spz",
     ),
