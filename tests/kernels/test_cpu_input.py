@@ -81,7 +81,7 @@ def test_bin_and_composite_name_the_argument() -> None:
         (bins._replace(ids=bins.ids.long()), "bins.ids: expected torch.int32"),
         (bins._replace(offsets=bins.offsets + 1), "bins.offsets must run from 0"),
         (bins._replace(offsets=bins.offsets.flip(0)), "bins.offsets must run from 0"),
-        (bins._replace(ids=bins.ids + 5), "but there are 5 Gaussians"),
+        (bins._replace(ids=torch.where(bins.ids == 4, 5, bins.ids)), "is 5, but there are 5 Gaussians"),
         (bins._replace(ids=bins.ids - 5), "but there are 5 Gaussians"),
     ):
         with pytest.raises((TypeError, ValueError), match=message):

@@ -115,6 +115,10 @@ def test_denormals_are_flushed_inside_the_kernels_only() -> None:
     from splatmill_worker.kernels import ops
     from tests.support.kernels.cases import scene
 
+    first, second = [torch.full((64, 3), 1e-39)], [torch.full((64, 3), 1e-39)]
+    ops.adam_([torch.zeros(64, 3)], [torch.zeros(64, 3)], first, second, [0.1], step=1, backend="cpu")
+    assert not first[0].any()  # 0.9 * 1e-39 is a denormal number as well
+    assert not second[0].any()
     case = scene("state", 40)
     ops.project(*case.groups(), *case.camera(), case.width, case.height, degree=3)
     tiny = torch.tensor([1e-30], dtype=torch.float32)

@@ -103,6 +103,13 @@ def known(degree: int, antialias: bool) -> tuple[Tensor, Tensor]:
     return exact, unit_of(case, exact)
 
 
+def test_every_gaussian_of_many_counts_once() -> None:
+    """More than one task updates: 256 belong to each."""
+    case = scene("pose of many", 700)
+    fused, separate = by_step(case), by_ops(case, "cpu", torch.float32)
+    assert (fused - separate).norm() <= 1e-4 * separate.norm()
+
+
 def test_the_loss_falls_along_it_by_its_length() -> None:
     """A photo taken from elsewhere: a motion h along the unit gradient changes the step's own loss by h |gradient|."""
     case = scene("pose photo", 150)

@@ -205,6 +205,18 @@ def test_state_goes_in_and_comes_out_unchanged() -> None:
     assert torch.count_nonzero(step.moments()[0]) == 0
 
 
+@pytest.mark.parametrize(("given", "degree"), [(1, 0), (4, 1), (9, 2)])
+def test_coefficients_that_are_not_given_are_0(given: int, degree: int) -> None:
+    case = replace(scene("fewer coefficients", 37), degree=degree)
+    *others, sh = case.groups()
+    padded = torch.cat([sh[:, :given], torch.zeros_like(sh[:, given:])], 1)
+    few, all16 = (
+        case.project([*others, x], case.viewmat, "cpu") for x in (sh[:, :given].contiguous(), padded)
+    )
+    assert few.colors.any()
+    assert torch.equal(few.colors, all16.colors)
+
+
 def test_a_gradient_that_is_not_finite_moves_nothing_and_is_counted() -> None:
     case = scene("refused", 20)
     step = make_step(case)

@@ -6,6 +6,7 @@ minutes. The library that is measured is compiled from the kernels' headers when
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
@@ -57,6 +58,15 @@ def test_no_error_is_larger_than_the_table_says(function: Function, build: str) 
             assert largest <= row[figure] * (1 + 1e-8), (
                 f"{name}: {largest:.6g}, the table has {row[figure]:.6g}"
             )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("build", isa.supported())
+@pytest.mark.parametrize(("x", "end"), [(-1e30, -87), (-1000, -87), (-87.5, -87), (88.5, 88), (700, 88)])
+def test_e_to_the_x_stays_at_the_ends_of_its_range(build: str, x: float, end: float) -> None:
+    first = place(x)
+    found = errors(load(build), "exp", [(first, first + 1)])
+    assert found.absolute == pytest.approx(abs(math.exp(x) - math.exp(end)), rel=1e-6, abs=0)
 
 
 @pytest.mark.parametrize("function", FUNCTIONS, ids=lambda f: f.name)

@@ -178,6 +178,29 @@ def test_bin_agrees_with_the_definition_but_for_real_crossings(name: str, device
     assert order == [i for _, i in pairs(exact) if (_, i) in got]
 
 
+@BY_DEVICE
+def test_a_large_image_has_tiles_to_its_last_corner(device: str) -> None:
+    """More tiles than 16 bits number, and a splat that touches more of them than are tested at a time."""
+    width, height = 3000, 2990
+    sigma = torch.tensor([3.0, 30.0, 5.0], dtype=torch.float64)
+    opacities = torch.full((3,), 0.9, dtype=torch.float64)
+    half = sigma * torch.sqrt(2 * torch.log(opacities * 255))
+    fields = Projected(
+        means2d=torch.tensor([[2991.0, 2985.0], [2800.0, 2700.0], [8.0, 8.0]], dtype=torch.float64),
+        conics=torch.stack([sigma**-2, torch.zeros(3, dtype=torch.float64), sigma**-2], dim=1),
+        opacities=opacities,
+        colors=torch.ones(3, 3, dtype=torch.float64),
+        depths=torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64),
+        extents=torch.stack([half, half], dim=1),
+    )
+    wanted = pairs(reference.bin(fields, width, height))
+    got = pairs(ops.bin(single(fields, device), width, height, backend="gpu"))
+    assert -(-width // TILE) * -(-height // TILE) > gpu_bin.SHORT_TILES
+    assert max(tile for tile, _ in wanted) > gpu_bin.SHORT_TILES
+    assert sum(i == 1 for _, i in wanted) > gpu_bin.LANES
+    assert got == wanted
+
+
 def margin(fields: Projected, i: int, width: int, height: int) -> float:
     """What the lists of an image of whole tiles add to the level of d^T C d, so that rounding loses no pair."""
     plain, per_term = (float(getattr(x, "value", x)) for x in (gpu_bin.MARGIN, gpu_bin.MARGIN_PER_TERM))
@@ -334,6 +357,33 @@ def test_a_bad_number_culls_its_gaussian_and_touches_no_other(group: str, device
         for victim, value in zip(victims.tolist(), BAD, strict=True):
             if not abs(value) < float("inf"):
                 assert not seen.extents[victim].any(), f"{group}[{slot}] = {value} was not culled"
+
+
+@BY_DEVICE
+def test_a_gaussian_on_the_near_plane_is_culled(device: str) -> None:
+    case = case_for("a block and one", device, 17)
+    near = torch.tensor(case.near)
+    beyond = torch.nextafter(near, torch.tensor(1.0))
+    means = torch.zeros_like(case.means)
+    means[:, 2] = torch.where(torch.arange(len(means)) % 2 == 0, near, beyond)
+    case = replace(
+        case, means=means, viewmat=torch.eye(4), log_scales=torch.full_like(case.log_scales, -6.0),
+        logit_opacities=torch.zeros_like(case.logit_opacities),
+    )  # fmt: skip
+    drawn = (project(case, torch.float32, "gpu", device)[0].extents > 0).all(1)
+    assert torch.equal(drawn.cpu(), means[:, 2] == beyond)
+
+
+@BY_DEVICE
+@pytest.mark.parametrize("length", [1e-30, 1e30])
+def test_the_length_of_a_quaternion_does_not_matter(length: float, device: str) -> None:
+    case = case_for("a block and one", device, 17)
+    plain, _ = project(case, torch.float32, "gpu", device)
+    seen, _ = project(replace(case, quats=case.quats * length), torch.float32, "gpu", device)
+    assert plain.extents.any()
+    for field, a, b in zip(Projected._fields, seen, plain, strict=True):
+        # The product with a power of ten rounds each component once.
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4 * b.detach().abs().max().item(), msg=field)
 
 
 @BY_DEVICE

@@ -65,15 +65,24 @@ PROOFS = {
     "reference/knn": ["test_knn.py"],
     "reference/loss": ["test_loss.py"],
     "gpu/adam": [f"{GPU_OPS}adam_agrees_with_the_definition", "test_gpu_step.py"],
-    "gpu/bin": [f"{GPU_OPS}bin_agrees_with_the_definition_but_for_real_crossings", "test_gpu_step.py"],
+    "gpu/bin": [
+        f"{GPU_OPS}bin_agrees_with_the_definition_but_for_real_crossings",
+        f"{GPU_OPS}a_large_image_has_tiles_to_its_last_corner",
+        "test_gpu_settings.py::test_every_mode_of_a_training_step_with_small_constants",
+    ],
     "gpu/blend": [f"{GPU_OPS}composite_and_its_gradient_agree_with_the_definition"],
     "gpu/composite": [f"{GPU_OPS}composite_and_its_gradient_agree_with_the_definition"],
     "gpu/composite_backward": [f"{GPU_OPS}composite_and_its_gradient_agree_with_the_definition"],
+    "gpu/photos": ["test_gpu_waiting.py"],
     "gpu/loss": [f"{GPU_OPS}loss_and_its_gradient_agree_with_the_definition"],
     "gpu/knn": [f"{GPU_OPS}knn_agrees_with_the_definition"],
-    "gpu/project": [*PROJECTION, f"{GPU_OPS}a_bad_number_culls_its_gaussian_and_touches_no_other"],
+    "gpu/project": [
+        *PROJECTION,
+        f"{GPU_OPS}a_bad_number_culls_its_gaussian_and_touches_no_other",
+        f"{GPU_OPS}a_gaussian_on_the_near_plane_is_culled",
+    ],
     "gpu/project_backward": PROJECTION[::-1],
-    "gpu/projection": PROJECTION,
+    "gpu/projection": [*PROJECTION, f"{GPU_OPS}the_length_of_a_quaternion_does_not_matter"],
     "gpu/harmonics": PROJECTION[::-1],
 }
 """The tests most likely to catch a fault in a file, by its path without suffix. Where none are named: `DEFAULT`."""
@@ -92,7 +101,10 @@ ALL = [
     "test_adam.py", "test_loss.py", "test_knn.py", "test_proof_poison.py", "test_cpu_input.py",
     "test_reference_order.py", "test_reference_gsplat.py", "test_cpu_isa.py", FUNCTIONS,
 ]  # fmt: skip
-ALL_GPU = ["test_gpu_step.py", "test_gpu_ops.py"]
+ALL_GPU = [
+    "test_gpu_step.py", "test_gpu_ops.py", "test_gpu_waiting.py", "test_gpu_records.py", "test_gpu_launches.py",
+    "test_gpu_train.py", "test_gpu_settings.py",
+]  # fmt: skip
 
 Row = dict[str, Any]
 
@@ -189,6 +201,8 @@ def pytest(copy: Copy, mutant: Mutant | None, tests: Sequence[str]) -> str:
         "mutant",
         "-p",
         "pytest_timeout",
+        "-p",
+        "pytest_cov.plugin",  # for its marker
         "-p",
         "no:cacheprovider",
         "--timeout",

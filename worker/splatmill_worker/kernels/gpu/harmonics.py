@@ -102,11 +102,10 @@ def slope(x, y, z, k: tl.constexpr):
 
 @triton.jit
 def shade(sh, i, here, stride, x, y, z, COEFFICIENTS: tl.constexpr, USED: tl.constexpr, PLANAR: tl.constexpr):
-    """Colour before the clamp at 0, and the sum of |coefficient|, which is finite when every coefficient read is."""
+    """Colour before the clamp at 0; not finite where a coefficient that is read is not."""
     red = tl.zeros_like(x) + 0.5
     green = tl.zeros_like(x) + 0.5
     blue = tl.zeros_like(x) + 0.5
-    size = tl.zeros_like(x)
     for k in tl.static_range(USED):
         value = basis(x, y, z, k)
         r = tl.load(at(sh, i, 3 * k, stride, 3 * COEFFICIENTS, PLANAR), mask=here, other=0.0)
@@ -115,5 +114,4 @@ def shade(sh, i, here, stride, x, y, z, COEFFICIENTS: tl.constexpr, USED: tl.con
         red += value * r
         green += value * g
         blue += value * b
-        size += tl.abs(r) + tl.abs(g) + tl.abs(b)
-    return red, green, blue, size
+    return red, green, blue

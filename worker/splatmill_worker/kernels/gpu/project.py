@@ -100,12 +100,12 @@ def project_kernel(
     d1 = m1 + w01 * t0 + w11 * t1 + w21 * t2
     d2 = m2 + w02 * t0 + w12 * t1 + w22 * t2
     length = tl.sqrt_rn(d0 * d0 + d1 * d1 + d2 * d2)
-    red, green, blue, size = shade(
+    red, green, blue = shade(
         sh, i, here, stride, d0 / length, d1 / length, d2 / length, COEFFICIENTS, USED, PLANAR
     )
 
     # Every guard is a comparison that NaN fails.
-    keep = here & (z > near) & (opacity > CUT) & finite(logit) & finite(size)
+    keep = here & (z > near) & (opacity > CUT) & finite(logit)
     keep = keep & finite(m0) & finite(m1) & finite(m2) & finite(l0) & finite(l1) & finite(l2)
     keep = keep & finite(qw) & finite(qx) & finite(qy) & finite(qz)
     keep = keep & finite(mx) & finite(my) & finite(det) & finite(a) & finite(c)  # b is bounded by a and c

@@ -92,7 +92,7 @@ def color_backward_kernel(
     # A row that is not seen may sit on the camera centre; it gets direction 0 and no gradient.
     length = tl.where(length > 0.0, length, 1.0)
     d0, d1, d2 = d0 / length, d1 / length, d2 / length
-    red, green, blue, _ = shade(sh, i, seen, stride, d0, d1, d2, COEFFICIENTS, USED, PLANAR)
+    red, green, blue = shade(sh, i, seen, stride, d0, d1, d2, COEFFICIENTS, USED, PLANAR)
     g_red = tl.where(red >= 0.0, g_red, 0.0)
     g_green = tl.where(green >= 0.0, g_green, 0.0)
     g_blue = tl.where(blue >= 0.0, g_blue, 0.0)
