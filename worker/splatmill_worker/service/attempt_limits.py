@@ -1,4 +1,4 @@
-"""The limits of an attempt, which its parent process watches, and how its processes give way to others."""
+"""The limits of an attempt, which its parent process watches: how long it may run, and how much memory it may use."""
 
 import os
 import time
@@ -12,10 +12,6 @@ from splatmill_worker import memory, settings
 OOM_SCORE = 900
 """`oom_score_adj` of an attempt's processes, of at most 1000. If the machine runs out of memory, the kernel kills them
 before Redis, the API and the worker itself, whose score is 0."""
-
-NICENESS = 5
-"""How far an attempt's processes stand back, of at most 19, where others want the same processor: the API, the renderer
-and Redis answer within milliseconds, and take little of it."""
 
 _MEMORY_SECONDS = 0.5  # between two looks at the memory in use
 
@@ -104,9 +100,3 @@ def die_first() -> None:
     path = Path(f"/proc/{os.getpid()}/oom_score_adj")
     with suppress(OSError, ValueError):  # not Linux, or hidden
         path.write_text(str(max(OOM_SCORE, int(path.read_text()))))
-
-
-def stand_back() -> None:
-    """Have the kernel prefer other processes to this one, and those that it starts, where they want the processor."""
-    with suppress(OSError):  # forbidden
-        os.nice(NICENESS)

@@ -34,14 +34,7 @@ from splatmill.backplane.process import die_with_parent
 from splatmill_worker.service import hand_back, recovery
 from splatmill_worker.service.abandoned_folders import remove_abandoned
 from splatmill_worker.service.attempt import Attempt, start_attempt
-from splatmill_worker.service.attempt_limits import (
-    Exceeded,
-    Limits,
-    LimitWatch,
-    RunTimeExceeded,
-    die_first,
-    stand_back,
-)
+from splatmill_worker.service.attempt_limits import Exceeded, Limits, LimitWatch, RunTimeExceeded, die_first
 from splatmill_worker.service.disk_reserve import shortage_text
 from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.lock import JobLock, LockState
@@ -335,7 +328,6 @@ class AttemptWorker(Worker):
                     os.setpgid(0, 0)
                     die_with_parent(parent)
                     die_first()
-                    stand_back()
                     hand_back.install_signal_handlers()
                     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
                     self._run_child(job, queue)
