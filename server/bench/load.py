@@ -135,7 +135,7 @@ def _with_clients(
         [sys.executable, "-m", "_load.clients", json.dumps(given)],
         env=environment,
         stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
         text=True,
     )
     api = _child(up, _PROCESSES["api"])
@@ -143,7 +143,9 @@ def _with_clients(
     with _watched(up, clients.pid) as taken:
         if asked.profile and count == asked.clients[-1]:
             _profile(up, asked.seconds)
-        said, _ = clients.communicate(timeout=asked.seconds + 120)
+        said, complaints = clients.communicate(timeout=asked.seconds + 120)
+    if clients.returncode:
+        raise SystemExit(f"The {count} clients ended with status {clients.returncode}:\n{complaints[-2000:]}")
     taken["machine"] = {"cores": round((worked() - all_before) / (time.monotonic() - begun), 2)}
     taken["api"]["ms_per_answer"] = round(1000 * (_cpu(api) - cpu) / max(1, _answered(url) - before), 2)
     found: Row = json.loads(said.splitlines()[-1])
