@@ -163,8 +163,7 @@ class Jobs:
             return with_places(self.connection, [(with_links(held.job()), held.row.generation)])[0]
         if (stored := self.stored(job_id)) is not None:
             return stored
-        self.row(job_id)  # says why there is none
-        raise job_not_found(job_id)
+        return self._placed(self.row(job_id))  # raises what is wrong with the row, or that there is none
 
     def stored(self, job_id: str) -> Job | None:
         """Return an ended job from storage: from the `job.json` of its model or the file of its log, or None."""
