@@ -9,6 +9,9 @@ One `splatmill up` on this machine, whose cores the clients, the training and th
 described in `_load/clients.py`. Each number of clients gets rows with p50 and p99 by kind of request, the CPU seconds a
 second and the memory of each process. Rows go to results/load.jsonl, the table to load.md and figures/load.png.
 
+Clients arrive independently of each other: when they began together, second by second, half of a job's answer at 50
+clients was the wait for those that had come with it.
+
 The CPU time that the API takes for an answer is told too, because other programs on the machine disturb it least.
 
 Expected before it was measured: one process with one event loop is the knee, and most of a request is spent in Python
@@ -167,6 +170,8 @@ def _watched(up: psutil.Process, clients: int) -> Iterator[dict[str, Any]]:
         processes["training"] = trainers[0]
     processes["clients"] = psutil.Process(clients)
     memory = dict.fromkeys(processes, 0)
+    begun, before = time.monotonic(), {name: _cpu(process) for name, process in processes.items()}
+    last = dict(before)
     stop = threading.Event()
 
     def look() -> None:
@@ -174,22 +179,20 @@ def _watched(up: psutil.Process, clients: int) -> Iterator[dict[str, Any]]:
             for name, process in processes.items():
                 with suppress(psutil.Error):
                     memory[name] = max(memory[name], process.memory_info().rss)
+                    last[name] = _cpu(process) or last[name]  # the clients have ended when all is over
 
     thread = threading.Thread(target=look)
     taken: dict[str, Any] = {}
-    begun, before = time.monotonic(), {name: _cpu(process) for name, process in processes.items()}
-    last = dict(before)
     thread.start()
     try:
         yield taken
     finally:
         seconds = time.monotonic() - begun
-        last = {name: _cpu(process) or last[name] for name, process in processes.items()}
         stop.set()
         thread.join()
         for name in processes:
             cores = round((last[name] - before[name]) / seconds, 2)
-            taken[name] = {"cores": cores if name != "clients" else None, "bytes": memory[name]}
+            taken[name] = {"cores": cores, "bytes": memory[name]}
 
 
 def _cpu(process: psutil.Process) -> float:
@@ -260,7 +263,7 @@ def document(rows: list[Row]) -> str:
         text.append(
             "| clients | " + " | ".join(f"{what}, p50 / p99 ms" for what in whats) + " | requests a second |"
             " errors | API, CPU ms an answer |"
-            " cores: API, Redis, renderer, training, whole machine | memory: API, Redis, renderer MB |"
+            " cores: API, Redis, renderer, training, clients, whole machine | memory: API, Redis, renderer MB |"
         )
         text.append("|---" * (len(whats) + 6) + "|")
         for count in sorted({row["clients"] for row in of_label}):
@@ -280,7 +283,9 @@ def _line(rows: list[Row], whats: list[str], count: int) -> str:
     errors = sum(row["errors"] for row in newest.values())
     taken = rows[-1]["processes"]
     cores = ", ".join(
-        f"{taken[n]['cores']:.2f}" for n in ("api", "redis", "renderer", "training", "machine") if n in taken
+        f"{taken[n]['cores']:.2f}"
+        for n in ("api", "redis", "renderer", "training", "clients", "machine")
+        if n in taken
     )
     memory = ", ".join(f"{taken[n]['bytes'] / 1e6:.0f}" for n in ("api", "redis", "renderer"))
     cost = f"{taken['api']['ms_per_answer']:.1f}"

@@ -3,11 +3,14 @@
     python -m _load.clients '{"url": ..., "clients": 200, "seconds": 20, "job": ..., "model": ..., "camera": {...}}'
 
 Of a hundred clients, 80 ask for a job once a second, 10 follow its events, and 10 upload a photo every two seconds.
-Five more look at a model, once a second each, however many the others are. The last line of the output is JSON: an
+Five more look at a model, once a second each, however many the others are. Clients know nothing of each other: each
+begins at a random moment of its own second, where locust starts those of a second together, as one burst that is
+repeated for ever. The last line of the output is JSON: an
 object for each kind of request, and the errors.
 """
 
 import json
+import random
 import sys
 import time
 from typing import Any, cast
@@ -28,9 +31,19 @@ PHOTOS_PER_CAPTURE = 20
 
 _SPAWN_SECONDS = 5.0  # over which the clients arrive; the figures begin after it
 _asked: dict[str, Any] = {}
+_moments = random.Random(0)
 
 
-class Poller(FastHttpUser):
+class Client(FastHttpUser):
+    """Begins at a random moment."""
+
+    abstract = True
+
+    def on_start(self) -> None:
+        gevent.sleep(_moments.uniform(0, 2))
+
+
+class Poller(Client):
     """Asks for the state of the job that trains."""
 
     weight = 80
@@ -41,7 +54,7 @@ class Poller(FastHttpUser):
         self.client.get(f"/v1/jobs/{_asked['job']}", name="job")
 
 
-class Follower(FastHttpUser):
+class Follower(Client):
     """Follows the events of that job for as long as the stream lasts; what counts is the time to its first event."""
 
     weight = 10
@@ -72,13 +85,14 @@ class Follower(FastHttpUser):
             _tell("events", begun, error)
 
 
-class Uploader(FastHttpUser):
+class Uploader(Client):
     """Uploads photos to captures of its own."""
 
     weight = 10
     wait_time = constant_pacing(2)
 
     def on_start(self) -> None:
+        super().on_start()
         self.count = 0
         self.capture = ""
 
@@ -91,7 +105,7 @@ class Uploader(FastHttpUser):
         self.client.put(path, data=cast(Any, bytes(PHOTO_BYTES)), name="photo")
 
 
-class Viewer(FastHttpUser):
+class Viewer(Client):
     """Looks at a model."""
 
     fixed_count = VIEWERS
@@ -123,7 +137,7 @@ def main() -> None:
     runner = environment.create_local_runner()
     count = int(_asked["clients"])
     runner.start(count + VIEWERS, spawn_rate=max(1.0, (count + VIEWERS) / _SPAWN_SECONDS))
-    gevent.sleep(_SPAWN_SECONDS + 2)
+    gevent.sleep(_SPAWN_SECONDS + 3)
     kept = {name: entry for name, entry in _entries(environment).items() if name == "events"}
     connected = {name: _row(name, entry) for name, entry in kept.items()}
     environment.stats.reset_all()
