@@ -59,7 +59,7 @@ screenshots: $(VENV)/.installed-dev ## make the documentation's pictures of the 
 bench: install ## error against run time: kernels, functions, stability, worst inputs, stiffness, SfM, training, formats (long)
 	for name in kernels functions stability worst stiffness sfm train live formats; do $(BIN)/splatmill bench $$name || exit 1; done
 
-soak: $(VENV)/.installed-dev ## faults at random moments against the whole service (STORAGE=s3, SOAK_ARGS="--faults 30"; half an hour)
+soak: $(VENV)/.installed-dev ## faults at random moments against the whole service (STORAGE=s3, SOAK_ARGS="--faults 30"; some 25 minutes)
 	$(BIN)/splatmill bench soak --storage $(or $(STORAGE),folder) $(SOAK_ARGS)
 
 capacity: $(VENV)/.installed-dev ## pages, memory and start of a service with a hundred thousand records (CAPACITY_ARGS="--records 2000")

@@ -1,17 +1,21 @@
 """Faults at random moments against the running service, and the proof that it loses nothing.
 
-    splatmill bench soak                                 # 340 faults, more than 200 of them kills; about half an hour
+    splatmill bench soak                                 # 330 faults, more than 200 of them kills; some 25 minutes
     splatmill bench soak --storage s3
     splatmill bench soak --faults 30 --seed 7
     splatmill bench soak --plot-only
 
 `splatmill up` runs with a Redis behind a proxy, on a small disk where this user may mount one, with a clock that can be
 set. Clients upload, start jobs, cancel some and look at models, all the while. Most jobs take steps without photos
-(`_soak/pipeline.py`); every twelfth trains ten photos of the still life with the engine. After each fault the service
-must answer, and a job must get on, within 30 s; one fault in four is followed by the next at once instead. At the end
-every job that was accepted has its model or its cancellation, no two attempts at a job ran at once, no process is left,
-every file is whole, and Redis and storage tell the same. Otherwise the exit status is 1, with a sentence for each thing
-that does not hold.
+(`_soak/pipeline.py`); every sixteenth trains ten photos of the still life with the engine.
+
+Within 30 s of a fault's end the service answers, takes a capture and shows a model, every job that had begun has taken
+another step or ended, and no process has lost its parent (`_soak/recovery.py`). One fault in four is followed by the
+next at once instead, after which the jobs of both must get on. At the end every job that was accepted has its model or
+its cancellation, no two attempts at a job ran at once, no step whose checkpoint was stored was taken again, no pipeline
+ran for a model that was stored, no process is left, every file in storage is whole and explained by a record, and
+Redis, storage and the API's lists agree on every capture, job and model (`_soak/verdict.py`). Otherwise the exit status
+is 1, with a sentence for each thing that does not hold.
 
 Rows go to results/soak.jsonl, the table to soak.md. A seed fixes the faults and their order, not the moments at which
 the machine does what.
@@ -32,18 +36,16 @@ from pathlib import Path
 from _rows import Row, append, footer, lines, origin
 from _soak import faults, verdict
 from _soak.clients import Clients
-from _soak.service import Service, wait_for
+from _soak.recovery import MEASURED, RESUME_SECONDS, recover
+from _soak.service import Service
 from _still_life import posed_capture
 
 HERE = Path(__file__).resolve().parent
 
-RESUME_SECONDS = 30.0
-"""Seconds within which the service answers and a job gets on after a fault."""
-
 _AT_ONCE = 0.25
 """Share of the faults that are followed by the next without waiting for either."""
 
-_PAUSE = (0.1, 2.0)  # seconds before a fault
+_PAUSE = (0.1, 1.5)  # seconds before a fault
 
 PHOTOS, WIDTH, HEIGHT = 10, 160, 120
 
@@ -53,7 +55,7 @@ def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="splatmill bench soak", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--faults", type=int, default=340, help="number of faults (default: %(default)s)")
+    parser.add_argument("--faults", type=int, default=330, help="number of faults (default: %(default)s)")
     parser.add_argument("--seconds", type=float, help="end with the fault after so many seconds")
     parser.add_argument(
         "--only", nargs="+", metavar="FAULT", help="each of these once, by the names of the table"
@@ -127,19 +129,20 @@ def soak(
                 break
             time.sleep(rng.uniform(*_PAUSE))
             row = same | {"number": number, "fault": fault.name, "kills": fault.kills}
-            row |= _one(service, target, fault, rng.random() < _AT_ONCE, begun)
+            row |= _one(service, clients, target, fault, rng.random() < _AT_ONCE, begun)
             rows.append(row)
             _say(row)
         complaints = [
             f"fault {row['number']} ({row['fault']}): {row['complaint']}" for row in rows if row["complaint"]
         ]
-        clients.submitting = False
+        over = time.monotonic()
         complaints += verdict.settle(clients)
+        settled = time.monotonic() - over
         clients.stop()
         complaints += verdict.check(service, clients)
         service.stop()
         complaints += verdict.check_stopped(service)
-        rows.append(same | _summary(rows, clients, time.monotonic() - begun, left_out, complaints))
+        rows.append(same | _summary(rows, clients, time.monotonic() - begun, settled, left_out, complaints))
     finally:
         if keep is not None:
             keep.mkdir(parents=True, exist_ok=True)
@@ -149,44 +152,48 @@ def soak(
     return rows
 
 
-def _one(service: Service, target: faults.Target, fault: faults.Fault, at_once: bool, begun: float) -> Row:
-    """Do a fault, and measure until the service answers and a job gets on again."""
+def _one(
+    service: Service,
+    clients: Clients,
+    target: faults.Target,
+    fault: faults.Fault,
+    at_once: bool,
+    begun: float,
+) -> Row:
+    """Do a fault, and measure until all works again."""
     service.family()
-    start = time.monotonic()
-    row: Row = {"at": round(start - begun, 2), "answers": None, "works": None, "complaint": None}
+    target.strike()
+    row: Row = {"at": round(target.struck - begun, 2), "complaint": None, **dict.fromkeys(MEASURED)}
     try:
         fault.act(target)
-        healed = target.healed
-        row["lasted"] = round(healed - start, 2)
-        if not at_once:
-            wait_for(service.ready, RESUME_SECONDS, "the service is ready again")
-            row["answers"] = round(time.monotonic() - healed, 2)
-            step = wait_for(
-                lambda: _step_after(service, healed),
-                healed + RESUME_SECONDS - time.monotonic(),
-                "a job gets on",
-            )
-            row["works"] = round(step - healed, 2)
     except AssertionError as error:
         row["complaint"] = str(error)
+        target.healed = time.monotonic()
+    clients.faults.append((fault.name, target.healed))
+    row["lasted"] = round(target.healed - target.struck, 2)
+    if not at_once and row["complaint"] is None:
+        measured, row["complaint"] = recover(service, clients, target.struck, target.healed)
+        row |= {what: round(seconds, 2) for what, seconds in measured.items()}
     return row
 
 
-def _step_after(service: Service, moment: float) -> float | None:
-    """Return when a job first got on after a moment, on the monotonic clock; None if none has."""
-    for line in service.records():
-        if line["what"] in ("begin", "step") and line["at"] > moment:
-            return float(line["at"])
-    return None
-
-
 def _summary(
-    rows: list[Row], clients: Clients, seconds: float, left_out: dict[str, str], complaints: list[str]
+    rows: list[Row],
+    clients: Clients,
+    seconds: float,
+    settled: float,
+    left_out: dict[str, str],
+    complaints: list[str],
 ) -> Row:
+    """Return the row of the whole.
+
+    settled: seconds that the last jobs took to end.
+    """
     states = [promise.state for promise in clients.promises.values()]
     return {
         "fault": None,
         "seconds": round(seconds),
+        "settled": round(settled, 1),
         "faults": len(rows),
         "killed": sum(row["kills"] for row in rows),
         "jobs": len(states),
@@ -229,25 +236,28 @@ def _storage_part(storage: str, rows: list[Row], names: list[str]) -> list[str]:
         text += ["**What did not hold:**", "", *(f"- {complaint}" for complaint in end["complaints"]), ""]
     else:
         text += [
-            "Nothing was lost, no two attempts at a job ran at once, no process was left, every file was whole, and "
-            "Redis and storage agreed.",
+            f"Within {RESUME_SECONDS:g} s of every fault that no other followed at once, the service answered, took a "
+            "capture and showed a model, and every job that had begun had got on or ended. Nothing was lost, no two "
+            "attempts at a job ran at once, no step with a stored checkpoint was taken again, no process was left, "
+            "every file was whole, and Redis, storage and the API's lists agreed on every record.",
             "",
         ]
     text += [f"Not run: {name}, because {why}." for name, why in end["left_out"].items()]
     text += [""] if end["left_out"] else []
     text += [
-        "Seconds from the kill, or from the beginning of what takes the fault back: median (longest), of the "
-        "faults that no other followed at once.",
+        "Seconds from the end of the fault (a kill ends at once, unless the soak itself starts again what it killed): "
+        "median (longest).",
         "",
-        "| fault | times | waited for | answers | a job gets on |",
-        "|---|---|---|---|---|",
+        "| fault | times | waited for | answers | accepts | shows | resumes | failed |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for name in names:
         found = [row for row in rows if row["fault"] == name]
         if found:
-            waited = [row for row in found if row["works"] is not None]
-            cells = [_seconds([row[key] for row in waited]) for key in ("answers", "works")]
-            text.append(f"| {name} | {len(found)} | {len(waited)} | {' | '.join(cells)} |")
+            waited = [row for row in found if any(row[what] is not None for what in MEASURED)]
+            cells = [_seconds([row[what] for row in waited if row[what] is not None]) for what in MEASURED]
+            failed = sum(row["complaint"] is not None for row in found)
+            text.append(f"| {name} | {len(found)} | {len(waited)} | {' | '.join(cells)} | {failed} |")
     return [*text, ""]
 
 
@@ -256,8 +266,8 @@ def _seconds(values: list[float]) -> str:
 
 
 def _say(row: Row) -> None:
-    waited = f"answers {row['answers']} s, works {row['works']} s" if row["works"] is not None else "at once"
-    print(f"{row['number'] + 1} {row['fault']}: {row['complaint'] or waited}", flush=True)
+    times = ", ".join(f"{what} {row[what]} s" for what in MEASURED if row[what] is not None)
+    print(f"{row['number'] + 1} {row['fault']}: {row['complaint'] or times or 'at once'}", flush=True)
 
 
 if __name__ == "__main__":

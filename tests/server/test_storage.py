@@ -116,17 +116,6 @@ def test_a_stream_that_breaks_leaves_nothing(storage: Storage) -> None:
     assert asyncio.run(read(24_999_990, None)) == whole[-10:]
 
 
-def test_a_folder_comes_out_as_it_was_stored(storage: Storage, tmp_path: Path) -> None:
-    prefix = layout.job_work("a" * 16)
-    names = ["a.txt", "deep/er/c.txt", "deep/ü b.txt"]
-    for name in names:
-        storage.put(f"{prefix}/{name}", name.encode())
-    target = tmp_path / "target"
-    assert storage.download_prefix(prefix, target) == names
-    assert {n: (target / n).read_text() for n in names} == {n: n for n in names}
-    assert not list(target.rglob("*.part"))
-
-
 def test_a_failed_download_leaves_nothing(storage: Storage, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         storage.download("missing", tmp_path / "folder" / "file")

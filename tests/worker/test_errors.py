@@ -6,10 +6,11 @@ Does not prove that each place raises the right one.
 from __future__ import annotations
 
 import ast
+from http import HTTPStatus
 
 import pytest
 
-from splatmill.schema import PROBLEMS
+from splatmill.schema import PROBLEMS, Problem, code_for_status
 from splatmill_worker import errors
 from splatmill_worker.errors import FailureName, ModelUnreadable, TrainingFailed, WorkerError
 from splatmill_worker.service.problems import problem_of
@@ -43,6 +44,24 @@ def test_every_code_is_in_the_table_of_problems() -> None:
     assert {code: place for code, place in codes.items() if code not in PROBLEMS} == {}
     assert set(TrainingFailed.CODES.values()) <= PROBLEMS.keys()
     assert TrainingFailed.CODES.keys() == TrainingFailed.ADVICE.keys() == set(FailureName)
+
+
+def test_every_code_of_the_table_is_given_somewhere() -> None:
+    parts = ("client/splatmill", "server/splatmill_server", "worker/splatmill_worker")
+    table = ROOT / "client/splatmill/schema/problems.py"
+    texts = [p.read_text() for part in parts for p in (ROOT / part).rglob("*.py") if p != table]
+    given = {code for code in PROBLEMS if any(f'"{code}"' in text for text in texts)}
+    assert PROBLEMS.keys() - given - {code_for_status(status.value) for status in HTTPStatus} == set()
+
+
+def test_a_code_that_is_not_given_any_more_is_still_read() -> None:
+    stored = {
+        "title": "The record of the job was lost",
+        "status": 500,
+        "detail": "It is gone.",
+        "code": "job_lost",
+    }
+    assert Problem.model_validate(stored).code == "job_lost"
 
 
 @pytest.mark.parametrize("name", FailureName)

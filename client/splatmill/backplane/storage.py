@@ -304,17 +304,6 @@ class Storage:
                     return
                 time.sleep(pause)
 
-    def download_prefix(self, prefix: str, folder: Path) -> list[str]:
-        """Copy all files under `prefix` to `folder`, except those of the same size already there; return the names."""
-        names = []
-        for entry in self.entries(prefix):
-            name = entry.path[len(prefix.rstrip("/")) + 1 :]
-            target = folder / name
-            if not (target.is_file() and target.stat().st_size == entry.size):
-                self.download(entry.path, target)
-            names.append(name)
-        return names
-
     def check(self) -> None:
         """Write and delete a file to test storage. Raises StorageError if that fails."""
         path = f"health/{os.getpid()}"

@@ -80,8 +80,6 @@ PROBLEMS: dict[str, Kind] = {
     "image_truncated": Kind(422, "The image file is incomplete"),
     "image_too_small": Kind(422, "The image is too small"),
     "image_too_large": Kind(422, "The image has too many pixels"),
-    "archive_invalid": Kind(422, "The archive cannot be read"),
-    "archive_unsafe": Kind(422, "The archive contains paths that lead outside of it"),
     "archive_bomb": Kind(422, "The archive would unpack to too much data"),
     "video_unreadable": Kind(422, "The video cannot be read"),
     "no_images": Kind(422, "There are no images"),
@@ -96,7 +94,6 @@ PROBLEMS: dict[str, Kind] = {
     "sfm_failed": Kind(422, "The cameras could not be recovered"),
     # Training.
     "backend_unavailable": Kind(422, "The chosen backend does not run on this machine"),
-    "budget_too_small": Kind(422, "The budget is too small to train anything"),
     "non_finite": Kind(500, "The optimisation produced values that are not finite"),
     "diverged": Kind(500, "The optimisation diverged"),
     "empty_scene": Kind(500, "No Gaussians were left in the scene"),
@@ -104,7 +101,6 @@ PROBLEMS: dict[str, Kind] = {
     "run_time_exceeded": Kind(500, "The job ran longer than the worker allows"),
     # The service itself.
     "worker_lost": Kind(500, "The worker ended without reporting a result"),
-    "job_lost": Kind(500, "The record of the job was lost"),
     "attempts_exhausted": Kind(500, "Every attempt at the job ended early"),
     "render_failed": Kind(500, "The image could not be rendered"),
     "conversion_failed": Kind(500, "The model could not be converted"),

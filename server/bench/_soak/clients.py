@@ -20,18 +20,20 @@ UNFINISHED = 3
 FORGOTTEN_SECONDS = 30.0
 """Seconds after which a job that the service does not know counts as lost."""
 
-_TRANSIENT = {
-    "storage_full",
-    "worker_disk_full",
-    "storage_unavailable",
-    "queue_unavailable",
-    "attempts_exhausted",
+CAUSES = {
+    "storage_full": "disk",
+    "worker_disk_full": "disk",
+    "storage_unavailable": "S3",
+    "queue_unavailable": "Redis",
 }
-"""Codes of failures whose advice is to restart the job: faults may cause them, if they last or repeat."""
+"""Codes of failures that tell a client to restart the job, and what the name of the fault that may cause it holds."""
+
+_CAUSE_SECONDS = 60.0
+"""Seconds after a fault in which a job may fail of it: attempts are repeated first."""
 
 _PAUSE = 0.1  # seconds between two rounds
 
-_CAMERA = {
+CAMERA = {
     "camera_to_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -4], [0, 0, 0, 1]],
     "fov_y_deg": 60,
     "width": 64,
@@ -63,23 +65,30 @@ class Promise:
 
 @dataclass
 class Clients:
-    """Clients with a seed, in a thread. `complaints` is what no client should have met.
+    """Clients with a seed, in a thread.
 
     photos: files of captures that are trained by the engine; every `photo_share`-th job is one of these.
+    complaints: what no client should have met.
+    captures: those that the service has accepted.
+    faults: names of the faults so far, and the monotonic time at which each was over.
     """
 
     service: Service
     seed: int
     photos: dict[str, bytes] = field(default_factory=dict)
-    photo_share: int = 12
+    photo_share: int = 16
     promises: dict[str, Promise] = field(default_factory=dict)
     complaints: list[str] = field(default_factory=list)
+    captures: list[str] = field(default_factory=list)
+    faults: list[tuple[str, float]] = field(default_factory=list)
     views: int = 0
     retries: int = 0
     number: int = 0
-    submitting: bool = True
 
     def __post_init__(self) -> None:
+        self._submitting = threading.Event()
+        self._submitting.set()
+        self._submission = threading.Lock()
         self._random = random.Random(self.seed)
         self._stop = threading.Event()
         self._http = httpx.Client(base_url=self.service.http.base_url, timeout=15, trust_env=False)
@@ -87,6 +96,12 @@ class Clients:
 
     def start(self) -> None:
         self._thread.start()
+
+    def submit_no_more(self) -> None:
+        """Finish the submission that is under way, and begin no other."""
+        self._submitting.clear()
+        with self._submission:
+            pass
 
     def stop(self) -> None:
         """Submit and look no more."""
@@ -100,8 +115,9 @@ class Clients:
     def _run(self) -> None:
         while not self._stop.wait(_PAUSE):
             try:
-                if self.submitting and len(self.unfinished()) < UNFINISHED:
-                    self._submit()
+                with self._submission:
+                    if self._submitting.is_set() and len(self.unfinished()) < UNFINISHED:
+                        self._submit()
                 for promise in self.unfinished():
                     self._look(promise)
             except Exception as error:  # a client that stops would end the proof in silence
@@ -114,11 +130,12 @@ class Clients:
         if made is None:
             return
         capture = str(made.json()["id"])
+        self.captures.append(capture)
         if engine:
             files, options = self.photos, {"steps": 150}
         else:
             script = {
-                "steps": self._random.randint(8, 40),
+                "steps": self._random.randint(8, 24),
                 "seconds": 0.1,
                 "bytes": self._random.choice((1_000, 300_000)),
                 "gaussians": self._random.choice((1, 3000)),
@@ -180,7 +197,9 @@ class Clients:
             self._view(promise)
 
     def _failed(self, promise: Promise, problem: Any) -> None:
-        if problem["code"] not in _TRANSIENT:
+        cause = CAUSES.get(problem["code"])
+        since = time.monotonic() - _CAUSE_SECONDS
+        if cause is None or not any(cause in name and over > since for name, over in self.faults):
             promise.state, promise.failure = "failed", f"{problem['code']}: {problem['detail']}"
             return
         try:
@@ -200,7 +219,7 @@ class Clients:
 
     def _view(self, promise: Promise) -> None:
         try:
-            answer = self._http.post(f"/v1/models/{promise.job}/render", json={"camera": _CAMERA})
+            answer = self._http.post(f"/v1/models/{promise.job}/render", json={"camera": CAMERA})
         except httpx.HTTPError:
             return
         if answer.status_code == 200:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import psutil
 
+from _soak.proxy import Proxy
 from _soak.service import Service, wait_for
 
 MAX_TRAINER_KILLS = 2
@@ -20,6 +21,7 @@ _HOLD = (
 )  # seconds that a stop, a cut or a stall lasts: below and above the timeout of Redis with its retries
 _AWAY = (0.0, 1.0)  # seconds before what was killed is started again
 _TARGET_SECONDS = 20.0
+_MET_SECONDS = 10.0
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class Target:
     """The service as the faults reach it.
 
     killed: kills of trainers by job.
+    struck: monotonic time at which the newest fault began.
     healed: monotonic time at which the newest fault was over: its kill, or the beginning of what takes it back.
     """
 
@@ -51,7 +54,11 @@ class Target:
         self.service = service
         self.rng = rng
         self.killed: dict[str, int] = {}
-        self.healed = 0.0
+        self.struck = self.healed = 0.0
+
+    def strike(self) -> None:
+        """Note that the fault begins now."""
+        self.struck = time.monotonic()
 
     def trainer(self, *, spare: bool = False) -> int:
         """Return the process of the attempt that runs. With `spare`, not of a job whose trainers were killed often."""
@@ -79,9 +86,15 @@ class Target:
         time.sleep(self.rng.uniform(*bounds))
         self.healed = time.monotonic()
 
+    def met(self, proxy: Proxy) -> None:
+        """Let the fault of a proxy last for some seconds, and until it has met something."""
+        self.last(_HOLD)
+        wait_for(lambda: proxy.met, _MET_SECONDS, "the fault has met a request")
+        self.healed = time.monotonic()
+
     def kill(self, pid: int) -> None:
         """Kill a process that the service starts again by itself."""
-        self.healed = time.monotonic()
+        self.struck = self.healed = time.monotonic()
         self.service.kill(pid)
 
 
@@ -97,12 +110,14 @@ def _kill_part(name: str) -> Callable[[Target], None]:
 
 
 def _kill_up(target: Target) -> None:
+    target.strike()
     target.service.kill_up()
     target.last(_AWAY)
     target.service.start()
 
 
 def _kill_all(target: Target) -> None:
+    target.strike()
     target.service.kill_all()
     target.last(_AWAY)
     target.service.start_redis()
@@ -110,12 +125,14 @@ def _kill_all(target: Target) -> None:
 
 
 def _kill_redis(target: Target) -> None:
+    target.strike()
     target.service.kill_redis()
     target.last(_AWAY)
     target.service.start_redis()
 
 
 def _empty_redis(target: Target) -> None:
+    target.strike()
     target.service.kill_redis(empty=True)
     target.last(_AWAY)
     target.service.start_redis()
@@ -124,6 +141,7 @@ def _empty_redis(target: Target) -> None:
 def _stop(find: Callable[[Target], int]) -> Callable[[Target], None]:
     def act(target: Target) -> None:
         pid = find(target)
+        target.strike()
         os.kill(pid, signal.SIGSTOP)
         target.last(_HOLD)
         if psutil.pid_exists(pid):
@@ -132,40 +150,46 @@ def _stop(find: Callable[[Target], int]) -> Callable[[Target], None]:
     return act
 
 
-def _cut_redis(target: Target) -> None:
-    target.service.redis_proxy.cut()
-    target.last(_HOLD)
-    target.service.redis_proxy.heal()
-
-
-def _stall_redis(target: Target) -> None:
-    target.service.redis_proxy.stall()
-    target.last(_HOLD)
-    target.service.redis_proxy.heal()
-
-
-def _s3(what: str) -> Callable[[Target], None]:
+def _redis(what: str) -> Callable[[Target], None]:
     def act(target: Target) -> None:
-        proxy = target.service.s3_proxy
-        assert proxy is not None
-        getattr(proxy, what)()
-        target.last(_HOLD)
-        proxy.heal()
+        spoil(target, target.service.redis_proxy, what)
 
     return act
 
 
+def _s3(what: str) -> Callable[[Target], None]:
+    def act(target: Target) -> None:
+        assert target.service.s3_proxy is not None
+        spoil(target, target.service.s3_proxy, what)
+
+    return act
+
+
+def spoil(target: Target, proxy: Proxy, what: str) -> None:
+    """Have a proxy cut off, stall or fail what passes it, and heal it whatever comes."""
+    target.strike()
+    try:
+        getattr(proxy, what)()
+        target.met(proxy)
+    finally:
+        proxy.heal()
+
+
 def _full_disk(target: Target) -> None:
-    target.service.fill_disk()
-    target.last(_HOLD)
-    target.service.empty_disk()
+    target.strike()
+    try:
+        target.service.fill_disk()
+        target.last(_HOLD)
+    finally:
+        target.service.empty_disk()
 
 
 def _jump(target: Target) -> None:
     """Forward by up to half an hour, or back to where the clock was, and the other way round."""
     clock = target.service.clock
-    target.healed = time.monotonic()
+    target.struck = target.healed = time.monotonic()
     clock.jump(-clock.offset if clock.offset else target.rng.choice((-1, 1)) * target.rng.randint(20, 1800))
+    assert target.service.sees_clock(), "Redis does not follow the clock that was set."
 
 
 FAULTS = (
@@ -182,8 +206,8 @@ FAULTS = (
     Fault("API stopped", 1, False, _stop(lambda target: target.service.part("api"))),
     Fault("renderer stopped", 1, False, _stop(lambda target: target.service.part("renderer"))),
     Fault("Redis stopped", 1, False, _stop(lambda target: target.service.redis_pid)),
-    Fault("Redis cut off", 1, False, _cut_redis),
-    Fault("Redis stalled", 1, False, _stall_redis),
+    Fault("Redis cut off", 1, False, _redis("cut")),
+    Fault("Redis stalled", 1, False, _redis("stall")),
     Fault("disk full", 1, False, _full_disk, "disk"),
     Fault("clock set", 1, False, _jump, "clock"),
     Fault("S3 cut off", 1, False, _s3("cut"), "s3"),

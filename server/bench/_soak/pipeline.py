@@ -3,8 +3,9 @@
 It runs in the attempt's process (SPLATMILL_PIPELINE). The record is one file of all attempts, SOAK_TRACE, with a JSON
 line for each of
 
-    begin: the process, the job, the step that it resumes from, and whether another attempt at the job runs beside it;
-    step: a step whose checkpoint is stored, or any event of the engine;
+    begin: the process, the job, the step that it resumes from, whether another attempt at the job runs beside it
+        (`overlap`), and whether its model is in storage already (`published`);
+    step: a step whose checkpoint is stored (`stored`), or any event of the engine;
     end: the pipeline has returned with a whole model.
 
 Times are those of the machine's monotonic clock, which all processes share and no fault of a soak sets.
@@ -20,8 +21,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from splatmill.backplane import layout
+from splatmill.backplane.storage import Storage, StorageError
 from splatmill.files import atomic_write
 from splatmill.schema import Event, JobState, MetricEvent, PlanEvent, ProgressEvent, StateEvent, TrainOptions
+from splatmill_worker.settings import storage_url
 
 SCRIPT = "soak.json"
 """Name of the image of a capture that is no photo: a job on it takes the steps that it lists, without the engine."""
@@ -54,10 +58,10 @@ def run(
         overlap = True
     script = capture / "images" / SCRIPT
     if script.is_file():
-        record(job, "begin", overlap=overlap, step=_step(workdir))
+        record(job, "begin", overlap=overlap, published=_published(job), step=_step(workdir))
         result: Any = _steps(json.loads(script.read_text()), job, workdir, emit, cancelled)
     else:
-        record(job, "begin", overlap=overlap, step=None)
+        record(job, "begin", overlap=overlap, published=_published(job), step=None)
 
         def noted(event: Event) -> None:
             record(job, "step", step=event.step if isinstance(event, ProgressEvent) else None)
@@ -97,7 +101,7 @@ def _steps(
         time.sleep(script["seconds"])
         text = json.dumps({"step": step, "padding": "x" * int(script["bytes"])})
         atomic_write(_checkpoint(workdir), text)
-        record(job, "step", step=step)
+        record(job, "step", step=step, stored=True)
         emit(ProgressEvent(stage="training", done=step, total=total, step=step, loss=1 / step))
         if cancelled():
             return SimpleNamespace(ended="cancelled")
@@ -113,6 +117,14 @@ def _steps(
     (out / "report.json").write_text(json.dumps({"curve": curve, "seconds": {}}))
     (out / "cameras.json").write_text(json.dumps({"cameras": []}))
     return SimpleNamespace(ended="succeeded")
+
+
+def _published(job: str) -> bool:
+    """Return whether the model of this job is stored, as far as storage answers."""
+    try:
+        return Storage(storage_url()).exists(layout.job_record(job))
+    except StorageError:
+        return False
 
 
 def _checkpoint(workdir: Path) -> Path:

@@ -13,11 +13,15 @@ _UNAVAILABLE = (
 
 
 class Proxy:
-    """Forwards connections from a free port of this machine to `target`, host and port. It must be closed."""
+    """Forwards connections from a free port of this machine to `target`, host and port. It must be closed.
+
+    met: how many connections, pieces or requests the newest fault has met.
+    """
 
     def __init__(self, target: tuple[str, int]) -> None:
         self.target = target
         self.port = 0
+        self.met = 0
         self._cut = self._errors = False
         self._links: set[asyncio.StreamWriter] = set()
         self._loop = asyncio.new_event_loop()
@@ -33,6 +37,7 @@ class Proxy:
 
         def now() -> None:
             self._cut = True
+            self.met = len(self._links)
             for link in list(self._links):
                 link.transport.abort()
 
@@ -40,12 +45,18 @@ class Proxy:
 
     def stall(self) -> None:
         """Let no byte through, in either direction. What is sent meanwhile arrives later."""
-        self._call(self._flows.clear)
+
+        def now() -> None:
+            self.met = 0
+            self._flows.clear()
+
+        self._call(now)
 
     def fail(self) -> None:
         """Answer every HTTP request with 503, as S3 does when it is asked too much."""
 
         def now() -> None:
+            self.met = 0
             self._errors = True
 
         self._call(now)
@@ -87,6 +98,7 @@ class Proxy:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if self._cut:
+            self.met += 1
             writer.transport.abort()
             return
         self._links.add(writer)
@@ -115,8 +127,10 @@ class Proxy:
     ) -> None:
         """Forward until the source ends. `client` is who is answered with errors."""
         while data := await source.read(65536):
+            self.met += not self._flows.is_set()
             await self._flows.wait()
             if client is not None and self._errors:
+                self.met += 1
                 client.write(_UNAVAILABLE)
                 with contextlib.suppress(OSError):
                     await client.drain()

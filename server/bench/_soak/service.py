@@ -18,6 +18,7 @@ import psutil
 import redis
 
 from _soak.clock import Clock
+from _soak.orphans import Adoption
 from _soak.proxy import Proxy
 from splatmill.backplane.connection import connect
 from splatmill.backplane.process import die_with_parent, start_time
@@ -29,6 +30,9 @@ DISK_BYTES = 256 << 20
 
 RESERVE_BYTES = 16 << 20
 """Bytes of that disk that uploads and workers leave free."""
+
+_CLOCK_SECONDS = 5.0
+"""Seconds by which a reading of two clocks may differ; the clock is set by more."""
 
 _GONE_SECONDS = 10.0  # for the children of a killed process to end
 
@@ -57,6 +61,9 @@ class Service:
         self.clock = Clock(folder)
         self.disk = _mount(self.data)
         self.seen: dict[int, str | None] = {}
+        self._records: list[Any] = []
+        self._read = 0
+        self._adoption = Adoption()
         self._ports = [_free_port() for _ in range(3)]
         self._redis: subprocess.Popen[bytes] | None = None
         self._up: subprocess.Popen[str] | None = None
@@ -145,6 +152,7 @@ class Service:
         self.redis_proxy.close()
         if self.s3_proxy is not None:
             self.s3_proxy.close()
+        self._adoption.end()
         if self.disk:
             subprocess.run(["umount", "--lazy", str(self.data)], check=False)
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -181,6 +189,11 @@ class Service:
     def left(self) -> list[int]:
         """Return the processes that were seen below `up` and still run."""
         return [pid for pid, began in self.seen.items() if began is not None and start_time(pid) == began]
+
+    def orphans(self) -> list[int]:
+        """Return the processes below this one that have lost their parent and run on."""
+        own = [process.pid for process in (self._redis, self._up, self._s3) if process is not None]
+        return self._adoption.orphans(own)
 
     def kill(self, *pids: int) -> None:
         """Kill processes, and wait until those below them are gone too. Raises AssertionError for one that stays."""
@@ -245,13 +258,26 @@ class Service:
 
     def records(self) -> list[Any]:
         """Return all lines of the pipelines' record (see `pipeline`)."""
-        return [json.loads(line) for line in self.trace.read_text().splitlines()]
+        with self.trace.open("rb") as file:
+            file.seek(self._read)
+            fresh = file.read()
+        whole = fresh[: fresh.rfind(b"\n") + 1]
+        self._read += len(whole)
+        self._records += [json.loads(line) for line in whole.splitlines()]
+        return self._records
+
+    def sees_clock(self) -> bool:
+        """Return whether the clock of Redis is off by as much as the injected one."""
+        with self.redis() as connection:
+            seconds, micros = connection.time()
+        return abs(seconds + micros / 1e6 - time.time() - self.clock.offset) < _CLOCK_SECONDS
 
     def fill_disk(self) -> None:
         """Leave no byte free on the disk of the data folder."""
         with (self.data / "filler").open("wb", buffering=0) as file, suppress(OSError):
             while True:
                 file.write(bytes(1 << 20))
+        assert shutil.disk_usage(self.data).free < 1 << 20, "the disk is not full"
 
     def empty_disk(self) -> None:
         """Take back what `fill_disk` did."""

@@ -1,67 +1,105 @@
 """What must hold when a soak has ended: nothing lost, run twice or left over, and two stores that agree."""
 
 import hashlib
-import json
-from collections.abc import Iterable
+import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
-from _soak.clients import FINAL, Clients, Promise
+import httpx
+import redis
+
+from _soak import agreement, attempts, files
+from _soak.clients import CAMERA, FINAL, Clients
+from _soak.orphans import command
 from _soak.service import Service, wait_for
-from splatmill.backplane import events, keys, layout, leases, lines
+from splatmill.backplane import events
 from splatmill.backplane.records import UnreadableRecord
-from splatmill.backplane.storage import Storage
-from splatmill.schema import Role, StateEvent
+from splatmill.schema import StateEvent
 
-SETTLE_SECONDS = 180.0
-"""Seconds for the last jobs to end once no fault comes any more."""
+SETTLE_SECONDS = 90.0
+"""Seconds for the last jobs to end once no fault comes any more: at most one of the engine and two of a few seconds."""
 
 _AGREE_SECONDS = 40.0  # for the reaper to look once more
+_ANSWER_SECONDS = 120.0  # for a page of models of which each is read from storage for the first time
 
 
 def settle(clients: Clients) -> list[str]:
     """Wait for every job to end; return a sentence for each that does not."""
+    clients.submit_no_more()
     with suppress(AssertionError):
         wait_for(lambda: not clients.unfinished(), SETTLE_SECONDS, "every job has ended")
-    return [f"{promise.job} is still {promise.state}" for promise in clients.unfinished()]
+    return [
+        f"{promise.job} is still {promise.state} {SETTLE_SECONDS:g} s after the last fault"
+        for promise in clients.unfinished()
+    ]
 
 
 def check(service: Service, clients: Clients) -> list[str]:
     """Return a sentence for each thing that does not hold, while the service runs and no job does."""
     storage = service.storage()
-    return [
-        *clients.complaints,
-        *_lost(service, clients, storage),
-        *twice(service.records()),
-        *_told_twice(service),
-        *halves(clients.promises.values(), storage),
-        *_disagreements(service, clients, storage),
-    ]
+    records = service.records()
+    with service.redis() as connection:
+        held = _rest(service, connection)
+        try:
+            listed = {kind: _listed(service, kind) for kind in ("captures", "jobs", "models")}
+            unread = _unread(service, clients)
+        except httpx.HTTPError as error:
+            return [*clients.complaints, f"the service does not answer after all faults: {error!r}"]
+        return [
+            *clients.complaints,
+            *lost(clients, listed["jobs"], listed["models"]),
+            *unread,
+            *attempts.overlapping(records),
+            *attempts.repeated(records),
+            *attempts.run_again(records),
+            *told_twice(connection, {line["job"] for line in records}),
+            *files.halves(clients.promises.values(), storage),
+            *files.strays(storage),
+            *held,
+            *agreement.compare(connection, storage, listed, clients.captures),
+        ]
 
 
 def check_stopped(service: Service) -> list[str]:
     """Return a sentence for each process that the stopped service has left behind."""
-    left = service.left()
-    for process in _marked(service.trace):
-        left.append(process)
-    return [f"process {pid} still runs: {_command(pid)}" for pid in sorted(set(left))]
+    left = {*service.left(), *_marked(service.trace), *service.orphans()}
+    return [f"process {pid} still runs: {command(pid)}" for pid in sorted(left)]
 
 
-def _lost(service: Service, clients: Clients, storage: Storage) -> list[str]:
+def lost(clients: Clients, jobs: list[str], models: list[str]) -> list[str]:
+    """Return a sentence for each job that failed, or that is not where it should be.
+
+    jobs, models: ids of those that the API lists.
+    """
     found = []
-    listed = _listed(service, "jobs")
-    models = _listed(service, "models")
     for promise in clients.promises.values():
         if promise.failure is not None:
             found.append(f"{promise.job} failed: {promise.failure}")
+        elif promise.state in FINAL:  # of others, `settle` tells
+            if promise.job not in jobs:
+                found.append(f"{promise.job} was accepted and is not among the jobs")
+            if (promise.state == "succeeded") != (promise.job in models):
+                there = "is" if promise.job in models else "is not"
+                found.append(f"{promise.job} is {promise.state} and {there} among the models")
+    return found
+
+
+def _unread(service: Service, clients: Clients) -> list[str]:
+    """Models that a client cannot download as they are in storage, or cannot look at."""
+    found = []
+    for promise in clients.promises.values():
+        if promise.state != "succeeded":
             continue
-        if promise.state not in FINAL:
-            continue  # `settle` tells
-        if listed.count(promise.job) != 1:
-            found.append(f"{promise.job} is listed {listed.count(promise.job)} times among the jobs")
-        if promise.state == "succeeded" and models.count(promise.job) != 1:
-            found.append(f"{promise.job} is listed {models.count(promise.job)} times among the models")
+        address = f"/v1/models/{promise.job}"
+        record = service.http.get(f"{address}/files/job.json")
+        model = service.http.get(f"{address}/files/model.ply")
+        if record.status_code != 200 or model.status_code != 200:
+            found.append(f"{address} cannot be downloaded: {record.status_code}, {model.status_code}")
+        elif hashlib.sha256(model.content).hexdigest() != record.json()["sha256"]["model.ply"]:
+            found.append(f"{address}/files/model.ply is not what its record says")
+        view = service.http.post(f"{address}/render", json={"camera": CAMERA})
+        if not view.content.startswith(b"\x89PNG"):
+            found.append(f"{address} cannot be looked at: {view.status_code} {view.text[:200]}")
     return found
 
 
@@ -71,98 +109,39 @@ def _listed(service: Service, what: str) -> list[str]:
     cursor: str | None = None
     while True:
         parameters = {"limit": "100"} | ({"cursor": cursor} if cursor else {})
-        page = service.http.get(f"/v1/{what}", params=parameters).raise_for_status().json()
+        page = (
+            service.http.get(f"/v1/{what}", params=parameters, timeout=_ANSWER_SECONDS)
+            .raise_for_status()
+            .json()
+        )
         ids += [item["id"] for item in page[what]]
         cursor = page.get("cursor")
         if cursor is None:
             return ids
 
 
-def twice(records: Iterable[Any]) -> list[str]:
-    """Return a sentence for each attempt that began while another at the same job ran.
-
-    records: the lines of the pipelines' record.
-    """
-    return [
-        f"two attempts at {line['job']} ran at once, one of them process {line['pid']}"
-        for line in records
-        if line["what"] == "begin" and line["overlap"]
-    ]
-
-
-def _told_twice(service: Service) -> list[str]:
-    """Jobs that clients were told of twice that they have succeeded."""
+def told_twice(connection: redis.Redis, jobs: set[str]) -> list[str]:
+    """Return a sentence for each job whose states tell more than once in a generation that it has succeeded."""
     found = []
-    ended = {line["job"] for line in service.records() if line["what"] == "end"}
-    with service.redis() as connection:
-        for job in sorted(ended):
-            stored = events.read_states(connection, job)
-            told = [s for s in stored if isinstance(s.event, StateEvent) and s.event.state == "succeeded"]
-            if len(told) > len({s.generation for s in told}):
-                found.append(f"{job} was told to have succeeded {len(told)} times")
+    for job in sorted(jobs):
+        stored = events.read_states(connection, job)
+        told = [s for s in stored if isinstance(s.event, StateEvent) and s.event.state == "succeeded"]
+        if len(told) > len({s.generation for s in told}):
+            found.append(f"{job} was told to have succeeded {len(told)} times")
     return found
 
 
-def halves(promises: Iterable[Promise], storage: Storage) -> list[str]:
-    """Return a sentence for each file that is not what was uploaded, or not what the model's record says."""
-    found = []
-    for promise in promises:
-        for name, content in promise.files.items():
-            role, _, file = name.partition("/")
-            path = layout.capture_file(promise.capture, Role(role), file)
-            try:
-                if storage.get(path) != content:
-                    found.append(f"{path} is not what was uploaded")
-            except FileNotFoundError:
-                found.append(f"{path} was uploaded and is missing")
-        if promise.state != "succeeded":
-            continue
+def _rest(service: Service, connection: redis.Redis) -> list[str]:
+    """What is still held of work when the reaper has had time to look."""
+    end = time.monotonic() + _AGREE_SECONDS
+    while True:
         try:
-            record = json.loads(storage.get(layout.job_record(promise.job)))
-        except (FileNotFoundError, ValueError) as error:
-            found.append(f"the record of the model {promise.job} cannot be read: {error}")
-            continue
-        for name, digest in record["sha256"].items():
-            path = layout.model_file(promise.job, name)
-            try:
-                whole = hashlib.sha256(storage.get(path)).hexdigest() == digest
-            except FileNotFoundError:
-                whole = False
-            if not whole:
-                found.append(f"{path} is not whole")
-    return found
-
-
-def _disagreements(service: Service, clients: Clients, storage: Storage) -> list[str]:
-    """What Redis still holds of jobs that have ended, and models without a job or the other way round."""
-    found: list[str] = []
-    with service.redis() as connection:
-        remains: dict[str, Any] = {}
-
-        def clean() -> bool:
-            remains["unfinished jobs"] = [job.decode() for job in connection.smembers(keys.ACTIVE)]  # type: ignore[union-attr]  # redis types its replies as awaitable
-            remains["leases"] = [lease.member for lease in leases.held(connection)]
-            remains["waiting entries"] = [
-                f"{count} of {name}"
-                for name in lines.LINES
-                if (count := lines.look(connection).count(name)) > 0
-            ]
-            remains["locks"] = [key.decode() for key in connection.scan_iter(match=keys.lock("*"))]
-            return not any(remains.values())
-
-        try:
-            wait_for(clean, _AGREE_SECONDS, "Redis holds no work")
-        except AssertionError:
-            found += [f"Redis still holds {what}: {held}" for what, held in remains.items() if held]
+            held = agreement.remains(connection, service.storage())
         except UnreadableRecord as error:
-            found.append(f"Redis holds a record that cannot be read: {error}")
-    for promise in clients.promises.values():
-        published = storage.exists(layout.job_record(promise.job))
-        if published != (promise.state == "succeeded"):
-            found.append(
-                f"{promise.job} is {promise.state}, but storage has {'a' if published else 'no'} model of it"
-            )
-    return found
+            return [f"Redis holds a record that cannot be read: {error}"]
+        if not held or time.monotonic() > end:
+            return [f"there are still {what}: {found}" for what, found in held.items()]
+        time.sleep(0.2)
 
 
 def _marked(trace: Path) -> list[int]:
@@ -176,10 +155,3 @@ def _marked(trace: Path) -> list[int]:
         except OSError:
             continue
     return found
-
-
-def _command(pid: int) -> str:
-    try:
-        return (Path("/proc") / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ").decode()[:200]
-    except OSError:
-        return "it has just ended"

@@ -6,7 +6,7 @@ bucket's own failures (tests/server/test_bucket).
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from splatmill.backplane.storage import Storage, StorageError
 from splatmill.backplane.storage_errors import StorageUnreachableError
 from splatmill.schema import Role
 from splatmill_worker.errors import CaptureIncomplete, FolderInUse, StartNotStored
-from splatmill_worker.service import job_folder, mirror
+from splatmill_worker.service import job_folder, mirror, sfm_cache
 from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.job_folder import JobFolder, hold
 from splatmill_worker.service.mirror import Mirror
@@ -28,7 +28,7 @@ from tests.support.faulty_s3 import FaultyS3, faulty_s3
 from tests.support.jobs import CAPTURE
 from tests.support.waiting import wait_for
 
-JOB = "job00001"
+JOB, OTHER = "job00001", "job00002"
 
 
 def staged(folder: JobFolder) -> dict[str, bytes]:
@@ -99,6 +99,50 @@ def test_a_staging_that_is_stopped_fetches_no_more_files(bucket: tuple[FaultyS3,
     with pytest.raises(HandedBack):
         folder.stage_capture(stop)
     assert 1 <= len(staged(folder)) <= DOWNLOADS
+
+
+def test_checkpoints_and_cameras_come_from_a_bucket_several_at_a_time(
+    bucket: tuple[FaultyS3, Storage], tmp_path: Path
+) -> None:
+    s3, storage = bucket
+    names = [f"film/{number:03}.jpg" for number in range(DOWNLOADS)] + ["checkpoints/ü b.pt"]
+    for name in names:
+        storage.put(f"{layout.job_work(OTHER)}/{name}", name.encode())
+        storage.put(f"{layout.capture_sfm(CAPTURE)}/photos/model-1/{name}", name.encode())
+    storage.put(f"{layout.capture_sfm(CAPTURE)}/photos/model-1/facts.json", b"{}")
+    folder = JobFolder(storage, OTHER, CAPTURE)
+
+    def at_once(action: Callable[[], object], path: str) -> object:
+        s3.fault = lambda request: "wait" if request.method == "GET" and path in request.path else None
+        with ThreadPoolExecutor(1) as pool:
+            task = pool.submit(action)
+            wait_for(lambda: s3.stalled == DOWNLOADS)
+            s3.fault = lambda _: None
+            s3.release()
+            return task.result(20)
+
+    assert at_once(folder.restore, "/work/film") == sorted(names)
+    assert at_once(lambda: sfm_cache.fetch(storage, CAPTURE, folder.run), "/model-1/film") == 1
+    for name in names:
+        assert (folder.run / name).read_text() == name
+        assert (folder.run / "sfm/photos/model-1" / name).read_text() == name
+    assert not list(folder.path.rglob("*.part"))
+
+
+def test_a_restoring_that_breaks_off_is_begun_anew(bucket: tuple[FaultyS3, Storage]) -> None:
+    """Half of what an attempt stored would pass for all of it: a checkpoint without its plan."""
+    s3, storage = bucket
+    for name in ("checkpoints/checkpoint.pt", "plan.json"):
+        storage.put(f"{layout.job_work(JOB)}/{name}", name.encode())
+    folder = JobFolder(storage, JOB, CAPTURE)
+    s3.fault = lambda request: 503 if request.path.endswith("plan.json") else None
+    with pytest.raises(StorageUnreachableError):
+        folder.restore()
+    s3.fault = lambda _: None
+    storage.put(f"{layout.job_work(JOB)}/checkpoints/checkpoint.pt", b"checkpoints/of later.....")
+    assert folder.restore() == ["checkpoints/checkpoint.pt", "plan.json"]
+    assert (folder.run / "checkpoints/checkpoint.pt").read_bytes() == b"checkpoints/of later....."
+    assert (folder.run / "plan.json").is_file()
 
 
 def test_a_file_that_the_bucket_does_not_give_ends_the_staging_by_name(

@@ -22,7 +22,7 @@ from splatmill.schema import TIME_LAPSE
 from splatmill_worker.errors import CaptureIncomplete, FolderInUse, StartNotStored
 from splatmill_worker.service.disk_reserve import shortage
 from splatmill_worker.service.own_copy import link_or_copy
-from splatmill_worker.service.staging import Report, is_whole, stage
+from splatmill_worker.service.staging import Report, fetch, is_whole, stage
 from splatmill_worker.settings import work_folder
 
 LOCK_SECONDS = 10.0
@@ -33,6 +33,9 @@ START, FILM, CHECKPOINTS, SNAPSHOTS = "start.ply", "film", "checkpoints", TIME_L
 of the time-lapse."""
 
 _CAMERAS = "sfm"
+
+_RESTORING = "restoring"
+"""Name beside the run folder of what comes from storage to become it."""
 
 
 class JobFolder:
@@ -119,7 +122,16 @@ class JobFolder:
         if not resumes:
             for name in (FILM, SNAPSHOTS):
                 self.storage.delete_prefix(f"{stored}/{name}")
-        return [] if own else self.storage.download_prefix(stored, self.run)
+        if own:
+            return []
+        # Renamed when it is whole: a part of it would pass for what an attempt on this machine left.
+        part = self.path / _RESTORING
+        shutil.rmtree(part, ignore_errors=True)
+        entries = {entry.path[len(stored) + 1 :]: entry for entry in self.storage.entries(stored)}
+        fetch(self.storage, {part / name: entry for name, entry in entries.items()})
+        if entries:
+            part.rename(self.run)
+        return list(entries)
 
     def close(self) -> None:
         """Release the lock and keep the folder."""

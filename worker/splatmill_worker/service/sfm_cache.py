@@ -9,7 +9,8 @@ import logging
 from pathlib import Path
 
 from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import Entry, Storage
+from splatmill_worker.service import staging
 
 log = logging.getLogger("splatmill_worker")
 
@@ -21,9 +22,9 @@ _LAST_FILE = "facts.json"
 def fetch(storage: Storage, capture_id: str, run: Path) -> int:
     """Copy the cached models of a capture that the `run` folder lacks into it. Return their number."""
     prefix = layout.capture_sfm(capture_id)
-    names = [entry.path[len(prefix) + 1 :] for entry in storage.entries(prefix)]
-    fetched = 0
-    for last in (name for name in names if name.endswith(f"/{_LAST_FILE}")):
+    entries = {entry.path[len(prefix) + 1 :]: entry for entry in storage.entries(prefix)}
+    lasts, others = dict[Path, Entry](), dict[Path, Entry]()
+    for last in (name for name in entries if name.endswith(f"/{_LAST_FILE}")):
         folder = last.removesuffix(_LAST_FILE)
         if (run / _FOLDER / last).is_file():
             continue
@@ -31,10 +32,15 @@ def fetch(storage: Storage, capture_id: str, run: Path) -> int:
             log.warning("The stored cameras %s of this capture are not readable and are not used.", folder)
             storage.delete(f"{prefix}/{last}")  # so that `store` replaces them
             continue
-        for name in [*(n for n in names if n.startswith(folder) and n != last), last]:
-            storage.download(f"{prefix}/{name}", run / _FOLDER / name)
-        fetched += 1
-    return fetched
+        lasts[run / _FOLDER / last] = entries[last]
+        others |= {
+            run / _FOLDER / name: entry
+            for name, entry in entries.items()
+            if name.startswith(folder) and name != last
+        }
+    staging.fetch(storage, others)
+    staging.fetch(storage, lasts)
+    return len(lasts)
 
 
 def _readable(document: bytes) -> bool:

@@ -1,4 +1,4 @@
-"""Copies the files of a stored capture into a job's folder, several at a time from a bucket, and says how far it is."""
+"""Copies stored files into a job's folder, several at a time from a bucket: a capture, or what attempts have left."""
 
 import threading
 from collections.abc import Callable, Mapping
@@ -60,3 +60,16 @@ def stage(storage: Storage, wanted: Mapping[Path, Entry], report: Report) -> Non
         wait(tasks, return_when=FIRST_EXCEPTION)
     for task in tasks:
         task.result()
+
+
+def fetch(storage: Storage, wanted: Mapping[Path, Entry]) -> None:
+    """Make each path a file with the bytes of its entry, whatever was there, as `stage` does.
+
+    Raises FileNotFoundError for a file that is deleted from storage meanwhile.
+    """
+    for path in wanted:
+        path.unlink(missing_ok=True)
+    stage(storage, wanted, lambda done, total: None)
+    for path, entry in wanted.items():
+        if not path.is_file():
+            raise FileNotFoundError(f"{entry.path} was deleted from storage while it was being read.")
