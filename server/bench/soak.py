@@ -24,6 +24,7 @@ the machine does what.
 from __future__ import annotations
 
 import argparse
+import math
 import random
 import shutil
 import statistics
@@ -164,12 +165,13 @@ def _one(
     service.family()
     target.strike()
     row: Row = {"at": round(target.struck - begun, 2), "complaint": None, **dict.fromkeys(MEASURED)}
+    clients.faults.append((fault.name, math.inf))
     try:
         fault.act(target)
     except AssertionError as error:
         row["complaint"] = str(error)
         target.healed = time.monotonic()
-    clients.faults.append((fault.name, target.healed))
+    clients.faults[-1] = fault.name, target.healed
     row["lasted"] = round(target.healed - target.struck, 2)
     if not at_once and row["complaint"] is None:
         measured, row["complaint"] = recover(service, clients, target.struck, target.healed)

@@ -61,7 +61,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        loops = (service.reaper.run, service.imports.run, service.deliveries.run, service.sweeper.run)
+        loops = (
+            service.reaper.run,
+            service.imports.run,
+            service.deliveries.run,
+            service.relisting.run,
+            service.sweeper.run,
+        )
         tasks = [asyncio.create_task(loop()) for loop in loops]
         try:
             yield

@@ -35,6 +35,7 @@ from splatmill_server.shares import Shares
 from splatmill_server.space.deletion import Deletion
 from splatmill_server.space.ledger import Ledger
 from splatmill_server.space.quota import Quota
+from splatmill_server.space.relisting import Relisting
 from splatmill_server.space.retention import Ages
 from splatmill_server.space.sweeper import Sweeper
 from splatmill_server.space.usage import Usage
@@ -106,6 +107,7 @@ class Service:
     usage: Usage
     quota: Quota
     deletion: Deletion
+    relisting: Relisting
     sweeper: Sweeper
     closing: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server is stopped, so that event streams end and do not delay it."""
@@ -160,6 +162,7 @@ class Service:
             usage=usage,
             quota=quota,
             deletion=deletion,
+            relisting=Relisting(connection, storage, captures, models, settings.reaper_interval),
             sweeper=Sweeper(usage, deletion, captures, models, _ages(settings), settings.sweep_interval),
         )
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.backplane import layout
+from splatmill.backplane import layout, lists
 from splatmill.backplane.connection import connect
-from tests.support.redis_server import empty_redis
+from tests.support.redis_server import RedisServer, empty_redis
 from tests.support.served_app import Serve, ServedApp, problem, served_app, store_model
 from tests.support.server_events import brief, follow
 
@@ -76,3 +76,37 @@ def test_a_request_that_redis_refuses_is_answered_with_the_cause(app: ServedApp)
     finally:
         app.redis.config_set("min-replicas-to-write", 0)
     assert app.http.post(f"/v1/jobs/{job_id}/cancel").json()["state"] == "cancelled"
+
+
+def test_what_redis_has_lost_of_its_lists_is_listed_again(serve: Serve, tmp_path: Path) -> None:
+    """A Redis that is killed loses its last second of writes, and a capture can be made while it refuses writes."""
+    server = RedisServer(tmp_path)
+    server.start()
+    app = serve(redis_url=server.url)
+
+    def listed(what: str) -> list[str]:
+        return [found["id"] for found in app.http.get(f"/v1/{what}").json()[what]]
+
+    try:
+        capture = app.capture()
+        store_model(app.service, MODEL)
+        assert (listed("captures"), listed("models")) == ([capture], [MODEL])
+        assert app.service.relisting.look() == 0
+        server.connection.zrem(lists.name("captures"), capture)
+        server.connection.zrem(lists.name("models"), MODEL)
+        assert app.service.relisting.look() == 0, "this Redis was compared with storage"
+        server.kill()
+        server.start()
+        assert (listed("captures"), listed("models")) == ([], [])
+        assert app.service.relisting.look() == 2
+        assert (listed("captures"), listed("models")) == ([capture], [MODEL])
+
+        server.connection.config_set("min-replicas-to-write", 1)
+        other = str(app.http.post("/v1/captures", json={}).json()["id"])
+        server.connection.config_set("min-replicas-to-write", 0)
+        assert listed("captures") == [capture]
+        assert app.service.relisting.look() == 1
+        assert listed("captures") == [other, capture]
+    finally:
+        server.connection.close()
+        server.kill()

@@ -70,7 +70,7 @@ class Clients:
     photos: files of captures that are trained by the engine; every `photo_share`-th job is one of these.
     complaints: what no client should have met.
     captures: those that the service has accepted.
-    faults: names of the faults so far, and the monotonic time at which each was over.
+    faults: names of the faults so far, and the monotonic time at which each was over; infinity: it goes on.
     """
 
     service: Service

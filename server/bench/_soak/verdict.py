@@ -14,12 +14,15 @@ from _soak.orphans import command
 from _soak.service import Service, wait_for
 from splatmill.backplane import events
 from splatmill.backplane.records import UnreadableRecord
+from splatmill.backplane.storage import Storage
 from splatmill.schema import StateEvent
 
 SETTLE_SECONDS = 90.0
 """Seconds for the last jobs to end once no fault comes any more: at most one of the engine and two of a few seconds."""
 
-_AGREE_SECONDS = 40.0  # for the reaper to look once more
+_AGREE_SECONDS = 30.0
+"""Seconds for Redis, storage and the API's lists to agree once all jobs have ended."""
+
 _ANSWER_SECONDS = 120.0  # for a page of models of which each is read from storage for the first time
 
 
@@ -39,9 +42,8 @@ def check(service: Service, clients: Clients) -> list[str]:
     storage = service.storage()
     records = service.records()
     with service.redis() as connection:
-        held = _rest(service, connection)
         try:
-            listed = {kind: _listed(service, kind) for kind in ("captures", "jobs", "models")}
+            listed, differences = _agreed(service, connection, storage, clients)
             unread = _unread(service, clients)
         except httpx.HTTPError as error:
             return [*clients.complaints, f"the service does not answer after all faults: {error!r}"]
@@ -55,8 +57,7 @@ def check(service: Service, clients: Clients) -> list[str]:
             *told_twice(connection, {line["job"] for line in records}),
             *files.halves(clients.promises.values(), storage),
             *files.strays(storage),
-            *held,
-            *agreement.compare(connection, storage, listed, clients.captures),
+            *differences,
         ]
 
 
@@ -131,17 +132,22 @@ def told_twice(connection: redis.Redis, jobs: set[str]) -> list[str]:
     return found
 
 
-def _rest(service: Service, connection: redis.Redis) -> list[str]:
-    """What is still held of work when the reaper has had time to look."""
+def _agreed(
+    service: Service, connection: redis.Redis, storage: Storage, clients: Clients
+) -> tuple[dict[str, list[str]], list[str]]:
+    """Return what the API lists, and where Redis, storage and that differ once the service has had time to repair."""
     end = time.monotonic() + _AGREE_SECONDS
     while True:
+        listed = {kind: _listed(service, kind) for kind in ("captures", "jobs", "models")}
         try:
-            held = agreement.remains(connection, service.storage())
+            held = agreement.remains(connection, storage)
+            found = [f"there are still {what}: {names}" for what, names in held.items()]
+            found += agreement.compare(connection, storage, listed, clients.captures)
         except UnreadableRecord as error:
-            return [f"Redis holds a record that cannot be read: {error}"]
-        if not held or time.monotonic() > end:
-            return [f"there are still {what}: {found}" for what, found in held.items()]
-        time.sleep(0.2)
+            found = [f"Redis holds a record that cannot be read: {error}"]
+        if not found or time.monotonic() > end:
+            return listed, found
+        time.sleep(1)
 
 
 def _marked(trace: Path) -> list[int]:

@@ -62,6 +62,8 @@ class Captures:
         self.lists = listed
         self.settings = settings
         self.metrics = metrics
+        self.unlisted = False
+        """Whether a capture was made that could not be listed."""
         self.digests = Digests(storage)
         self._recent: dict[str, tuple[float, Capture]] = {}
         # Number of files per capture, as last seen: listing the folder at each upload would take quadratic time.
@@ -86,7 +88,8 @@ class Captures:
             self._list([capture])
         except (
             redis.RedisError
-        ) as error:  # captures can be made and filled without Redis; the sweeper lists this one
+        ) as error:  # captures can be made and filled without Redis; `space.relisting` lists this one
+            self.unlisted = True
             log.warning("a capture is not listed yet", capture=capture.id, error=str(error))
         if self.storage.put_new(layout.capture_record(capture.id), record):
             return capture, True
