@@ -13,7 +13,7 @@ import splatmill
 from splatmill.schema import CreateJob, EventRecord, Problem
 from splatmill_server import problems
 from splatmill_server.access.exposure import check_exposure
-from splatmill_server.access.permission import PERMITTED
+from splatmill_server.access.permission import PERMITTED, is_open
 from splatmill_server.access.sessions import COOKIE
 from splatmill_server.middleware import RequestMiddleware
 from splatmill_server.routes import (
@@ -138,6 +138,10 @@ def _describe(app: FastAPI, *, keyless: bool) -> None:
                 "session": {"type": "apiKey", "in": "cookie", "name": COOKIE},
             }
             document["security"] = [{"key": []}, {"session": []}, *([{}] if keyless else [])]
+            for path, operations in document["paths"].items():
+                if is_open(path):
+                    for operation in operations.values():
+                        operation["security"] = []
             app.openapi_schema = document
         return app.openapi_schema
 

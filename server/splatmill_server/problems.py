@@ -11,6 +11,7 @@ from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.responses import Response
+from starlette.routing import Match
 
 from splatmill.backplane.storage import StorageError, StorageFullError
 from splatmill.schema import PROBLEM_MEDIA_TYPE, PROBLEMS, Problem, UnsafeName, code_for_status
@@ -57,6 +58,19 @@ class ProblemResponse(Response):
         super().__init__(named.model_dump_json(exclude_none=True), problem.status, headers)
 
 
+_METHODS = ("DELETE", "GET", "HEAD", "OPTIONS", "PATCH", "POST", "PUT")
+
+
+def _methods(request: Request) -> list[str]:
+    """Return the methods that the address of a request accepts. Starlette names those of its first route alone."""
+
+    def accepted(method: str) -> bool:
+        asked = {**request.scope, "method": method}
+        return any(route.matches(asked)[0] is Match.FULL for route in request.app.routes)
+
+    return [method for method in _METHODS if accepted(method)]
+
+
 def install(app: FastAPI) -> None:
     """Register the handlers of all errors that endpoints raise."""
 
@@ -64,15 +78,16 @@ def install(app: FastAPI) -> None:
     def on_http(request: Request, error: HTTPException) -> Response:
         if isinstance(error, ProblemError):
             return ProblemResponse(error.problem, request.url.path, error.headers)
-        code, path = code_for_status(error.status_code), request.url.path
+        code, path, headers = code_for_status(error.status_code), request.url.path, dict(error.headers or {})
         match error.status_code:
             case 404:
                 detail = f"There is nothing at {path}."
                 advice = "Find the addresses at /docs or in /openapi.json."
             case 405:
-                allowed = (error.headers or {}).get("allow") or (error.headers or {}).get("Allow", "another")
+                allowed = ", ".join(_methods(request))
                 detail = f"{path} does not accept the method {request.method}."
                 advice = f"Use {allowed}."
+                headers["Allow"] = allowed
             case 400:
                 detail = "The body does not have the format that its Content-Type names."
                 advice = "Send valid JSON in UTF-8."
@@ -81,7 +96,7 @@ def install(app: FastAPI) -> None:
         problem = Problem.of(code, detail, advice=advice or None).model_copy(
             update={"status": error.status_code}
         )
-        return ProblemResponse(problem, path, error.headers)
+        return ProblemResponse(problem, path, headers)
 
     @app.exception_handler(RequestValidationError)
     def on_validation(request: Request, error: RequestValidationError) -> Response:

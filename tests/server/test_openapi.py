@@ -25,6 +25,20 @@ schemathesis.serializer.alias("application/partial-upload", "application/octet-s
 CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
 
 
+def test_the_document_says_what_needs_no_key_and_what_a_body_may_meet(serve: Serve) -> None:
+    document = serve(api_key="s3cret").http.get("/openapi.json").json()
+    open_addresses = {
+        path for path, each in document["paths"].items() for one in each.values() if one.get("security") == []
+    }
+    assert {"/healthz", "/readyz", "/s/{token}/model/render"} <= open_addresses
+    assert not any(path.startswith("/v1/") for path in open_addresses)
+    for path, each in document["paths"].items():
+        for method, operation in each.items():
+            content = operation.get("requestBody", {}).get("content", {})
+            if "application/json" in content:
+                assert {"400", "413", "415"} <= operation["responses"].keys(), (method, path)
+
+
 def test_made_up_requests_get_described_answers(serve: Serve) -> None:
     app = serve(api_key="s3cret")  # a stored key that a made-up request makes does not close the server
     schema = schemathesis.openapi.from_url(f"{str(app.http.base_url).rstrip('/')}/openapi.json")

@@ -61,7 +61,8 @@ def test_addresses_and_methods_that_do_not_exist(app: ServedApp) -> None:
     problem(app.http.get("/no/such/page"), 404, "not_found")
     refused = app.http.patch("/v1/jobs")
     problem(refused, 405, "method_not_allowed")
-    assert refused.headers["allow"]
+    assert refused.headers["allow"] == "GET, POST"
+    assert app.http.options("/v1/captures/x").headers["allow"] == "DELETE, GET"
     assert problem(app.http.get("/v1/jobs/x"), 404, "job_not_found")["instance"] == "/v1/jobs/x"
 
 

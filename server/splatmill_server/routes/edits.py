@@ -31,7 +31,9 @@ _EXAMPLE = {"box": {"min": [-1, -1, -1], "max": [1, 1, 1]}, "min_opacity": 0.05,
     response_model=Edited,
     responses=answer(200, "What the edit would do; no model was made")
     | RENDER_PROBLEMS
-    | problems("unsupported_media_type", "body_too_large", "storage_full", "quota_exceeded"),
+    | problems(
+        "malformed_body", "unsupported_media_type", "body_too_large", "storage_full", "quota_exceeded"
+    ),
     dependencies=[JSON_ONLY],
 )
 async def edit_model(

@@ -183,7 +183,9 @@ def get_cameras(service: Shared, model_id: ModelId) -> ModelCameras:
 @router.post(
     "/{model_id}/render",
     response_class=Response,
-    responses=RENDERED | RENDER_PROBLEMS | problems("unsupported_media_type", "body_too_large"),
+    responses=RENDERED
+    | RENDER_PROBLEMS
+    | problems("malformed_body", "unsupported_media_type", "body_too_large"),
     dependencies=[JSON_ONLY],
 )
 @needs(Scope.read)
@@ -218,7 +220,7 @@ async def render_cacheable(service: Shared, model_id: ModelId, request: Request)
     responses=binary("The video", "video/mp4")
     | answer(304, "The video is unchanged")
     | RENDER_PROBLEMS
-    | problems("unsupported_media_type", "body_too_large", "size_out_of_range"),
+    | problems("malformed_body", "unsupported_media_type", "body_too_large", "size_out_of_range"),
     dependencies=[JSON_ONLY],
 )
 @needs(Scope.read)

@@ -83,4 +83,5 @@ def answer(status: int, description: str, **more: Any) -> Responses:
 def binary(description: str, *media_types: str) -> Responses:
     """Return a successful response that is a file of one of these media types."""
     schema = {"type": "string", "format": "binary"}
-    return {200: {"description": description, "content": {name: {"schema": schema} for name in media_types}}}
+    content = {name: {"schema": {} if name == "application/json" else schema} for name in media_types}
+    return {200: {"description": description, "content": content}}

@@ -20,7 +20,7 @@ NamePart = Annotated[
 ]
 
 
-def _json_only(request: Request) -> None:
+async def _json_only(request: Request) -> None:  # as a coroutine, it takes no thread of the pool
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     has_body = request.headers.get("content-length", "0") != "0" or "transfer-encoding" in request.headers
     if has_body and media_type != "application/json" and not media_type.endswith("+json"):

@@ -1,7 +1,7 @@
 """The endpoints of `/s/{token}/model`: what a link to a model gives to people without a key. They only read, and only
 this model. Their addresses are those of `/v1/models/{model_id}`, below another one."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Request
 from starlette.concurrency import run_in_threadpool
@@ -22,9 +22,6 @@ router = APIRouter(prefix="/s/{token}/model", tags=["shares"])
 LIMITS = KeyLimits(requests_per_minute=600)
 """Requests a minute through one link, whoever sends them: dragging without WebGL asks for some pictures a second."""
 
-_OPEN: dict[str, Any] = {"security": []}
-"""The token in the address is all that these endpoints ask for."""
-
 
 async def _share(
     service: Shared, request: Request, token: Annotated[str, Path(description="Token of the link.")]
@@ -43,7 +40,6 @@ OpenShare = Annotated[StoredShare, Depends(_share)]
 @router.get(
     "",
     responses=problems("share_not_found", "share_ended", "model_not_found", "model_corrupt"),
-    openapi_extra=_OPEN,
 )
 def get_shared_model(service: Shared, share: OpenShare) -> SharedModel:
     """Get the model that a link shows."""
@@ -60,7 +56,6 @@ def get_shared_model(service: Shared, share: OpenShare) -> SharedModel:
     | problems(
         "share_not_found", "share_ended", "model_not_found", "file_not_found", "range_not_satisfiable"
     ),
-    openapi_extra=_OPEN,
 )
 async def get_shared_file(service: Shared, share: OpenShare, name: str, request: Request) -> Response:
     """Download a file of the model that a link shows."""
@@ -72,7 +67,6 @@ async def get_shared_file(service: Shared, share: OpenShare, name: str, request:
 @router.get(
     "/formats",
     responses=problems("share_not_found", "share_ended", "model_not_found", "model_corrupt"),
-    openapi_extra=_OPEN,
 )
 def get_shared_formats(
     service: Shared, share: OpenShare, token: Annotated[str, Path(description="Token of the link.")]
@@ -102,7 +96,6 @@ def get_shared_formats(
         "renderer_unavailable",
         "render_timeout",
     ),
-    openapi_extra=_OPEN,
 )
 async def download_shared(
     service: Shared,
@@ -119,7 +112,6 @@ async def download_shared(
     responses=problems(
         "share_not_found", "share_ended", "model_not_found", "file_not_found", "model_corrupt"
     ),
-    openapi_extra=_OPEN,
 )
 def get_shared_cameras(service: Shared, share: OpenShare) -> ModelCameras:
     """Get the cameras of the photos in the coordinates of the model that a link shows."""
@@ -130,7 +122,7 @@ def get_shared_cameras(service: Shared, share: OpenShare) -> ModelCameras:
     "/render",
     response_class=Response,
     responses=RENDERED | RENDER_PROBLEMS | problems("share_not_found", "share_ended"),
-    openapi_extra={"parameters": CAMERA_QUERY, **_OPEN},
+    openapi_extra={"parameters": CAMERA_QUERY},
 )
 async def render_shared(service: Shared, share: OpenShare, request: Request) -> Response:
     """Render an image of the model that a link shows."""
