@@ -5,7 +5,17 @@ One module per page. Each has a function `page()` that returns the page as Markd
 
 from pathlib import Path
 
-from docs.generate import command_line, environment, errors, formats, hostile, python_errors, rest, settings
+from docs.generate import (
+    command_line,
+    environment,
+    errors,
+    formats,
+    hostile,
+    metrics,
+    python_errors,
+    rest,
+    settings,
+)
 
 PAGES = {
     "command-line.md": command_line.page,
@@ -13,6 +23,7 @@ PAGES = {
     "errors.md": errors.page,
     "formats.md": formats.page,
     "hostile.md": hostile.page,
+    "metrics.md": metrics.page,
     "python-errors.md": python_errors.page,
     "rest.md": rest.page,
     "settings.md": settings.page,

@@ -1,9 +1,13 @@
-"""Requests to the renderer process, and the problems of one that is missing, gone or slow."""
+"""Requests to the renderer process, what is counted of them, and the problems of one that is missing, gone or slow."""
 
+import asyncio
+import time
 from collections.abc import Mapping
 
 import httpx
 
+from splatmill.backplane import rendering
+from splatmill_server.metrics import Metrics
 from splatmill_server.problems import ProblemError
 
 
@@ -44,3 +48,40 @@ async def post(
             "`python -m splatmill_worker renderer`. Models can be downloaded without it.",
             headers={"Retry-After": "5"},
         ) from error
+
+
+class Counted(httpx.AsyncBaseTransport):
+    """Counts the requests that it passes on, by their kind and how they ended."""
+
+    def __init__(self, transport: httpx.AsyncBaseTransport, metrics: Metrics) -> None:
+        self._transport = transport
+        self._metrics = metrics
+
+    async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
+        kind = request.url.path.rpartition("/")[2]
+        if request.url.path == rendering.HEALTH:
+            return await self._transport.handle_async_request(request)
+        result, began = "failed", time.monotonic()
+        try:
+            answer = await self._transport.handle_async_request(request)
+            result = _RESULTS.get(answer.status_code, "failed")
+            return answer
+        except asyncio.CancelledError:
+            result = "abandoned"
+            raise
+        except httpx.TimeoutException:
+            result = "timeout"
+            raise
+        except httpx.TransportError:
+            result = "unreachable"
+            raise
+        finally:
+            self._metrics.renders.labels(kind, result).inc()
+            if result == "made":
+                self._metrics.render_seconds.labels(kind).observe(time.monotonic() - began)
+
+    async def aclose(self) -> None:
+        await self._transport.aclose()
+
+
+_RESULTS = {200: "made", 204: "made", 304: "not_modified", 499: "abandoned", 503: "refused"}

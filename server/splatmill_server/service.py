@@ -30,6 +30,7 @@ from splatmill_server.lists import Lists
 from splatmill_server.metrics import Metrics
 from splatmill_server.models import Models
 from splatmill_server.outgoing import Outgoing
+from splatmill_server.renderer import Counted
 from splatmill_server.settings import Settings
 from splatmill_server.shares import Shares
 from splatmill_server.space.deletion import Deletion
@@ -115,10 +116,10 @@ class Service:
     @classmethod
     def of(cls, settings: Settings) -> "Service":
         """Return the state for these settings. Raises StorageError if storage cannot be opened."""
-        storage = Storage(settings.storage)
+        metrics = Metrics()
+        storage = Storage(settings.storage, watch=metrics.storage_operation)
         redis_async = connect_async(settings.redis_url)
         connection = connect(settings.redis_url, timeout=settings.redis_timeout, retries=1)
-        metrics = Metrics()
         lists = Lists(connection)
         jobs = Jobs(connection, storage, metrics, lists)
         models = Models(storage, jobs, lists)
@@ -130,7 +131,7 @@ class Service:
         deletion = Deletion(connection, storage, captures, jobs, usage.ledger)
         outgoing = Outgoing(settings.outgoing_allow)
         webhooks = Webhooks(storage, jobs)
-        renderer = _renderer(settings)
+        renderer = _renderer(settings, metrics)
         stored_keys = Keys(storage, bootstrap=settings.api_key is not None)
         sessions = Sessions(redis_async, settings.session_seconds, settings.redis_timeout)
         return cls(
@@ -147,7 +148,7 @@ class Service:
             imports=Imports(connection, storage, captures, quota, outgoing, settings),
             outgoing=outgoing,
             webhooks=webhooks,
-            deliveries=Deliveries(connection, webhooks, outgoing),
+            deliveries=Deliveries(connection, webhooks, outgoing, metrics),
             jobs=jobs,
             lists=lists,
             finished=Finished(storage, lists),
@@ -185,12 +186,12 @@ def _ages(settings: Settings) -> Ages:
     )
 
 
-def _renderer(settings: Settings) -> httpx.AsyncClient | None:
+def _renderer(settings: Settings, metrics: Metrics) -> httpx.AsyncClient | None:
     if settings.renderer_url is None:
         return None
     base, socket = rendering.address(settings.renderer_url)
     # The renderer has a private address, so requests to it must not go through a proxy.
-    transport = httpx.AsyncHTTPTransport(uds=socket) if socket else None
+    transport = Counted(httpx.AsyncHTTPTransport(uds=socket, trust_env=False), metrics)
     return httpx.AsyncClient(base_url=base, transport=transport, trust_env=False)
 
 

@@ -27,11 +27,17 @@ log, curve and progress are deleted. These are in storage by then. Only the serv
 WRITABLE = PREFIX + "writable"
 """String that is written to find out whether Redis takes writes; it expires."""
 
+TOTALS = PREFIX + "totals"
+"""Hash of what is counted for the whole service (see `totals`), by field."""
+
 PLACES = PREFIX + "queue:places"
 """Hash of the waiting entries: entry to `<line>:<owner>`, the sorted set that holds it."""
 
 TURNS = PREFIX + "queue:turns"
 """Sorted set of owners, scored by the number of the turn in which a worker last took an entry of theirs; 0: never."""
+
+ARRIVED = PREFIX + "queue:arrived"
+"""Sorted set of the waiting entries, scored by the time in seconds, by the clock of Redis, since which they wait."""
 
 COUNTERS = PREFIX + "queue:counters"
 """Hash of the last numbers given: `back` and `front` of a line, and `turn`."""

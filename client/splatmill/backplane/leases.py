@@ -15,7 +15,7 @@ from typing import Any, Literal, cast
 import redis
 from rq.registry import StartedJobRegistry
 
-from splatmill.backplane import keys
+from splatmill.backplane import keys, totals
 from splatmill.backplane.entries import (
     HEARTBEAT_SLACK,
     KEEP_FINISHED,
@@ -60,7 +60,8 @@ _EXPIRED = """
 return redis.call('ZRANGEBYSCORE', KEYS[1], '-inf', redis.call('TIME')[1])
 """
 
-# KEYS: leases, RQ's record of the entry, queue. ARGV: member, entry, whether only if expired, limit, seconds to keep.
+# KEYS: leases, RQ's record of the entry, queue, totals. ARGV: member, entry, whether only if expired, limit, seconds to
+# keep, name of the total.
 _REQUEUE = """
 local expires = redis.call('ZSCORE', KEYS[1], ARGV[1])
 if not expires then return 'kept' end
@@ -72,10 +73,12 @@ local lost = redis.call('HINCRBY', KEYS[2], 'splatmill_lost', 1)
 if lost >= tonumber(ARGV[4]) then
   redis.call('HSET', KEYS[2], 'status', 'failed')
   redis.call('EXPIRE', KEYS[2], ARGV[5])
+  redis.call('HINCRBY', KEYS[4], ARGV[6] .. '|failed', 1)
   return 'failed'
 end
 redis.call('HSET', KEYS[2], 'status', 'queued', 'worker_name', '')
 redis.call('RPUSH', KEYS[3], ARGV[2])
+redis.call('HINCRBY', KEYS[4], ARGV[6] .. '|waiting', 1)
 return 'waiting'
 """
 
@@ -156,15 +159,17 @@ def requeue(connection: redis.Redis, lease: Lease, *, if_expired: bool) -> Reque
     """Put an entry whose worker was lost behind those that wait, or fail it after MAX_LOST times, in one step."""
     answer = connection.eval(
         _REQUEUE,
-        3,
+        4,
         key(),
         f"rq:job:{lease.entry}",
         f"rq:queue:{TRAIN}",
+        keys.TOTALS,
         lease.member,
         lease.entry,
         int(if_expired),
         MAX_LOST,
         KEEP_FINISHED,
+        totals.WORKERS_LOST.name,
     )
     return cast(Requeued, cast(bytes, answer).decode())
 

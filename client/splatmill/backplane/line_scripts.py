@@ -5,7 +5,7 @@ Each begins by sorting what has arrived, and returns first the entries that it r
 
 from string import Template
 
-from splatmill.backplane import keys, leases
+from splatmill.backplane import keys, leases, totals
 from splatmill.backplane.entries import TRAIN
 from splatmill.schema import DEFAULT_OWNER
 
@@ -15,7 +15,12 @@ _BELLS = 100
 _BEGIN = Template(
     """
 local inbox, leases = '${inbox}', '${leases}'
-local places, turns, counters = '${places}', '${turns}', '${counters}'
+local places, turns, counters, arrived = '${places}', '${turns}', '${counters}', '${arrived}'
+
+local function now()
+  local time = redis.call('TIME')
+  return tonumber(time[1]) + tonumber(time[2]) / 1000000
+end
 
 local function line_key(line, owner) return '${line}' .. line .. ':' .. owner end
 
@@ -31,6 +36,7 @@ local function leave(entry)
   local place = redis.call('HGET', places, entry)
   if not place then return 0 end
   redis.call('HDEL', places, entry)
+  redis.call('ZREM', arrived, entry)
   return redis.call('ZREM', '${line}' .. place, entry)
 end
 
@@ -44,6 +50,7 @@ local function queue_up(entry, job, in_front)
   -- Numbers stay below 2^40, so that a priority weighs more than any of them.
   redis.call('ZADD', line_key(line, owner), number - (tonumber(row[2]) or 0) * 1099511627776, entry)
   redis.call('HSET', places, entry, line .. ':' .. owner)
+  redis.call('ZADD', arrived, string.format('%.3f', now()), entry)
   redis.call('ZADD', turns, 'NX', 0, owner)
   redis.call('RPUSH', '${bell}' .. line, 1)
   redis.call('LTRIM', '${bell}' .. line, -${bells}, -1)
@@ -66,6 +73,7 @@ end
     places=keys.PLACES,
     turns=keys.TURNS,
     counters=keys.COUNTERS,
+    arrived=keys.ARRIVED,
     line=keys.line("", "")[:-1],
     bell=keys.bell(""),
     job=keys.job(""),
@@ -77,6 +85,7 @@ SORT = _BEGIN + "return {foreign}"
 
 TAKE = (
     _BEGIN
+    + totals.observing(totals.QUEUE_WAIT)
     + """
 local function first(owner)
   local found, line, lowest
@@ -94,16 +103,19 @@ for _, owner in ipairs(redis.call('ZRANGE', turns, 0, -1)) do
   while entry do
     redis.call('ZREM', line_key(line, owner), entry)
     redis.call('HDEL', places, entry)
+    local since = redis.call('ZSCORE', arrived, entry)
+    redis.call('ZREM', arrived, entry)
     local record = 'rq:job:' .. entry
     if redis.call('HGET', record, 'status') == 'queued' then
-      local now = tonumber(redis.call('TIME')[1])
+      local second = math.floor(now())
       local member = entry .. ':' .. ARGV[2]
       redis.call('ZADD', turns, redis.call('HINCRBY', counters, 'turn', 1), owner)
-      redis.call('ZADD', leases, now + ARGV[3], member)
-      redis.call('HSET', 'rq:execution:' .. member, 'id', ARGV[2], 'created_at', now, 'last_heartbeat', now,
+      redis.call('ZADD', leases, second + ARGV[3], member)
+      redis.call('HSET', 'rq:execution:' .. member, 'id', ARGV[2], 'created_at', second, 'last_heartbeat', second,
                  'worker_name', ARGV[1])
       redis.call('EXPIRE', 'rq:execution:' .. member, ARGV[3])
       redis.call('HSET', record, 'status', 'started', 'worker_name', ARGV[1])
+      if since then observe(line, now() - tonumber(since)) end
       return {foreign, entry, line}
     end
     entry, line = first(owner)  -- that one was deleted or has ended

@@ -108,7 +108,21 @@ def hand_back(connection: redis.Redis, lease: Lease) -> bool:
 
 def look(connection: redis.Redis, entries: Sequence[str] = ()) -> Waiting:
     """Return what waits, with the places of these entries."""
-    _, lengths, found = _run(connection, scripts.LOOK, *LINES, "", *entries)
+    return _waiting(_run(connection, scripts.LOOK, *LINES, "", *entries))
+
+
+def ask(pipe: Any) -> None:
+    """Add the command to a pipeline whose reply `answered` reads."""
+    pipe.eval(scripts.LOOK, 0, *LINES, "")
+
+
+def answered(reply: list[Any]) -> Waiting:
+    """Return what waits, from the reply to `ask`."""
+    return _waiting(_sorted(reply))
+
+
+def _waiting(answer: list[Any]) -> Waiting:
+    _, lengths, found = answer
     return Waiting(
         {owner.decode(): dict(zip(LINES, counts, strict=True)) for owner, counts in lengths},
         {
@@ -139,7 +153,11 @@ def mean_durations(connection: redis.Redis) -> dict[Line, float]:
 
 def _run(connection: redis.Redis, script: str, *arguments: Any) -> list[Any]:
     """Run a script whose first result is the entries that it removed because they belong to no job."""
-    answer = cast(list[Any], connection.register_script(script)(args=arguments))
+    return _sorted(cast(list[Any], connection.register_script(script)(args=arguments)))
+
+
+def _sorted(answer: list[Any]) -> list[Any]:
+    """Return the answer of a script, once what it removed is logged."""
     for entry in answer[0]:
         log.warning("removed the entry %r, because it is not '<job>-<generation>'", entry[:200])
     return answer

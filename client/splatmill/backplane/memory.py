@@ -1,6 +1,8 @@
 """The memory of Redis: how much of its limit is used, and what happens at the limit."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import redis
 
@@ -45,6 +47,10 @@ class RedisMemory:
 
 def read(connection: redis.Redis) -> RedisMemory:
     """Return the memory of Redis. Raises redis.RedisError."""
-    found = connection.info("memory")
+    return of(connection.info("memory"))
+
+
+def of(found: Mapping[str, Any]) -> RedisMemory:
+    """Return the memory of Redis from its answer to `INFO memory`."""
     limit = int(found.get("maxmemory", 0)) or None
     return RedisMemory(int(found["used_memory"]), limit, str(found.get("maxmemory_policy", "noeviction")))

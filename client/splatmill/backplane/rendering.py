@@ -4,10 +4,26 @@ Requests and responses are those of the public API (`RenderRequest`, `OrbitReque
 only forwards them. The renderer computes ETags and answers `If-None-Match` itself.
 """
 
+from pydantic import BaseModel
+
 HEALTH = "/healthz"
+"""The path at which the renderer answers that it runs, and with its `RendererState`."""
 
 CLIENT_HEADER = "Splatmill-Client"
 """Header of a request to the renderer: a text that is the same for all requests of one client, who take turns."""
+
+
+class RendererState(BaseModel):
+    """What the renderer says of itself.
+
+    status: "ok"; None if it did not answer.
+    admitted: number of requests that wait or are rendered.
+    cached: bytes of the models in its memory.
+    """
+
+    status: str | None = None
+    admitted: int = 0
+    cached: int = 0
 
 
 def render_path(model_id: str) -> str:

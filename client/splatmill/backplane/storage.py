@@ -10,7 +10,7 @@ import asyncio
 import os
 import re
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -41,6 +41,9 @@ _SMALL = 256 * 1024
 _CONCURRENT_BLOCKS = 4
 _DELETED_AT_ONCE = 1000
 
+Watch = Callable[[str, float, StorageError | None], None]
+"""Called after each operation with its verb (read, write, list, delete), its seconds, and the error that ended it."""
+
 _STAGED = re.compile(r"#\d+\Z", re.ASCII)
 
 
@@ -68,10 +71,19 @@ class Storage:
 
     read_only: for a process that only reads, and need not have the right to write to the folder.
     patience: how long a bucket may take.
+    watch: told of each operation. One that is repeated after a break counts once for each time.
     """
 
-    def __init__(self, url: str, *, read_only: bool = False, patience: Patience | None = None) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        read_only: bool = False,
+        patience: Patience | None = None,
+        watch: Watch | None = None,
+    ) -> None:
         self.url = url
+        self._watch = watch
         self.root: Path | None = None
         self._patience = patience or Patience()
         self._slots: Slots | None = None
@@ -94,17 +106,38 @@ class Storage:
     def _operation(self, verb: str, path: str) -> Iterator[None]:
         """Hold a slot of the bucket, and convert the errors of an operation."""
         if self._slots is None:
-            with storage_errors(verb, path):
+            with self._watched(verb, path):
                 yield
             return
         try:
-            with self._slots.taken(), storage_errors(verb, path):
+            with self._slots.taken(), self._watched(verb, path):
                 yield
         except NoSlot:
-            raise StorageBusyError(
+            refused = StorageBusyError(
                 f"Storage does not answer: {self._slots.count} operations wait for it, so it was not asked to {verb} "
                 f"{path}. Try again in some seconds."
-            ) from None
+            )
+            self._tell(verb, 0.0, refused)
+            raise refused from None
+
+    @contextmanager
+    def _watched(self, verb: str, path: str) -> Iterator[None]:
+        """Convert the errors of an operation, and tell of its end."""
+        began = time.monotonic()
+        try:
+            with storage_errors(verb, path):
+                yield
+        except StorageError as error:
+            self._tell(verb, time.monotonic() - began, error)
+            raise
+        except FileNotFoundError:
+            self._tell(verb, time.monotonic() - began, None)
+            raise
+        self._tell(verb, time.monotonic() - began, None)
+
+    def _tell(self, verb: str, seconds: float, error: StorageError | None) -> None:
+        if self._watch is not None:
+            self._watch(verb, seconds, error)
 
     def local_path(self, path: str) -> Path | None:
         """Return the local path of `path`, or None if storage is remote. The file need not exist."""
@@ -159,7 +192,7 @@ class Storage:
 
         The file appears once `chunks` has ended. A bucket gets what fits into one block in one request.
         """
-        with storage_errors("write", path):
+        with self._watched("write", path):
             if self.root is None:
                 first, ended = await _first_block(chunks)
                 if ended:
@@ -177,7 +210,7 @@ class Storage:
         reading = Resumption(start, end, self._patience.retries)
         while True:
             try:
-                with storage_errors("read", path):
+                with self._watched("read", path):
                     result = await obstore.get_async(self.bulk, path, options=reading.options())
                     reading.begun(result.meta)
                     async for chunk in result.stream(min_chunk_size=CHUNK):

@@ -25,27 +25,42 @@ _UNREACHABLE = re.compile(
 
 
 class StorageError(Exception):
-    """Storage cannot be read or written. The message says what was tried, and the reason."""
+    """Storage cannot be read or written. The message says what was tried, and the reason.
+
+    kind: what happened, in a word.
+    """
+
+    kind = "failed"
 
 
 class StorageFullError(StorageError):
     """Storage is full (disk, quota or file size limit). Nothing was stored."""
 
+    kind = "full"
+
 
 class StorageStalledError(StorageError):
     """Storage has not answered, or has sent no further byte, for too long, also when it was asked again."""
+
+    kind = "stalled"
 
 
 class StorageUnreachableError(StorageError):
     """Storage cannot be reached, breaks connections, or answers that it cannot serve, also when it was asked again."""
 
+    kind = "unreachable"
+
 
 class StorageBusyError(StorageError):
     """As many operations as may wait for storage wait already; this one was not begun."""
 
+    kind = "busy"
+
 
 class StorageChangedError(StorageError):
     """A file was replaced while it was read, so that the rest of the bytes would be of another file."""
+
+    kind = "changed"
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from rq.worker_registration import REDIS_WORKER_KEYS
 from splatmill.backplane.lines import LINES, Line
 
 _LINES_FIELD = "splatmill_lines"
+_SPARE_FIELD = "splatmill_spare"
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,8 @@ class WorkerRecord:
     state: idle, busy, suspended, ...
     entry: the entry that it runs.
     last_heartbeat: time of its last heartbeat by its own clock.
+    spare: bytes that are free on its disk beyond its reserve; negative once the reserve is used. None for a worker of
+        an earlier version.
     """
 
     key: str
@@ -31,6 +34,7 @@ class WorkerRecord:
     state: str
     entry: str | None
     last_heartbeat: datetime | None
+    spare: int | None = None
 
 
 def served(lines: Sequence[Line]) -> dict[str, str]:
@@ -38,9 +42,19 @@ def served(lines: Sequence[Line]) -> dict[str, str]:
     return {_LINES_FIELD: ",".join(lines)}
 
 
+def spare(free: int) -> dict[str, str]:
+    """Return the fields of a worker's record that tell what is free on its disk beyond its reserve, in bytes."""
+    return {_SPARE_FIELD: str(free)}
+
+
 def listening(connection: redis.Redis) -> list[WorkerRecord]:
     """Return the workers that listen or work, by name."""
-    known = sorted(cast(set[bytes], connection.smembers(REDIS_WORKER_KEYS)))
+    return recorded(connection, cast(set[bytes], connection.smembers(REDIS_WORKER_KEYS)))
+
+
+def recorded(connection: redis.Redis, names: Iterable[bytes]) -> list[WorkerRecord]:
+    """Return those of the workers with these keys that listen or work, by name, in one round trip."""
+    known = sorted(names)
     with connection.pipeline(transaction=False) as pipe:
         for worker_key in known:
             pipe.hgetall(worker_key)
@@ -66,7 +80,15 @@ def _record(worker_key: str, stored: dict[str, Any]) -> WorkerRecord:
         state=stored.get("state", b"?").decode(),
         entry=stored.get("current_job", b"").decode() or None,
         last_heartbeat=_moment(stored.get("last_heartbeat", b"").decode()),
+        spare=_integer(stored.get(_SPARE_FIELD, b"").decode()),
     )
+
+
+def _integer(text: str) -> int | None:
+    try:
+        return int(text)
+    except ValueError:
+        return None
 
 
 def _moment(text: str) -> datetime | None:

@@ -370,6 +370,7 @@ class Captures:
             raise capture_not_found(capture_id)
         self.digests.remember(self.recent(capture_id), file)
         self.metrics.uploaded.inc(file.size)
+        self.metrics.files.inc()
         self._counts[capture_id] = self._counts.get(capture_id, 0) + 1
 
     def _in_the_way(self, capture_id: str, role: Role, name: str) -> str | None:

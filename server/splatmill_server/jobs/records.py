@@ -22,7 +22,7 @@ from splatmill.schema import DEFAULT_OWNER, CreateJob, Job, JobPage, JobState, P
 from splatmill.schema.tolerant import keep_readable
 from splatmill_server.filters import JobFilter
 from splatmill_server.jobs import curve as job_curve
-from splatmill_server.jobs import listing, requests, restoring, shrinking
+from splatmill_server.jobs import listing, outcome, requests, restoring, shrinking
 from splatmill_server.jobs import log as job_log
 from splatmill_server.jobs.links import with_links
 from splatmill_server.jobs.queue_places import with_places
@@ -235,12 +235,14 @@ class Jobs:
         def remove(pipe: Any) -> None:
             nonlocal retired
             known = row.read(self.connection, job_id)
-            state = fold(known, events.read_states(self.connection, job_id)).state if known else None
+            states = events.read_states(self.connection, job_id)
+            state = fold(known, states).state if known else None
             retired = known if state is not None and state.final else None
             pipe.multi()
-            if known is None or retired is not None:
+            if known is None:
                 pipe.srem(keys.ACTIVE, job_id)
-            if known is not None and state is not None and state.final:
+            elif state is not None and state.final:
+                outcome.retire(pipe, known, states)
                 created = lists.milliseconds(known.created_at)
                 lists.put_job(pipe, job_id, created, known.owner, known.capture, state.value)
                 shrinking.note(pipe, job_id, moment)
@@ -350,6 +352,7 @@ class Jobs:
     def delete(self, job_id: str) -> None:
         """Delete a job that has ended, its work files and its model. Raises 404 and 409 problems."""
         owner, capture = self.owner(job_id), None
+        found: JobRow | None = None
         try:
             found = self.row(job_id)
         except ProblemError as error:
@@ -372,6 +375,7 @@ class Jobs:
             self._announce_unretired(job_id)
             for generation in range(1, found.generation + 1):
                 queue.forget(self.connection, job_id, generation)
+        states = events.read_states(self.connection, job_id)
         self.storage.delete(layout.watched_job(job_id))
         # The record goes first, so that no model with missing files is visible.
         self.storage.delete(layout.job_record(job_id))
@@ -382,6 +386,8 @@ class Jobs:
             lists.remove_job(pipe, job_id, owner, capture)
             lists.remove(pipe, "models", job_id, owner)
             pipe.hdel(keys.records("models"), job_id)
+            if found is not None:  # it may have ended so lately that it still counts as unfinished
+                outcome.retire(pipe, found, states)
             pipe.srem(keys.ACTIVE, job_id)
             pipe.zrem(keys.WHOLE, job_id)
             pipe.execute()
@@ -443,6 +449,8 @@ class Jobs:
         def apply(pipe: Any) -> None:
             found = self.row(job_id)
             changes = decide(found, self._job(found))
+            begins = changes is not None and "generation" in changes
+            states = events.read_states(self.connection, job_id) if begins else []
             pipe.multi()
             if changes is None:
                 return
@@ -451,7 +459,10 @@ class Jobs:
             if begun is not None:
                 pipe.incr(begun)
             pipe.hset(keys.job(job_id), mapping=kept)
-            if "generation" in kept:
+            if begins:
+                outcome.retire(
+                    pipe, found, states
+                )  # the end of the former generation, if nobody has seen it yet
                 pipe.sadd(keys.ACTIVE, job_id)
                 pipe.zrem(keys.WHOLE, job_id)
                 created = lists.milliseconds(found.created_at)

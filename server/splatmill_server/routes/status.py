@@ -1,7 +1,10 @@
 """The endpoints about the service itself: options, info, health and metrics."""
 
+import asyncio
+import shutil
 from collections.abc import Sequence
 
+import httpx
 import redis
 from fastapi import APIRouter, Request
 from starlette.concurrency import run_in_threadpool
@@ -10,6 +13,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 import splatmill
 from splatmill.backplane import entries, lines, memory, rendering, workers
 from splatmill.backplane.lines import Waiting
+from splatmill.backplane.rendering import RendererState
 from splatmill.backplane.workers import WorkerRecord
 from splatmill.schema import (
     ARCHIVE_SUFFIXES,
@@ -30,13 +34,16 @@ from splatmill.schema import (
     WorkerInfo,
     describe_options,
 )
-from splatmill_server import metrics
+from splatmill_server import metrics, scrape
 from splatmill_server.access.caller import Caller, Who
 from splatmill_server.answers.docs_page import CONTENT_SECURITY_POLICY, docs_page
 from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.service import Service, Shared
 
 router = APIRouter(tags=["service"])
+
+_RENDERER_SECONDS = 1.0
+"""Seconds that the metrics wait for the renderer."""
 
 
 @router.get("/v1/options", responses=problems())
@@ -114,24 +121,40 @@ async def readyz(service: Shared) -> Response:
     response_class=Response,
     responses=answer(200, "The metrics", content={"text/plain": {}}) | problems(),
 )
-def get_metrics(service: Shared) -> Response:
+async def get_metrics(service: Shared) -> Response:
     """Get the metrics in the text format of Prometheus."""
-    gauges = service.metrics
+    seen, state = await asyncio.gather(run_in_threadpool(_seen, service), _renderer_state(service))
+    found = [*scrape.families(seen), *scrape.of_disk(_spare(service)), *scrape.of_renderer(state)]
+    return Response(service.metrics.text(found), media_type=metrics.MEDIA_TYPE)
+
+
+def _seen(service: Service) -> scrape.Seen | None:
+    """Return what Redis tells, or None if it does not answer."""
     try:
-        listening = workers.listening(service.redis)
-        for name, queue in _queues(lines.look(service.redis), listening).items():
-            gauges.waiting.labels(name).set(queue.waiting)
-            gauges.serving.labels(name).set(queue.workers)
-        gauges.workers.clear()
-        for worker in listening:
-            gauges.workers.labels(worker.state).inc()
-        used = memory.read(service.redis)
-        gauges.redis_memory.set(used.used)
-        gauges.redis_limit.set(used.limit or 0)
-        gauges.redis_up.set(1)
+        return scrape.read(service.redis)
     except redis.RedisError:
-        gauges.redis_up.set(0)
-    return Response(gauges.text(), media_type=metrics.MEDIA_TYPE)
+        return None
+
+
+def _spare(service: Service) -> int | None:
+    """Return the bytes that are free on the disk of storage beyond its reserve; None for a bucket."""
+    if service.storage.root is None:
+        return None
+    try:
+        return shutil.disk_usage(service.storage.root).free - service.settings.min_free_bytes
+    except OSError:
+        return None
+
+
+async def _renderer_state(service: Service) -> RendererState | None:
+    """Return the state of the renderer. None: there is none."""
+    if service.renderer is None:
+        return None
+    try:
+        answer = await service.renderer.get(rendering.HEALTH, timeout=_RENDERER_SECONDS)
+        return RendererState.model_validate(answer.json()) if answer.is_success else RendererState()
+    except (httpx.HTTPError, ValueError):
+        return RendererState()
 
 
 def _queues(waiting: Waiting, listening: Sequence[WorkerRecord]) -> dict[str, QueueInfo]:

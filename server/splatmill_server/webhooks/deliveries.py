@@ -20,6 +20,7 @@ from splatmill.backplane.storage import StorageError
 from splatmill.schema import DeliveryAttempt, DeliveryState, format_duration
 from splatmill.webhook_signature import sign
 from splatmill_server.leases import lease
+from splatmill_server.metrics import Metrics
 from splatmill_server.outgoing import Outgoing, OutgoingError
 from splatmill_server.webhooks.records import DeliveryRecord, WebhookRecord, Webhooks, mark_of
 
@@ -54,11 +55,14 @@ _CONCURRENT_EACH = 2
 class Deliveries:
     """The loop that sends."""
 
-    def __init__(self, connection: redis.Redis, webhooks: Webhooks, outgoing: Outgoing) -> None:
+    def __init__(
+        self, connection: redis.Redis, webhooks: Webhooks, outgoing: Outgoing, metrics: Metrics
+    ) -> None:
         self.connection = connection
         self.webhooks = webhooks
         self.storage = webhooks.storage
         self.outgoing = outgoing
+        self.metrics = metrics
         self._running: dict[tuple[str, str], asyncio.Task[None]] = {}
         self._looked_at = float("-inf")
         self._wake = asyncio.Event()
@@ -91,6 +95,7 @@ class Deliveries:
             self._looked_at = time.monotonic()
             await run_in_threadpool(self.webhooks.delete_old)
         marks = await run_in_threadpool(lambda: list(self.storage.entries(layout.due_deliveries())))
+        self.metrics.webhooks_waiting.set(len(marks))
         for entry in marks:  # sorted by the time at which they are due
             due, _, rest = entry.path.rsplit("/", 1)[-1].partition(".")
             webhook_id, _, delivery_id = rest.partition(".")
@@ -125,6 +130,8 @@ class Deliveries:
             if found.next_at <= datetime.now(UTC):
                 found = await self._send(webhook, found)
                 await run_in_threadpool(self.webhooks.write_delivery, found)
+                result = "retried" if found.state is DeliveryState.pending else found.state.value
+                self.metrics.webhook_attempts.labels(result).inc()
             if found.state is DeliveryState.pending:
                 await run_in_threadpool(self.webhooks.mark, found)
                 if mark == mark_of(found):

@@ -99,6 +99,10 @@ def test_a_picture_is_passed_on_with_what_belongs_to_it(app: ServedApp) -> None:
         headers={"If-None-Match": answer.headers["etag"]},
     )
     assert (again.status_code, again.content) == (304, b"")
+    counted = app.http.get("/metrics").text
+    assert 'splatmill_renders_total{kind="render",result="made"} 1.0' in counted
+    assert 'splatmill_renders_total{kind="render",result="not_modified"} 1.0' in counted
+    assert 'splatmill_render_seconds_count{kind="render"} 1.0' in counted
 
 
 def test_the_cacheable_address_asks_for_the_same_picture(app: ServedApp) -> None:
@@ -135,6 +139,8 @@ def test_the_renderer_learns_that_the_client_has_left(app: ServedApp) -> None:
         client.sendall("\r\n".join([*lines, "", ""]).encode() + wish.read())
         assert ASKED.wait(20)
     assert LEFT.wait(20)
+    abandoned = 'splatmill_renders_total{kind="orbit",result="abandoned"} 1.0'
+    wait_for(lambda: abandoned in app.http.get("/metrics").text)
     assert app.http.post(f"/v1/models/{MODEL}/orbit").status_code == 200
 
 

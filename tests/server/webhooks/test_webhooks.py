@@ -162,6 +162,9 @@ def test_what_is_not_taken_is_sent_again_with_the_same_id(app: ServedApp, peer: 
     assert len({seen.body for seen in peer.seen}) == 1
     for seen in peer.seen:
         verified(made, seen)
+    counted = app.http.get("/metrics").text
+    assert 'splatmill_webhook_attempts_total{result="retried"} 3.0' in counted
+    assert 'splatmill_webhook_attempts_total{result="delivered"} 1.0' in counted
 
 
 def test_the_pauses_grow_and_retry_after_is_followed(

@@ -17,7 +17,7 @@ from typing import Any, cast
 import pytest
 from rq.job import Callback
 
-from splatmill.backplane import entries, layout, leases, lines, queue, workers
+from splatmill.backplane import entries, keys, layout, leases, lines, queue, totals, workers
 from splatmill.backplane.row import now
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Backend, Job, Role, TrainOptions
@@ -97,8 +97,16 @@ def test_the_function_and_callbacks_that_an_entry_names_are_never_imported(
             on_success=Callback("intruder.called"),
             on_failure=Callback("intruder.called"),
         )
+
+    def counted(end: str) -> int:
+        return int(redis_server.connection.hget(keys.TOTALS, f"splatmill_attempts|{end}") or 0)
+
     with worker(redis_server, storage, tmp_path):
         jobs = {job_id: wait_for(partial(ended, redis_server, job_id)) for job_id in functions}
+        wait_for(lambda: counted("reported") == len(functions))
+        [found] = workers.listening(redis_server.connection)
+        assert found.spare is not None
+    assert float(redis_server.connection.hget(keys.TOTALS, totals.ATTEMPT_CPU.name) or 0) > 0
     assert {job_id: job.state for job_id, job in jobs.items()} == dict.fromkeys(functions, "succeeded")
     assert {job.attempt for job in jobs.values()} == {1}
     assert not trace.exists()

@@ -94,8 +94,11 @@ class RenderApp:
         )
 
     async def health(self, request: Request) -> Response:
-        """Respond that the process is alive."""
-        return JSONResponse({"status": "ok"})
+        """Respond that the process is alive, and how busy it is."""
+        state = rendering.RendererState(
+            status="ok", admitted=self._queue.admitted_count, cached=self._cache.bytes
+        )
+        return JSONResponse(state.model_dump())
 
     async def render(self, request: Request) -> Response:
         """Respond with an image."""

@@ -58,7 +58,8 @@ class ModelCache:
     @property
     def bytes(self) -> int:
         """Memory of all models in the cache."""
-        return sum(model.bytes for model in self._models.values())
+        # A copy, because another thread may load a model.
+        return sum(model.bytes for model in [*self._models.values()])
 
     def etag(self, model_id: str) -> str:
         """Return storage's present tag of a model, without reading it. Raises ModelNotFound."""

@@ -40,6 +40,11 @@ class RenderQueue:
         # Those that wait for their turn, by client; the first client is next.
         self._waiting: OrderedDict[str, deque[asyncio.Future[None]]] = OrderedDict()
 
+    @property
+    def admitted_count(self) -> int:
+        """Number of requests that wait or are served."""
+        return self._admitted.total()
+
     @contextlib.asynccontextmanager
     async def admitted(self, client: str = "") -> AsyncIterator[None]:
         """Hold a place in the queue while a request of a client is served. Raises QueueFull when there is none."""

@@ -23,6 +23,11 @@ def shortage(needed: int = 0) -> DiskReserveReached | None:
     return DiskReserveReached(folder, free, reserve, needed)
 
 
+def spare_bytes() -> int:
+    """Return the bytes that are free on the disk of the data folder beyond the reserve; negative if it is used."""
+    return _free_bytes(data_folder()) - disk_reserve()
+
+
 def shortage_text() -> str | None:
     """Return why a worker takes no job, or None if it may."""
     found = shortage()

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, cast
 from uuid import uuid4
 
 import redis
@@ -27,7 +27,7 @@ from rq.utils import now
 from rq.worker.base import WorkerStatus
 from rq.worker_registration import clean_worker_registry, register
 
-from splatmill.backplane import entries, leases, lines, workers
+from splatmill.backplane import entries, leases, lines, totals, workers
 from splatmill.backplane.leases import Lease, Reclaim
 from splatmill.backplane.lines import Line
 from splatmill.backplane.process import die_with_parent
@@ -35,7 +35,7 @@ from splatmill_worker.service import hand_back, recovery
 from splatmill_worker.service.abandoned_folders import remove_abandoned
 from splatmill_worker.service.attempt import Attempt, start_attempt
 from splatmill_worker.service.attempt_limits import Exceeded, Limits, LimitWatch, RunTimeExceeded, die_first
-from splatmill_worker.service.disk_reserve import shortage_text
+from splatmill_worker.service.disk_reserve import shortage_text, spare_bytes
 from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.lock import JobLock, LockState
 from splatmill_worker.service.process_exit import (
@@ -53,6 +53,9 @@ and the next attempt resumes from the last checkpoint that was stored. docker-co
 the return of the job to the queue."""
 
 T = TypeVar("T")
+
+AttemptEnd = Literal["reported", "stopped", "handed_back", "limited", "crashed", "superseded"]
+"""How an attempt ended, as it is counted (`totals.ATTEMPTS`)."""
 
 _RETRY_SECONDS = 0.5
 _SPACE_SECONDS = 1.0  # between two looks at a disk that is full
@@ -133,6 +136,8 @@ class AttemptWorker(Worker):
                 record: Any = self.serialize() | {"state": self.get_state()}
                 self.connection.hset(self.key, mapping=record)
                 register(self)
+            elif pipeline is None:
+                self.connection.hset(self.key, mapping=cast(Any, workers.spare(spare_bytes())))
         except redis.RedisError as error:
             self.log.warning("Worker %s: Redis took no heartbeat: %s", self.name, error)
 
@@ -167,7 +172,8 @@ class AttemptWorker(Worker):
 
     def serialize(self) -> dict[str, Any]:
         """Return the worker's record: RQ's, with its process and the lines that it serves."""
-        return super().serialize() | recovery.process_fields() | workers.served(self._served)
+        own = workers.served(self._served) | workers.spare(spare_bytes())
+        return super().serialize() | recovery.process_fields() | own
 
     def run_maintenance_tasks(self) -> None:
         try:
@@ -366,7 +372,18 @@ class AttemptWorker(Worker):
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(horse, signal.SIGKILL)
         self._horse_pid = 0
-        self._until_redis_works(lambda: self._settle(job, queue, process_exit))
+        end = self._until_redis_works(lambda: self._settle(job, queue, process_exit))
+        self._count(end, usage.ru_utime + usage.ru_stime)
+
+    def _count(self, end: AttemptEnd, cpu_seconds: float) -> None:
+        """Count an attempt that has ended. A Redis that fails now loses the count, which nothing depends on."""
+        counted = totals.counted(totals.ATTEMPTS, end) | totals.counted(totals.ATTEMPT_CPU, by=cpu_seconds)
+        try:
+            with self.connection.pipeline() as pipe:
+                totals.add(pipe, counted)
+                pipe.execute()
+        except redis.RedisError as error:
+            self.log.warning("Worker %s: the end of an attempt is not counted: %s", self.name, error)
 
     def _wait(self, job: Job) -> tuple[int, Any]:
         """Wait for the attempt's process, sending heartbeats.
@@ -404,8 +421,11 @@ class AttemptWorker(Worker):
             if handle is not None:
                 os.close(handle)
 
-    def _settle(self, job: Job, queue: Queue, process_exit: ProcessExit) -> None:
-        """Report how an attempt ended and update its queue entry, unless its process has done so itself."""
+    def _settle(self, job: Job, queue: Queue, process_exit: ProcessExit) -> AttemptEnd:
+        """Report how an attempt ended and update its queue entry, unless its process has done so itself.
+
+        Return in a word how it ended.
+        """
         assert self._lock is not None
         holder = self._lock.holder()
         ours = holder if holder and holder.token == self._lock.token else None
@@ -413,34 +433,38 @@ class AttemptWorker(Worker):
         self._lock.release()
         if process_exit.clean:
             if self.connection.hget(job.key, "status") != JobStatus.FINISHED.value.encode():
-                return  # a transient failure, which waits again
+                return "reported"  # a transient failure, which waits again
             lines.took(self.connection, self._line, time.monotonic() - self._began)
-            return
+            return "reported"
         if self._superseded or not Job.exists(job.id, self.connection):
-            return
+            return "superseded"
         if process_exit.withdrawn:
             self._stopped_job_id = job.id
         if self._stopped_job_id == job.id:
             # The server reports `cancelled` once it reads this status: no process is left.
             self.handle_job_failure(job, queue, exc_string="Stopped on request.")
-        elif job.get_status() is not JobStatus.STARTED:
-            return  # the process died after it had updated its entry
-        elif self._exceeded is not None:
+            return "stopped"
+        if job.get_status() is not JobStatus.STARTED:
+            return "reported"  # the process died after it had updated its entry
+        if self._exceeded is not None:
             # Another attempt would come to the same limit.
             ended.report_failed(self._exceeded.problem())
             job.retries_left = 0
             self.handle_job_failure(job, queue, exc_string=self._exceeded.problem().detail)
-        elif process_exit.handed_back or process_exit.unreported or self._stop_requested:
+            return "limited"
+        if process_exit.handed_back or process_exit.unreported or self._stop_requested:
             why = "Redis took no events." if process_exit.unreported else "The worker is stopping."
             ended.report_requeued(f"{why} The job was put back in front of its owner's others.")
             recovery.hand_back(self, self._lease)
-        elif job.should_retry:
+            return "handed_back"
+        if job.should_retry:
             left = f"{job.retries_left} {'retry is' if job.retries_left == 1 else 'retries are'} left"
             ended.report_requeued(f"The job's process {process_exit.cause}. It is tried again: {left}.")
             self.handle_job_failure(job, queue, exc_string=f"The process {process_exit.cause}.")
         else:
             ended.report_failed(process_exit.problem(attempts=entries.MAX_RETRIES + 1))
             self.handle_job_failure(job, queue, exc_string=f"The process {process_exit.cause}.")
+        return "crashed"
 
     def _until_redis_works(self, action: Callable[[], T]) -> T:
         """Return the result of `action`, which is repeated while Redis cannot be reached or refuses.
