@@ -5,7 +5,9 @@ The bucket is moto's server behind a proxy that spoils requests. Not proved here
 """
 
 import asyncio
+import contextlib
 import secrets
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -24,6 +26,7 @@ from splatmill.backplane.storage_errors import (
     StorageStalledError,
     StorageUnreachableError,
 )
+from splatmill.schema import Role
 from tests.support.faulty_s3 import Fault, FaultyS3, Request, faulty_s3
 from tests.support.served_app import Serve, problem
 from tests.support.waiting import wait_for
@@ -214,6 +217,51 @@ def test_a_model_goes_to_a_slow_client_without_being_held_in_memory(s3: FaultyS3
         assert s3.untaken > size / 2
         assert app.http.get("/v1/jobs").status_code == 200
         assert seen + sum(map(len, pieces)) == size
+
+
+SLOW = 45
+"""Slow clients at once: more than the API has threads, and more than it has slots of the bucket."""
+
+
+def test_slow_clients_hold_neither_threads_nor_slots(s3: FaultyS3, serve: Serve) -> None:
+    """Downloads that nobody reads and uploads that stop half-way leave others to be served, and end whole."""
+    app = serve(storage=f"{s3.storage}/{secrets.token_hex(8)}")
+    job_id, capture_id = app.job(), app.capture()
+    app.begin(job_id)
+    app.finish(job_id)
+    model = secrets.token_bytes(1 << 20) * 4
+    app.service.storage.put(layout.model_file(job_id, "model.ply"), model)
+    photo, host = secrets.token_bytes(200_000), "Host: localhost\r\n"
+    with contextlib.ExitStack() as stack:
+        clients = [stack.enter_context(socket.create_connection(app.address)) for _ in range(2 * SLOW)]
+        for client in clients:
+            client.settimeout(60)
+        reading, writing = clients[:SLOW], clients[SLOW:]
+        for client in reading:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
+            client.sendall(f"GET /v1/models/{job_id}/files/model.ply HTTP/1.0\r\n{host}\r\n".encode())
+            assert client.recv(12, socket.MSG_PEEK).endswith(b" 200")
+        for number, client in enumerate(writing):
+            head = f"PUT /v1/captures/{capture_id}/images/{number}.jpg HTTP/1.0\r\n{host}"
+            client.sendall(f"{head}Content-Length: {len(photo)}\r\n\r\n".encode() + photo[:100_000])
+        assert app.http.get("/v1/jobs").status_code == 200
+        assert app.http.get(f"/v1/captures/{capture_id}").status_code == 200
+        assert app.http.put(f"/v1/captures/{capture_id}/images/quick.jpg", content=photo).status_code == 201
+        for client in writing:
+            client.sendall(photo[100_000:])
+        assert all(b" 201 " in _rest(client).split(b"\r\n")[0] for client in writing)
+        assert all(_rest(client).partition(b"\r\n\r\n")[2] == model for client in reading)
+    for number in range(SLOW):
+        stored = layout.capture_file(capture_id, Role.images, f"{number}.jpg")
+        assert app.service.storage.get(stored) == photo
+
+
+def _rest(client: socket.socket) -> bytes:
+    """What a connection still brings."""
+    pieces = []
+    while piece := client.recv(1 << 16):
+        pieces.append(piece)
+    return b"".join(pieces)
 
 
 def test_slots_are_refused_at_once_after_one_has_waited_in_vain() -> None:

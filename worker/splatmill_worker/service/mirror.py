@@ -14,7 +14,8 @@ INTERVAL = 15.0
 
 CHECKPOINT_INTERVAL = 60.0
 """Least seconds between the beginnings of two copies of the checkpoint, which changes as a whole: parameters, and
-moments of Adam. Training that was done since the last copy is lost if the machine fails; a stop copies it at once."""
+moments of Adam (decisions: CHECKPOINT_INTERVAL). Training that was done since the last copy is lost if the machine
+fails; a stop copies it at once."""
 
 CHECKPOINT_SHARE = 0.1
 """Largest share of the time that goes into copies of the checkpoint: a gigabyte over a slow line takes minutes."""
