@@ -22,6 +22,32 @@ from splatmill_server.metrics import SAME, SMALLEST
 _KINDS: tuple[lists.Kind, ...] = ("captures", "jobs", "models")
 
 
+SERVICE_FAULTS = (
+    "attempts_exhausted",
+    "capture_incomplete",
+    "internal_error",
+    "out_of_memory",
+    "queue_unavailable",
+    "storage_full",
+    "storage_unavailable",
+    "storage_unwritable",
+    "worker_disk_full",
+    "worker_lost",
+)
+"""Problem codes of failed jobs that are no fault of their photos. They are told of before there is one: Prometheus sees
+no increase in a counter that appears with its first count."""
+
+_FROM_ZERO: dict[str, tuple[tuple[str, ...], ...]] = {
+    totals.JOBS_ENDED.name: (
+        ("succeeded", ""),
+        ("cancelled", ""),
+        *(("failed", code) for code in SERVICE_FAULTS),
+    ),
+    totals.WORKERS_LOST.name: (("waiting",), ("failed",)),
+    totals.ATTEMPT_CPU.name: ((),),
+}
+
+
 @dataclass(frozen=True)
 class Seen:
     """What Redis tells at a scrape.
@@ -90,7 +116,7 @@ def families(seen: Seen | None) -> Iterator[Metric]:
     yield from _of_storage(seen)
     yield from _of_redis(seen)
     for total in totals.TOTALS:
-        yield _family(total, seen.counted[total.name] if seen is not None else Counted())
+        yield _family(total, seen.counted[total.name] if seen is not None else None)
 
 
 def of_disk(spare: int | None) -> Iterator[Metric]:
@@ -195,16 +221,18 @@ def _gauge(name: str, text: str, *labels: str) -> GaugeMetricFamily:
     return GaugeMetricFamily(name, f"{text} {SAME}", labels=labels)
 
 
-def _family(total: Total, counted: Counted) -> Metric:
+def _family(total: Total, counted: Counted | None) -> Metric:
     text = f"{total.text} {SAME}"
     if not total.bounds:
         counter = CounterMetricFamily(total.name, text, labels=total.labels)
-        for labels, value in sorted(counted.values.items()):
-            counter.add_metric(labels, value)
-        if not total.labels and not counted.values:
-            counter.add_metric([], 0)
+        if counted is not None:
+            zeros = dict.fromkeys(_FROM_ZERO.get(total.name, ()), 0.0)
+            for labels, value in sorted((zeros | counted.values).items()):
+                counter.add_metric(labels, value)
         return counter
     histogram = HistogramMetricFamily(total.name, text, labels=total.labels)
+    if counted is None:
+        return histogram
     for labels, found in sorted(counted.distributions.items(), key=lambda item: item[0]):
         histogram.add_metric(labels, _buckets(total, found), found.sum)
     return histogram
