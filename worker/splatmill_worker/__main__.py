@@ -50,6 +50,13 @@ def main(argv: list[str] | None = None) -> int:
     convert.add_argument("model", type=Path)
     convert.add_argument("outs", type=Path, nargs="+")
     convert.add_argument("--photos", type=Path, help="folder of the photos, to compare with")
+    clean = programs.add_parser("clean-file", help="remove what its photos do not support from a model file")
+    clean.add_argument("model", type=Path)
+    clean.add_argument("--out", type=Path, required=True)
+    clean.add_argument("--capture", type=Path, help="folder of the photos")
+    clean.add_argument("--edit", help="EditModel as JSON")
+    clean.add_argument("--min-weight", type=float, help="least weight in some photo, pixels")
+    clean.add_argument("--image-size", type=int, help="longest side of the photos, pixels")
     text = programs.add_parser("model-text", help="turn the files of a COLMAP model from binary to text")
     text.add_argument("folder", type=Path)
     fit_image = programs.add_parser("fit-image", help="fit one image by Gaussians in a plane")
@@ -83,6 +90,10 @@ def main(argv: list[str] | None = None) -> int:
         from splatmill_worker.render_service.convert import main as convert_main
 
         return convert_main(chosen.model, chosen.outs, chosen.photos)
+    if chosen.program == "clean-file":
+        from splatmill_worker.render_service.clean import run as clean_run
+
+        return clean_run(chosen)
     if chosen.program == "model-text":
         from splatmill_worker.sfm.posed.text import main as text_main
 

@@ -1,0 +1,112 @@
+"""Proves that what is planted into a trained still life is found and named, and that what photos support stays.
+
+Does not prove the evidence (test_evidence.py), nor how real models gain or lose (worker/bench/clean.md).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from splatmill_worker.splat.cleaning.cleaning import Cleaning, Reason, clean, photo_psnr
+from splatmill_worker.splat.cleaning.evidence import evidence_of
+from splatmill_worker.splat.engine.open import gaussians_of
+from splatmill_worker.splat.gaussians import SH_C0, Gaussians, concatenate
+from splatmill_worker.splat.train.loop import train
+from splatmill_worker.splat.views import TrainingView
+from tests.support.training import first_engine, plan, split
+
+BLACK = torch.zeros(3)
+KINDS: tuple[Reason, ...] = ("needle", "giant", "floater", "island")
+EACH = 4
+"""Gaussians planted of each kind."""
+
+
+def planted(kind: Reason, views: list[TrainingView]) -> Gaussians:
+    """EACH Gaussians of a kind in pure magenta, which the still life does not have, where the views look."""
+    rows = []
+    for view in views[:EACH]:
+        camera = view.full.camera
+        ahead = torch.from_numpy(camera.to_world(torch.tensor([[0.05, -0.05, 1.0]]).numpy())[0]).float()
+        toward = ahead - torch.from_numpy(camera.center).float()
+        center = torch.from_numpy(camera.center).float()
+        depth, scales, opacity = {
+            "giant": (0.6, (-1.2, -1.2, -1.2), 0.5),
+            "needle": (0.8, (-2.0, -6.0, -6.0), 0.9),
+            "island": (0.75, (-4.5, -4.5, -4.5), 0.9),
+            "floater": (0.25, (-4.0, -4.0, -4.0), 0.7),
+        }[kind]
+        rows.append(
+            Gaussians(
+                (center + depth * toward)[None],
+                torch.tensor([scales]),
+                torch.tensor([[1.0, 0.2, 0.1, 0.0]]),
+                torch.tensor([math.log(opacity / (1.0 - opacity))]),
+                torch.tensor([[[0.5, -0.5, 0.5]]]) / SH_C0,
+            )
+        )
+    return concatenate(*rows)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A still life trained for a moment, its training views and its held-out ones."""
+
+    gaussians: Gaussians
+    training: list[TrainingView]
+    held_out: list[TrainingView]
+
+    def psnr(self, gaussians: Gaussians) -> float:
+        """Mean over the held-out photos, dB."""
+        return sum(photo_psnr(gaussians, view.full, BLACK) for view in self.held_out) / len(self.held_out)
+
+    def cleaned(self, gaussians: Gaussians) -> Cleaning:
+        return clean(gaussians, [view.full for view in self.training], BLACK)
+
+
+@pytest.fixture(scope="module")
+def life() -> Trained:
+    training, held_out = split()
+    engine = first_engine()
+    train(engine, training, held_out, plan(300), extent=1.1)
+    return Trained(gaussians_of(engine).padded(1), training, held_out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_planted_goes(life: Trained, kind: Reason) -> None:
+    foreign = planted(kind, life.training).padded(1)
+    spoilt = concatenate(life.gaussians, foreign)
+    assert life.psnr(spoilt) < life.psnr(life.gaussians) - 0.01
+    found = life.cleaned(spoilt)
+    gone = ~found.keep
+    assert int(gone[-EACH:].sum()) == EACH
+    assert found.removed.get(kind, 0) >= EACH
+    assert sum(found.removed.values()) == int(gone.sum())
+    # Held-out photos took no part in it, and are shown as without what was planted, or better.
+    assert life.psnr(spoilt.select(found.keep)) >= life.psnr(life.gaussians) - 0.02
+    assert found.psnr > found.psnr_before
+
+
+@pytest.mark.slow
+def test_what_photos_support_stays(life: Trained) -> None:
+    """Of the Gaussians that training left, those that go are ones that the photos are better without."""
+    found = life.cleaned(life.gaussians)
+    gone = ~found.keep
+    assert found.psnr >= found.psnr_before
+    assert life.psnr(life.gaussians.select(found.keep)) >= life.psnr(life.gaussians) - 0.02
+    photos = [view.full for view in life.training]
+    evidence = evidence_of(life.gaussians, photos, BLACK)
+    heavy = evidence.support > 0.1 * evidence.support.max()
+    assert int(heavy.sum()) > 10
+    assert not bool((gone & heavy).any())
+    assert bool((evidence.weight[gone] > 0).all())  # what no photo shows is no matter of support
+
+
+@pytest.mark.slow
+def test_the_same_model_and_photos_give_the_same_result(life: Trained) -> None:
+    spoilt = concatenate(life.gaussians, planted("giant", life.training).padded(1))
+    assert torch.equal(life.cleaned(spoilt).keep, life.cleaned(spoilt).keep)
