@@ -1,5 +1,8 @@
-"""What all tests share: threads of the kernels sleep soon at barriers, as they do in the worker's own processes, test
-processes that run side by side divide the cores between them, and no garbage is looked for while tests are collected."""
+"""What all tests share.
+
+Threads of the kernels sleep soon at barriers, as they do in the worker's own processes. Test processes that run side by
+side divide the cores between them. No garbage is looked for while tests are collected.
+"""
 
 import gc
 import os
@@ -13,7 +16,8 @@ processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if processes > 1:
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // processes)))
 
-gc.disable()  # collecting the tests makes millions of objects, all of which stay: looking at them takes a third of its time
+# Collecting the tests makes millions of objects, and all of them stay: to look through them takes a third of the time.
+gc.disable()
 
 
 def pytest_collection_finish() -> None:

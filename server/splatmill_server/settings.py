@@ -8,7 +8,7 @@ from pydantic import Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from splatmill.backplane import rendering
-from splatmill.backplane.connection import DEFAULT_URL
+from splatmill.backplane.address import DEFAULT_URL
 from splatmill.schema import DEFAULT_PORT, ByteSize, Duration
 from splatmill_server import outgoing
 

@@ -6,6 +6,7 @@ are drawn by the processor (SwiftShader), so tests count them and do not time th
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -19,6 +20,7 @@ import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
 from tests.support import still_life
+from tests.support.made_once import made_once
 from tests.support.up import Up
 
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
@@ -51,13 +53,8 @@ def browser() -> Iterator[Browser]:
         browser.close()
 
 
-@pytest.fixture(scope="session")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
-    """`splatmill up` with the real worker and renderer, without keys."""
-    environment = {"SPLATMILL_PIPELINE": "splatmill_worker.pipeline", "OMP_NUM_THREADS": "1"}
-    up = Up(tmp_path_factory.mktemp("up") / "data", environment).start()
-    yield up
-    up.close()
+REAL = {"SPLATMILL_PIPELINE": "splatmill_worker.pipeline", "OMP_NUM_THREADS": "1"}
+"""The environment of a service with the real worker."""
 
 
 @dataclass
@@ -73,22 +70,48 @@ class SmallModel:
 
 
 @pytest.fixture(scope="session")
-def model(service: Up, tmp_path_factory: pytest.TempPathFactory) -> SmallModel:
-    """A model of 14 photos with given cameras, trained for some steps on the service."""
-    folder = still_life.posed_capture(tmp_path_factory.mktemp("posed") / "capture")
-    capture = service.http.post("/v1/captures", json={"name": "still life"}).json()["id"]
-    for role in ("images", "poses"):
-        for path in sorted((folder / role).iterdir()):
-            answer = service.http.put(f"/v1/captures/{capture}/{role}/{path.name}", content=path.read_bytes())
-            assert answer.status_code == 201, answer.text
-    options = {"steps": 120, "max_gaussians": 3000}
-    answer = service.http.post(
-        "/v1/jobs", json={"capture": capture, "options": options, "name": "still life"}
-    )
-    assert answer.status_code == 202, answer.text
-    job = service.ended(answer.json()["id"], 120)
-    assert job["state"] == "succeeded", job
-    return SmallModel(job["id"], capture)
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a service leaves that has trained the small model: its data folder `data`, and the ids in `model.json`.
+
+    It is trained once for all test processes.
+    """
+    return made_once(tmp_path_factory, "trained", _train)
+
+
+def _train(folder: Path) -> None:
+    """Train a model of 14 photos with given cameras for some steps on a service."""
+    photos = still_life.posed_capture(folder / "capture")
+    up = Up(folder / "data", REAL).start()
+    try:
+        capture = up.http.post("/v1/captures", json={"name": "still life"}).json()["id"]
+        for role in ("images", "poses"):
+            for path in sorted((photos / role).iterdir()):
+                answer = up.http.put(f"/v1/captures/{capture}/{role}/{path.name}", content=path.read_bytes())
+                assert answer.status_code == 201, answer.text
+        options = {"steps": 120, "max_gaussians": 3000}
+        answer = up.http.post("/v1/jobs", json={"capture": capture, "options": options, "name": "still life"})
+        assert answer.status_code == 202, answer.text
+        job = up.ended(answer.json()["id"], 120)
+        assert job["state"] == "succeeded", job
+    finally:
+        up.close()
+    (folder / "model.json").write_text(json.dumps({"id": job["id"], "capture": capture}))
+
+
+@pytest.fixture(scope="session")
+def service(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
+    """`splatmill up` with the real worker and renderer, without keys, on a copy of what `trained` holds."""
+    data = tmp_path_factory.mktemp("up") / "data"
+    shutil.copytree(trained / "data", data, ignore=shutil.ignore_patterns("*.sock"))
+    up = Up(data, REAL).start()
+    yield up
+    up.close()
+
+
+@pytest.fixture(scope="session")
+def model(service: Up, trained: Path) -> SmallModel:
+    """The model that the service holds."""
+    return SmallModel(**json.loads((trained / "model.json").read_text()))
 
 
 @dataclass

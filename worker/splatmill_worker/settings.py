@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from splatmill.backplane.connection import DEFAULT_URL
+from splatmill.backplane.address import DEFAULT_URL
 from splatmill.schema.quantities import parse_bytes, parse_duration
 
 DISK_RESERVE = 256 * 2**20

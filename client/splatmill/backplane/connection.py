@@ -8,11 +8,9 @@ from redis.asyncio.retry import Retry as AsyncRetry
 from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
+from splatmill.backplane.address import DEFAULT_URL
 from splatmill.backplane.redact import redacted
 from splatmill.backplane.refusal import RefusalAwareRedis
-
-DEFAULT_URL = "redis://127.0.0.1:6379/0"
-
 
 ASYNC_CONNECTIONS = 32
 """Largest number of connections of an asyncio client. Those who follow events share one."""

@@ -1,9 +1,12 @@
-"""Proves how an attempt that storage refuses ends: queued again while it can be retried, failed by name when not; and
-that photos reach structure from motion from a storage on another file system.
+"""Proves how an attempt that storage refuses ends: queued again while it can be retried, failed by name when not; that
+photos reach structure from motion from a storage on another file system; and that garbage is collected while a pipeline
+runs, and not while it is imported.
 
 Does not prove what happens to the processes: tests/service does.
 """
 
+import gc
+import importlib
 import logging
 from pathlib import Path
 
@@ -69,3 +72,21 @@ def test_photos_reach_structure_from_motion_from_another_file_system(
     problem = read_job(connection, JOB).problem
     assert problem is not None
     assert (problem.code, problem.facts["photos"]) == ("sfm_no_features", 4), problem.detail
+
+
+def test_no_garbage_is_collected_while_the_pipeline_is_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "made_pipeline.py").write_text("import gc\nenabled = gc.isenabled()\nrun = gc.isenabled\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(module, "PIPELINE", "made_pipeline")
+    frozen = gc.get_freeze_count()
+    run: object = module._pipeline()
+    assert not importlib.import_module("made_pipeline").enabled
+    assert run is gc.isenabled
+    assert gc.isenabled()
+    assert gc.get_freeze_count() > frozen
+    monkeypatch.setattr(module, "PIPELINE", "no_such_pipeline")
+    with pytest.raises(ModuleNotFoundError):
+        module._pipeline()
+    assert gc.isenabled()

@@ -4,6 +4,7 @@ It runs in a process of its own (see rq_worker). Each failure becomes a named pr
 retried. When the process is killed, its parent reports the failure.
 """
 
+import gc
 import importlib
 import logging
 import os
@@ -188,8 +189,7 @@ def _train(attempt: Attempt, row: JobRow, folder: JobFolder, disk: DiskWatch, ou
 
         folder.run.mkdir(parents=True, exist_ok=True)
         with decoders.confined(read=[folder.path], write=[folder.run]):
-            run = cast(Pipeline, importlib.import_module(PIPELINE).run)
-            result = run(
+            result = _pipeline()(
                 folder.capture,
                 folder.run,
                 row.options,
@@ -209,6 +209,16 @@ def _train(attempt: Attempt, row: JobRow, folder: JobFolder, disk: DiskWatch, ou
     mirror.close(copy=ended_early)
     if ended_early:
         raise HandedBack if disk.error is None or hand_back.requested() else disk.error
+
+
+def _pipeline() -> Pipeline:
+    """Import the pipeline. What it imports stays, and is never garbage (decisions: import-without-collection)."""
+    gc.disable()
+    try:
+        return cast(Pipeline, importlib.import_module(PIPELINE).run)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def _forward(event: Event, folder: JobFolder, outbox: Outbox) -> None:
