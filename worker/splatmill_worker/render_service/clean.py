@@ -23,9 +23,9 @@ from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.render_service.local import REFUSED, STOPPED, UNWRITABLE, read
 from splatmill_worker.scene import Normalization, Scene, View, split
 from splatmill_worker.sfm import posed
-from splatmill_worker.splat.cleaning.cleaning import clean, photo_psnr
-from splatmill_worker.splat.cleaning.evidence import evidence_of
+from splatmill_worker.splat.cleaning import clean, photo_psnr
 from splatmill_worker.splat.evaluate import benchmark_background
+from splatmill_worker.splat.evidence import evidence_of
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.start.given_model import assess

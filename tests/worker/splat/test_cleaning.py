@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from splatmill_worker.splat.cleaning.cleaning import Cleaning, Reason, clean, photo_psnr
-from splatmill_worker.splat.cleaning.evidence import evidence_of
+from splatmill_worker.splat.cleaning import Cleaning, Reason, clean, photo_psnr
 from splatmill_worker.splat.engine.open import gaussians_of
+from splatmill_worker.splat.evidence import evidence_of
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians, concatenate
 from splatmill_worker.splat.train.loop import train
 from splatmill_worker.splat.views import TrainingView

@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from splatmill_worker.splat.cleaning.evidence import BELOW_CLAMP, HALF_LEVEL, evidence_of
+from splatmill_worker.splat.evidence import BELOW_CLAMP, HALF_LEVEL, evidence_of
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.render import render
 from splatmill_worker.splat.views import Target

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.splat.cleaning.evidence import HALF_LEVEL, Evidence, evidence_of
 from splatmill_worker.splat.evaluate import psnr
+from splatmill_worker.splat.evidence import HALF_LEVEL, Evidence, evidence_of
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.render import render
 
