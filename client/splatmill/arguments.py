@@ -44,6 +44,7 @@ class TrainArguments(TypedDict, total=False):
     matcher: Matcher | Literal["auto", "exhaustive", "sequential", "spatial"]
     sfm_effort: Effort | Literal["auto", "lean", "standard", "high"]
     pose_refinement: Switch | Literal["auto", "on", "off"]
+    scale: str | None
     sh_degree: int | None
     densify: Switch | Literal["auto", "on", "off"]
     antialias: Switch | Literal["auto", "on", "off"]

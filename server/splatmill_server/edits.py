@@ -48,6 +48,8 @@ def _store_others(storage: Storage, model_id: str, new_id: str, request: EditMod
             if (score := scores.get(row.get("name"))) is not None:
                 row |= score.model_dump(mode="json", include={"psnr", "ssim"})
         storage.put(layout.model_file(new_id, "cameras.json"), json.dumps(cameras, indent=1).encode())
+    if frame := _read(storage, model_id, "frame.json"):
+        storage.put(layout.model_file(new_id, "frame.json"), json.dumps(frame, indent=1).encode())
     report = _edited_report(_read(storage, model_id, "report.json"), model_id, request, edited)
     storage.put(layout.model_file(new_id, "report.json"), json.dumps(report, indent=1).encode())
     moment = now().isoformat()

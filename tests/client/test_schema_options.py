@@ -4,6 +4,7 @@ Does not prove that the trainer honours an option; that is shown where each is u
 """
 
 import json
+import re
 
 import pytest
 from hypothesis import given
@@ -18,6 +19,7 @@ from splatmill.schema import (
     describe_options,
     format_bytes,
     format_duration,
+    known_distance,
     parse_bytes,
     parse_duration,
 )
@@ -152,3 +154,34 @@ def test_shown_durations(seconds: float, text: str):
 )
 def test_shown_sizes(count: float, text: str):
     assert format_bytes(count) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "distance"),
+    [
+        ("a.jpg b.jpg 2.5m", ("a.jpg", "b.jpg", 2.5)),
+        ("a.jpg b.jpg 25 cm", ("a.jpg", "b.jpg", 0.25)),
+        ("'day one/a.jpg' b.jpg 10FT", ("day one/a.jpg", "b.jpg", pytest.approx(3.048))),
+    ],
+)
+def test_known_distances(text: str, distance: object):
+    assert known_distance(text) == distance
+    assert TrainOptions(scale=text).scale == text
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a.jpg 2m", "is no distance between two photos"),
+        ("a.jpg b.jpg c.jpg d.jpg 2m", "is no distance between two photos"),
+        ("a.jpg b.jpg 2.5", "'2.5' is no length in mm, cm, m, km, in, ft"),
+        ("a.jpg b.jpg 2 parsecs", "is no length"),
+        ("a.jpg b.jpg 0m", "give one above zero"),
+        ("a.jpg a.jpg 1m", "is named twice"),
+        ("'a.jpg b.jpg 1m", "has an open quotation mark"),
+        ("a.jpg b.jpg -1m", "is no length"),
+    ],
+)
+def test_texts_that_are_no_distance(text: str, said: str):
+    with pytest.raises(ValueError, match=re.escape(said)):
+        TrainOptions(scale=text)

@@ -51,6 +51,7 @@ def app(serve: Serve, folder: Path) -> ServedApp:
 
 def test_a_part_of_a_model_becomes_a_new_one(app: ServedApp, folder: Path, tmp_path: Path) -> None:
     hold_out(app, MODEL, VIEWS)
+    app.service.storage.put(layout.model_file(MODEL, "frame.json"), b'{"unit": "metre"}')
     right = int((ply.read(folder / "model.ply").gaussians.means[:, 0] >= 0).sum())
     with Client(str(app.http.base_url)) as client:
         model = client.model(MODEL)
@@ -66,6 +67,9 @@ def test_a_part_of_a_model_becomes_a_new_one(app: ServedApp, folder: Path, tmp_p
         half = client.model(made.model)
         assert (half.model.name, half.model.gaussians, half.model.psnr) == ("half a ball", right, made.psnr)
         assert ply.read(half.download(tmp_path / "half.ply")).gaussians.means[:, 0].min() >= 0
+        assert json.loads(half.download(tmp_path / "frame.json", file="frame.json").read_text()) == {
+            "unit": "metre"
+        }
         assert client.model(MODEL).model.gaussians == 400
         for wrong in ({}, {"box": {"min": [0, 0, 0], "max": [0, 1, 1]}}, {"min_opacity": 2.0}):
             with pytest.raises(InvalidRequest):

@@ -55,6 +55,7 @@ def test_a_posed_capture_becomes_a_model_with_its_reports(tmp_path: Path) -> Non
         "cameras.zip", "held_out",
     }  # fmt: skip
     written = json.loads((out / "report.json").read_text())
+    assert written["frame"] is None
     report = Report.model_validate(written)
     assert [row.step for row in report.curve] == sorted(row.step for row in report.curve)
     assert report.curve[-1].step == 150
@@ -163,6 +164,7 @@ def test_nothing_held_out_is_reported_as_such(tmp_path: Path) -> None:
         ({"test_views": ["nowhere.png"]}, "holdout_empty"),
         ({"holdout": 1}, "holdout_empty"),
         ({"far_shell": "on"}, "option_out_of_range"),
+        ({"scale": "00.png 08.png 1m"}, "option_out_of_range"),
     ],
 )
 def test_what_cannot_be_done_is_refused_by_code(tmp_path: Path, asked: dict[str, object], code: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from splatmill.schema import Backend, TrainOptions
+from splatmill.schema import Backend, TrainOptions, known_distance
 from splatmill_worker import sfm
 from splatmill_worker.errors import Refusal
 from splatmill_worker.kernels.gpu.device import absence
@@ -38,11 +38,17 @@ def posed_scene(
     cancelled: polled; when it returns true, Cancelled is raised.
     observer: looks at the cameras and points while structure from motion places them.
 
-    Raises Refusal for poses that cannot be used, and SfmFailed.
+    Raises Refusal for poses that cannot be used and for a scale that cannot be followed, and SfmFailed.
     """
     capture = zipped.data_set(capture, workdir, cancelled)
     given = posed.find(capture)
     if given is not None:
+        if options.scale is not None:
+            raise Refusal(
+                "option_out_of_range",
+                "scale is given, and so are the cameras: given cameras are never moved.",
+                advice="Leave out the option scale, or scale the given cameras.",
+            )
         try:
             scene = given.load()
         except (ValueError, OSError) as error:
@@ -71,6 +77,7 @@ def posed_scene(
         on_progress,
         cancelled,
         observer,
+        None if options.scale is None else known_distance(options.scale),
     )
 
 

@@ -85,7 +85,7 @@ def run(
     onlookers: Onlookers | None = None,
     revise: Revise = lambda plan: plan,
 ) -> Outcome:
-    """Train a scene from `capture`, and leave model.ply, cameras.json, cameras.zip and the reports in `workdir/out`.
+    """Train a scene from `capture`, and leave the model, its cameras and frame, and the reports in `workdir/out`.
 
     capture: folder with images/, and masks/ and poses/ where they were given.
     workdir: folder that is kept between attempts; what an earlier attempt stored there is used again.

@@ -1,4 +1,4 @@
-"""A scene: photos with cameras, sparse points, the held-out split, and the similarity to the training world.
+"""A scene: photos with cameras, sparse points, the held-out split, and the similarities between worlds.
 
 Cameras follow OpenCV: x right, y down, z forward, world-to-camera matrices, and the centre of the first pixel at
 (0.5, 0.5). All geometry is float64; `Normalization` brings it to a size at which float32 is accurate.
@@ -12,6 +12,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+from splatmill.schema import ModelFrame
 
 Float = npt.NDArray[np.float64]
 Real = npt.NDArray[np.floating[Any]]
@@ -142,15 +144,18 @@ def viewmat_of(rotation: Float, center: Float) -> Float:
     return viewmat
 
 
-def looked_at(centers: Float, axes: Float, ridge: float = 1e-3) -> Float:
-    """The point [3] with the least sum of squared distances to all optical axes.
+def looked_at(centers: Float, axes: Float, ridge: float = 1e-3, weights: Float | None = None) -> Float:
+    """The point [3] with the least weighted sum of squared distances to all optical axes.
 
     centers, axes: positions and viewing directions [n,3] of the cameras; directions of any length.
     ridge: weight per camera of the squared distance to the cameras' mean position. Parallel axes leave the point
         undetermined; the ridge then keeps it near the cameras. With 0, parallel axes raise numpy's LinAlgError.
+    weights: of the axes [n]; None: all 1.
     """
     axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
+    if weights is not None:
+        across = across * weights[:, None, None]
     middle = centers.mean(axis=0)
     right = (across @ (centers - middle)[:, :, None]).sum(axis=0)[:, 0]
     target: Float = middle + np.linalg.solve(across.sum(axis=0) + ridge * len(centers) * np.eye(3), right)
@@ -201,6 +206,7 @@ class Scene:
     left_out: (name, reason) of each photo or file that is not used.
     notes: sentences for the user.
     warnings: sentences for the user about what is probably wrong.
+    frame: how the world was chosen; None where it is that of given poses, or of a reconstruction as it came out.
     """
 
     views: tuple[View, ...]
@@ -214,6 +220,7 @@ class Scene:
     left_out: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    frame: ModelFrame | None = None
 
     @property
     def centers(self) -> Float:
@@ -244,6 +251,55 @@ def split(scene: Scene, holdout: int = 8) -> tuple[tuple[View, ...], tuple[View,
     test = tuple(views[::holdout])
     names = {view.name for view in test}
     return tuple(view for view in views if view.name not in names), test
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """The map x' = scale * rotation @ x + translation from one world to another, in float64.
+
+    rotation: [3,3], with determinant 1.
+    scale: above zero.
+    translation: [3].
+    """
+
+    rotation: Float
+    scale: float
+    translation: Float
+
+    @staticmethod
+    def of(matrix: Real) -> Similarity:
+        """The similarity with a matrix [4,4]."""
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        return Similarity(np.asarray(matrix[:3, :3] / scale, np.float64), scale, np.array(matrix[:3, 3]))
+
+    @property
+    def matrix(self) -> Float:
+        """The matrix [4,4]."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.scale * self.rotation
+        matrix[:3, 3] = self.translation
+        return matrix
+
+    def then(self, other: Similarity) -> Similarity:
+        """This one, and `other` after it."""
+        return Similarity(
+            other.rotation @ self.rotation, other.scale * self.scale, other.points(self.translation)
+        )
+
+    def points(self, points: Float) -> Float:
+        """Points [...,3] in the other world."""
+        moved: Float = self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + self.translation
+        return moved
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera in the other world: its photo is the same, and depths are multiplied by `scale`."""
+        rotation = camera.viewmat[:3, :3] @ self.rotation.T
+        return replace(camera, viewmat=viewmat_of(rotation, self.points(camera.center)))
+
+    def apply(self, scene: Scene) -> Scene:
+        """The scene in the other world."""
+        views = tuple(replace(view, camera=self.camera(view.camera)) for view in scene.views)
+        return replace(scene, views=views, points=self.points(scene.points))
 
 
 @dataclass(frozen=True)

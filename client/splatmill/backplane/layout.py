@@ -44,6 +44,7 @@ MODEL_FILES = {
     "report.html": "text/html; charset=utf-8",
     "cameras.json": "application/json",
     "cameras.zip": "application/zip",
+    "frame.json": "application/json",
     "job.json": "application/json",
     "preview.jpg": "image/jpeg",
     "progress.mp4": "video/mp4",

@@ -82,6 +82,7 @@ from splatmill.schema.events import (
 )
 from splatmill.schema.fit_image import FitImageOptions
 from splatmill.schema.formats import DOWNLOADS, MODEL_FORMATS, ModelFormat
+from splatmill.schema.frames import GeographicOrigin, KnownDistance, ModelFrame, known_distance
 from splatmill.schema.imports import (
     CreateImport,
     Import,
@@ -264,6 +265,7 @@ __all__ = [
     "FileName",
     "FitImageOptions",
     "Format",
+    "GeographicOrigin",
     "Health",
     "Import",
     "ImportList",
@@ -277,6 +279,7 @@ __all__ = [
     "KeyList",
     "KeyWithSecret",
     "Kind",
+    "KnownDistance",
     "Limits",
     "LogEvent",
     "LogLine",
@@ -295,6 +298,7 @@ __all__ = [
     "ModelDownloads",
     "ModelFile",
     "ModelFormat",
+    "ModelFrame",
     "ModelPage",
     "NewKeyLimits",
     "OptionHelp",
@@ -352,6 +356,7 @@ __all__ = [
     "describe_options",
     "format_bytes",
     "format_duration",
+    "known_distance",
     "may_be_empty",
     "parse_bytes",
     "parse_duration",

@@ -14,6 +14,7 @@ from pydantic.fields import FieldInfo
 from splatmill.schema.base import Request, Response
 from splatmill.schema.captures import safe_name
 from splatmill.schema.formats import is_model_file, readable_suffixes
+from splatmill.schema.frames import known_distance
 from splatmill.schema.ids import ID
 from splatmill.schema.quantities import ByteSize, Duration
 
@@ -76,7 +77,7 @@ def _group(name: str) -> dict[str, Any]:
 _BUDGET, _PHOTOS, _CAMERAS, _ENGINE = map(_group, ("budget", "photos", "cameras", "engine"))
 
 
-_ADDED_LATER = ("time_lapse",)
+_ADDED_LATER = ("time_lapse", "scale")
 """Options that requests to the first version did not have."""
 
 
@@ -274,6 +275,16 @@ class TrainOptions(Request):
         ),
         json_schema_extra=_CAMERAS,
     )
+    scale: str | None = Field(
+        default=None,
+        max_length=512,
+        description=(
+            'Distance between the cameras of two photos, as in "a.jpg b.jpg 2.5m", in mm, cm, m, km, in or ft: '
+            "the model is then in metres. Left out, GPS tells metres where the photos have it and cover enough "
+            "ground, and the unit is arbitrary otherwise. Not for cameras that were given, which are never moved."
+        ),
+        json_schema_extra=_CAMERAS,
+    )
     sh_degree: int | None = Field(
         default=None,
         ge=0,
@@ -331,6 +342,13 @@ class TrainOptions(Request):
                 f"{start[:80]!r} is neither the id of a model nor the name of a {readable_suffixes()} file"
             )
         return safe_name(start)
+
+    @field_validator("scale")
+    @classmethod
+    def _distance(cls, scale: str | None) -> str | None:
+        if scale is not None:
+            known_distance(scale)
+        return scale
 
     def later_defaults(self) -> set[str]:
         """Return the options that were added after the first version and have their defaults."""

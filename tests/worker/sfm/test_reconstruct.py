@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from splatmill.schema import KnownDistance
 from splatmill_worker import sfm, synthetic
-from splatmill_worker.errors import Cancelled
-from splatmill_worker.scene import Camera, Scene
+from splatmill_worker.errors import Cancelled, Refusal
+from splatmill_worker.scene import Camera, Scene, Similarity
 from tests.support.paths import DATA
 
 pytestmark = pytest.mark.slow
@@ -96,6 +97,51 @@ def test_the_same_photos_are_read_back(
     np.testing.assert_array_equal(again.points, first.points)
     for a, b in zip(again.views, first.views, strict=True):
         np.testing.assert_array_equal(a.camera.viewmat, b.camera.viewmat)
+
+
+def test_the_scene_stands_upright_and_centred(
+    still_life: tuple[Path, dict[str, Camera]], solved: tuple[Scene, Path]
+) -> None:
+    """In the world of the still life z points up, and its photos look at the middle of its table."""
+    scene, _ = solved
+    assert scene.frame is not None
+    assert scene.frame.reasons["up"] == "Up is where 16 of 16 photos are held level."
+    tilts = []
+    for view in scene.views:
+        true = still_life[1][view.name].viewmat[:3, :3] @ [0.0, 0.0, -1.0]
+        tilts.append(math.degrees(math.acos(np.clip(view.camera.viewmat[:3, 1] @ true, -1.0, 1.0))))
+    assert np.median(tilts) < 1.5
+    assert np.median(np.linalg.norm(scene.centers, axis=1)) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_cameras_stored_before_there_were_frames_keep_their_world(
+    still_life: tuple[Path, dict[str, Camera]], solved: tuple[Scene, Path], tmp_path: Path
+) -> None:
+    framed, workdir = solved
+    shutil.copytree(workdir, tmp_path / "work")
+    (kept,) = (tmp_path / "work").glob("sfm/*/model-*/frame.json")
+    kept.unlink()
+    scene = reconstruct(still_life[0], tmp_path / "work")
+    assert scene.frame is None
+    assert framed.frame is not None
+    back = Similarity.of(np.linalg.inv(np.array(framed.frame.from_sfm)))
+    np.testing.assert_allclose(scene.points, back.points(framed.points), atol=1e-6)
+    first, last = scene.views[0].name, scene.views[8].name
+    known = KnownDistance(first, last, 3.0)
+    scaled = sfm.reconstruct(
+        still_life[0], None, tmp_path / "work", sfm.SfmOptions(), quiet, lambda: False, known=known
+    )
+    assert np.linalg.norm(scaled.centers[0] - scaled.centers[8]) == pytest.approx(3.0)
+    with pytest.raises(Refusal, match=r"scale names nowhere\.png, and there is no such photo among the 16"):
+        sfm.reconstruct(
+            still_life[0],
+            None,
+            tmp_path / "work",
+            sfm.SfmOptions(),
+            quiet,
+            lambda: False,
+            known=KnownDistance(first, "nowhere.png", 1.0),
+        )
 
 
 def test_a_stored_model_that_is_damaged_is_recovered_anew(

@@ -1,4 +1,4 @@
-"""The stored model of a capture: COLMAP's files, the stereo points and facts.json in one folder."""
+"""The stored model of a capture: COLMAP's files, the stereo points, the frame and facts.json in one folder."""
 
 from __future__ import annotations
 
@@ -8,16 +8,24 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from splatmill.schema import KnownDistance, ModelFrame
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.prepare import Prepared
 from splatmill_worker.scene import Scene, View
 from splatmill_worker.sfm import features, stereo
 from splatmill_worker.sfm.colors import color_points
 from splatmill_worker.sfm.final_model import FinalModel
+from splatmill_worker.sfm.frame import choose, in_frame
 from splatmill_worker.sfm.posed.colmap_model import posed_view, scene_of
 from splatmill_worker.sfm.run import SfmRun, torch_threads
 
 STEREO = "stereo.npz"
+FRAME = "frame.json"
+"""How the world of COLMAP's files and the stereo points becomes that of the scene. A folder without it was stored
+before there were frames; its scene keeps the world of its files, in which there may be checkpoints and models."""
+
 FACTS = "facts.json"
 
 
@@ -40,6 +48,9 @@ def store_model(run: SfmRun, final: FinalModel, folder: Path) -> None:
         # Photos are swept one after the other, so that each torch call gets all threads.
         with run.clock("stereo"), torch_threads(run.threads):
             stereo.with_stereo_points(scene, partial / STEREO, run.on_progress, run.cancelled)
+    tags = {photo.name: photo.exif for photo in run.prepared.photos}
+    frame = choose(scene, [tags[view.name] for view in scene.views])
+    (partial / FRAME).write_text(frame.model_dump_json(indent=1), "utf-8")
     document = {
         "facts": final.facts
         | {"seconds": {stage: round(seconds, 3) for stage, seconds in run.seconds.items()}},
@@ -51,8 +62,13 @@ def store_model(run: SfmRun, final: FinalModel, folder: Path) -> None:
     partial.rename(folder)
 
 
-def load_model(prepared: Prepared, folder: Path) -> Scene:
-    """The scene of the model that `store_model` wrote to `folder`, with the photos where they are now."""
+def load_model(prepared: Prepared, folder: Path, known: KnownDistance | None = None) -> Scene:
+    """The scene of the model that `store_model` wrote to `folder`, with the photos where they are now, in its frame.
+
+    known: a distance that makes the metre its unit.
+
+    Raises Refusal when that distance is between photos without a camera, or at one place.
+    """
     model = pycolmap.Reconstruction(folder)
     document: dict[str, Any] = json.loads((folder / FACTS).read_text("utf-8"))
     scene = scene_of(
@@ -63,9 +79,15 @@ def load_model(prepared: Prepared, folder: Path) -> Scene:
         notes=(*prepared.notes, *document["notes"]),
     )
     scene = replace(scene, facts=document["facts"])
-    if not (folder / STEREO).is_file():
+    if (folder / STEREO).is_file():
+        scene = stereo.add(scene, stereo.StereoPoints.load(folder / STEREO))
+    if (folder / FRAME).is_file():
+        frame = ModelFrame.model_validate_json((folder / FRAME).read_bytes())
+    elif known is None:
         return scene
-    return stereo.add(scene, stereo.StereoPoints.load(folder / STEREO))
+    else:
+        frame = ModelFrame(unit="arbitrary", from_sfm=np.eye(4).tolist())
+    return in_frame(scene, frame, known)
 
 
 def _views(prepared: Prepared, model: pycolmap.Reconstruction) -> dict[int, View]:

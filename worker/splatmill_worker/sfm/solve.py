@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from splatmill.schema import KnownDistance
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.images.prepare import Prepared, prepare
@@ -20,6 +21,7 @@ from splatmill_worker.sfm import cameras, checks, stereo
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if
 from splatmill_worker.sfm.effort import ENOUGH_REGISTERED, registered_counts, solve_at, verified_pairs
 from splatmill_worker.sfm.final_model import final_model
+from splatmill_worker.sfm.frame import require_photos
 from splatmill_worker.sfm.model_store import is_stored, load_model, store_model
 from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions, fitted
 from splatmill_worker.sfm.placed import PlacingObserver
@@ -36,6 +38,7 @@ def reconstruct(
     on_progress: OnProgress,
     cancelled: Callable[[], bool],
     observer: PlacingObserver | None = None,
+    known: KnownDistance | None = None,
 ) -> Scene:
     """Recover the cameras of the photos under `images`, and of those in its videos and zips.
 
@@ -46,13 +49,15 @@ def reconstruct(
     cancelled: polled; Cancelled is raised within a fraction of a second of it turning true, except that the global
         mapper and a bundle adjustment that are running finish first.
     observer: looks at the cameras and points while the incremental mapper places them.
+    known: a distance between two photos, which makes the metre the unit of the scene.
 
-    Raises SfmFailed with facts and advice when no usable model is found, and Cancelled.
+    Raises SfmFailed with facts and advice when no usable model is found, Refusal for a distance between photos that
+    are not there, that have no camera, or that are at one place, and Cancelled.
     """
     prepared = prepare(
         images, masks, workdir, frames=options.frames, on_progress=on_progress, cancelled=cancelled
     )
-    return reconstruct_photos(prepared, workdir, options, on_progress, cancelled, observer)
+    return reconstruct_photos(prepared, workdir, options, on_progress, cancelled, observer, known)
 
 
 def reconstruct_photos(
@@ -62,15 +67,17 @@ def reconstruct_photos(
     on_progress: OnProgress = lambda stage, done, total, note: None,
     cancelled: Callable[[], bool] = lambda: False,
     observer: PlacingObserver | None = None,
+    known: KnownDistance | None = None,
 ) -> Scene:
     """`reconstruct` for photos that `images.prepare` has examined."""
     _require_photos(prepared)
+    require_photos(known, [photo.name for photo in prepared.photos])
     stop_if(cancelled)
     folder = workdir / "sfm" / prepared.key[:24]
     stored = folder / f"model-{digest(VERSION, stereo.VERSION, pycolmap.__version__, options)}"
     if is_stored(stored):
         try:
-            return load_model(prepared, stored)
+            return load_model(prepared, stored, known)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
             log.warning(
                 "The stored cameras are not readable and are recovered anew: %s: %s", stored.name, error
@@ -84,7 +91,7 @@ def reconstruct_photos(
         run = SfmRun(prepared, groups, model, options, folder, threads, pool, on_progress, cancelled)
         run.observer = observer
         store_model(run, final_model(run, _solve(run)), stored)
-    return load_model(prepared, stored)
+    return load_model(prepared, stored, known)
 
 
 def _require_photos(prepared: Prepared) -> None:

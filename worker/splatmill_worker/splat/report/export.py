@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 
 from splatmill.files import atomic_write
-from splatmill.schema import CameraSpec, ModelCamera, ModelCameras
+from splatmill.schema import CameraSpec, ModelCamera, ModelCameras, ModelFrame
 from splatmill_worker.scene import Camera, Normalization, Scene
 from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.plan.plan import Plan
@@ -35,17 +35,19 @@ class ExportWorld:
     normalization: from the world that the cameras came in to the training world.
     offset: [3], added to an exported point to get to the world that the cameras came in. Zero except for scenes far
         from their origin (geo-referenced ones).
+    frame: how the world that the cameras came in was chosen; None where it was given.
     """
 
     normalization: Normalization
     offset: npt.NDArray[np.float64]
+    frame: ModelFrame | None = None
 
     @staticmethod
     def of(normalization: Normalization, scene: Scene) -> ExportWorld:
         """The world of `scene`, or one that is moved near the cameras where float32 could not hold that."""
         middle = scene.centers.mean(axis=0)
         far = float(np.linalg.norm(middle)) * normalization.scale > FAR
-        return ExportWorld(normalization, np.round(middle) if far else np.zeros(3))
+        return ExportWorld(normalization, np.round(middle) if far else np.zeros(3), scene.frame)
 
     def camera(self, camera: Camera) -> Camera:
         """A camera of the training world in this world."""
@@ -70,7 +72,7 @@ class Exported:
 def export(
     out: Path, trained: Trained, plan: Plan, world: ExportWorld, held_out: Sequence[TrainingView]
 ) -> Exported:
-    """Write model.ply, cameras.json and the held-out photos into the folder `out`."""
+    """Write model.ply, cameras.json, frame.json if there is a frame, and the held-out photos into the folder `out`."""
     scale = 1.0 / world.normalization.scale
     shift = -scale * world.normalization.translation - world.offset
     gaussians = trained.gaussians.moved(scale, torch.from_numpy(shift))
@@ -100,6 +102,8 @@ def export(
     ]
     document = ModelCameras(cameras=cameras).model_dump(mode="json", exclude_none=True)
     atomic_write(out / "cameras.json", json.dumps(document, indent=1))
+    if world.frame is not None:
+        atomic_write(out / "frame.json", world.frame.model_dump_json(indent=1))
     return Exported(written, world, left_out)
 
 

@@ -76,6 +76,7 @@ def render(
         f"<p class=dim>Peak memory: {format_bytes(report['peak_memory'])}.</p>",
         "<h2>What was decided, and why</h2>",
         _plan(report["plan"]),
+        *_frame(report["frame"]),
         "<h2>What was left out, and why</h2>",
         _table(
             ["", ""],
@@ -142,6 +143,15 @@ def _plan(plan: dict[str, Any]) -> str:
         shown = "" if isinstance(value, dict) else "yes" if value is True else str(value)
         rows.append([name.replace("_", " "), shown, reason])
     return _table(["", "", ""], rows, 3)
+
+
+def _frame(frame: dict[str, Any] | None) -> list[str]:
+    if frame is None:
+        return []
+    return [
+        "<h2>Coordinates of the model</h2>",
+        _table(["", ""], list(map(list, frame["reasons"].items())), 2),
+    ]
 
 
 def _comparison(view: ViewComparison) -> str:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from splatmill.files import atomic_write
+from splatmill.schema import ModelFrame
 from splatmill_worker.scene import Scene
 from splatmill_worker.splat.evaluate import Renderer, Score
 from splatmill_worker.splat.machine import machine, peak_memory, versions
@@ -115,6 +116,7 @@ def write_report(
             "warnings": [*finished.warnings, *_unplaced(planned.scene), *_misfits(trained)],
             "facts": planned.facts.as_dict(),
             "sfm": planned.scene.facts,
+            "frame": _frame(planned.scene.frame),
             "time_lapse": finished.time_lapse,
             "offset": offset.tolist() if offset.any() else None,
             "peak_memory": peak_memory(),
@@ -160,6 +162,11 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def _frame(frame: ModelFrame | None) -> dict[str, Any] | None:
+    """The frame without the place of its origin: others who see a report may not know where photos were taken."""
+    return None if frame is None else frame.model_dump(mode="json", exclude={"origin", "format"})
 
 
 def _result(trained: Trained, written: int) -> dict[str, Any]:

@@ -25,6 +25,7 @@ const FILES = {
   "model.ply": "The Gaussians as they were trained, for any viewer or editor",
   "cameras.zip": "The cameras and points as a COLMAP model and as transforms.json, for other tools",
   "cameras.json": "The cameras of the photos",
+  "frame.json": "How the coordinates were chosen: up, unit, and where on the earth",
   "report.json": "The report as data",
   "report.html": "The report as a page",
   "report.png": "Error against run time",
