@@ -15,6 +15,7 @@ from splatmill.job import MOST_LINES, AsyncJobHandle
 from splatmill.keys import Keys
 from splatmill.loop import BackgroundLoop
 from splatmill.model import AsyncModelHandle
+from splatmill.orbits import Orbits
 from splatmill.schema import (
     Box,
     CameraSpec,
@@ -351,6 +352,7 @@ class ModelHandle:
         self._loop = loop
         self._async = handle
         self.shares = Shares(loop, handle.shares)
+        self.orbits = Orbits(loop, handle.orbits)
 
     @property
     def id(self) -> str:
@@ -396,14 +398,26 @@ class ModelHandle:
         return self._loop.run(self._async.render(camera, **options))
 
     def orbit(
-        self, path: AnyPath, *, timeout: float | None = None, **options: Unpack[OrbitArguments]
+        self,
+        path: AnyPath,
+        *,
+        timeout: float | None = None,
+        on_progress: OnProgress | None = None,
+        keep: bool = True,
+        **options: Unpack[OrbitArguments],
     ) -> Path:
         """Render a video (MP4) that circles the scene, write it to `path`, and return the path written.
 
         `options` are the fields of `OrbitRequest`. `timeout` is the number of seconds to wait for the video; left out,
-        as long as the server does by default.
+        as long as it takes. `on_progress` is called with the number of frames that are rendered.
+
+        keep: keep the video with the model, where the same options find it again, and go on after a restart of the
+        server. False renders it for this call alone, which a key with the scope `read` may do too.
         """
-        return self._loop.run(self._async.orbit(path, timeout=timeout, **options))
+        return self._loop.run_reporting(
+            lambda report: self._async.orbit(path, timeout=timeout, on_progress=report, keep=keep, **options),
+            on_progress,
+        )
 
     def edit(
         self,

@@ -122,11 +122,15 @@ class JobCancelled(SplatmillError):
 
 
 class WaitTimeout(SplatmillError, TimeoutError):
-    """The job has not ended within the given time. It continues; `state` is what it was last seen in."""
+    """The job, or the orbit video, has not ended within the given time. It continues.
 
-    def __init__(self, job_id: str, state: str, seconds: float) -> None:
+    job_id: the id of the job or of the video.
+    state: what it was last seen in.
+    """
+
+    def __init__(self, job_id: str, state: str, seconds: float, what: str = "job") -> None:
         super().__init__(
-            f"The job {job_id} has not ended within {seconds:g} seconds; its state is {state}.",
+            f"The {what} {job_id} has not ended within {seconds:g} seconds; its state is {state}.",
             "It continues on the server; wait for it again, or cancel it.",
         )
         self.job_id = job_id

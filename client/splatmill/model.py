@@ -1,5 +1,6 @@
 """A finished model on the server: its files, its cameras, and images rendered from it."""
 
+import asyncio
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Unpack
@@ -11,8 +12,9 @@ from pydantic import ValidationError
 from splatmill.arguments import OrbitArguments, RenderArguments
 from splatmill.connection import Connection, read_answer
 from splatmill.downloads import AnyPath, OnBytes, download, target_of
-from splatmill.errors import invalid_request
+from splatmill.errors import WaitTimeout, invalid_request
 from splatmill.files import atomic_write
+from splatmill.orbits import AsyncOrbits, orbit_request
 from splatmill.schema import (
     Box,
     CameraSpec,
@@ -27,6 +29,7 @@ from splatmill.schema import (
     RenderRequest,
 )
 from splatmill.shares import AsyncShares
+from splatmill.uploads import OnProgress
 
 # Longer than the server waits for its renderer, so that the server's problem arrives before this timeout.
 RENDER_TIMEOUT = httpx.Timeout(30.0, read=150.0)
@@ -41,6 +44,7 @@ class AsyncModelHandle:
         self.connection = connection
         self.model = model
         self.shares = AsyncShares(connection, model.id)
+        self.orbits = AsyncOrbits(connection, model.id)
 
     @property
     def id(self) -> str:
@@ -117,18 +121,40 @@ class AsyncModelHandle:
         return response.content
 
     async def orbit(
-        self, path: AnyPath, *, timeout: float | None = None, **options: Unpack[OrbitArguments]
+        self,
+        path: AnyPath,
+        *,
+        timeout: float | None = None,
+        on_progress: OnProgress | None = None,
+        keep: bool = True,
+        **options: Unpack[OrbitArguments],
     ) -> Path:
         """Render a video (MP4) that circles the scene, write it to `path`, and return the path written.
 
         `options` are the fields of `OrbitRequest`. `timeout` is the number of seconds to wait for the video; left out,
-        as long as the server does by default. Raises InvalidRequest for options that are not valid, and
-        ConnectionFailed after the timeout.
+        as long as it takes. `on_progress` is called with the number of frames that are rendered.
+
+        keep: keep the video with the model, where the same options find it again, and go on after a restart of the
+        server. False renders it for this call alone, which a key with the scope `read` may do too; it is waited for as
+        long as the server does by default.
+
+        Raises InvalidRequest for options that are not valid. After the timeout it raises WaitTimeout, and the rendering
+        continues; without `keep` it raises ConnectionFailed, and the rendering ends.
         """
+        target = target_of(path, "orbit.mp4")
+        if not keep:
+            return await self._orbit_for_this_call(target, timeout, orbit_request(options))
+        begun = await self.orbits.start(**options)
         try:
-            request = OrbitRequest.model_validate(options)
-        except ValidationError as error:
-            raise invalid_request(error) from error
+            async with asyncio.timeout(timeout) as limit:
+                await self.orbits.wait(begun.id, on_progress)
+        except TimeoutError as error:
+            if not limit.expired() or timeout is None:
+                raise
+            raise WaitTimeout(begun.id, "not whole", timeout, "orbit video") from error
+        return await self.orbits.download(begun.id, target)
+
+    async def _orbit_for_this_call(self, target: Path, timeout: float | None, request: OrbitRequest) -> Path:
         response = await self.connection.request(
             "POST",
             f"/v1/models/{self.id}/orbit",
@@ -137,7 +163,6 @@ class AsyncModelHandle:
             costly=True,
             timeout=ORBIT_TIMEOUT if timeout is None else httpx.Timeout(30.0, read=timeout),
         )
-        target = target_of(path, "orbit.mp4")
         atomic_write(target, response.content)
         return target
 

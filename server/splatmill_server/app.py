@@ -25,6 +25,7 @@ from splatmill_server.routes import (
     job_outputs,
     jobs,
     models,
+    orbits,
     session,
     shared,
     shares,
@@ -64,6 +65,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         loops = (
             service.reaper.run,
             service.imports.run,
+            service.orbits.run,
             service.deliveries.run,
             service.relisting.run,
             service.sweeper.run,
@@ -99,6 +101,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         estimate,
         edits,
         models,
+        orbits,
         shares,
         webhooks,
         key_routes,

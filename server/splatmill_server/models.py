@@ -285,6 +285,7 @@ def _links(model_id: str) -> dict[str, str]:
         "cameras": f"{base}/cameras",
         "render": f"{base}/render",
         "orbit": f"{base}/orbit",
+        "orbits": f"{base}/orbits",
         "formats": f"{base}/formats",
         "html": f"{base}/download/html",
         "ply": f"{base}/files/model.ply",

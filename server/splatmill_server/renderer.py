@@ -19,12 +19,7 @@ async def post(
     Raises a 503 problem if there is no renderer, and a 504 problem if it does not answer within `seconds`.
     """
     if renderer is None:
-        raise ProblemError(
-            "renderer_unavailable",
-            "This server has no renderer, so it cannot render images.",
-            advice="Start `python -m splatmill_worker renderer` and set SPLATMILL_RENDERER_URL. "
-            "Models can be downloaded without it.",
-        )
+        raise no_renderer()
     try:
         sent = renderer.build_request(
             "POST",
@@ -48,6 +43,16 @@ async def post(
             "`python -m splatmill_worker renderer`. Models can be downloaded without it.",
             headers={"Retry-After": "5"},
         ) from error
+
+
+def no_renderer() -> ProblemError:
+    """Return the 503 problem of a server without a renderer."""
+    return ProblemError(
+        "renderer_unavailable",
+        "This server has no renderer, so it cannot render images.",
+        advice="Start `python -m splatmill_worker renderer` and set SPLATMILL_RENDERER_URL. "
+        "Models can be downloaded without it.",
+    )
 
 
 class Counted(httpx.AsyncBaseTransport):

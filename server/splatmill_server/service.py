@@ -29,6 +29,7 @@ from splatmill_server.jobs.records import Jobs
 from splatmill_server.lists import Lists
 from splatmill_server.metrics import Metrics
 from splatmill_server.models import Models
+from splatmill_server.orbits import Orbits
 from splatmill_server.outgoing import Outgoing
 from splatmill_server.renderer import Counted
 from splatmill_server.settings import Settings
@@ -100,6 +101,7 @@ class Service:
     models: Models
     shares: Shares
     conversions: Conversions
+    orbits: Orbits
     keys: Keys
     authentication: Authentication
     sessions: Sessions
@@ -155,6 +157,7 @@ class Service:
             models=models,
             shares=Shares(storage, models),
             conversions=Conversions(storage, connection, models, renderer, settings.orbit_timeout),
+            orbits=Orbits(storage, connection, models, renderer, settings.orbit_timeout),
             keys=stored_keys,
             authentication=Authentication(settings, stored_keys, sessions),
             sessions=sessions,

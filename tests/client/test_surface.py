@@ -10,7 +10,7 @@ from typing import Any, get_type_hints
 import pytest
 
 import splatmill
-from splatmill import aio, client, imports, job, keys, model, shares, webhooks
+from splatmill import aio, client, imports, job, keys, model, orbits, shares, webhooks
 
 TWINS = [
     (client.Client, aio.AsyncClient),
@@ -18,6 +18,7 @@ TWINS = [
     (client.ModelHandle, model.AsyncModelHandle),
     (keys.Keys, keys.AsyncKeys),
     (webhooks.Webhooks, webhooks.AsyncWebhooks),
+    (orbits.Orbits, orbits.AsyncOrbits),
     (shares.Shares, shares.AsyncShares),
     (imports.Imports, imports.AsyncImports),
 ]

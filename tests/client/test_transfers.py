@@ -245,7 +245,7 @@ def test_a_slow_rendering_is_not_asked_for_again(peer, reply, tmp_path):
         with pytest.raises(Unavailable, match="120 seconds"):
             model.render(at | {"width": 64, "height": 48, "fov_y_deg": 50})
         with pytest.raises(Unavailable, match="120 seconds"):
-            model.orbit(tmp_path)
+            model.orbit(tmp_path, keep=False)
     assert [seen.method for seen in peer.seen] == ["GET", "POST", "POST"]
 
 
@@ -255,5 +255,5 @@ def test_an_orbit_is_waited_for_as_long_as_asked_and_asked_for_once(peer, reply,
 
     peer.answer = lambda seen: reply(body=MODEL) if seen.method == "GET" else never(seen)
     with Client(peer.url) as client, pytest.raises(ConnectionFailed):
-        client.model("m1").orbit(tmp_path, timeout=0.3)
+        client.model("m1").orbit(tmp_path, timeout=0.3, keep=False)
     assert [seen.method for seen in peer.seen] == ["GET", "POST"]

@@ -11,6 +11,7 @@ captures/{id}/uploads/{upload}/blocks/...   its bytes so far, in a bucket: objec
 captures/{id}/imports/{import}.json         record of a file that the server fetches from an address
 captures/{id}/sfm/...                       reconstruction, shared by the jobs of the capture
 imports/{capture}.{import}                  mark of an import that has not ended
+orbits/{owner}.{model}.{orbit}              mark of an orbit video that has not ended; owner is a digest
 webhooks/{id}/webhook.json                  record of a webhook, with its secrets
 webhooks/{id}/deliveries/{delivery}.json    one event for this webhook, and the attempts to deliver it
 due/{time}.{webhook}.{delivery}             mark of a delivery that is pending: Unix time of its next attempt
@@ -24,6 +25,9 @@ models/{id}/held_out/{n}.webp               held-out photo, as the renderings we
 models/{id}/time_lapse/{n}.ply              snapshot of the training, a compressed .ply
 models/{id}/formats/{format}                the model in another file format
 models/{id}/formats/{format}.json           what the conversion cost and lost; written last
+models/{id}/orbits/{orbit}/orbit.json       record of an orbit video, and how many of its frames are stored
+models/{id}/orbits/{orbit}/frames/{n}.mp4   some of its frames, from the n-th on, until the video is whole
+models/{id}/orbits/{orbit}/orbit.mp4        the video
 models/{id}/job.json                        record of the ended job; written last: a model exists once it does
 keys/{id}.json                              a key of the API: its owner, scopes, limits, and the digests of its secrets
 keys/{id}.revoked                           the key was revoked; it counts more than the record beside it
@@ -87,12 +91,13 @@ def folder_of(path: str) -> tuple[str, str, str] | None:
 
 def is_derived(kind: str, inside: str) -> bool:
     """Return whether a path inside of a folder can be made again: a capture's reconstruction and manifest, a job's work
-    files, or a model's conversions to other formats."""
+    files, or a model's conversions to other formats and orbit videos."""
     return (kind, inside.partition("/")[0]) in (
         ("captures", "sfm"),
         ("captures", MANIFEST),
         ("jobs", "work"),
         ("models", "formats"),
+        ("models", "orbits"),
     )
 
 
@@ -232,6 +237,39 @@ def conversion(model_id: str, key: str) -> str:
 def conversion_record(model_id: str, key: str) -> str:
     """Return the path of the record of a conversion; the file is whole once it exists."""
     return f"models/{model_id}/formats/{key}.json"
+
+
+def model_orbits(model_id: str) -> str:
+    """Return the folder of the orbit videos of a model."""
+    return f"models/{model_id}/orbits"
+
+
+def orbit(model_id: str, orbit_id: str) -> str:
+    return f"models/{model_id}/orbits/{orbit_id}"
+
+
+def orbit_record(model_id: str, orbit_id: str) -> str:
+    return f"models/{model_id}/orbits/{orbit_id}/orbit.json"
+
+
+def orbit_video(model_id: str, orbit_id: str) -> str:
+    return f"models/{model_id}/orbits/{orbit_id}/orbit.mp4"
+
+
+def orbit_frames(model_id: str, orbit_id: str, first: int | None = None) -> str:
+    """Return the folder of the frames of an unfinished orbit video, or the path of those from one frame on."""
+    folder = f"models/{model_id}/orbits/{orbit_id}/frames"
+    return folder if first is None else f"{folder}/{first:06d}.mp4"
+
+
+def unfinished_orbits() -> str:
+    """Return the folder of the marks of all orbit videos that have not ended."""
+    return "orbits"
+
+
+def unfinished_orbit(owner: str, model_id: str, orbit_id: str) -> str:
+    """Return the path of the mark of an orbit video; `owner` is a digest, since owners may have any name."""
+    return f"orbits/{owner}.{model_id}.{orbit_id}"
 
 
 def job_record(job_id: str) -> str:

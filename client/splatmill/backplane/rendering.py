@@ -1,7 +1,8 @@
 """The HTTP interface of the renderer process, on a port or a unix socket.
 
 Requests and responses are those of the public API (`RenderRequest`, `OrbitRequest`, problem documents), so the server
-only forwards them. The renderer computes ETags and answers `If-None-Match` itself.
+only forwards them; for what it keeps, it asks in its own name. The renderer computes ETags and answers `If-None-Match`
+itself.
 """
 
 from pydantic import BaseModel
@@ -34,6 +35,16 @@ def render_path(model_id: str) -> str:
 def orbit_path(model_id: str) -> str:
     """Return the path to which an `OrbitRequest` is posted; the response is an MP4 video."""
     return f"/v1/models/{model_id}/orbit"
+
+
+def orbit_frames_path(model_id: str) -> str:
+    """Return the path to which an `OrbitFrames` is posted; the response is an MP4 video of these frames."""
+    return f"/v1/models/{model_id}/orbit/frames"
+
+
+def orbit_join_path(model_id: str) -> str:
+    """Return the path to which a `JoinOrbit` is posted; the response is the MP4 video of all stored frames."""
+    return f"/v1/models/{model_id}/orbit/join"
 
 
 def convert_path(model_id: str) -> str:

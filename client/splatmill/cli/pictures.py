@@ -9,6 +9,7 @@ from splatmill.cli.local_model import is_local, local_cameras, orbit_local, rend
 from splatmill.cli.servers import ServerOption, open_client
 
 if TYPE_CHECKING:
+    from splatmill.client import ModelHandle
     from splatmill.schema import CameraSpec, ModelCamera
 
 ModelOrFile = Annotated[
@@ -107,9 +108,19 @@ def orbit(
     width: Annotated[int, typer.Option(min=16, max=3840, help="Width in pixels; must be even.")] = 640,
     height: Annotated[int, typer.Option(min=16, max=2160, help="Height in pixels; must be even.")] = 480,
     up: Up = None,
+    keep: Annotated[
+        bool,
+        typer.Option(
+            "--keep/--no-keep",
+            help="Keep the video with the model on the server. A key with the scope read needs --no-keep.",
+        ),
+    ] = True,
     server: ServerOption = None,
 ) -> None:
-    """Render a video that circles the scene of a model on a server, or in a file on this machine."""
+    """Render a video that circles the scene of a model on a server, or in a file on this machine.
+
+    Ctrl-C cancels the video on the server.
+    """
     options: dict[str, Any] = {"seconds": seconds, "fps": fps, "width": width, "height": height}
     if is_local(model_id):
         cameras = local_cameras(Path(model_id))
@@ -117,7 +128,22 @@ def orbit(
         orbit_local(Path(model_id), out, options, with_cameras=bool(cameras), up=up or "z")
     _check_up(up, used=False)
     with open_client(server) as client:
-        typer.echo(client.model(model_id).orbit(out, **options))
+        model = client.model(model_id)
+        typer.echo(_kept(model, out, options) if keep else model.orbit(out, keep=False, **options))
+
+
+def _kept(model: "ModelHandle", out: Path, options: dict[str, Any]) -> Path:
+    """Let the server render a video, show how far it is, and download it."""
+    from splatmill.cli.progress import make_display
+
+    begun = model.orbits.start(**options)
+    try:
+        with make_display() as display:
+            model.orbits.wait(begun.id, display.progress)
+    except KeyboardInterrupt:
+        model.orbits.delete(begun.id)
+        raise
+    return model.orbits.download(begun.id, out)
 
 
 def _check_up(up: str | None, *, used: bool) -> None:

@@ -140,6 +140,13 @@ from splatmill.schema.options import (
     TrainOptions,
     describe_options,
 )
+from splatmill.schema.orbits import (
+    JoinOrbit,
+    Orbit,
+    OrbitFrames,
+    OrbitList,
+    OrbitState,
+)
 from splatmill.schema.photos import (
     ARCHIVE_SUFFIXES,
     MASK_FOLDERS,
@@ -274,6 +281,7 @@ __all__ = [
     "Job",
     "JobPage",
     "JobState",
+    "JoinOrbit",
     "Key",
     "KeyLimits",
     "KeyList",
@@ -304,7 +312,11 @@ __all__ = [
     "OptionHelp",
     "OptionList",
     "OptionType",
+    "Orbit",
+    "OrbitFrames",
+    "OrbitList",
     "OrbitRequest",
+    "OrbitState",
     "Output",
     "Owner",
     "OwnerUse",

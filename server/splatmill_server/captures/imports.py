@@ -9,9 +9,7 @@ import json
 import secrets
 import time
 from collections.abc import AsyncIterator
-from contextlib import suppress
 from datetime import UTC, datetime
-from functools import partial
 from urllib.parse import unquote
 
 import httpx
@@ -24,11 +22,11 @@ from splatmill.backplane.records import FORMAT, warn
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import CreateImport, Import, ImportState, Problem, UnsafeName, safe_name
 from splatmill_server.captures.records import Captures
-from splatmill_server.leases import lease
 from splatmill_server.outgoing import AddressRefused, Answer, NoAnswer, Outgoing
 from splatmill_server.problems import ProblemError, problem_of_storage
 from splatmill_server.settings import Settings
 from splatmill_server.space.quota import Quota
+from splatmill_server.unfinished import Unfinished
 
 log = structlog.get_logger()
 
@@ -62,15 +60,21 @@ class Imports:
         outgoing: Outgoing,
         settings: Settings,
     ) -> None:
-        self.connection = connection
         self.storage = storage
         self.captures = captures
         self.quota = quota
         self.outgoing = outgoing
         self.settings = settings
-        self._wake = asyncio.Event()
-        self._gate = asyncio.Semaphore(_CONCURRENT)
-        self._running: dict[tuple[str, str], asyncio.Task[None]] = {}
+        self.unfinished = Unfinished(
+            connection,
+            storage,
+            "import",
+            layout.unfinished_imports(),
+            self._work,
+            at_once=_CONCURRENT,
+            of_line=_CONCURRENT,
+            look_seconds=_LOOK_SECONDS,
+        )
 
     async def create(self, capture_id: str, request: CreateImport) -> Import:
         """Accept an import, which then runs in the background.
@@ -93,7 +97,7 @@ class Imports:
             created_at=datetime.now(UTC),
         )
         await run_in_threadpool(self._accept, made)
-        self._wake.set()
+        self.unfinished.wake()
         return made
 
     def _accept(self, made: Import) -> None:
@@ -129,42 +133,11 @@ class Imports:
 
     async def run(self) -> None:
         """Take up unfinished imports until this task is cancelled. A cancelled import is taken up again later."""
-        try:
-            while True:
-                self._wake.clear()
-                try:
-                    await self._take_up()
-                except (StorageError, redis.RedisError) as error:
-                    log.warning("imports cannot be looked for", error=str(error))
-                except Exception:
-                    log.exception("imports cannot be looked for")
-                with suppress(TimeoutError):
-                    await asyncio.wait_for(self._wake.wait(), _LOOK_SECONDS)
-        finally:
-            tasks = list(self._running.values())
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+        await self.unfinished.run()
 
-    async def _take_up(self) -> None:
-        marks = await run_in_threadpool(lambda: list(self.storage.entries(layout.unfinished_imports())))
-        for entry in marks:
-            capture_id, _, import_id = entry.path.rsplit("/", 1)[-1].partition(".")
-            key = (capture_id, import_id)
-            if key not in self._running and layout.is_id(capture_id) and layout.is_id(import_id):
-                task = asyncio.create_task(self._work(*key))
-                self._running[key] = task
-                task.add_done_callback(partial(self._running.pop, key))
-
-    async def _work(self, capture_id: str, import_id: str) -> None:
-        try:
-            async with self._gate, lease(self.connection, "import", f"{capture_id}.{import_id}") as mine:
-                if mine:
-                    await self._fetch_to_the_end(capture_id, import_id)
-        except (StorageError, redis.RedisError) as error:
-            log.warning("an import waits", capture=capture_id, id=import_id, error=str(error))
-        except Exception:
-            log.exception("an import waits", capture=capture_id, id=import_id)
+    async def _work(self, name: str) -> None:
+        capture_id, _, import_id = name.partition(".")
+        await self._fetch_to_the_end(capture_id, import_id)
 
     async def _fetch_to_the_end(self, capture_id: str, import_id: str) -> None:
         found = await run_in_threadpool(self._read, capture_id, import_id)

@@ -23,10 +23,11 @@ class Holding(BaseModel):
     """One folder of storage: a capture, the files of a job, or a model.
 
     bytes: size of all files but `derived`.
-    derived: size of what can be made again: a capture's reconstruction, a job's checkpoints, or a model's conversions.
+    derived: size of what can be made again: a capture's reconstruction, a job's checkpoints, or a model's conversions
+        and orbit videos.
     files: number of files.
-    modified: time of the last write of any file, in seconds since 1970; conversions make a model no younger, and
-        manifests no capture.
+    modified: time of the last write of any file, in seconds since 1970; conversions and videos make a model no
+        younger, and manifests no capture.
     whole: whether the record is there: `capture.json`, which is written first; `job.json` of a model, which is written
         last; the log of a job that has ended.
     owner: None if nothing says whose it is.

@@ -156,7 +156,7 @@ def test_an_import_goes_on_after_a_restart_of_the_server(
     assert second.http.get(address).json()["state"] == "running"
     assert len(peer.seen) == 1
     # What a killed process leaves: a record, a mark, and a lease that expires.
-    first.service.imports._running[capture_id, address.rsplit("/", 1)[1]].cancel()
+    first.service.imports.unfinished.running[f"{capture_id}.{address.rsplit('/', 1)[1]}"].cancel()
     done = ended(second, address)
     assert (done["state"], done["attempts"]) == ("succeeded", 2)
 

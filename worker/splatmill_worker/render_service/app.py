@@ -5,12 +5,13 @@ Torch and the kernels are loaded with the first image, so that an idle renderer 
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shutil
 import tempfile
 import traceback
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -32,7 +33,9 @@ from splatmill.schema import (
     PROBLEM_MEDIA_TYPE,
     ConversionRequest,
     EditModel,
+    JoinOrbit,
     ModelCameras,
+    OrbitFrames,
     OrbitRequest,
     Problem,
     RenderRequest,
@@ -88,6 +91,8 @@ class RenderApp:
                 Route(rendering.HEALTH, self.health),
                 Route(rendering.render_path("{model_id}"), self.render, methods=["POST"]),
                 Route(rendering.orbit_path("{model_id}"), self.orbit, methods=["POST"]),
+                Route(rendering.orbit_frames_path("{model_id}"), self.orbit_frames, methods=["POST"]),
+                Route(rendering.orbit_join_path("{model_id}"), self.orbit_join, methods=["POST"]),
                 Route(rendering.convert_path("{model_id}"), self.convert, methods=["POST"]),
                 Route(rendering.edits_path("{model_id}"), self.edit, methods=["POST"]),
             ]
@@ -107,6 +112,14 @@ class RenderApp:
     async def orbit(self, request: Request) -> Response:
         """Respond with a video."""
         return await self._respond(request, OrbitRequest, self._video)
+
+    async def orbit_frames(self, request: Request) -> Response:
+        """Respond with a video of some frames of an orbit."""
+        return await self._respond(request, OrbitFrames, self._frames)
+
+    async def orbit_join(self, request: Request) -> Response:
+        """Respond with the video of all frames of an orbit that are stored."""
+        return await self._respond(request, JoinOrbit, self._joined)
 
     async def convert(self, request: Request) -> Response:
         """Respond with the model in another file format."""
@@ -178,6 +191,13 @@ class RenderApp:
     async def _video(
         self, request: Request, model_id: str, body: OrbitRequest, headers: dict[str, str]
     ) -> Response:
+        return await self._frames(
+            request, model_id, OrbitFrames(orbit=body, first=0, count=body.frames), headers
+        )
+
+    async def _frames(
+        self, request: Request, model_id: str, body: OrbitFrames, headers: dict[str, str]
+    ) -> Response:
         """Render frame by frame, so that images can be rendered in between, and none is rendered for a client that has
         left."""
         from splatmill_worker.film import Film
@@ -186,26 +206,42 @@ class RenderApp:
         model = await self._queue.run(
             lambda: self._cache.get(model_id), request.is_disconnected, _client(request)
         )
-        cameras = await run_in_threadpool(self._orbit_cameras, model, body)
-        descriptor, name = tempfile.mkstemp(prefix="splatmill-orbit-", suffix=".mp4")
-        os.close(descriptor)
-        path = Path(name)
-        try:
-            film = Film(path, body.width, body.height, body.fps)
+        orbit = body.orbit
+        cameras = await run_in_threadpool(self._orbit_cameras, model, orbit)
+        with _video_file() as path:
+            film = Film(path, orbit.width, orbit.height, orbit.fps)
 
             def add(camera: Camera) -> None:
-                film.add(render_frame(model, camera, body.background))
+                film.add(render_frame(model, camera, orbit.background))
 
             try:
-                for camera in cameras:
+                for camera in cameras[body.first : body.first + body.count]:
                     await self._queue.run(partial(add, camera), request.is_disconnected, _client(request))
             finally:
                 await run_in_threadpool(film.close)
-        except BaseException:
-            path.unlink(missing_ok=True)
-            raise
-        remove = BackgroundTask(path.unlink, missing_ok=True)
-        return FileResponse(path, media_type="video/mp4", headers=headers, background=remove)
+        return _video_response(path, headers)
+
+    async def _joined(
+        self, request: Request, model_id: str, body: JoinOrbit, headers: dict[str, str]
+    ) -> Response:
+        """Join in a thread beside what is rendered: nothing is decoded."""
+        with _video_file() as path:
+            await run_in_threadpool(self._join, model_id, body, path)
+        return _video_response(path, headers)
+
+    def _join(self, model_id: str, body: JoinOrbit, path: Path) -> None:
+        from splatmill_worker.render_service.joining import join
+
+        with tempfile.TemporaryDirectory(prefix="splatmill-orbit-") as folder:
+            parts = []
+            for entry in self._storage.entries(layout.orbit_frames(model_id, body.orbit)):
+                parts.append(Path(folder) / entry.path.rsplit("/", 1)[-1])
+                self._storage.download(entry.path, parts[-1])
+            frames = join(parts, path)
+        if frames != body.frames:
+            raise ValueError(
+                f"{frames} frames of the orbit {body.orbit} are stored, and {body.frames} belong to it"
+            )
 
     async def _converted(
         self, request: Request, model_id: str, body: ConversionRequest, headers: dict[str, str]
@@ -279,6 +315,24 @@ class RenderApp:
         except (FileNotFoundError, ValidationError):
             stored = None
         return list(orbit_cameras(stored, model.gaussians.means.double().cpu().numpy(), body))
+
+
+@contextlib.contextmanager
+def _video_file() -> Iterator[Path]:
+    """Yield the path of a new file, which is removed if the block raises."""
+    descriptor, name = tempfile.mkstemp(prefix="splatmill-orbit-", suffix=".mp4")
+    os.close(descriptor)
+    try:
+        yield Path(name)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _video_response(path: Path, headers: dict[str, str]) -> Response:
+    """Respond with a video, whose file is then removed."""
+    remove = BackgroundTask(path.unlink, missing_ok=True)
+    return FileResponse(path, media_type="video/mp4", headers=headers, background=remove)
 
 
 def _client(request: Request) -> str:

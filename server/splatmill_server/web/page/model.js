@@ -58,7 +58,7 @@ async function show(shown) {
   byId("whole").hidden = false;
   showCompare(byId("compare"), shown);
   void showDownloads(byId("downloads"), shown);
-  showOrbit(byId("orbit"), shown);
+  void showOrbit(byId("orbit"), shown);
   const stage = new Stage(shown);
   showCameras(byId("cameras"), shown, stage);
   await stage.open();

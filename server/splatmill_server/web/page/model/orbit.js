@@ -1,51 +1,108 @@
-// The orbit video: rendered by the server on demand, played here, and saved.
+// Orbit videos: rendered by the server in the background, kept with the model, played here, and saved.
 
-import { request, whole } from "../api.js";
+import { get, request, send } from "../api.js";
 import { h } from "../dom.js";
+import { bytes } from "../format.js";
 import { noticeOf } from "../shell.js";
 
 /** @import {Shown} from "../model.js" */
 
 const SIZES = { "640 x 480": [640, 480], "960 x 720": [960, 720], "1280 x 720": [1280, 720] };
 
+/** Milliseconds between two looks how far a video is. */
+const LOOK_MS = 500;
+
 /**
  * @param {HTMLElement} section
  * @param {Shown} shown
  */
-export function showOrbit(section, { model, address, background }) {
+export async function showOrbit(section, { model, address, background }) {
   const size = h("select", { id: "orbit-size" }, Object.keys(SIZES).map((name) => h("option", {}, name)));
   const length = h("select", { id: "orbit-length" }, [4, 6, 10].map((seconds) => h("option", { value: seconds }, `${seconds} seconds`)));
   const make = h("button", { type: "button", onclick: start }, "Make the video");
-  const stop = h("button", { type: "button", class: "quiet", hidden: true, onclick: () => running?.abort() }, "Stop");
+  const stop = h("button", { type: "button", class: "quiet", hidden: true }, "Stop");
   const state = h("p", { class: "hint", role: "status" });
+  const bar = h("progress", { hidden: true, "aria-label": "Frames rendered" });
   const place = h("div");
-  /** @type {AbortController | null} */
-  let running = null;
-  let shownUrl = "";
+  const kept = h("ul", { class: "kept" });
 
   async function start() {
-    running = new AbortController();
-    make.disabled = true;
-    stop.hidden = false;
-    place.replaceChildren();
     const [width, height] = SIZES[/** @type {keyof typeof SIZES} */ (size.value)];
-    state.textContent = `Rendering ${24 * Number(length.value)} frames. Without a GPU on the server this takes minutes.`;
+    make.disabled = true;
+    place.replaceChildren();
     try {
-      const answer = await request("POST", `${address}/orbit`, {
-        json: { seconds: Number(length.value), width, height, background }, signal: running.signal,
-      });
-      URL.revokeObjectURL(shownUrl);
-      shownUrl = URL.createObjectURL(await whole(answer.blob()));
-      place.append(
-        h("video", { src: shownUrl, controls: true, loop: true, playsinline: true, "aria-label": "Video that circles the scene" }),
-        h("p", {}, h("a", { href: shownUrl, download: `${model.name || model.id}-orbit.mp4` }, "Save the video")));
-      state.textContent = "";
+      await follow(await send("POST", `${address}/orbits`, { seconds: Number(length.value), width, height, background }));
     } catch (error) {
-      state.textContent = running.signal.aborted ? "Stopped." : "";
-      if (!running.signal.aborted) place.append(noticeOf(/** @type {Error} */ (error)));
+      place.append(noticeOf(/** @type {Error} */ (error)));
     } finally {
       make.disabled = false;
-      stop.hidden = true;
+    }
+  }
+
+  /** Show how far a video is until it is whole, and then the video. @param {any} orbit */
+  async function follow(orbit) {
+    let stopped = false;
+    stop.onclick = async () => {
+      stopped = true;
+      try {
+        await request("DELETE", orbit.links.self);
+      } catch (error) {
+        place.append(noticeOf(/** @type {Error} */ (error)));
+      }
+    };
+    make.disabled = true;
+    stop.hidden = bar.hidden = false;
+    try {
+      while (!stopped && !["succeeded", "failed"].includes(orbit.state)) {
+        bar.max = orbit.frames;
+        bar.value = orbit.frames_done;
+        state.textContent = `${orbit.frames_done} of ${orbit.frames} frames are rendered. The server goes on if this page is closed.`;
+        await new Promise((resolve) => setTimeout(resolve, LOOK_MS));
+        if (!stopped) orbit = await get(orbit.links.self);
+      }
+      state.textContent = stopped ? "Stopped." : orbit.state === "failed" ? orbit.problem.detail : "";
+      if (!stopped && orbit.state === "succeeded") {
+        play(orbit);
+        await list();
+      }
+    } catch (error) {
+      state.textContent = stopped ? "Stopped." : "";
+      if (!stopped) throw error;
+    } finally {
+      make.disabled = false;
+      stop.hidden = bar.hidden = true;
+    }
+  }
+
+  /** @param {any} orbit */
+  function play(orbit) {
+    place.replaceChildren(
+      h("video", { src: orbit.links.video, controls: true, loop: true, playsinline: true, "aria-label": "Video that circles the scene" }),
+      h("p", {}, h("a", { href: orbit.links.video, download: `${model.name || model.id}-orbit.mp4` }, "Save the video")));
+  }
+
+  /** List the videos that are kept, and return those that are not whole yet. */
+  async function list() {
+    /** @type {any[]} */
+    const orbits = (await get(`${address}/orbits`)).orbits;
+    kept.replaceChildren(...orbits.filter(({ state }) => state === "succeeded").map((orbit) => {
+      const { width, height, seconds } = orbit.request;
+      const name = `${width} x ${height}, ${seconds} seconds, ${bytes(orbit.bytes)}`;
+      return h("li", {},
+        h("button", { type: "button", class: "quiet", onclick: () => play(orbit) }, `Play ${name}`),
+        h("button", { type: "button", class: "quiet", "aria-label": `Delete the video ${name}`, onclick: () => remove(orbit) }, "Delete"));
+    }));
+    return orbits.filter(({ state }) => state === "queued" || state === "running");
+  }
+
+  /** @param {any} orbit */
+  async function remove(orbit) {
+    try {
+      await request("DELETE", orbit.links.self);
+      place.replaceChildren();
+      await list();
+    } catch (error) {
+      place.append(noticeOf(/** @type {Error} */ (error)));
     }
   }
 
@@ -54,5 +111,11 @@ export function showOrbit(section, { model, address, background }) {
     h("div", { class: "row" },
       h("div", { class: "field" }, h("label", { for: "orbit-size" }, "Size"), size),
       h("div", { class: "field" }, h("label", { for: "orbit-length" }, "Length"), length)),
-    h("div", { class: "row" }, make, stop), state, place);
+    h("div", { class: "row" }, make, stop), bar, state, place, kept);
+  try {
+    const [unfinished] = await list();
+    if (unfinished) await follow(unfinished);
+  } catch (error) {
+    place.append(noticeOf(/** @type {Error} */ (error)));
+  }
 }

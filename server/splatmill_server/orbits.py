@@ -1,0 +1,357 @@
+"""Orbit videos: rendered in the background, a part at a time, and kept in storage with their model.
+
+An orbit video is a record, and a mark while it has not ended, so it goes on after a restart of the API or the renderer
+with the first frame that is not stored. Its id follows from the model and the request, so that the same request finds
+the same video.
+"""
+
+import asyncio
+import hashlib
+import json
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+import httpx
+import structlog
+from pydantic import BaseModel, ValidationError
+from redis import Redis
+from starlette.concurrency import run_in_threadpool
+
+from splatmill.backplane import layout, rendering
+from splatmill.backplane.records import FORMAT, reason, warn
+from splatmill.backplane.storage import Storage
+from splatmill.schema import (
+    DEFAULT_OWNER,
+    PROBLEMS,
+    JoinOrbit,
+    Orbit,
+    OrbitFrames,
+    OrbitRequest,
+    OrbitState,
+    Problem,
+)
+from splatmill_server.models import Models
+from splatmill_server.problems import ProblemError
+from splatmill_server.renderer import no_renderer, post
+from splatmill_server.unfinished import Unfinished
+
+log = structlog.get_logger()
+
+MAX_UNFINISHED = 20
+"""Orbit videos of one owner that may be unfinished at once."""
+
+MAX_OF_MODEL = 100
+"""Orbit videos of one model that are kept."""
+
+MAX_ATTEMPTS = 4
+"""Times that the renderer is asked for one part. A renderer that cannot be reached, or is busy, is asked for ever."""
+
+PART_PIXELS = 16_000_000
+PART_FRAMES = (8, 48)
+"""Pixels of all frames of a part, and its smallest and largest number of frames.
+
+At 640 x 480, a part takes a second of two cores. It is what a restart repeats, and each begins with a frame that refers
+to none before it, so that smaller parts make a larger video.
+"""
+
+_AT_ONCE = 8
+"""Orbit videos that one API process has rendered at once, each of another owner."""
+
+_LOOK_SECONDS = 15.0
+"""Seconds between two looks for orbit videos that another process has left."""
+
+_PAUSE_SECONDS = 2.0
+"""Seconds before a renderer that did not deliver is asked again."""
+
+_VERSION = "1"
+"""Part of each id, to be raised when the same request gives another video than before."""
+
+
+class _Delayed(Exception):
+    """The renderer did not deliver a part. It may do so later: `problem` says why, `counts` whether it tried."""
+
+    def __init__(self, problem: Problem, *, counts: bool) -> None:
+        super().__init__(problem.detail)
+        self.problem = problem
+        self.counts = counts
+
+
+class Orbits:
+    """All operations on orbit videos.
+
+    seconds: how long the renderer may take for a part.
+    """
+
+    def __init__(
+        self,
+        storage: Storage,
+        connection: Redis,
+        models: Models,
+        renderer: httpx.AsyncClient | None,
+        seconds: float,
+    ) -> None:
+        self._storage = storage
+        self._models = models
+        self._renderer = renderer
+        self._seconds = seconds
+        self._asking: dict[str, asyncio.Task[None]] = {}
+        self.unfinished = Unfinished(
+            connection,
+            storage,
+            "orbit",
+            layout.unfinished_orbits(),
+            self._work,
+            at_once=_AT_ONCE,
+            of_line=1,
+            look_seconds=_LOOK_SECONDS,
+        )
+
+    async def create(self, model_id: str, request: OrbitRequest, check_room: Callable[[], None]) -> Orbit:
+        """Return the orbit video of a request, which is rendered in the background if it is not there.
+
+        check_room: raises a problem if the owner has no room in storage; called for a new video.
+
+        Raises 404 and 409 problems of the model, a 503 problem without a renderer, and a 409 problem for too many orbit
+        videos.
+        """
+        made = await run_in_threadpool(self._accept, model_id, request, check_room)
+        self.unfinished.wake()
+        return made
+
+    def _accept(self, model_id: str, request: OrbitRequest, check_room: Callable[[], None]) -> Orbit:
+        ply = self._models.file(model_id, "model.ply")
+        if self._renderer is None:
+            raise no_renderer()
+        orbit_id = _id_of(ply.etag, request)
+        mark = layout.unfinished_orbit(self._line(model_id), model_id, orbit_id)
+        found = self._read(model_id, orbit_id)
+        if found is not None and found.state is OrbitState.succeeded:
+            return found
+        if found is None or found.state is OrbitState.failed:
+            self._check_number(model_id, new=found is None)
+            check_room()
+            found = Orbit(
+                id=orbit_id,
+                model=model_id,
+                request=request,
+                state=OrbitState.queued,
+                frames=request.frames,
+                created_at=datetime.now(UTC),
+            )
+            self._put(found)
+        # After the record, without which a mark is removed; also for a record whose mark was never written.
+        self._storage.put_new(mark, b"{}")
+        return _with_links(found)
+
+    def _check_number(self, model_id: str, *, new: bool) -> None:
+        line = self._line(model_id)
+        marks = [entry.path.rsplit("/", 1)[-1] for entry in self._storage.entries(layout.unfinished_orbits())]
+        if sum(mark.partition(".")[0] == line for mark in marks) >= MAX_UNFINISHED:
+            raise ProblemError(
+                "too_many_orbits",
+                f"{MAX_UNFINISHED} orbit videos of this owner wait already, or are being rendered.",
+                advice="Wait until one has ended, or delete one.",
+                facts={"limit": MAX_UNFINISHED},
+            )
+        if new and len(self._storage.children(layout.model_orbits(model_id))) >= MAX_OF_MODEL:
+            raise ProblemError(
+                "too_many_orbits",
+                f"The model {model_id} has {MAX_OF_MODEL} orbit videos.",
+                advice=f"Delete those that are no longer needed; GET /v1/models/{model_id}/orbits lists them.",
+                facts={"limit": MAX_OF_MODEL},
+            )
+
+    def get(self, model_id: str, orbit_id: str) -> Orbit:
+        """Return an orbit video. Raises 404 problems, and the problems of the model."""
+        self._models.check(model_id)
+        found = self._read(model_id, orbit_id) if layout.is_id(orbit_id) else None
+        if found is None:
+            raise ProblemError(
+                "orbit_not_found",
+                f"The model {model_id} has no orbit video {orbit_id[:80]!r}.",
+                advice=f"List its orbit videos with GET /v1/models/{model_id}/orbits.",
+            )
+        return found
+
+    def video(self, model_id: str, orbit_id: str) -> str:
+        """Return the path of a video in storage. Raises the problems of `get`, and a 409 problem if it is not whole."""
+        found = self.get(model_id, orbit_id)
+        if found.state is not OrbitState.succeeded:
+            raise ProblemError(
+                "orbit_not_ready",
+                f"{found.frames_done} of {found.frames} frames are rendered; the orbit video is {found.state.value}.",
+                advice="Wait until it has succeeded."
+                if found.problem is None
+                else "Ask for it again with POST; its problem says why it failed.",
+                facts={"state": found.state.value, "frames_done": found.frames_done, "frames": found.frames},
+            )
+        return layout.orbit_video(model_id, orbit_id)
+
+    def list(self, model_id: str) -> list[Orbit]:
+        """Return the orbit videos of a model, newest first. Raises the problems of the model."""
+        self._models.check(model_id)
+        names = self._storage.children(layout.model_orbits(model_id))
+        found = [orbit for name in names if (orbit := self._read(model_id, name)) is not None]
+        return sorted(found, key=lambda orbit: orbit.created_at, reverse=True)
+
+    async def delete(self, model_id: str, orbit_id: str) -> None:
+        """Delete an orbit video. One that is not whole is not rendered any further. Raises the problems of `get`."""
+        name = await run_in_threadpool(self._forget, model_id, orbit_id)
+        if (asking := self._asking.get(name)) is not None:
+            asking.cancel()
+
+    def _forget(self, model_id: str, orbit_id: str) -> str:
+        self.get(model_id, orbit_id)
+        mark = layout.unfinished_orbit(self._line(model_id), model_id, orbit_id)
+        # The mark first: what a process that works on the video stores after this, it deletes again.
+        self._storage.delete(mark)
+        self._storage.delete_prefix(layout.orbit(model_id, orbit_id))
+        return mark.rsplit("/", 1)[-1]
+
+    async def run(self) -> None:
+        """Have unfinished orbit videos rendered until this task is cancelled. They are then taken up again later."""
+        if self._renderer is not None:
+            await self.unfinished.run()
+
+    async def _work(self, name: str) -> None:
+        """Have an orbit video rendered to its end."""
+        _, model_id, orbit_id = name.split(".")
+        attempts = 0
+        while (found := await run_in_threadpool(self._read, model_id, orbit_id)) and not found.state.final:
+            try:
+                after = await self._next(name, found)
+                attempts = 0
+            except _Delayed as delay:
+                attempts += delay.counts
+                log.info("an orbit video waits", model=model_id, id=orbit_id, reason=str(delay))
+                if attempts < MAX_ATTEMPTS:
+                    await asyncio.sleep(_PAUSE_SECONDS)
+                    continue
+                after = _failed(found, delay.problem)
+            except ProblemError as error:
+                after = _failed(found, error.problem)
+            if after is not None:
+                await run_in_threadpool(self._write, name, after)
+        if found is None:
+            await run_in_threadpool(self._storage.delete_prefix, layout.orbit(model_id, orbit_id))
+        elif found.state is OrbitState.succeeded:
+            await run_in_threadpool(self._storage.delete_prefix, layout.orbit_frames(model_id, orbit_id))
+        await run_in_threadpool(self._storage.delete, f"{layout.unfinished_orbits()}/{name}")
+
+    async def _next(self, name: str, found: Orbit) -> Orbit | None:
+        """Have the next part rendered, or the video made of all, and return the record; None if it was deleted."""
+        model_id, first = found.model, found.frames_done
+        if first < found.frames:
+            count = min(_part_frames(found.request), found.frames - first)
+            body = OrbitFrames(orbit=found.request, first=first, count=count)
+            path = layout.orbit_frames(model_id, found.id, first)
+            if not await self._asked(name, rendering.orbit_frames_path(model_id), body, path):
+                return None
+            return found.model_copy(update={"state": OrbitState.running, "frames_done": first + count})
+        path = layout.orbit_video(model_id, found.id)
+        whole = JoinOrbit(orbit=found.id, frames=found.frames)
+        if not await self._asked(name, rendering.orbit_join_path(model_id), whole, path):
+            return None
+        entry = await run_in_threadpool(self._storage.head, path)
+        if entry is None:
+            return None
+        return found.model_copy(
+            update={"state": OrbitState.succeeded, "bytes": entry.size, "finished_at": datetime.now(UTC)}
+        )
+
+    async def _asked(self, name: str, address: str, body: BaseModel, path: str) -> bool:
+        """Store what the renderer answers at `path`. Return False if the video was deleted meanwhile."""
+        task = self._asking[name] = asyncio.create_task(self._ask(name, address, body, path))
+        try:
+            await asyncio.wait({task})
+        finally:
+            self._asking.pop(name, None)
+            task.cancel()
+            await asyncio.wait({task})
+        if task.cancelled():
+            return False
+        task.result()
+        return True
+
+    async def _ask(self, name: str, address: str, body: BaseModel, path: str) -> None:
+        # Owners take turns in the renderer, and the videos of an owner with the views that its people look at.
+        headers = {rendering.CLIENT_HEADER: f"orbits of {name.partition('.')[0]}"}
+        try:
+            answer = await post(self._renderer, address, body.model_dump_json(), headers, self._seconds)
+        except ProblemError as error:
+            refused = isinstance(error.__cause__, httpx.ConnectError | httpx.ConnectTimeout)
+            raise _Delayed(error.problem, counts=not refused) from error
+        try:
+            if answer.status_code != 200:
+                raise _refusal(await answer.aread())
+            await self._storage.stream_put(path, answer.aiter_raw())
+        except httpx.TransportError as error:
+            detail = f"The renderer ended before its answer did ({type(error).__name__})."
+            raise _Delayed(_orbit_problem("render_failed", detail), counts=True) from error
+        finally:
+            await answer.aclose()
+
+    def _line(self, model_id: str) -> str:
+        """Return what the marks of all videos of a model's owner begin with."""
+        return hashlib.sha256((self._models.owner(model_id) or DEFAULT_OWNER).encode()).hexdigest()[:16]
+
+    def _read(self, model_id: str, orbit_id: str) -> Orbit | None:
+        path = layout.orbit_record(model_id, orbit_id)
+        try:
+            return _with_links(Orbit.model_validate_json(self._storage.get(path)))
+        except FileNotFoundError:
+            return None
+        except ValueError as error:
+            warn(path, reason(error))
+            return None
+
+    def _put(self, record: Orbit) -> None:
+        fields = record.model_dump(mode="json", exclude_none=True, exclude={"links"}) | {"format": FORMAT}
+        self._storage.put(layout.orbit_record(record.model, record.id), json.dumps(fields).encode())
+
+    def _write(self, name: str, record: Orbit) -> None:
+        """Store the record, unless the video or its model was deleted."""
+        self._put(record)
+        marked = self._storage.exists(f"{layout.unfinished_orbits()}/{name}")
+        if not (marked and self._storage.exists(layout.job_record(record.model))):
+            self._storage.delete_prefix(layout.orbit(record.model, record.id))
+
+
+def _id_of(etag: str, request: OrbitRequest) -> str:
+    parts = [_VERSION, etag, request.model_dump_json()]
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
+
+
+def _part_frames(request: OrbitRequest) -> int:
+    """Return the number of frames of a part of a video."""
+    fewest, most = PART_FRAMES
+    return max(fewest, min(most, PART_PIXELS // (request.width * request.height)))
+
+
+def _refusal(body: bytes) -> Exception:
+    """What an answer of the renderer without a video means: that it may be asked again, or a problem of the video."""
+    try:
+        found = Problem.model_validate_json(body)
+    except ValidationError:
+        found = _orbit_problem("render_failed", "The renderer answered without a problem document.")
+    if found.code not in PROBLEMS:
+        found = _orbit_problem("render_failed", found.detail)
+    if found.status >= 500 and found.code != "model_corrupt":
+        return _Delayed(found, counts=found.status != 503)
+    return ProblemError(found.code, found.detail, advice=found.advice, facts=found.facts)
+
+
+def _orbit_problem(code: str, detail: str) -> Problem:
+    advice = "Ask for the video again. If the problem persists, read the log of the renderer."
+    return Problem.of(code, detail, advice=advice)
+
+
+def _failed(found: Orbit, problem: Problem) -> Orbit:
+    return found.model_copy(
+        update={"state": OrbitState.failed, "problem": problem, "finished_at": datetime.now(UTC)}
+    )
+
+
+def _with_links(found: Orbit) -> Orbit:
+    base = f"/v1/models/{found.model}/orbits/{found.id}"
+    return found.model_copy(update={"links": {"self": base, "video": f"{base}/video"}})
