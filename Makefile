@@ -19,7 +19,7 @@ WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 2)))
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: help install demo quick test coverage check wheels docs screenshots bench soak capacity load serve sanitize clean
+.PHONY: help install demo quick test coverage check wheels docs screenshots bench soak capacity fleet load serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -64,6 +64,9 @@ soak: $(VENV)/.installed-dev ## faults at random moments against the whole servi
 
 capacity: $(VENV)/.installed-dev ## pages, memory and start of a service with a hundred thousand records (CAPACITY_ARGS="--records 2000")
 	$(BIN)/splatmill bench capacity $(CAPACITY_ARGS)
+
+fleet: $(VENV)/.installed-dev ## what 10 to 1,000 simulated workers ask of Redis and the API (some minutes; FLEET_ARGS="--workers 10")
+	$(BIN)/splatmill bench fleet $(FLEET_ARGS)
 
 load: $(VENV)/.installed-dev ## p50, p99, errors and memory against the number of clients (some minutes)
 	$(BIN)/splatmill bench load $(LOAD_ARGS)

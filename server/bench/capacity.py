@@ -34,6 +34,7 @@ from _capacity.followers import Served, follow_all
 from _capacity.operations import counted
 from _capacity.seed import FIRST, Seeded, seed
 from _capacity.table import write_table
+from _private_redis import running
 from _rows import Row, append, origin
 
 from splatmill.backplane import keys, memory
@@ -43,7 +44,6 @@ from splatmill_server.app import create_app
 from splatmill_server.paging import write_cursor
 from splatmill_server.service import Service
 from splatmill_server.settings import Settings
-from splatmill_server.up.redis_server import find
 
 HERE = Path(__file__).resolve().parent
 ROWS = HERE / "results" / "capacity.jsonl"
@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--table", action="store_true", help="write the table from the rows")
     asked = parser.parse_args(argv)
     if not asked.table:
-        with tempfile.TemporaryDirectory(prefix="capacity") as name, _redis(Path(name)) as url:
+        with tempfile.TemporaryDirectory(prefix="capacity") as name, running(Path(name)) as url:
             for row in measure(Path(name), url, asked.records, asked.followers):
                 print(row, flush=True)
                 append(ROWS, {**row, **origin("server", "client")})
@@ -134,13 +134,13 @@ async def _page(
     params: dict[str, Any] = {"limit": PAGE, **asked}
     if after is not None:
         params["cursor"] = write_cursor(int((FIRST.timestamp() + after) * 1000), f"{after:016x}")
-    with counted(service.storage) as cold:
+    with counted() as cold:
         began = time.perf_counter()
         (await http.get(f"/v1/{kind}", params=params)).raise_for_status()
         first = time.perf_counter() - began
     seconds, round_trips, storage = [], [], []
     for _ in range(REPEATS):
-        with counted(service.storage) as operations:
+        with counted() as operations:
             began = time.perf_counter()
             answer = (await http.get(f"/v1/{kind}", params=params)).raise_for_status().json()
             seconds.append(time.perf_counter() - began)
@@ -161,7 +161,7 @@ async def _page(
 
 def _timed(what: str, service: Service, act: Any) -> Row:
     """Time something, and count its operations."""
-    with counted(service.storage) as operations:
+    with counted() as operations:
         began = time.perf_counter()
         act()
         seconds = time.perf_counter() - began
@@ -172,21 +172,6 @@ def _timed(what: str, service: Service, act: Any) -> Row:
 def _memory(when: str, service: Service) -> Row:
     """Return the memory of Redis."""
     return {"what": f"memory {when}", "bytes": memory.read(service.redis).used}
-
-
-@contextmanager
-def _redis(folder: Path) -> Iterator[str]:
-    """Run a Redis in a folder."""
-    path = folder / "r.sock"
-    command = [str(find()[0]), "--port", "0", "--unixsocket", str(path), "--save", "", "--dir", str(folder)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    try:
-        while not path.exists():
-            time.sleep(0.02)
-        yield f"unix://{path}"
-    finally:
-        process.terminate()
-        process.wait(30)
 
 
 @contextmanager

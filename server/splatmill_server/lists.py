@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any, TypeVar, cast
 
 import redis
@@ -30,7 +31,8 @@ SCANNED = 2000
 """Largest number of records that are looked at for one page of a list."""
 
 BATCH = 200
-"""Number of records that are looked at together for a list that does not hold all of them."""
+"""Number of records that are looked at together at first for a list that does not hold all of them; then twice as many
+each time."""
 
 LONGEST_WAIT = 10.0
 """Seconds that a request waits for lists that are being made."""
@@ -45,13 +47,26 @@ _LOCK_SECONDS = 30.0
 """Seconds after which the lock of a process that died is free again. The process that makes the lists renews it."""
 
 
+@dataclass(frozen=True)
+class Ended:
+    """What a list of models tells of a job that has succeeded.
+
+    moment: the time of its end in milliseconds.
+    """
+
+    moment: int
+    owner: str
+    name: str | None
+
+
 class Lists:
     """The lists of one service."""
 
     def __init__(self, connection: redis.Redis) -> None:
         self.connection = connection
-        self.makers: list[Callable[[], int]] = []
-        """Each makes the lists of one kind from storage, and returns the number of records."""
+        self.makers: list[Callable[[dict[str, Ended]], int]] = []
+        """Each makes the lists of one kind from storage, and returns the number of records. The first, that of jobs,
+        adds those that have succeeded to what it is given, so that the records of their models need not be read."""
 
     def page(
         self,
@@ -61,12 +76,15 @@ class Lists:
         read: Callable[[Sequence[str]], Mapping[str, T]],
         *,
         narrowed: bool,
+        likely: Callable[[Sequence[str]], list[str]] | None = None,
     ) -> tuple[list[T], str | None]:
         """Return the records of a page, newest first, and the cursor of the next one.
 
         names: the lists whose union is paged through.
         read: returns those of the records with these ids that belong to the list, by id.
         narrowed: whether `read` leaves out more than a few.
+        likely: leaves out many of those that do not belong to the list, and none that does, for less than `read`, which
+            then gets as many as the page still needs.
 
         At most SCANNED records are looked at; a page then holds fewer than `limit`, and has a cursor all the same.
         Raises problems for a cursor that is not valid (422), and while the lists are being made (503).
@@ -78,14 +96,18 @@ class Lists:
         while len(found) <= limit and scanned < SCANNED and not ended:
             batch = self.newest(names, after, size)
             ended = len(batch) < size
-            scanned, size = scanned + len(batch), max(limit + 1, BATCH)
+            scanned += len(batch)
+            size = min(max(2 * size, BATCH), SCANNED - scanned)
             after = batch[-1] if batch else after
-            admitted = read([record_id for _, record_id in batch])
-            found += [
-                (moment, record_id, admitted[record_id])
-                for moment, record_id in batch
-                if record_id in admitted
-            ]
+            moments = {record_id: moment for moment, record_id in batch}
+            left = likely(list(moments)) if likely is not None else list(moments)
+            while left and len(found) <= limit:
+                together = limit + 1 - len(found) if likely is not None else len(left)
+                admitted = read(left[:together])
+                found += [
+                    (moments[name], name, admitted[name]) for name in left[:together] if name in admitted
+                ]
+                left = left[together:]
         following = None
         if len(found) > limit:
             following = write_cursor(*found[limit - 1][:2])
@@ -133,7 +155,8 @@ class Lists:
         renewal = threading.Thread(target=_renew, args=(lock, done), name="lists", daemon=True)
         renewal.start()
         try:
-            counts = [make() for make in self.makers]
+            succeeded: dict[str, Ended] = {}
+            counts = [make(succeeded) for make in self.makers]
             self.connection.set(keys.LISTED, lists.VERSION)
         finally:
             done.set()

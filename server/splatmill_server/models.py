@@ -3,7 +3,7 @@
 import json
 import re
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import ValidationError
@@ -25,7 +25,7 @@ from splatmill.schema import (
 )
 from splatmill_server.filters import Filter
 from splatmill_server.jobs.records import Jobs, read_record
-from splatmill_server.lists import Lists, each
+from splatmill_server.lists import Ended, Lists, each
 from splatmill_server.problems import ProblemError
 
 _HEADER_BYTES = 8192
@@ -184,18 +184,24 @@ class Models:
             lists.add_model(self.lists.connection, record.id, moment, record.owner or DEFAULT_OWNER)
         return len(found)
 
-    def make_lists(self) -> int:
-        """List all models in storage, and return their number. Their files are read when they are first asked for."""
+    def make_lists(self, succeeded: Mapping[str, Ended]) -> int:
+        """List all models in storage, and return their number. Their files are read when they are first asked for.
+
+        succeeded: jobs that have, whose models need no reading; the record of any other is read.
+        """
         connection, count = self.lists.connection, 0
         lists.clear(connection, "models")
         ids = [name for name in self.storage.children(layout.models()) if layout.is_id(name)]
         for start in range(0, len(ids), _LISTED_TOGETHER):
             batch = ids[start : start + _LISTED_TOGETHER]
-            found = {record.id: record for record in each(self._record, batch) if record is not None}
+            found = {model_id: succeeded[model_id] for model_id in batch if model_id in succeeded}
+            others = [model_id for model_id in batch if model_id not in succeeded]
+            found |= {
+                record.id: _ended(record) for record in each(self._record, others) if record is not None
+            }
             with connection.pipeline() as pipe:
                 for model_id, record in found.items():
-                    moment = lists.milliseconds(record.finished_at or record.created_at)
-                    lists.add(pipe, "models", model_id, moment, record.owner or DEFAULT_OWNER)
+                    lists.add(pipe, "models", model_id, record.moment, record.owner)
                 pipe.execute()
             names = {model_id: _Named(name=record.name) for model_id, record in found.items()}
             self.lists.keep("models", {model_id: _keep(named) for model_id, named in names.items()})
@@ -275,6 +281,12 @@ class Models:
             return None, None
         measured = [point for point in report.curve if point.psnr is not None]
         return (measured[-1].psnr, measured[-1].ssim) if measured else (None, None)
+
+
+def _ended(record: Job) -> Ended:
+    """Return what a list of models tells of the record of one."""
+    moment = lists.milliseconds(record.finished_at or record.created_at)
+    return Ended(moment, record.owner or DEFAULT_OWNER, record.name)
 
 
 def _links(model_id: str) -> dict[str, str]:

@@ -52,8 +52,10 @@ LATEST: dict[type, str] = {ProgressEvent: "progress", PreviewEvent: "preview"}
 """The types of events whose newest entry is in the hash `keys.latest` too, each with its field. So no reader looks for
 them in a stream of thousands of entries."""
 
-# KEYS: stream, hash of the newest entries. ARGV: generation, attempt, event, format, bound or "", field or "".
+# KEYS: stream, hash of the newest entries, states. ARGV: generation, attempt, event, format, bound or "", field or "",
+# "1" if nothing is to be appended where there are no states.
 _APPEND = """
+if ARGV[7] == '1' and redis.call('EXISTS', KEYS[3]) == 0 then return false end
 local bound = ARGV[5] == '' and {} or {'MAXLEN', '~', ARGV[5]}
 local entry = {'*', 'g', ARGV[1], 'a', ARGV[2], 'e', ARGV[3], 'format', ARGV[4]}
 for _, part in ipairs(entry) do bound[#bound + 1] = part end
@@ -123,12 +125,25 @@ def begin_attempt(connection: redis.Redis, job_id: str) -> int:
 
 def append(connection: redis.Redis, job_id: str, generation: int, attempt: int, event: Event) -> str:
     """Append an event to its stream and return the id of the entry. For workers."""
+    return cast(bytes, _append(connection, job_id, generation, attempt, event, known=False)).decode()
+
+
+def append_if_known(
+    connection: redis.Redis, job_id: str, generation: int, attempt: int, event: Event
+) -> bool:
+    """Append an event unless Redis has no states of the job, as one that has lost its data. Return whether it has."""
+    return _append(connection, job_id, generation, attempt, event, known=True) is not None
+
+
+def _append(
+    connection: redis.Redis, job_id: str, generation: int, attempt: int, event: Event, *, known: bool
+) -> bytes | None:
     stream = stream_of(event)
     bound, field = BOUNDS[stream], LATEST.get(type(event), "")
     entry = generation, attempt, event.model_dump_json(exclude_none=True), FORMAT
     script = connection.register_script(_APPEND)
-    found = script(keys=[stream(job_id), keys.latest(job_id)], args=[*entry, bound or "", field])
-    return cast(bytes, found).decode()
+    names = [stream(job_id), keys.latest(job_id), keys.states(job_id)]
+    return cast("bytes | None", script(keys=names, args=[*entry, bound or "", field, int(known)]))
 
 
 Entries = Iterable[tuple[bytes, Mapping[bytes, bytes]]]

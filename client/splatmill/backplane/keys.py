@@ -30,6 +30,9 @@ WRITABLE = PREFIX + "writable"
 TOTALS = PREFIX + "totals"
 """Hash of what is counted for the whole service (see `totals`), by field."""
 
+TIDIED = PREFIX + "queue:tidied"
+"""String that exists while no worker needs to tidy RQ's lists of entries and of workers, since one has. It expires."""
+
 PLACES = PREFIX + "queue:places"
 """Hash of the waiting entries: entry to `<line>:<owner>`, the sorted set that holds it."""
 

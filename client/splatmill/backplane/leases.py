@@ -8,7 +8,7 @@ here is that of Redis, read in the same step.
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
@@ -143,6 +143,14 @@ def drop(connection: redis.Redis, lease: Lease) -> None:
 def held(connection: redis.Redis) -> list[Lease]:
     """Return all leases, also the expired ones. A member of another form is removed and logged."""
     return _leases(connection, cast(list[bytes], connection.zrange(key(), 0, -1)))
+
+
+def owners(connection: redis.Redis, held_leases: Sequence[Lease]) -> list[str | None]:
+    """Return the name of the worker that holds each of these leases; None where its record has expired."""
+    with connection.pipeline(transaction=False) as pipe:
+        for lease in held_leases:
+            pipe.hget(f"rq:execution:{lease.member}", "worker_name")
+        return [name.decode() if name is not None else None for name in pipe.execute()]
 
 
 def running(connection: redis.Redis) -> dict[str, float]:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, cast
+from typing import cast
 
 import redis
 from rq.worker_registration import REDIS_WORKER_KEYS
@@ -12,6 +12,7 @@ from splatmill.backplane.lines import LINES, Line
 
 _LINES_FIELD = "splatmill_lines"
 _SPARE_FIELD = "splatmill_spare"
+_FIELDS = ("death", "state", "current_job", "last_heartbeat", _LINES_FIELD, _SPARE_FIELD)
 
 
 @dataclass(frozen=True)
@@ -57,12 +58,13 @@ def recorded(connection: redis.Redis, names: Iterable[bytes]) -> list[WorkerReco
     known = sorted(names)
     with connection.pipeline(transaction=False) as pipe:
         for worker_key in known:
-            pipe.hgetall(worker_key)
-        replies = cast(list[dict[bytes, bytes]], pipe.execute())
+            pipe.hmget(worker_key, *_FIELDS)
+        replies = cast(list[list[bytes | None]], pipe.execute())
+    found = zip(known, (dict(zip(_FIELDS, reply, strict=True)) for reply in replies), strict=True)
     return [
-        _record(worker_key.decode(), {key.decode(): value for key, value in stored.items()})
-        for worker_key, stored in zip(known, replies, strict=True)
-        if stored and b"death" not in stored
+        _record(worker_key.decode(), {name: value for name, value in stored.items() if value is not None})
+        for worker_key, stored in found
+        if stored["death"] is None and any(value is not None for value in stored.values())
     ]
 
 
@@ -71,7 +73,7 @@ def serving(workers: Iterable[WorkerRecord], line: Line) -> list[WorkerRecord]:
     return [worker for worker in workers if line in worker.lines]
 
 
-def _record(worker_key: str, stored: dict[str, Any]) -> WorkerRecord:
+def _record(worker_key: str, stored: dict[str, bytes]) -> WorkerRecord:
     names = stored.get(_LINES_FIELD, b"").decode().split(",")
     return WorkerRecord(
         key=worker_key,

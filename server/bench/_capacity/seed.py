@@ -6,11 +6,12 @@ one, and the files of a model. Redis knows nothing of them: it is filled as one 
 
 import json
 import random
-import struct
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+
+from _one_gaussian import ply
 
 from splatmill.backplane import layout
 from splatmill.backplane.records import FORMAT
@@ -99,12 +100,7 @@ def _store(storage: Storage, number: int, name: str, state: str) -> None:
 
 
 def _store_model(storage: Storage, name: str, ended: dict[str, object]) -> None:
-    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    header = ["ply", "format binary_little_endian 1.0", "element vertex 1"]
-    header += [f"property float {field}" for field in names] + ["end_header", ""]
-    body = struct.pack(f"<{len(names)}f", *([0.0] * len(names)))
-    storage.put(layout.model_file(name, "model.ply"), "\n".join(header).encode() + body)
+    storage.put(layout.model_file(name, "model.ply"), ply())
     curve = [{"seconds": 3.0, "step": 100, "psnr": 27.5, "ssim": 0.9, "gaussians": 1}]
     report = {"curve": curve, "seconds": {"sfm": 1.0, "train": 3.0, "evaluate": 0.1}}
     storage.put(layout.model_file(name, "report.json"), json.dumps(report).encode())

@@ -14,12 +14,13 @@ Times are those of the machine's monotonic clock, which all processes share and 
 import fcntl
 import json
 import os
-import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+
+from _one_gaussian import ply
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage, StorageError
@@ -29,12 +30,6 @@ from splatmill_worker.settings import storage_url
 
 SCRIPT = "soak.json"
 """Name of the image of a capture that is no photo: a job on it takes the steps that it lists, without the engine."""
-
-_PROPERTIES = (
-    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"),
-    *("rot_0", "rot_1", "rot_2", "rot_3"),
-)
-_GAUSSIAN = (0.0, 0.0, 0.0, 1.7, -1.7, -1.7, 4.0, -2.2, -2.2, -2.2, 1.0, 0.0, 0.0, 0.0)
 
 
 def run(
@@ -109,10 +104,7 @@ def _steps(
     emit(StateEvent(state=JobState.exporting))
     out = workdir / "out"
     out.mkdir(exist_ok=True)
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {script['gaussians']}"]
-    header += [f"property float {name}" for name in _PROPERTIES] + ["end_header", ""]
-    body = struct.pack(f"<{len(_GAUSSIAN)}f", *_GAUSSIAN) * int(script["gaussians"])
-    (out / "model.ply").write_bytes("\n".join(header).encode() + body)
+    (out / "model.ply").write_bytes(ply(int(script["gaussians"])))
     curve = [{"seconds": 1.0, "step": total, "psnr": 30.0, "gaussians": script["gaussians"]}]
     (out / "report.json").write_text(json.dumps({"curve": curve, "seconds": {}}))
     (out / "cameras.json").write_text(json.dumps({"cameras": []}))

@@ -186,8 +186,8 @@ class Captures:
         self._list(list(found.values()))
         return len(found)
 
-    def make_lists(self) -> int:
-        """List all captures in storage, and return their number."""
+    def make_lists(self, succeeded: object = None) -> int:
+        """List all captures in storage, and return their number (see `Lists.makers`)."""
         connection = self.lists.connection
         lists.clear(connection, "captures")
         ids = self.storage.children(layout.captures())

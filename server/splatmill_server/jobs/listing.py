@@ -1,6 +1,8 @@
 """Pages of the list of jobs: the list that is asked for, and which of its jobs belong to the page."""
 
 from collections.abc import Mapping, Sequence
+from string import Template
+from typing import cast
 
 import redis
 
@@ -8,19 +10,54 @@ from splatmill.backplane import keys, lists
 from splatmill.schema import JobPage
 from splatmill_server.filters import JobFilter
 from splatmill_server.jobs.links import with_links
-from splatmill_server.jobs.queue_places import with_places
+from splatmill_server.jobs.queue_places import QueuePlaces
 from splatmill_server.jobs.reading import Held, read_jobs
 from splatmill_server.lists import Lists
 
+# ARGV: number of states, states, jobs. For each job: whether it may be in one of the states (in any, if none is given),
+# and the fields of its row. A verdict and a restart say more than the states do, so that such jobs are always likely.
+_GLANCE = Template(
+    """
+local count, found = tonumber(ARGV[1]), {}
+
+local function likely(job, verdict, generation)
+  if count == 0 or verdict or generation ~= '1' then return 1 end
+  local told = redis.call('XRANGE', '${job}' .. job .. ':states', '-', '+')
+  for index = 2, count + 1 do
+    if ARGV[index] == 'queued' and #told == 0 then return 1 end
+    local wanted = '"state":"' .. ARGV[index] .. '"'
+    for _, entry in ipairs(told) do
+      for _, part in ipairs(entry[2]) do
+        if string.find(part, wanted, 1, true) then return 1 end
+      end
+    end
+  end
+  return false
+end
+
+for index = count + 2, #ARGV do
+  local row = redis.call('HMGET', '${job}' .. ARGV[index], 'verdict', 'generation', ${fields})
+  found[#found + 1] = {likely(ARGV[index], row[1], row[2] or '1'), unpack(row, 3)}
+end
+return found
+"""
+).substitute(job=keys.job(""), fields=", ".join(f"'{name}'" for name in JobFilter.FIELDS))
+
 
 def page(
-    connection: redis.Redis, listed: Lists, cursor: str | None, limit: int, wanted: JobFilter
+    connection: redis.Redis,
+    listed: Lists,
+    places: QueuePlaces,
+    cursor: str | None,
+    limit: int,
+    wanted: JobFilter,
 ) -> JobPage:
     """Return a page of the jobs that `wanted` admits, newest first. Raises the problems of `Lists.page`."""
 
+    def likely(job_ids: Sequence[str]) -> list[str]:
+        return _likely(connection, job_ids, wanted)
+
     def read(job_ids: Sequence[str]) -> Mapping[str, Held]:
-        if wanted.name is not None:
-            job_ids = _admitted(connection, job_ids, wanted)
         held = read_jobs(connection, job_ids)
         return {
             job_id: found
@@ -29,11 +66,12 @@ def page(
             and (wanted.states is None or found.state in wanted.states)
         }
 
-    unfinished = wanted.states is not None and not all(state.final for state in wanted.states)
-    narrowed = wanted.name is not None or unfinished
-    found, following = listed.page(_lists(wanted), cursor, limit, read, narrowed=narrowed)
+    narrowed = wanted.name is not None or wanted.states is not None
+    found, following = listed.page(
+        _lists(wanted), cursor, limit, read, narrowed=narrowed, likely=likely if narrowed else None
+    )
     jobs = [(with_links(held.job()), held.row.generation) for held in found]
-    return JobPage(jobs=with_places(connection, jobs), cursor=following)
+    return JobPage(jobs=places.fill(jobs), cursor=following)
 
 
 def _lists(wanted: JobFilter) -> list[str]:
@@ -49,10 +87,18 @@ def _lists(wanted: JobFilter) -> list[str]:
     return [lists.name("jobs", owner=wanted.owner, group=group) for group in groups]
 
 
-def _admitted(connection: redis.Redis, job_ids: Sequence[str], wanted: JobFilter) -> list[str]:
-    """Return those of the jobs whose rows the filter admits, read without their options."""
-    with connection.pipeline(transaction=False) as pipe:
-        for job_id in job_ids:
-            pipe.hmget(keys.job(job_id), *JobFilter.FIELDS)
-        rows = [dict(zip(JobFilter.FIELDS, reply, strict=True)) for reply in pipe.execute()]
-    return [job_id for job_id, fields in zip(job_ids, rows, strict=True) if wanted.admits_row(fields)]
+def _likely(connection: redis.Redis, job_ids: Sequence[str], wanted: JobFilter) -> list[str]:
+    """Return those of the jobs whose rows the filter admits, and which may be in one of its states.
+
+    One script reads a few fields of each row, and of the states no more than whether they name a wanted one: many jobs
+    that wait, or run, are looked at for a page of those that do not.
+    """
+    if not job_ids:
+        return []
+    states = sorted(state.value for state in wanted.states or ())
+    script = connection.register_script(_GLANCE)
+    replies = cast(list[list[bytes | None]], script(args=[len(states), *states, *job_ids]))
+    rows = [dict(zip(("likely", *JobFilter.FIELDS), reply, strict=True)) for reply in replies]
+    return [
+        job_id for job_id, row in zip(job_ids, rows, strict=True) if row["likely"] and wanted.admits_row(row)
+    ]

@@ -25,9 +25,9 @@ from splatmill_server.jobs import curve as job_curve
 from splatmill_server.jobs import listing, outcome, requests, restoring, shrinking
 from splatmill_server.jobs import log as job_log
 from splatmill_server.jobs.links import with_links
-from splatmill_server.jobs.queue_places import with_places
+from splatmill_server.jobs.queue_places import QueuePlaces
 from splatmill_server.jobs.reading import read_jobs
-from splatmill_server.lists import Lists
+from splatmill_server.lists import Ended, Lists
 from splatmill_server.metrics import Metrics
 from splatmill_server.problems import ProblemError
 from splatmill_server.space.marks import DELETING, check_marks, mark_keys, needs_of
@@ -47,6 +47,7 @@ class Jobs:
         self.storage = storage
         self.metrics = metrics
         self.lists = listed
+        self._places = QueuePlaces(connection)
         self.on_end: list[Callable[[Job, int], None]] = []
         """Called with a job that has ended, and its generation, before it is forgotten that it was unfinished.
 
@@ -160,7 +161,7 @@ class Jobs:
     def get(self, job_id: str) -> Job:
         """Return the job as clients see it. A job that has ended is read from storage if Redis has lost it."""
         if layout.is_id(job_id) and (held := read_jobs(self.connection, [job_id]).get(job_id)) is not None:
-            return with_places(self.connection, [(with_links(held.job()), held.row.generation)])[0]
+            return self._places.fill([(with_links(held.job()), held.row.generation)])[0]
         if (stored := self.stored(job_id)) is not None:
             return stored
         return self._placed(self.row(job_id))  # raises what is wrong with the row, or that there is none
@@ -180,11 +181,11 @@ class Jobs:
 
     def page(self, cursor: str | None, limit: int, wanted: JobFilter | None = None) -> JobPage:
         """Return a page of the jobs that `wanted` admits, newest first (see `Lists.page`)."""
-        return listing.page(self.connection, self.lists, cursor, limit, wanted or JobFilter())
+        return listing.page(self.connection, self.lists, self._places, cursor, limit, wanted or JobFilter())
 
-    def make_lists(self) -> int:
-        """List all jobs, restore those that storage alone knows, and return their number."""
-        return restoring.make_lists(self.connection, self.storage, self.lists)
+    def make_lists(self, succeeded: dict[str, Ended]) -> int:
+        """List all jobs, restore those that storage alone knows, and return their number (see `Lists.makers`)."""
+        return restoring.make_lists(self.connection, self.storage, self.lists, succeeded)
 
     def restore(self, job_ids: Sequence[str]) -> int:
         """Restore those of these unfinished jobs that Redis has lost, and return their number."""
@@ -431,7 +432,7 @@ class Jobs:
         return with_links(fold(found, states, events.last_progress(self.connection, found.id)))
 
     def _placed(self, found: JobRow) -> Job:
-        return with_places(self.connection, [(self._job(found), found.generation)])[0]
+        return self._places.fill([(self._job(found), found.generation)])[0]
 
     def _change(
         self,

@@ -18,7 +18,7 @@ from splatmill.schema import Event, Job, JobState, PlanEvent, ProgressEvent, Sta
 from splatmill_server.jobs import log as job_log
 from splatmill_server.jobs import requests, shrinking
 from splatmill_server.jobs.reading import read_jobs
-from splatmill_server.lists import Lists, each
+from splatmill_server.lists import Ended, Lists, each
 
 log = structlog.get_logger()
 
@@ -28,16 +28,19 @@ GRACE = leases.LEASE
 _BATCH = 500
 
 
-def make_lists(connection: redis.Redis, storage: Storage, listed: Lists) -> int:
-    """List all jobs that have rows, restore those that storage alone knows, and return the number of both."""
+def make_lists(connection: redis.Redis, storage: Storage, listed: Lists, succeeded: dict[str, Ended]) -> int:
+    """List all jobs that have rows, restore those that storage alone knows, and return the number of both.
+
+    succeeded: gets the jobs that have.
+    """
     lists.clear(connection, "jobs")
-    count = _list_rows(connection, storage)
+    count = _list_rows(connection, storage, succeeded)
     unfinished = requests.names(storage)
     for start in range(0, len(unfinished), _BATCH):
         count += restore_unfinished(connection, storage, unfinished[start : start + _BATCH])
     ended = storage.children(layout.jobs())
     for start in range(0, len(ended), _BATCH):
-        count += _restore_ended(connection, storage, listed, ended[start : start + _BATCH])
+        count += _restore_ended(connection, storage, listed, ended[start : start + _BATCH], succeeded)
     return count
 
 
@@ -85,7 +88,7 @@ def _unfinished(storage: Storage, job_id: str) -> JobRow | None:
     return found
 
 
-def _list_rows(connection: redis.Redis, storage: Storage) -> int:
+def _list_rows(connection: redis.Redis, storage: Storage, succeeded: dict[str, Ended]) -> int:
     """List the jobs that have rows, each in its group."""
     active = {entry.decode() for entry in cast(set[bytes], connection.smembers(keys.ACTIVE))}
     now, count = connection.time()[0], 0
@@ -99,6 +102,7 @@ def _list_rows(connection: redis.Redis, storage: Storage) -> int:
                 lists.put_job(pipe, job_id, created, found.row.owner, found.row.capture, group)
                 if not unfinished:
                     shrinking.note(pipe, job_id, now)
+                    _note(succeeded, found.job())
             pipe.execute()
         for found in held.values():
             if not found.state.final:  # an earlier version stored no requests
@@ -107,7 +111,13 @@ def _list_rows(connection: redis.Redis, storage: Storage) -> int:
     return count
 
 
-def _restore_ended(connection: redis.Redis, storage: Storage, listed: Lists, job_ids: Sequence[str]) -> int:
+def _restore_ended(
+    connection: redis.Redis,
+    storage: Storage,
+    listed: Lists,
+    job_ids: Sequence[str],
+    succeeded: dict[str, Ended],
+) -> int:
     """Restore those of the jobs that have ended and have no row, and return their number."""
     missing = [job_id for job_id in without_row(connection, job_ids) if layout.is_id(job_id)]
     ends = [
@@ -116,6 +126,7 @@ def _restore_ended(connection: redis.Redis, storage: Storage, listed: Lists, job
     with connection.pipeline() as pipe:
         for end in ends:
             _restore(pipe, end.job, end.generation)
+            _note(succeeded, end.job)
         pipe.execute()
     for job_id in listed.deleted(StoredKind.model, [end.job.id for end in ends]):
         if not storage.exists(layout.job_log(job_id)):
@@ -125,6 +136,13 @@ def _restore_ended(connection: redis.Redis, storage: Storage, listed: Lists, job
                 lists.remove_job(pipe, job_id, end.job.owner, end.job.capture)
                 pipe.execute()
     return len(ends)
+
+
+def _note(succeeded: dict[str, Ended], job: Job) -> None:
+    """Note a job if it has succeeded. It ended just after its model was stored."""
+    if job.state is JobState.succeeded:
+        moment = lists.milliseconds(job.finished_at or job.created_at)
+        succeeded[job.id] = Ended(moment, job.owner or JobRow.model_fields["owner"].default, job.name)
 
 
 def _restore(pipe: Any, job: Job, generation: int) -> None:

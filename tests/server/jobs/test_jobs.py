@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from splatmill.backplane import keys, layout, queue, row
-from splatmill.schema import JobState, Problem, ProgressEvent, StateEvent
+from splatmill.schema import JobState, PlanEvent, Problem, ProgressEvent, StateEvent
 from splatmill_server import lists
 from tests.support.served_app import ServedApp, problem, raw, stored
 
@@ -163,6 +163,35 @@ def pages(app: ServedApp, **params: Any) -> list[str]:
         if page["cursor"] is None:
             return seen
         params["cursor"] = page["cursor"]
+
+
+def test_a_list_by_state_holds_each_job_that_is_in_the_state_and_no_other(app: ServedApp) -> None:
+    capture_id = app.capture()
+    jobs = [app.job(capture_id) for _ in range(7)]
+    waits, runs, again, ended, late, restarted, cancelled = jobs
+    for job_id in (runs, again, ended, late, restarted):
+        app.begin(job_id)
+        app.say(job_id, PlanEvent(plan={"text": '"state":"failed"'}), StateEvent(state=JobState.training))
+    app.say(again, StateEvent(state=JobState.queued))
+    app.say(late, StateEvent(state=JobState.succeeded), StateEvent(state=JobState.queued))
+    for job_id in (ended, restarted):
+        app.say(job_id, StateEvent(state=JobState.failed, problem=Problem.of("diverged", "It diverged.")))
+    app.http.post(f"/v1/jobs/{restarted}/restart").raise_for_status()
+    app.http.post(f"/v1/jobs/{cancelled}/cancel").raise_for_status()
+    app.service.reaper.tick()
+    states = {job_id: app.state(job_id) for job_id in jobs}
+    assert states == {
+        waits: "queued",
+        runs: "training",
+        again: "queued",
+        ended: "failed",
+        late: "succeeded",
+        restarted: "queued",
+        cancelled: "cancelled",
+    }
+    for state in JobState:
+        listed = {job_id for job_id, found in states.items() if found == state.value}
+        assert set(pages(app, limit=1, state=state.value)) == listed, state
 
 
 def test_a_page_of_a_narrowed_list_looks_at_a_limited_number_of_jobs(

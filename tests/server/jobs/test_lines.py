@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import redis
+from _capacity.operations import counted
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rq import Retry
@@ -14,6 +15,7 @@ from rq import Retry
 from splatmill.backplane import entries, keys, leases, lines, queue, workers
 from splatmill.backplane.lines import LINES, Line
 from splatmill.schema import Backend, TrainOptions
+from splatmill_server.jobs import queue_places
 from splatmill_server.jobs.queue_places import start_after
 from tests.support.jobs import write_row
 from tests.support.queue_entries import take, waiting
@@ -242,3 +244,18 @@ def test_jobs_are_listed_while_redis_refuses_writes(app: ServedApp) -> None:
     finally:
         app.redis.config_set("min-replicas-to-write", "0")
     assert shown(app, late)[0] == 1
+
+
+def test_many_workers_are_not_read_for_each_job_that_waits(
+    app: ServedApp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(queue_places, "_FRESH_SECONDS_EACH", 60.0)
+    jobs = app.service.jobs
+    job_id = app.job()
+    assert jobs.get(job_id).waiting_for == "any"
+    listen(app.redis, "plain", "any", "cpu")
+    assert jobs.get(job_id).waiting_for is None, "without workers, each look reads them"
+    listen(app.redis, "another", "any")
+    with counted() as operations:
+        assert jobs.get(job_id).queue_position == 0
+    assert operations.round_trips == 2, "the job, and its place in the queue"

@@ -4,6 +4,7 @@ Does not prove how the server reads them: tests/server does.
 """
 
 import redis
+from _capacity.operations import counted
 
 from splatmill.backplane import events
 from splatmill.schema import Event, JobState, LogEvent, PlanEvent, ProgressEvent, StateEvent
@@ -78,3 +79,16 @@ def test_what_is_said_while_redis_is_away_arrives_when_it_is_back(redis_server: 
         "after",
     ]
     assert len(events.read_states(connection, "job00001")) == 1
+
+
+def test_an_event_is_one_round_trip(connection: redis.Redis) -> None:
+    outbox = Outbox(Attempt(connection, "job00001", 1, 1, JobLock(connection, "job00001", "a")))
+    outbox.put(StateEvent(state=JobState.training))
+    assert outbox.flush()
+    with counted() as operations:
+        for line in range(20):
+            outbox.put(LogEvent(message=f"line {line}"))
+        assert outbox.flush()
+    outbox.close()
+    assert operations.round_trips == 20
+    assert len(events.read_log(connection, "job00001")) == 20

@@ -41,9 +41,9 @@ class Attempt:
         """Append an event to the job's streams under the number of this attempt."""
         events.append(self.connection, self.job_id, self.generation, self.number, event)
 
-    def is_known(self) -> bool:
-        """Return whether Redis still has the states of the job; it has not if it lost its data."""
-        return bool(self.connection.exists(keys.states(self.job_id)))
+    def report_if_known(self, event: Event) -> bool:
+        """Append an event if Redis still has the states of the job; it has not if it lost its data. Return whether."""
+        return events.append_if_known(self.connection, self.job_id, self.generation, self.number, event)
 
     def rejoin(self) -> None:
         """Take the lock and the number of this attempt again, in a Redis that has lost both."""

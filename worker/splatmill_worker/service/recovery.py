@@ -7,6 +7,7 @@ record, so that another one on the same machine can tell that it is dead.
 import json
 import os
 import signal
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, cast
 
@@ -65,16 +66,17 @@ def requeue_orphans(worker: Worker) -> None:
     """Requeue the entries of dead workers, and delete the records of these workers."""
     queue = worker.queues[0]
     others = [key for key in get_keys(queue) if key != worker.key]
-    dead = {key for key in others if _worker_is_dead(worker.connection, key)}
-    for lease in leases.held(worker.connection):
-        _requeue_if_orphaned(worker, lease)
-    living = [found for found in workers.listening(worker.connection) if found.key not in dead]
-    if all(found.lines for found in living):
-        # Workers of earlier versions, which serve no lines, keep an entry in this list between taking it and
-        # registering it. With none of them alive, every entry in it belonged to a dead one.
-        for entry_id in queue.intermediate_queue.get_job_ids():
-            if worker.connection.lrem(queue.intermediate_queue_key, 1, entry_id):
-                queue.push_job_id(entry_id)
+    dead = set(_dead_workers(worker.connection, others))
+    living_names = {
+        key.removeprefix(worker.redis_worker_namespace_prefix) for key in others if key not in dead
+    }
+    held = leases.held(worker.connection)
+    for lease, owner in zip(held, leases.owners(worker.connection, held), strict=True):
+        if owner not in living_names:
+            _requeue_if_orphaned(worker, lease)
+    for entry_id in _kept_by_dead_workers(worker, dead):
+        if worker.connection.lrem(queue.intermediate_queue_key, 1, entry_id):
+            queue.push_job_id(entry_id)
     for key in dead:
         with worker.connection.pipeline() as pipeline:
             pipeline.srem(worker.redis_workers_keys, key)
@@ -83,12 +85,42 @@ def requeue_orphans(worker: Worker) -> None:
             pipeline.execute()
 
 
-def _worker_is_dead(connection: redis.Redis, worker_key: str) -> bool:
-    """Return whether a registered worker is certainly dead, or has been silent until its record expired."""
-    recorded = cast(bytes | None, connection.hget(worker_key, _PROCESS_FIELD))
-    if recorded is None:
-        return not connection.exists(worker_key)
-    return ProcessIdentity.load(json.loads(recorded)).dead()
+def _kept_by_dead_workers(worker: Worker, dead: set[str]) -> list[str]:
+    """Return the entries that workers of earlier versions had taken and not registered when they died.
+
+    Those serve no lines, and keep such an entry in a list of RQ. With none of them alive, every entry in it belonged to
+    a dead one.
+    """
+    found: list[str] = worker.queues[0].intermediate_queue.get_job_ids()
+    if not found:
+        return []
+    living = [other for other in workers.listening(worker.connection) if other.key not in dead]
+    return found if all(other.lines for other in living) else []
+
+
+def _dead_workers(connection: redis.Redis, worker_keys: Sequence[str]) -> list[str]:
+    """Return those of the registered workers that are certainly dead, or silent until their records expired.
+
+    It takes two round trips, because a worker that starts looks at all others.
+    """
+    with connection.pipeline(transaction=False) as pipe:
+        for key in worker_keys:
+            pipe.hget(key, _PROCESS_FIELD)
+        recorded = cast(list[bytes | None], pipe.execute())
+        silent = [key for key, process in zip(worker_keys, recorded, strict=True) if process is None]
+        for key in silent:
+            pipe.exists(key)
+        gone = [key for key, there in zip(silent, pipe.execute(), strict=True) if not there]
+    ended = {
+        process: ProcessIdentity.load(json.loads(process)).dead()
+        for process in set(recorded)
+        if process is not None
+    }
+    return gone + [
+        key
+        for key, process in zip(worker_keys, recorded, strict=True)
+        if process is not None and ended[process]
+    ]
 
 
 def _requeue_if_orphaned(worker: Worker, lease: Lease) -> None:
@@ -98,7 +130,7 @@ def _requeue_if_orphaned(worker: Worker, lease: Lease) -> None:
     holder = lock.holder()
     try:
         owner = Execution.fetch(lease.execution, lease.entry, connection).worker_name
-        orphaned = _worker_is_dead(connection, worker.redis_worker_namespace_prefix + owner)
+        orphaned = bool(_dead_workers(connection, [worker.redis_worker_namespace_prefix + owner]))
     except ValueError:
         # The record of the execution has expired. The lock has not, and it names the process.
         orphaned = holder is not None and holder.process.visible() and holder.process.dead()

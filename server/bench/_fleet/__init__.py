@@ -1,0 +1,1 @@
+"""Parts of `bench fleet`: simulated workers in a few processes, the API in this one, and meters of Redis."""
