@@ -56,8 +56,11 @@ def test_every_backend_has_the_same_stems(backend: str):
         # An attempt imports this before its first word; matplotlib would take a fifth of that time.
         ("splatmill_worker.pipeline", {"matplotlib", "triton"}),
         ("splatmill_worker.kernels", {"triton", "pycolmap", "redis", "splatmill"}),
-        # The processes that decode photos import this: each attempt starts some, which know no Redis.
-        ("splatmill_worker.images.video", {"torch", "pycolmap", "redis", "rq", "obstore", "httpx"}),
+        # The processes that decode photos import this: each attempt starts some, which know neither Redis nor messages.
+        (
+            "splatmill_worker.images.video",
+            {"torch", "pycolmap", "redis", "rq", "obstore", "httpx", "pydantic"},
+        ),
     ],
 )
 def test_importing_stays_cheap(module: str, forbidden: set[str]):

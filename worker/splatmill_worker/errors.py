@@ -25,9 +25,12 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatmill.schema import Problem, format_bytes
+from splatmill.schema.quantities import format_bytes
+
+if TYPE_CHECKING:
+    from splatmill.schema import Problem
 
 
 class WorkerError(Exception):
@@ -50,6 +53,9 @@ class WorkerError(Exception):
 
     def problem(self) -> Problem:
         """Return the problem document for this failure."""
+        # Imported here, because the processes that decode photos need no documents.
+        from splatmill.schema import Problem
+
         return Problem.of(self.code, self.message, facts=self.facts, advice=self.advice)
 
 

@@ -1,204 +1,213 @@
-"""The wire schema: every request, response, event, option and problem of the service."""
+"""The wire schema: every request, response, event, option and problem of the service.
 
-from splatmill.schema.access import (
-    DEFAULT_OWNER,
-    CreateKey,
-    Key,
-    KeyLimits,
-    KeyList,
-    KeyWithSecret,
-    Me,
-    NewKeyLimits,
-    Owner,
-    RotateKey,
-    Scope,
-    Use,
-)
-from splatmill.schema.base import (
-    Measured,
-    Request,
-    Response,
-    Time,
-)
-from splatmill.schema.cameras import (
-    DEPTH_SCALE_HEADER,
-    MAX_RENDER_PIXELS,
-    MAX_RENDER_SIDE,
-    RIGID_TOLERANCE,
-    CameraSpec,
-    Color,
-    Convention,
-    Format,
-    Matrix,
-    MatrixRow,
-    OrbitRequest,
-    Output,
-    RenderRequest,
-    Side,
-)
-from splatmill.schema.captures import (
-    MAX_NAME_BYTES,
-    MAX_PART_BYTES,
-    MAX_PARTS,
-    SHA256_HEADER,
-    Capture,
-    CaptureFile,
-    CapturePage,
-    CreateCapture,
-    FileName,
-    Role,
-    UnsafeName,
-    may_be_empty,
-    safe_name,
-)
-from splatmill.schema.conversions import (
-    CONVERSION_HEADER,
-    CONVERSION_VERSION,
-    ComparedWith,
-    Conversion,
-    ConversionRequest,
-    ModelDownload,
-    ModelDownloads,
-)
-from splatmill.schema.edits import EDIT_HEADER, Box, Edited, EditedView, EditModel
-from splatmill.schema.estimates import Estimate, EstimateJob, StageEstimate
-from splatmill.schema.events import (
-    EVENT,
-    FINAL_STATES,
-    CamerasEvent,
-    Curve,
-    CurveRow,
-    Event,
-    EventRecord,
-    JobState,
-    LogEvent,
-    MetricEvent,
-    PlanEvent,
-    PreviewEvent,
-    Progress,
-    ProgressEvent,
-    SnapshotEvent,
-    StateEvent,
-)
-from splatmill.schema.fit_image import FitImageOptions
-from splatmill.schema.formats import DOWNLOADS, MODEL_FORMATS, ModelFormat
-from splatmill.schema.frames import GeographicOrigin, KnownDistance, ModelFrame, known_distance
-from splatmill.schema.imports import (
-    CreateImport,
-    Import,
-    ImportList,
-    ImportState,
-)
-from splatmill.schema.info import (
-    DEFAULT_PORT,
-    Accepted,
-    Health,
-    Info,
-    Limits,
-    QueueInfo,
-    Ready,
-    WorkerInfo,
-)
-from splatmill.schema.jobs import (
-    IDEMPOTENCY_HEADER,
-    CreateJob,
-    Job,
-    JobPage,
-    LogLine,
-    LogPage,
-)
-from splatmill.schema.live import (
-    SNAPSHOT_MEDIA_TYPE,
-    PlacedCamera,
-    Placement,
-    UnusedPhoto,
-    Watch,
-)
-from splatmill.schema.models import (
-    HELD_OUT,
-    TIME_LAPSE,
-    Model,
-    ModelCamera,
-    ModelCameras,
-    ModelFile,
-    ModelPage,
-    Report,
-    StageSeconds,
-)
-from splatmill.schema.options import (
-    PRESET_STEPS,
-    Backend,
-    Background,
-    Effort,
-    Mapper,
-    Matcher,
-    OptionHelp,
-    OptionList,
-    OptionType,
-    Preset,
-    Switch,
-    TrainOptions,
-    describe_options,
-)
-from splatmill.schema.orbits import (
-    JoinOrbit,
-    Orbit,
-    OrbitFrames,
-    OrbitList,
-    OrbitState,
-)
-from splatmill.schema.photos import (
-    ARCHIVE_SUFFIXES,
-    MASK_FOLDERS,
-    MASK_SUFFIXES,
-    MAX_PHOTO_PIXELS,
-    MIN_PHOTO_SIDE,
-    PHOTO_SUFFIXES,
-    VIDEO_SUFFIXES,
-)
-from splatmill.schema.problems import (
-    PROBLEM_MEDIA_TYPE,
-    PROBLEMS,
-    Kind,
-    Problem,
-    code_for_status,
-)
-from splatmill.schema.quantities import (
-    ByteSize,
-    Duration,
-    format_bytes,
-    format_duration,
-    parse_bytes,
-    parse_duration,
-)
-from splatmill.schema.shares import (
-    LONGEST_SHARE,
-    CreateShare,
-    Share,
-    SharedModel,
-    ShareList,
-    ShareWithToken,
-)
-from splatmill.schema.storage import (
-    OwnerUse,
-    PlannedDeletion,
-    StorageUse,
-    StoredBytes,
-    StoredKind,
-    StoredRecord,
-)
-from splatmill.schema.webhooks import (
-    CreateWebhook,
-    Delivery,
-    DeliveryAttempt,
-    DeliveryList,
-    DeliveryState,
-    Webhook,
-    WebhookEvent,
-    WebhookList,
-    WebhookPayload,
-    WebhookWithSecret,
-)
+All of it is imported when the first name of this package is used. `photos` and `quantities`, which define no messages,
+can be imported without the others: so the processes that decode photos start with half of the work.
+"""
+
+from importlib import import_module
+from pkgutil import iter_modules
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from splatmill.schema.access import (
+        DEFAULT_OWNER,
+        CreateKey,
+        Key,
+        KeyLimits,
+        KeyList,
+        KeyWithSecret,
+        Me,
+        NewKeyLimits,
+        Owner,
+        RotateKey,
+        Scope,
+        Use,
+    )
+    from splatmill.schema.base import (
+        ByteSize,
+        Duration,
+        Measured,
+        Request,
+        Response,
+        Time,
+    )
+    from splatmill.schema.cameras import (
+        DEPTH_SCALE_HEADER,
+        MAX_RENDER_PIXELS,
+        MAX_RENDER_SIDE,
+        RIGID_TOLERANCE,
+        CameraSpec,
+        Color,
+        Convention,
+        Format,
+        Matrix,
+        MatrixRow,
+        OrbitRequest,
+        Output,
+        RenderRequest,
+        Side,
+    )
+    from splatmill.schema.captures import (
+        MAX_NAME_BYTES,
+        MAX_PART_BYTES,
+        MAX_PARTS,
+        SHA256_HEADER,
+        Capture,
+        CaptureFile,
+        CapturePage,
+        CreateCapture,
+        FileName,
+        Role,
+        UnsafeName,
+        may_be_empty,
+        safe_name,
+    )
+    from splatmill.schema.conversions import (
+        CONVERSION_HEADER,
+        CONVERSION_VERSION,
+        ComparedWith,
+        Conversion,
+        ConversionRequest,
+        ModelDownload,
+        ModelDownloads,
+    )
+    from splatmill.schema.edits import EDIT_HEADER, Box, Edited, EditedView, EditModel
+    from splatmill.schema.estimates import Estimate, EstimateJob, StageEstimate
+    from splatmill.schema.events import (
+        EVENT,
+        FINAL_STATES,
+        CamerasEvent,
+        Curve,
+        CurveRow,
+        Event,
+        EventRecord,
+        JobState,
+        LogEvent,
+        MetricEvent,
+        PlanEvent,
+        PreviewEvent,
+        Progress,
+        ProgressEvent,
+        SnapshotEvent,
+        StateEvent,
+    )
+    from splatmill.schema.fit_image import FitImageOptions
+    from splatmill.schema.formats import DOWNLOADS, MODEL_FORMATS, ModelFormat
+    from splatmill.schema.frames import GeographicOrigin, KnownDistance, ModelFrame, known_distance
+    from splatmill.schema.imports import (
+        CreateImport,
+        Import,
+        ImportList,
+        ImportState,
+    )
+    from splatmill.schema.info import (
+        DEFAULT_PORT,
+        Accepted,
+        Health,
+        Info,
+        Limits,
+        QueueInfo,
+        Ready,
+        WorkerInfo,
+    )
+    from splatmill.schema.jobs import (
+        IDEMPOTENCY_HEADER,
+        CreateJob,
+        Job,
+        JobPage,
+        LogLine,
+        LogPage,
+    )
+    from splatmill.schema.live import (
+        SNAPSHOT_MEDIA_TYPE,
+        PlacedCamera,
+        Placement,
+        UnusedPhoto,
+        Watch,
+    )
+    from splatmill.schema.models import (
+        HELD_OUT,
+        TIME_LAPSE,
+        Model,
+        ModelCamera,
+        ModelCameras,
+        ModelFile,
+        ModelPage,
+        Report,
+        StageSeconds,
+    )
+    from splatmill.schema.options import (
+        PRESET_STEPS,
+        Backend,
+        Background,
+        Effort,
+        Mapper,
+        Matcher,
+        OptionHelp,
+        OptionList,
+        OptionType,
+        Preset,
+        Switch,
+        TrainOptions,
+        describe_options,
+    )
+    from splatmill.schema.orbits import (
+        JoinOrbit,
+        Orbit,
+        OrbitFrames,
+        OrbitList,
+        OrbitState,
+    )
+    from splatmill.schema.photos import (
+        ARCHIVE_SUFFIXES,
+        MASK_FOLDERS,
+        MASK_SUFFIXES,
+        MAX_PHOTO_PIXELS,
+        MIN_PHOTO_SIDE,
+        PHOTO_SUFFIXES,
+        VIDEO_SUFFIXES,
+    )
+    from splatmill.schema.problems import (
+        PROBLEM_MEDIA_TYPE,
+        PROBLEMS,
+        Kind,
+        Problem,
+        code_for_status,
+    )
+    from splatmill.schema.quantities import (
+        format_bytes,
+        format_duration,
+        parse_bytes,
+        parse_duration,
+    )
+    from splatmill.schema.shares import (
+        LONGEST_SHARE,
+        CreateShare,
+        Share,
+        SharedModel,
+        ShareList,
+        ShareWithToken,
+    )
+    from splatmill.schema.storage import (
+        OwnerUse,
+        PlannedDeletion,
+        StorageUse,
+        StoredBytes,
+        StoredKind,
+        StoredRecord,
+    )
+    from splatmill.schema.webhooks import (
+        CreateWebhook,
+        Delivery,
+        DeliveryAttempt,
+        DeliveryList,
+        DeliveryState,
+        Webhook,
+        WebhookEvent,
+        WebhookList,
+        WebhookPayload,
+        WebhookWithSecret,
+    )
 
 __all__ = [
     "ARCHIVE_SUFFIXES",
@@ -374,3 +383,14 @@ __all__ = [
     "parse_duration",
     "safe_name",
 ]
+
+
+if not TYPE_CHECKING:  # a type checker would take any name for one of this package
+
+    def __getattr__(name: str) -> Any:
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        for module in iter_modules(__path__):
+            found = vars(import_module(f"{__name__}.{module.name}"))
+            globals().update({each: found[each] for each in __all__ if each in found})
+        return globals()[name]

@@ -5,8 +5,7 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
-from splatmill.schema.base import Request, Response, Time
-from splatmill.schema.quantities import Duration
+from splatmill.schema.base import Duration, Request, Response, Time
 
 DEFAULT_OWNER = "default"
 """The owner of what is made without a key or with SPLATMILL_API_KEY, and of records that name no owner."""

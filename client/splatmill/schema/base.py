@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field
 
+from splatmill.schema.quantities import parse_bytes, parse_duration
+
 
 class Request(BaseModel):
     """A message from a client. An unknown field is an error, so that a misspelt option does not pass unnoticed."""
@@ -27,6 +29,12 @@ def _finite_or_none(value: Any) -> Any:
 
 Measured = Annotated[float | None, BeforeValidator(_finite_or_none)]
 """A measured number, or None where nothing was measured. NaN and infinities become None."""
+
+Duration = Annotated[float, BeforeValidator(parse_duration)]
+"""Seconds; `parse_duration` accepts a text such as `5m`."""
+
+ByteSize = Annotated[int, BeforeValidator(parse_bytes)]
+"""Bytes; `parse_bytes` accepts a text such as `1.5GB`."""
 
 
 def _without_controls(label: str) -> str:

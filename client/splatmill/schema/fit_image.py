@@ -4,8 +4,7 @@ from typing import Any
 
 from pydantic import Field
 
-from splatmill.schema.base import Request
-from splatmill.schema.quantities import Duration
+from splatmill.schema.base import Duration, Request
 
 _BUDGET: dict[str, Any] = {"group": "budget"}
 _PHOTOS: dict[str, Any] = {"group": "photos"}

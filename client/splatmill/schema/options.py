@@ -11,12 +11,11 @@ from annotated_types import Ge, Le, MaxLen, MinLen
 from pydantic import Field, field_validator
 from pydantic.fields import FieldInfo
 
-from splatmill.schema.base import Request, Response
+from splatmill.schema.base import ByteSize, Duration, Request, Response
 from splatmill.schema.captures import safe_name
 from splatmill.schema.formats import is_model_file, readable_suffixes
 from splatmill.schema.frames import known_distance
 from splatmill.schema.ids import ID
-from splatmill.schema.quantities import ByteSize, Duration
 
 
 class Preset(StrEnum):

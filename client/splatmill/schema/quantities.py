@@ -1,9 +1,7 @@
 """Durations and sizes as people write them: `90s`, `5m`, `1h30m`, `1.5GB`."""
 
 import re
-from typing import Annotated, Any
-
-from pydantic import BeforeValidator
+from typing import Any
 
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 _DURATION = re.compile(r"(?:(?:\d+(?:\.\d+)?)[smhd])+", re.ASCII)
@@ -67,10 +65,3 @@ def format_bytes(count: float) -> str:
             return f"{count:.0f} B" if unit == "B" else f"{count:.1f} {unit}"
         count /= 1000
     return f"{count:.1f} TB"
-
-
-Duration = Annotated[float, BeforeValidator(parse_duration)]
-"""Seconds; `parse_duration` accepts a text such as `5m`."""
-
-ByteSize = Annotated[int, BeforeValidator(parse_bytes)]
-"""Bytes; `parse_bytes` accepts a text such as `1.5GB`."""

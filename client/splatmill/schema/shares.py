@@ -2,9 +2,8 @@
 
 from pydantic import Field
 
-from splatmill.schema.base import Label, Measured, Request, Response, Time
+from splatmill.schema.base import Duration, Label, Measured, Request, Response, Time
 from splatmill.schema.models import ModelFile
-from splatmill.schema.quantities import Duration
 
 LONGEST_SHARE = 3650 * 86400.0
 """Seconds for which a link may be valid."""
