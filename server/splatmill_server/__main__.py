@@ -17,6 +17,7 @@ from fastapi import FastAPI
 from pydantic import ValidationError
 
 from splatmill.backplane.connection import InvalidRedisUrl
+from splatmill.backplane.log_lines import LogFormat
 from splatmill.backplane.redact import redacted
 from splatmill.backplane.storage import StorageError
 from splatmill_server.access.exposure import NeedsKey
@@ -53,6 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     allow_open_files()
     try:
         settings = Settings(**{name: value for name, value in given.items() if value is not None})
+        configure_logging(settings.log_format)
         app = create_app(settings)
         listener = listen(settings)
     except ValidationError as error:
@@ -145,21 +147,23 @@ def allow_open_files() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-def configure_logging(level: int = logging.INFO) -> None:
-    """Log readable lines on a terminal and JSON otherwise, also for uvicorn's messages."""
+def configure_logging(chosen: LogFormat | None = None, level: int = logging.INFO) -> None:
+    """Log in this format, also uvicorn's messages; by default, readable lines on a terminal and JSON otherwise."""
     shared: list[structlog.types.Processor] = [
         structlog.contextvars.merge_contextvars,
         structlog.processors.add_log_level,
         structlog.processors.TimeStamper(fmt="iso", utc=True),
     ]
-    terminal = sys.stderr.isatty()
+    text = sys.stderr.isatty() if chosen is None else chosen == "text"
     renderer: structlog.types.Processor = (
         # Rich tracebacks would print all local variables, including keys.
-        structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)
-        if terminal
+        structlog.dev.ConsoleRenderer(
+            colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback
+        )
+        if text
         else structlog.processors.JSONRenderer()
     )
-    errors = [] if terminal else [structlog.processors.format_exc_info]
+    errors = [] if text else [structlog.processors.format_exc_info]
     structlog.configure(
         processors=[*shared, *errors, renderer],
         wrapper_class=structlog.make_filtering_bound_logger(level),

@@ -93,6 +93,7 @@ class RequestMiddleware:
                 status=status,
                 seconds=round(seconds, 4),
                 bytes=sent,
+                **_job_of(scope),
             )
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -166,6 +167,12 @@ class RequestMiddleware:
             advice="Upload files one by one with PUT /v1/captures/{id}/images/{name}.",
             facts={"limit": self.max_body},
         )
+
+
+def _job_of(scope: Scope) -> dict[str, str]:
+    """Return the field that names the job of a request whose address names one."""
+    job_id = scope.get("path_params", {}).get("job_id")
+    return {"job": str(job_id)[:80]} if job_id else {}
 
 
 def _streams(scope: Scope, headers: Headers) -> bool:

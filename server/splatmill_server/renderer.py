@@ -5,6 +5,7 @@ import time
 from collections.abc import Mapping
 
 import httpx
+import structlog
 
 from splatmill.backplane import rendering
 from splatmill_server.metrics import Metrics
@@ -25,7 +26,12 @@ async def post(
             "POST",
             path,
             content=content,
-            headers={"Content-Type": "application/json", "Accept-Encoding": "identity", **headers},
+            headers={
+                "Content-Type": "application/json",
+                "Accept-Encoding": "identity",
+                **_request_id(),
+                **headers,
+            },
             timeout=httpx.Timeout(seconds, connect=5.0),
         )
         return await renderer.send(sent, stream=True)
@@ -53,6 +59,12 @@ def no_renderer() -> ProblemError:
         advice="Start `python -m splatmill_worker renderer` and set SPLATMILL_RENDERER_URL. "
         "Models can be downloaded without it.",
     )
+
+
+def _request_id() -> dict[str, str]:
+    """Return the header with the id of the request that is being answered, for the log of the renderer."""
+    found = structlog.contextvars.get_contextvars().get("request")
+    return {rendering.REQUEST_HEADER: found} if found else {}
 
 
 class Counted(httpx.AsyncBaseTransport):

@@ -9,6 +9,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from splatmill.backplane import rendering
 from splatmill.backplane.address import DEFAULT_URL
+from splatmill.backplane.log_lines import LogFormat
 from splatmill.schema import DEFAULT_PORT, ByteSize, Duration
 from splatmill_server import outgoing
 
@@ -63,6 +64,12 @@ class Settings(BaseSettings):
     )
     access_log: bool = Field(
         default=True, description="Whether each request is logged: who, what, status, seconds and bytes."
+    )
+
+    log_format: LogFormat | None = Field(
+        default=None,
+        description="`text` for people or `json`, one object a line. Left out, the server writes text to a terminal "
+        "and JSON elsewhere, and workers and the renderer, which read it too, write text.",
     )
 
     max_file_bytes: int = Field(

@@ -46,6 +46,7 @@ def refusal(*options: str, **env: str) -> str:
 def test_reasons_not_to_start_are_sentences(tmp_path: Path, redis_url: str) -> None:
     data = str(tmp_path / "data")
     assert "SPLATMILL_API_KEY" in refusal(SPLATMILL_HOST="0.0.0.0", SPLATMILL_DATA=data)
+    assert "SPLATMILL_LOG_FORMAT" in refusal(SPLATMILL_LOG_FORMAT="xml", SPLATMILL_DATA=data)
     assert "SPLATMILL_API_KEY" in refusal("--host", "0.0.0.0", SPLATMILL_DATA=data)
     (tmp_path / "file").write_text("x")
     assert "cannot be created" in refusal(SPLATMILL_DATA=str(tmp_path / "file"))

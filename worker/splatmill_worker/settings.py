@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from splatmill.backplane.address import DEFAULT_URL
+from splatmill.backplane.log_lines import LogFormat, parse_format
 from splatmill.schema.quantities import parse_bytes, parse_duration
 
 DISK_RESERVE = 256 * 2**20
@@ -43,6 +44,12 @@ def keep_work() -> float | None:
     Raises ValueError.
     """
     found: float | None = _read("SPLATMILL_KEEP_WORK", parse_duration, None)
+    return found
+
+
+def log_format() -> LogFormat:
+    """Return SPLATMILL_LOG_FORMAT, or `text`. Raises ValueError for another word than text and json."""
+    found: LogFormat = _read("SPLATMILL_LOG_FORMAT", parse_format, "text")
     return found
 
 

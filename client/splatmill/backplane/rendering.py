@@ -14,6 +14,10 @@ CLIENT_HEADER = "Splatmill-Client"
 """Header of a request to the renderer: a text that is the same for all requests of one client, who take turns."""
 
 
+REQUEST_HEADER = "X-Request-ID"
+"""Header of a request to the renderer: the id of the client's request, for the log."""
+
+
 class RendererState(BaseModel):
     """What the renderer says of itself.
 

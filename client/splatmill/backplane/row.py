@@ -34,7 +34,8 @@ class JobRow(BaseModel):
     """The request for a job, and the server's decisions about it.
 
     `generation` grows with each restart. `queued_at`, `cancel_requested_at` and `verdict` refer to the current one.
-    `format` is the version of the row's format (see `records`).
+    `format` is the version of the row's format (see `records`). `request` is the id (X-Request-ID) of the request that
+    began the generation.
     """
 
     format: int = FORMAT
@@ -49,6 +50,7 @@ class JobRow(BaseModel):
     generation: int = 1
     cancel_requested_at: Time | None = None
     verdict: Verdict | None = None
+    request: str | None = None
 
     def fields(self) -> dict[str, str]:
         """Return the fields of the hash: one per attribute that is not None, with models as JSON."""
@@ -90,6 +92,12 @@ def read(connection: redis.Redis, job_id: str) -> JobRow | None:
     """Return the row of a job, or None if Redis has none. Raises redis.RedisError if Redis cannot be reached,
     and UnreadableRecord for a row that cannot be read."""
     return JobRow.of(cast(dict[bytes, bytes], connection.hgetall(keys.job(job_id))))
+
+
+def request_of(connection: redis.Redis, job_id: str) -> str | None:
+    """Return the id of the request that began the job's generation, or None if it is not known."""
+    found = cast(bytes | None, connection.hget(keys.job(job_id), "request"))
+    return found.decode("utf-8", "replace") if found else None
 
 
 def now() -> datetime:

@@ -83,6 +83,7 @@ class Jobs:
             priority=request.priority,
             created_at=moment,
             queued_at=moment,
+            request=_request_id(),
         )
         if (known := row.read(self.connection, job_id)) is not None:
             return self._placed(known), False
@@ -115,6 +116,7 @@ class Jobs:
         # A crash here leaves a row that is not in the queue; the reaper enqueues it.
         queue.enqueue(self.connection, job_id, new.generation)
         self.metrics.created.inc()
+        log.info("job created", job=job_id, capture=request.capture)
         return self._placed(new), True
 
     def id_of_key(self, owner: str, key: str) -> str | None:
@@ -335,12 +337,13 @@ class Jobs:
                 raise job_not_found(job_id)
             self._check_room(found.owner, most)
             moment = row.now()
-            requests.keep(self.storage, requests.next_generation(found, moment))
+            requests.keep(self.storage, requests.next_generation(found, moment, _request_id()))
             return {
                 "generation": str(found.generation + 1),
                 "queued_at": moment.isoformat(),
                 "cancel_requested_at": "",
                 "verdict": "",
+                "request": _request_id() or "",
             }
 
         self._announce_unretired(job_id)
@@ -348,6 +351,7 @@ class Jobs:
         begun = self.row(job_id)
         requests.keep(self.storage, begun)  # again: the end of the former generation may just have removed it
         queue.enqueue(self.connection, job_id, begun.generation)
+        log.info("job restarted", job=job_id, generation=begun.generation)
         return self._placed(begun)
 
     def delete(self, job_id: str) -> None:
@@ -523,6 +527,11 @@ def job_not_found(job_id: str) -> ProblemError:
         f"There is no job {job_id[:80]!r}.",
         advice="List the jobs with GET /v1/jobs.",
     )
+
+
+def _request_id() -> str | None:
+    """Return the id of the request that is being answered, as the middleware has bound it to the log."""
+    return cast(str | None, structlog.contextvars.get_contextvars().get("request"))
 
 
 def _digest(owner: str, key: str) -> str:

@@ -20,9 +20,9 @@ def keep(storage: Storage, begun: JobRow) -> None:
     storage.put(layout.watched_job(begun.id), begun.model_dump_json(exclude_none=True).encode())
 
 
-def next_generation(found: JobRow, moment: datetime) -> JobRow:
-    """Return the row of a job as its restart at this time makes it."""
-    changes = {"generation": found.generation + 1, "queued_at": moment}
+def next_generation(found: JobRow, moment: datetime, request: str | None) -> JobRow:
+    """Return the row of a job as its restart at this time, by this request, makes it."""
+    changes = {"generation": found.generation + 1, "queued_at": moment, "request": request}
     return found.model_copy(update=changes | {"cancel_requested_at": None, "verdict": None})
 
 

@@ -18,12 +18,13 @@ STOP_SECONDS = 3
 
 def main(descriptor: int) -> None:
     """Serve on the listening socket with this file descriptor until a signal arrives."""
-    configure_logging()
     allow_open_files()
     listener = socket.socket(fileno=descriptor)
     address = listener.getsockname()
     # The supervisor has opened the socket; whether other machines reach it does not follow from SPLATMILL_HOST.
-    app = create_app(Settings(host=address[0]) if isinstance(address, tuple) else Settings())
+    settings = Settings(host=address[0]) if isinstance(address, tuple) else Settings()
+    configure_logging(settings.log_format)
+    app = create_app(settings)
     config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=STOP_SECONDS)
     Server(config, app).run(sockets=[listener])
 

@@ -7,6 +7,8 @@ import pytest
 import structlog
 from structlog.testing import CapturingLogger
 
+from splatmill.backplane.row import request_of
+from splatmill_server.jobs import requests as job_requests
 from tests.support.served_app import Serve
 
 pytestmark = pytest.mark.slow
@@ -57,6 +59,26 @@ def test_a_request_is_one_line(serve: Serve, lines: CapturingLogger) -> None:
     assert (refused["owner"], refused["status"]) == ("ann", 403)
     assert (nobody["owner"], nobody["key"], nobody["status"]) == ("", "", 401)
     assert made["secret"] not in str(lines.calls)
+
+
+def test_a_request_is_followed_to_its_job(serve: Serve, lines: CapturingLogger) -> None:
+    app = serve()
+    capture = app.capture()
+    made = app.http.post("/v1/jobs", json={"capture": capture}, headers={"X-Request-ID": "ann-7"})
+    job_id = made.json()["id"]
+    app.http.get(f"/v1/jobs/{job_id}")
+    assert request_of(app.redis, job_id) == "ann-7"
+    [created] = [call.kwargs for call in lines.calls if call.kwargs["event"] == "job created"]
+    assert (created["job"], created["capture"]) == (job_id, capture)
+    assert requests(lines)[-1]["job"] == job_id
+    # A restart is asked for by another request, which is the one to follow then.
+    app.http.post(f"/v1/jobs/{job_id}/cancel")
+    app.service.reaper.tick()
+    app.http.post(f"/v1/jobs/{job_id}/restart", headers={"X-Request-ID": "bob-8"}).raise_for_status()
+    assert request_of(app.redis, job_id) == "bob-8"
+    kept = job_requests.read(app.service.storage, job_id)
+    assert kept is not None
+    assert kept.request == "bob-8", "it is restored with the job"
 
 
 def test_it_can_be_turned_off(serve: Serve, lines: CapturingLogger) -> None:

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import IO, Any, cast
 
 import pytest
 from rq.job import Callback
@@ -49,7 +49,12 @@ sys.exit(main(["train", *sys.argv[2:]]))
 
 @contextlib.contextmanager
 def worker(
-    server: RedisServer, storage: Storage, folder: Path, *options: str, clock_ahead: float = 0.0
+    server: RedisServer,
+    storage: Storage,
+    folder: Path,
+    *options: str,
+    clock_ahead: float = 0.0,
+    stderr: IO[bytes] | None = None,
 ) -> Iterator[subprocess.Popen[bytes]]:
     """A worker whose Python also finds the modules in `folder`, and whose clock is this many seconds ahead."""
     environment = dict(os.environ) | {
@@ -59,7 +64,8 @@ def worker(
         "SPLATMILL_STORAGE": storage.url,
         "SPLATMILL_DATA": str(folder / "data"),
     }
-    process = subprocess.Popen([sys.executable, "-c", SHIFTED, str(clock_ahead), *options], env=environment)
+    command = [sys.executable, "-c", SHIFTED, str(clock_ahead), *options]
+    process = subprocess.Popen(command, env=environment, stderr=stderr)
     try:
         yield process
     finally:
@@ -110,6 +116,33 @@ def test_the_function_and_callbacks_that_an_entry_names_are_never_imported(
     assert {job_id: job.state for job_id, job in jobs.items()} == dict.fromkeys(functions, "succeeded")
     assert {job.attempt for job in jobs.values()} == {1}
     assert not trace.exists()
+
+
+def test_log_lines_are_objects_that_name_worker_job_attempt_and_request(
+    redis_server: RedisServer, storage: Storage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second job has a script without a diary, at which the stand-in fails with a traceback of several lines."""
+    monkeypatch.setenv("SPLATMILL_LOG_FORMAT", "json")
+    connection = redis_server.connection
+    storage.put(layout.capture_file("broken01", Role.images, "script.json"), b'{"steps": 1}')
+    for job_id, capture in (("job00001", CAPTURE), ("job00002", "broken01")):
+        write_row(connection, job_id, capture=capture, request=f"of {job_id}")
+        assert queue.enqueue(connection, job_id, 1)
+    with (tmp_path / "log").open("wb") as log, worker(redis_server, storage, tmp_path, stderr=log):
+        ends = [wait_for(partial(ended, redis_server, job_id)).state for job_id in ("job00001", "job00002")]
+        wait_for(lambda: (tmp_path / "log").read_text().count("has ended") == 2)
+    assert ends == ["succeeded", "failed"]
+    lines = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
+    assert len({line["worker"] for line in lines if "worker" in line}) == 1
+    for job_id in ("job00001", "job00002"):
+        mine = [line for line in lines if line.get("job") == job_id]
+        assert {line["request"] for line in mine} == {f"of {job_id}"}
+        assert [line["attempt"] for line in mine if "begins" in line["event"]] == [1]
+        assert mine[-1]["event"].endswith("has ended: reported")
+    [failure] = [line for line in lines if line["event"] == "the attempt failed"]
+    assert (failure["job"], failure["attempt"], failure["level"]) == ("job00002", 1, "error")
+    assert failure["exception"].startswith("Traceback")
+    assert "job" not in lines[-1], "what comes after the last job belongs to none"
 
 
 def test_a_job_that_was_cancelled_while_it_waited_is_not_begun(

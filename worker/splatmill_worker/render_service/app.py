@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import logging
 import os
 import shutil
 import tempfile
-import traceback
 from collections.abc import Awaitable, Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -61,6 +61,8 @@ _ENCODING_VERSION = b"1"
 """Part of each ETag, to be raised when the same request gives other bytes than before."""
 
 Body = TypeVar("Body", bound=BaseModel)
+
+log = logging.getLogger("splatmill.renderer")
 
 
 class FormatUnknown(Exception):
@@ -168,7 +170,8 @@ class RenderApp:
             return _problem_response(Problem.of("storage_unavailable", str(error), advice=advice))
         except Exception as error:
             # The client receives a problem document for any error, and the log receives the traceback.
-            traceback.print_exception(error)
+            said = {"request": request.headers.get(rendering.REQUEST_HEADER, "")[:64]}
+            log.exception("a request for the model %s failed", model_id, extra=said)
             return _problem_response(_problem_of_unexpected(error))
 
     def _etag(self, model_id: str, body: BaseModel) -> str:

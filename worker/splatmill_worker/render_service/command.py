@@ -6,10 +6,11 @@ from pathlib import Path
 
 import uvicorn
 
+from splatmill.backplane import log_lines
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import parse_bytes
 from splatmill_worker.render_service.app import RenderApp
-from splatmill_worker.settings import storage_url
+from splatmill_worker.settings import log_format, storage_url
 
 MAX_CACHE_BYTES = 1 << 30
 """Largest default for the memory of cached models; machines with little memory use an eighth of it."""
@@ -24,6 +25,7 @@ def serve(host: str, port: int, uds: Path | None, backend: str | None = None) ->
     SPLATMILL_RENDER_CACHE, a size such as 500MB, limits the memory of cached models.
     """
     try:
+        log_lines.configure(log_format())
         app = RenderApp(Storage(storage_url(), read_only=True), _cache_bytes(), backend)
     except (StorageError, ValueError) as error:
         print(error, file=sys.stderr)

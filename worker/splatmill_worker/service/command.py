@@ -5,7 +5,7 @@ import time
 
 import redis
 
-from splatmill.backplane import keys
+from splatmill.backplane import keys, log_lines
 from splatmill.backplane.connection import connect
 from splatmill.backplane.redact import redacted
 from splatmill_worker import settings
@@ -25,6 +25,7 @@ def serve(stop_grace: float | None, queues: str | None = None) -> int:
     """
     url = settings.redis_url()
     try:
+        log_lines.configure(settings.log_format())
         settings.disk_reserve()
         connection = connect(url)
         served = served_lines(queues or settings.queues())

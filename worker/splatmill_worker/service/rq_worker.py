@@ -27,10 +27,11 @@ from rq.utils import now
 from rq.worker.base import WorkerStatus
 from rq.worker_registration import clean_worker_registry, register
 
-from splatmill.backplane import entries, keys, leases, lines, totals, workers
+from splatmill.backplane import entries, keys, leases, lines, log_lines, totals, workers
 from splatmill.backplane.leases import Lease, Reclaim
 from splatmill.backplane.lines import Line
 from splatmill.backplane.process import die_with_parent
+from splatmill.backplane.row import request_of
 from splatmill_worker.service import hand_back, recovery
 from splatmill_worker.service.abandoned_folders import remove_abandoned
 from splatmill_worker.service.attempt import Attempt, start_attempt
@@ -109,6 +110,7 @@ class AttemptWorker(Worker):
             maintenance_interval=entries.MAINTENANCE_INTERVAL,
             job_monitoring_interval=entries.MONITORING_INTERVAL,
         )
+        log_lines.bind(worker=self.name)
         self._served = tuple(served)
         self._grace = stop_grace
         self._limits = limits or Limits()
@@ -319,12 +321,21 @@ class AttemptWorker(Worker):
     def execute_job(self, job: Job, queue: Queue) -> None:
         self._entry_id, self._superseded, self._exceeded = job.id, False, None
         self._began = time.monotonic()
+        self._bind_log(job)
         try:
             self.fork_work_horse(job, queue)
             self.monitor_work_horse(job, queue)
         finally:
             self._entry_id = None
         self._until_redis_works(lambda: self.set_state("idle"))
+        log_lines.bind(job=None, request=None)
+
+    def _bind_log(self, job: Job) -> None:
+        """Name the job, and the request that asked for it, in all lines until the attempt has ended."""
+        job_id, _ = entries.split_rq_id(job.id)
+        log_lines.bind(
+            job=job_id, request=self._until_redis_works(lambda: request_of(self.connection, job_id))
+        )
 
     def fork_work_horse(self, job: Job, queue: Queue) -> None:
         job_id, _ = entries.split_rq_id(job.id)
@@ -357,6 +368,8 @@ class AttemptWorker(Worker):
         assert isinstance(job, AttemptEntry)
         try:
             job.attempt = start_attempt(self.connection, job.id, self._lock.token)
+            log_lines.bind(attempt=job.attempt.number)
+            self.log.info("Worker %s: attempt %d at %s begins", self.name, job.attempt.number, job.id)
             self.main_work_horse(job, queue)
         except HandedBack:
             os._exit(HANDED_BACK_STATUS)
@@ -382,6 +395,7 @@ class AttemptWorker(Worker):
 
     def _count(self, end: AttemptEnd, cpu_seconds: float) -> None:
         """Count an attempt that has ended. A Redis that fails now loses the count, which nothing depends on."""
+        self.log.info("Worker %s: the attempt at %s has ended: %s", self.name, self._entry_id, end)
         counted = totals.counted(totals.ATTEMPTS, end) | totals.counted(totals.ATTEMPT_CPU, by=cpu_seconds)
         try:
             with self.connection.pipeline() as pipe:

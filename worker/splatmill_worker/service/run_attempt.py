@@ -92,6 +92,10 @@ class Pipeline(Protocol):
 
 
 log = logging.getLogger("splatmill_worker")
+"""Its lines go to the log of the job."""
+
+own_log = logging.getLogger("splatmill.attempt")
+"""Its lines go to the log of the worker alone."""
 
 
 def run_attempt(attempt: Attempt, can_retry: bool) -> None:
@@ -260,7 +264,7 @@ def _report_failure(error: Exception, outbox: Outbox, can_retry: bool) -> None:
     """Report the failure of the job, or raise a transient one again while the queue can retry."""
     trace = "".join(traceback.format_exception(error))
     with suppress(OSError):  # the disk of the worker's log may be full, which may be the failure
-        print(trace, flush=True)
+        own_log.error("the attempt failed", exc_info=error)
     problem = problem_of(error)
     if is_transient(error):
         if not outbox.flush():  # waits until Redis is back, if its absence was the failure
@@ -288,13 +292,13 @@ def _wait(seconds: float) -> None:
 
 def _exit_unreported(trouble: str | None) -> NoReturn:
     """End without a report, because Redis took none. The parent puts the job back into the queue once Redis works."""
-    print(f"Redis took no events for {PATIENCE:g} s ({trouble}); this attempt ends.", flush=True)
+    own_log.error("Redis took no events for %g s (%s); this attempt ends.", PATIENCE, trouble)
     os._exit(UNREPORTED_STATUS)
 
 
 def _exit_superseded() -> NoReturn:
     """End without publishing: another attempt has the job's lock. The parent notices at its next heartbeat too."""
-    print("Another attempt holds the job's lock; this one ends without storing its model.", flush=True)
+    own_log.error("Another attempt holds the job's lock; this one ends without storing its model.")
     os._exit(1)
 
 
