@@ -1,6 +1,6 @@
 """Faults at random moments against the running service, and the proof that it loses nothing.
 
-    splatmill bench soak                                 # 330 faults, more than 200 of them kills; some 25 minutes
+    splatmill bench soak                                 # 300 faults, 200 of them kills; some 25 minutes
     splatmill bench soak --storage s3
     splatmill bench soak --faults 30 --seed 7
     splatmill bench soak --plot-only
@@ -56,7 +56,9 @@ def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="splatmill bench soak", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--faults", type=int, default=330, help="number of faults (default: %(default)s)")
+    parser.add_argument(
+        "--faults", type=int, help=f"number of faults (default: until {faults.KILLS} are kills)"
+    )
     parser.add_argument("--seconds", type=float, help="end with the fault after so many seconds")
     parser.add_argument(
         "--only", nargs="+", metavar="FAULT", help="each of these once, by the names of the table"
@@ -100,7 +102,7 @@ def main(argv: list[str]) -> int:
 def soak(
     *,
     s3: bool,
-    count: int,
+    count: int | None,
     seed: int,
     seconds: float | None = None,
     only: Sequence[str] | None = None,
@@ -109,7 +111,7 @@ def soak(
 ) -> list[Row]:
     """Run one soak and return a row for each fault, and a last one for the whole.
 
-    count, seconds: the soak ends with the earlier of the two.
+    count, seconds: the soak ends with the earlier of the two. Without a count there are `faults.KILLS` kills.
     only: names of faults; each comes once if this soak can have it, and `count` says nothing.
     photos: what a capture for the engine consists of; without it, no job is trained by the engine.
     """
@@ -124,6 +126,7 @@ def soak(
         clients = Clients(service, seed, photos or {})
         clients.start()
         target = faults.Target(service, rng)
+        count = faults.enough(possible) if count is None else count
         same = {"bench": "soak", "storage": "s3" if s3 else "folder", "seed": seed}
         for number, fault in enumerate(faults.schedule(possible, count, rng, only)):
             if seconds is not None and time.monotonic() - begun > seconds:

@@ -427,6 +427,12 @@ def test_a_job_that_does_not_end_is_told(
 # Faults that happen
 
 
+def test_a_whole_soak_has_its_kills_and_every_kind_of_fault() -> None:
+    chosen = faults.schedule(list(faults.FAULTS), faults.enough(faults.FAULTS), random.Random(0))
+    assert sum(fault.kills for fault in chosen) >= faults.KILLS
+    assert all(chosen.count(fault) >= 5 for fault in faults.FAULTS)
+
+
 def test_a_fault_that_meets_nothing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(faults, "_MET_SECONDS", 0.1)
     monkeypatch.setattr(faults, "_HOLD", (0.0, 0.0))

@@ -77,6 +77,7 @@ if lost >= tonumber(ARGV[4]) then
   return 'failed'
 end
 redis.call('HSET', KEYS[2], 'status', 'queued', 'worker_name', '')
+if lost == 1 then redis.call('HSET', KEYS[2], 'splatmill_front', 1) end
 redis.call('RPUSH', KEYS[3], ARGV[2])
 redis.call('HINCRBY', KEYS[4], ARGV[6] .. '|waiting', 1)
 return 'waiting'
@@ -127,6 +128,11 @@ def advanced(connection: redis.Redis, entry: str) -> None:
     connection.hdel(f"rq:job:{entry}", "splatmill_lost")
 
 
+def to_the_front(connection: redis.Redis, entry: str) -> None:
+    """Have an entry come in front of its owner's others when it next waits."""
+    connection.hset(f"rq:job:{entry}", "splatmill_front", 1)
+
+
 def lost(connection: redis.Redis, entry: str) -> int:
     """Return how many attempts in a row have ended with their worker and without a new checkpoint."""
     return int(cast(Any, connection.hget(f"rq:job:{entry}", "splatmill_lost")) or 0)
@@ -164,7 +170,11 @@ def running(connection: redis.Redis) -> dict[str, float]:
 
 
 def requeue(connection: redis.Redis, lease: Lease, *, if_expired: bool) -> Requeued:
-    """Put an entry whose worker was lost behind those that wait, or fail it after MAX_LOST times, in one step."""
+    """Put an entry whose worker was lost into the queue, or fail it after MAX_LOST times, in one step.
+
+    It comes in front of its owner's others. One whose worker was lost before, without a new checkpoint since, comes
+    behind them: it may be what ends the worker.
+    """
     answer = connection.eval(
         _REQUEUE,
         4,

@@ -60,7 +60,7 @@ local foreign = {}
 while redis.call('LLEN', inbox) > 0 do  -- a Redis that refuses writes refuses to pop from an empty list as well
   local entry = redis.call('LPOP', inbox)
   local job = string.match(entry, '^(.+)%-%d+$$')
-  if job then queue_up(entry, job, false)
+  if job then queue_up(entry, job, redis.call('HDEL', 'rq:job:' .. entry, 'splatmill_front') == 1)
   else
     redis.call('DEL', 'rq:job:' .. entry)
     foreign[#foreign + 1] = entry

@@ -1,5 +1,6 @@
 """The kinds of fault: what each does to the service, at a moment of its own choice, and how it heals."""
 
+import math
 import os
 import random
 import signal
@@ -12,13 +13,19 @@ import psutil
 from _soak.proxy import Proxy
 from _soak.service import Service, wait_for
 
+KILLS = 200
+"""Kills in a whole soak."""
+
 MAX_TRAINER_KILLS = 2
 """Kills of the trainer of one job. A job whose process ends unexpectedly in four attempts is given up by design."""
 
-_HOLD = (
-    0.3,
-    4.0,
-)  # seconds that a stop, a cut or a stall lasts: below and above the timeout of Redis with its retries
+_HOLD = (0.3, 4.0)
+"""Seconds that a stop, a cut or a stall lasts: below and above the timeout of Redis with its retries."""
+
+_FROZEN = (18.0, 26.0)
+"""Seconds that a worker is stopped, until its lease has expired and its job is in the queue, while its trainer runs on.
+A lease lasts 15 s, and the reaper looks every 10."""
+
 _AWAY = (0.0, 1.0)  # seconds before what was killed is started again
 _TARGET_SECONDS = 20.0
 _MET_SECONDS = 10.0
@@ -138,12 +145,12 @@ def _empty_redis(target: Target) -> None:
     target.service.start_redis()
 
 
-def _stop(find: Callable[[Target], int]) -> Callable[[Target], None]:
+def _stop(find: Callable[[Target], int], bounds: tuple[float, float] = _HOLD) -> Callable[[Target], None]:
     def act(target: Target) -> None:
         pid = find(target)
         target.strike()
         os.kill(pid, signal.SIGSTOP)
-        target.last(_HOLD)
+        target.last(bounds)
         if psutil.pid_exists(pid):
             os.kill(pid, signal.SIGCONT)
 
@@ -203,6 +210,7 @@ FAULTS = (
     Fault("Redis emptied", 1, True, _empty_redis),
     Fault("trainer stopped", 1, False, _stop(Target.trainer)),
     Fault("worker stopped", 1, False, _stop(lambda target: target.service.part("worker"))),
+    Fault("worker frozen", 1, False, _stop(lambda target: target.service.part("worker"), _FROZEN)),
     Fault("API stopped", 1, False, _stop(lambda target: target.service.part("api"))),
     Fault("renderer stopped", 1, False, _stop(lambda target: target.service.part("renderer"))),
     Fault("Redis stopped", 1, False, _stop(lambda target: target.service.redis_pid)),
@@ -228,6 +236,12 @@ def possible(service: Service) -> tuple[list[Fault], dict[str, str]]:
         missing["clock"] = service.clock.missing
     left_out = {fault.name: missing[fault.needs] for fault in FAULTS if fault.needs in missing}
     return [fault for fault in FAULTS if fault.name not in left_out], left_out
+
+
+def enough(faults: Sequence[Fault]) -> int:
+    """Return the number of faults in the fewest whole rounds with KILLS kills."""
+    kills = sum(fault.weight for fault in faults if fault.kills)
+    return math.ceil(KILLS / kills) * sum(fault.weight for fault in faults)
 
 
 def schedule(

@@ -122,7 +122,9 @@ def test_taking_leases_in_the_same_step(connection: redis.Redis) -> None:
     assert leases.running(connection).keys() == {"mill-1"}
 
 
-def test_what_is_handed_back_comes_first_and_what_was_lost_comes_last(connection: redis.Redis) -> None:
+def test_what_is_handed_back_or_lost_once_comes_first_and_what_is_lost_again_comes_last(
+    connection: redis.Redis,
+) -> None:
     for number in range(3):
         submit(connection, f"job{number}")
     assert lines.hand_back(connection, take(connection))
@@ -130,7 +132,15 @@ def test_what_is_handed_back_comes_first_and_what_was_lost_comes_last(connection
     assert lease.entry == "job0-1"
     assert leases.requeue(connection, lease, if_expired=False) == "waiting"
     assert not lines.hand_back(connection, lease), "it was lost, and is not the worker's any more"
-    assert drain(connection) == ["job1", "job2", "job0"]
+    lease = take(connection)
+    assert lease.entry == "job0-1", "a job that was interrupted goes on before others begin"
+    assert leases.requeue(connection, lease, if_expired=False) == "waiting"
+    lease = take(connection)
+    assert lease.entry == "job1-1", "a job that loses its worker again and again delays no other"
+    leases.advanced(connection, lease.entry)
+    assert leases.requeue(connection, lease, if_expired=False) == "waiting"
+    leases.to_the_front(connection, "job2-1")
+    assert drain(connection) == ["job1", "job2", "job0"], "job2 waited already"
 
 
 arrivals = st.lists(

@@ -479,6 +479,8 @@ class AttemptWorker(Worker):
         if job.should_retry:
             left = f"{job.retries_left} {'retry is' if job.retries_left == 1 else 'retries are'} left"
             ended.report_requeued(f"The job's process {process_exit.cause}. It is tried again: {left}.")
+            if job.retries_left == entries.MAX_RETRIES:
+                leases.to_the_front(self.connection, job.id)
             self.handle_job_failure(job, queue, exc_string=f"The process {process_exit.cause}.")
         else:
             ended.report_failed(process_exit.problem(attempts=entries.MAX_RETRIES + 1))
