@@ -1,0 +1,93 @@
+"""What schemathesis is told by `bench openapi`: ids of records that exist, and addresses of this machine alone.
+
+A made-up id names nothing, so that most requests would end as 404. Every other id is replaced by one of the service's
+own, which are asked for from time to time, since requests make and delete records. The one whole model, and its job
+and share, are never given to DELETE, as nothing could be rendered after it.
+
+Addresses that the service would fetch or deliver to become one on which nobody listens.
+"""
+
+import json
+import os
+import zlib
+from typing import Any
+
+import httpx
+import schemathesis
+
+SERVICE: dict[str, Any] = json.loads(os.environ["SPLATMILL_BENCH_OPENAPI"])
+"""url and key of the service; `kept`: ids by the name of the path parameter, of records that stay."""
+
+NOBODY = "http://127.0.0.1:9/photos.zip"
+"""The port of the service `discard`, on which nothing listens."""
+
+AFTER = 200
+"""Requests after which the ids of records are asked for again."""
+
+_FORMATS = ("ply", "sog", "spz", "glb", "compressed.ply")
+_FILES = ("model.ply", "report.json", "cameras.json", "a.jpg", "0000.jpg")
+
+_known: dict[str, list[str]] = {}
+_asked = 0
+
+schemathesis.serializer.alias("application/partial-upload", "application/octet-stream")
+
+
+@schemathesis.hook
+def map_path_parameters(context: Any, path_parameters: dict[str, Any] | None) -> dict[str, Any] | None:
+    """Replace every other made-up id by one of a record."""
+    if not path_parameters:
+        return path_parameters
+    return {
+        name: _existing(name, str(value), context.operation.method) for name, value in path_parameters.items()
+    }
+
+
+@schemathesis.hook
+def map_body(context: Any, body: Any) -> Any:
+    """Replace addresses, and every other capture."""
+    if isinstance(body, dict):
+        if isinstance(body.get("url"), str):
+            body = body | {"url": NOBODY}
+        if isinstance(body.get("capture"), str):
+            body = body | {"capture": _existing("capture_id", body["capture"], "POST")}
+    return body
+
+
+def _existing(name: str, made_up: str, method: str) -> str:
+    drawn = zlib.crc32(made_up.encode("utf-8", "surrogatepass"))
+    if drawn % 2:
+        return made_up
+    found = _ids().get(name, [])
+    if method.upper() == "DELETE":
+        found = [one for one in found if one not in SERVICE["kept"].get(name, [])]
+    return found[drawn // 2 % len(found)] if found else made_up
+
+
+def _ids() -> dict[str, list[str]]:
+    global _asked
+    if _asked % AFTER == 0:
+        _known.update(_look())
+    _asked += 1
+    return _known
+
+
+def _look() -> dict[str, list[str]]:
+    """Ask the service for the ids of its records, by the name of the path parameter."""
+    found: dict[str, list[str]] = {name: list(ids) for name, ids in SERVICE["kept"].items()}
+    headers = {"Authorization": f"Bearer {SERVICE['key']}"}
+    with httpx.Client(base_url=SERVICE["url"], headers=headers, timeout=60, trust_env=False) as http:
+        for name, path in (
+            ("capture_id", "captures"),
+            ("job_id", "jobs"),
+            ("key_id", "keys"),
+            ("webhook_id", "webhooks"),
+        ):
+            listed = http.get(f"/v1/{path}").json()
+            rows = (
+                listed
+                if isinstance(listed, list)
+                else next(v for v in listed.values() if isinstance(v, list))
+            )
+            found[name] = [*found.get(name, []), *(row["id"] for row in rows)]
+    return found | {"role": ["images", "masks", "poses"], "format": list(_FORMATS), "name": list(_FILES)}

@@ -1,0 +1,237 @@
+"""Ten thousand requests made up from the OpenAPI document, many of them in sequences that follow from each other.
+
+    splatmill bench openapi                        # one round after the other until there are 10000; ten minutes
+    splatmill bench openapi --requests 1000 --seed 7
+    splatmill bench openapi --table                # the page again, from the rows
+
+`splatmill up` with an API key, a worker and a renderer, and what schemathesis knows to try: values at the edges of each
+schema, made-up ones that fit it and that do not, and sequences along the links between operations. Half of the ids are
+those of records, among them a model with its files, a share and a webhook (`_openapi/hooks.py`). The checks: no answer
+is a server error; status, headers, media type and body are those of the document; what is refused without a key; what
+was made can be read, and what was deleted cannot. Streams of events, which do not end, are left out.
+
+Rows go to results/openapi.jsonl, the page to openapi.md. Ends with status 1 if a check failed, if a request was not answered,
+if the service logged an error that it did not expect, or if it is not ready at the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+from _rows import Row, append, footer, lines, origin
+from _still_life import posed_capture
+from _up import served
+
+HERE = Path(__file__).resolve().parent
+ROWS = HERE / "results" / "openapi.jsonl"
+
+KEY = "bench-openapi"
+PHASES = ("coverage", "fuzzing", "stateful")
+
+LEFT_OUT = {
+    "unsupported_method": "PUT of captures/{id}/imports/{name} is the address of a file whose role is refused",
+    "negative_data_rejection": "a number may come as text in a query, where all is text",
+    "positive_data_acceptance": "what a schema allows may be refused for what is stored",
+}
+"""Checks of schemathesis that are not made, and why."""
+
+_UNEXPECTED = ("unexpected error", "Traceback")
+
+
+def main(argv: list[str]) -> int:
+    """Ask, and write rows and page."""
+    parser = argparse.ArgumentParser(
+        prog="splatmill bench openapi",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--requests", type=int, default=10_000, help="at least (default: 10000)")
+    parser.add_argument("--seed", type=int, default=0, help="of the first round (default: 0)")
+    parser.add_argument(
+        "--examples", type=int, default=20, help="for each operation, in a round (default: 20)"
+    )
+    parser.add_argument("--phases", nargs="+", default=list(PHASES), choices=PHASES)
+    parser.add_argument("--results", type=Path, default=ROWS)
+    parser.add_argument("--table", action="store_true", help="write the page from the rows")
+    asked = parser.parse_args(argv)
+    good = True
+    if not asked.table:
+        row = measure(asked.requests, asked.seed, asked.examples, asked.phases)
+        append(asked.results, row | origin("server", "client"))
+        good = row["ready"] and not (row["failures"] or row["errors"] or row["unexpected"])
+    rows = lines(asked.results)
+    if not rows:
+        print(f"There are no rows in {asked.results}.", file=sys.stderr)
+        return 1
+    page = HERE / "openapi.md" if asked.results == ROWS else asked.results.with_suffix(".md")
+    page.write_text(document(rows[-1]))
+    print(page.read_text())
+    return 0 if good else 1
+
+
+def measure(requests: int, seed: int, examples: int, phases: list[str]) -> Row:
+    """Return a row: the requests of all rounds, what became of them, and each failure with its reason."""
+    with (
+        tempfile.TemporaryDirectory(prefix="splatmill-openapi-") as name,
+        served(Path(name), {"SPLATMILL_API_KEY": KEY, "SPLATMILL_OUTGOING_ALLOW": "127.0.0.1:9"}) as (
+            url,
+            up,
+        ),
+    ):
+        folder = Path(name)
+        http = httpx.Client(
+            base_url=url, headers={"Authorization": f"Bearer {KEY}"}, timeout=120, trust_env=False
+        )
+        kept = _records(http)
+        api = next(child for child in up.children() if "splatmill_server.up.api" in " ".join(child.cmdline()))
+        before, begun = api.memory_info().rss, time.monotonic()
+        reports: list[Row] = []
+        while sum(report["test_cases"]["generated"] for report in reports) < requests:
+            reports.append(_round(url, kept, folder, seed + len(reports), examples, phases))
+        seconds = time.monotonic() - begun
+        ready = http.get("/readyz").status_code == 200 and psutil.pid_exists(api.pid)
+        grown = api.memory_info().rss - before
+        http.close()
+        log = (folder / "up.log").read_text(errors="replace")
+    unexpected = [line[:500] for line in log.splitlines() if any(word in line for word in _UNEXPECTED)]
+    return {
+        "bench": "openapi",
+        "requests": sum(report["test_cases"]["generated"] for report in reports),
+        "rounds": len(reports),
+        "seed": seed,
+        "operations": reports[0]["operations"]["tested"],
+        "seconds": round(seconds, 1),
+        "outcomes": _outcomes(reports),
+        "failures": [failure for report in reports for failure in report["failures"]],
+        "errors": [error for report in reports for error in report["errors"]],
+        "unexpected": unexpected,
+        "ready": ready,
+        "grown_bytes": grown,
+    }
+
+
+def _round(url: str, kept: Row, folder: Path, seed: int, examples: int, phases: list[str]) -> Row:
+    """Run schemathesis once, and return its report."""
+    report = folder / f"report-{seed}.json"
+    told = {"url": url, "key": KEY, "kept": kept}
+    environment = os.environ | {
+        "PYTHONPATH": str(HERE),
+        "SCHEMATHESIS_HOOKS": "_openapi.hooks",
+        "SPLATMILL_BENCH_OPENAPI": json.dumps(told),
+        "NO_PROXY": "*",
+    }
+    command = [str(Path(sys.executable).parent / "schemathesis"), "run", f"{url}/openapi.json"]
+    command += ["--header", f"Authorization: Bearer {KEY}", "--phases", ",".join(phases)]
+    command += ["--max-examples", str(examples), "--seed", str(seed), "--generation-database", "none"]
+    command += ["--checks", "all", "--exclude-checks", ",".join(LEFT_OUT)]
+    command += ["--exclude-path-regex", "/events$", "--continue-on-failure", "--no-shrink", "--no-color"]
+    command += [
+        "--request-timeout",
+        "60",
+        "--max-response-time",
+        "60",
+        "--report",
+        "json",
+        "--report-json-path",
+        str(report),
+    ]
+    ran = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=False)
+    if not report.is_file():
+        raise SystemExit(
+            f"schemathesis ended with status {ran.returncode}:\n{ran.stdout[-2000:]}{ran.stderr[-2000:]}"
+        )
+    found: Row = json.loads(report.read_text())
+    if found["exit_code"]:
+        print(ran.stdout[-60_000:], flush=True)
+    return found
+
+
+def _records(http: httpx.Client) -> dict[str, list[str]]:
+    """Make a capture, a model with a share, and a webhook; return their ids by the name of the path parameter."""
+    capture = str(http.post("/v1/captures", json={"name": "of the bench"}).raise_for_status().json()["id"])
+    for name, content in posed_capture(6, 64, 48).items():
+        http.put(f"/v1/captures/{capture}/{name}", content=content).raise_for_status()
+    asked = {"capture": capture, "options": {"steps": 20}}
+    job = str(http.post("/v1/jobs", json=asked).raise_for_status().json()["id"])
+    end = time.monotonic() + 300
+    while (state := http.get(f"/v1/jobs/{job}").raise_for_status().json()["state"]) != "succeeded":
+        if state in ("failed", "cancelled") or time.monotonic() > end:
+            raise SystemExit(f"The model could not be trained: {http.get(f'/v1/jobs/{job}').text}")
+        time.sleep(0.2)
+    share = http.post(f"/v1/models/{job}/shares", json={}).raise_for_status().json()
+    hook = http.post("/v1/webhooks", json={"url": "http://127.0.0.1:9/"}).raise_for_status().json()
+    return {
+        "capture_id": [capture],
+        "job_id": [job],
+        "model_id": [job],
+        "share_id": [share["id"]],
+        "token": [share["token"]],
+        "webhook_id": [hook["id"]],
+    }
+
+
+def _outcomes(reports: list[Row]) -> dict[str, int]:
+    """Return how many requests were accepted, refused as bad, named nothing, or met another state."""
+    sums: dict[str, int] = {}
+    for report in reports:
+        for phases in report["valid_rates"].values():
+            for counts in phases.values():
+                for outcome, count in counts.items():
+                    sums[outcome] = sums.get(outcome, 0) + count
+    return sums
+
+
+def document(row: Row) -> str:
+    """Return the page of a row."""
+    text = ["# Requests made up from the OpenAPI document", ""]
+    text += [
+        "Made by `splatmill bench openapi`; the head of `openapi.py` says what is tried and checked.",
+        "",
+    ]
+    text += [
+        f"{row['requests']} requests to {row['operations']} operations in {row['rounds']} rounds, "
+        f"{row['seconds']:.0f} seconds: {sum(f['count'] for f in row['failures'])} failed checks, "
+        f"{len(row['errors'])} errors of the tool, {len(row['unexpected'])} unexpected errors in the service's log. "
+        f"The API process grew by {row['grown_bytes'] / 1e6:.0f} MB; at the end the service "
+        f"{'was' if row['ready'] else 'was not'} ready.",
+        "",
+        "| of the well-formed requests | number |",
+        "|---|---:|",
+    ]
+    said: dict[str, str] = {
+        "accepted": "accepted",
+        "rejected": "refused for their content",
+        "unreachable": "named a record that is not there",
+        "conflicts": "met a record in another state",
+    }
+    text += [f"| {said.get(outcome, outcome)} | {count} |" for outcome, count in row["outcomes"].items()]
+    if row["failures"]:
+        text += ["", "| failed check | times | operations |", "|---|---:|---|"]
+        text += [
+            f"| {_named(failure)} | {failure['count']} | {_where(failure)} |" for failure in row["failures"]
+        ]
+    text += ["", "Not checked:", ""]
+    text += [f"- `{check}`: {reason}." for check, reason in LEFT_OUT.items()]
+    return "\n".join([*text, "", footer([row])]) + "\n"
+
+
+def _named(failure: dict[str, Any]) -> str:
+    return f"{failure['title']} ({failure['code']})"
+
+
+def _where(failure: dict[str, Any]) -> str:
+    return ", ".join(f"`{operation}`" for operation in failure["operations"])
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,44 @@
+"""The README's table of what the service survives is that of the rows; each bench's line says what its rows say."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import summary
+
+ORIGIN = {"machine": "one", "versions": {"python": "3"}, "commit": "abc"}
+SOAK: list[dict[str, Any]] = [
+    {"storage": "s3", "fault": "kill redis", "resumes": 7.4, "kills": True},
+    {"storage": "s3", "fault": None, "faults": 1, "killed": 1, "jobs": 3, "complaints": []},
+]
+
+
+def write(folder: Path, name: str, *rows: dict[str, object]) -> None:
+    (folder / f"{name}.jsonl").write_text("".join(json.dumps({**row, **ORIGIN}) + "\n" for row in rows))
+
+
+def test_the_readme_has_the_newest_rows() -> None:
+    text = summary.README.read_text()
+    assert summary.replaced(text, summary.table()) == text, "run `splatmill bench summary`"
+
+
+def test_benches_without_rows_have_no_line(tmp_path: Path) -> None:
+    assert summary.table(tmp_path).count("\n| ") == 0
+
+
+def test_what_did_not_hold_is_told(tmp_path: Path) -> None:
+    write(tmp_path, "soak", *SOAK)
+    held = (
+        "| 1 faults, 1 of them kills, while 3 jobs ran; storage in S3 | nothing lost, run twice or left over"
+    )
+    assert held in summary.table(tmp_path)
+    write(tmp_path, "soak", SOAK[0], SOAK[1] | {"complaints": ["job 1 is lost", "a file is half written"]})
+    assert "**2 things did not hold**; jobs went on within 7 s" in summary.table(tmp_path)
+
+
+def test_the_newest_row_counts(tmp_path: Path) -> None:
+    row = {"parser": "zip", "inputs": 10, "fault": "it ended with status -11"}
+    write(tmp_path, "fuzz", row, {"parser": "EXIF", "inputs": 5, "fault": ""})
+    assert "| 15 changed files for 2 parsers | 1 crashed" in summary.table(tmp_path)
+    write(tmp_path, "fuzz", row, row | {"inputs": 30, "fault": ""})
+    assert "| 30 changed files for 1 parsers | 0 crashed" in summary.table(tmp_path)
