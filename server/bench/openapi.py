@@ -10,8 +10,8 @@ those of records, among them a model with its files, a share and a webhook (`_op
 is a server error; status, headers, media type and body are those of the document; what is refused without a key; what
 was made can be read, and what was deleted cannot. Streams of events, which do not end, are left out.
 
-Rows go to results/openapi.jsonl, the page to openapi.md. Ends with status 1 if a check failed, if a request was not answered,
-if the service logged an error that it did not expect, or if it is not ready at the end.
+Rows go to results/openapi.jsonl, the page to openapi.md. Ends with status 1 if a check failed, if a request was not
+answered, if the service logged an error that it did not expect, or if it is not ready at the end.
 """
 
 from __future__ import annotations
