@@ -60,6 +60,7 @@ def renderer(tmp_path: Path) -> Iterator[str]:
         headers = {
             "ETag": etag,
             "Splatmill-Depth-Scale": "0.5",
+            "Splatmill-Request": request.headers["x-request-id"],
             "Set-Cookie": "no=1",
             "Cache-Control": "private",
         }
@@ -85,9 +86,14 @@ def app(serve: Serve, renderer: str) -> ServedApp:
 
 
 def test_a_picture_is_passed_on_with_what_belongs_to_it(app: ServedApp) -> None:
-    answer = app.http.post(f"/v1/models/{MODEL}/render", json={"camera": CAMERA, "output": "depth"})
+    answer = app.http.post(
+        f"/v1/models/{MODEL}/render",
+        json={"camera": CAMERA, "output": "depth"},
+        headers={"X-Request-ID": "ann-7"},
+    )
     assert answer.status_code == 200
     assert answer.headers["content-type"] == "image/png"
+    assert answer.headers["splatmill-request"] == "ann-7", "the log of the renderer names the request"
     assert answer.headers["splatmill-depth-scale"] == "0.5"
     assert "set-cookie" not in answer.headers
     lines = [json.loads(line) for line in answer.content.splitlines()]
