@@ -62,8 +62,8 @@ bench: install ## error against run time: kernels, functions, stability, worst i
 soak: $(VENV)/.installed-dev ## faults at random moments against the whole service (STORAGE=s3, SOAK_ARGS="--faults 30"; some 25 minutes)
 	$(BIN)/splatmill bench soak --storage $(or $(STORAGE),folder) $(SOAK_ARGS)
 
-capacity: $(VENV)/.installed-dev ## pages, memory and start of a service with a hundred thousand records (CAPACITY_ARGS="--records 2000")
-	$(BIN)/splatmill bench capacity $(CAPACITY_ARGS)
+capacity: $(VENV)/.installed-dev ## pages, memory and start of a service with a hundred thousand records (STORAGE=s3, CAPACITY_ARGS="--records 2000")
+	$(BIN)/splatmill bench capacity --storage $(or $(STORAGE),folder) $(CAPACITY_ARGS)
 
 fleet: $(VENV)/.installed-dev ## what 10 to 1,000 simulated workers ask of Redis and the API (some minutes; FLEET_ARGS="--workers 10")
 	$(BIN)/splatmill bench fleet $(FLEET_ARGS)

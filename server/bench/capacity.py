@@ -2,10 +2,12 @@
 
     splatmill bench capacity                     # a hundred thousand of each, a thousand followers; some ten minutes
     splatmill bench capacity --records 2000 --followers 100
+    splatmill bench capacity --storage s3        # two thousand of each, on moto's S3 server
     splatmill bench capacity --table             # the table again, from the rows
 
-Records are seeded as the service stores them (`_capacity/seed.py`). Redis is a process of its own, storage a folder. A
-page is asked of the app in this process, where its operations are counted; the rest is measured on a server process.
+Records are seeded as the service stores them (`_capacity/seed.py`). Redis is a process of its own, storage a folder or
+an S3 server on this machine, which answers some hundred requests a second and is there to count them, not to time them.
+A page is asked of the app in this process, where its operations are counted; the rest is measured on a server process.
 Rows go to results/capacity.jsonl, the table to capacity.md.
 
 Expected before it was measured: a page takes 2 to 3 round trips and under 100 ms anywhere in a list; an ended job and
@@ -16,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import logging
 import os
 import socket
 import subprocess
@@ -23,13 +26,15 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+import _s3_server
 import httpx
 import psutil
+import structlog
 from _capacity.followers import Served, follow_all
 from _capacity.operations import counted
 from _capacity.seed import FIRST, Seeded, seed
@@ -48,6 +53,9 @@ from splatmill_server.settings import Settings
 HERE = Path(__file__).resolve().parent
 ROWS = HERE / "results" / "capacity.jsonl"
 
+RECORDS = {"folder": 100_000, "s3": 2000}
+"""Records of each kind, by where they are stored."""
+
 PAGE = 50
 REPEATS = 5
 
@@ -59,25 +67,37 @@ def main(argv: list[str]) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--records", type=int, default=100_000, help="of each kind (default: 100000)")
+    parser.add_argument("--storage", choices=list(RECORDS), default="folder")
+    parser.add_argument("--records", type=int, help="of each kind (default: 100000, on s3 2000)")
     parser.add_argument("--followers", type=int, default=1000, help="of events (default: 1000)")
     parser.add_argument("--table", action="store_true", help="write the table from the rows")
     asked = parser.parse_args(argv)
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
     if not asked.table:
-        with tempfile.TemporaryDirectory(prefix="capacity") as name, running(Path(name)) as url:
-            for row in measure(Path(name), url, asked.records, asked.followers):
+        records = asked.records or RECORDS[asked.storage]
+        with (
+            tempfile.TemporaryDirectory(prefix="capacity") as name,
+            running(Path(name)) as url,
+            _s3_server.running("capacity") if asked.storage == "s3" else nullcontext() as bucket,
+        ):
+            for row in measure(Path(name), url, records, asked.followers, bucket):
                 print(row, flush=True)
                 append(ROWS, {**row, **origin("server", "client")})
     write_table(ROWS, HERE / "capacity.md")
     return 0
 
 
-def measure(folder: Path, redis_url: str, records: int, followers: int) -> Iterator[Row]:
-    """Yield a row for each thing that is measured, over `records` captures, jobs and models in an empty folder."""
-    settings = Settings(redis_url=redis_url, data=folder, access_log=False)
+def measure(
+    folder: Path, redis_url: str, records: int, followers: int, bucket: str | None = None
+) -> Iterator[Row]:
+    """Yield a row for each thing that is measured, over `records` captures, jobs and models in an empty folder.
+
+    bucket: URL of an empty bucket in which they lie instead.
+    """
+    settings = Settings(redis_url=redis_url, data=folder, access_log=False, storage=bucket or "")
     began = time.perf_counter()
     seeded = seed(Storage(settings.storage), records)
-    about = {"records": records}
+    about = {"records": records, "storage_in": "folder" if bucket is None else "s3"}
     yield {**about, "what": "seeding", "seconds": time.perf_counter() - began}
     app = create_app(settings)
     service: Service = app.state.service
@@ -138,12 +158,13 @@ async def _page(
         began = time.perf_counter()
         (await http.get(f"/v1/{kind}", params=params)).raise_for_status()
         first = time.perf_counter() - began
-    seconds, round_trips, storage = [], [], []
+    seconds, cpu, round_trips, storage = [], [], [], []
     for _ in range(REPEATS):
         with counted() as operations:
-            began = time.perf_counter()
+            began, busy = time.perf_counter(), time.process_time()
             answer = (await http.get(f"/v1/{kind}", params=params)).raise_for_status().json()
             seconds.append(time.perf_counter() - began)
+            cpu.append(time.process_time() - busy)
         round_trips.append(operations.round_trips)
         storage.append(sum(operations.storage.values()))
     return {
@@ -152,6 +173,7 @@ async def _page(
         "where": where,
         "found": len(answer[kind]),
         "seconds": median(seconds),
+        "cpu_seconds": median(cpu),
         "round_trips": min(round_trips),
         "storage": min(storage),
         "first_seconds": first,
@@ -177,7 +199,11 @@ def _memory(when: str, service: Service) -> Row:
 @contextmanager
 def _server(settings: Settings) -> Iterator[Served]:
     """Run an API process until it is ready."""
-    environment = os.environ | {"REDIS_URL": settings.redis_url, "SPLATMILL_DATA": str(settings.data)}
+    environment = os.environ | {
+        "REDIS_URL": settings.redis_url,
+        "SPLATMILL_DATA": str(settings.data),
+        "SPLATMILL_STORAGE": settings.storage,
+    }
     path = settings.data / "api.sock"
     command = [sys.executable, "-m", "splatmill_server", "--uds", str(path)]
     process = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)

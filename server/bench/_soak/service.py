@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import _s3_server
 import httpx
 import psutil
 import redis
@@ -245,7 +246,7 @@ class Service:
         """The storage past the proxy."""
         if self._s3 is None:
             return Storage(self.storage_url)
-        os.environ.update(_aws(self._ports[1]))
+        os.environ.update(_s3_server.environment(self._ports[1]))
         return Storage(self.storage_url)
 
     def ready(self) -> bool:
@@ -294,14 +295,14 @@ class Service:
 
     def _start_s3(self) -> None:
         port = self._ports[1]
-        self._s3 = self._popen(
-            [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)], "s3", dict(os.environ)
-        )
+        self._s3 = self._popen(_s3_server.command(port), "s3", dict(os.environ))
         url = f"http://127.0.0.1:{port}/soak"
         wait_for(lambda: _answers(lambda: httpx.put(url, trust_env=False)), 60, "the S3 server answers")
         self.s3_proxy = Proxy(("127.0.0.1", port))
         self.storage_url = "s3://soak/data"
-        self.environment |= _aws(self.s3_proxy.port) | {"SPLATMILL_STORAGE": self.storage_url}
+        self.environment |= _s3_server.environment(self.s3_proxy.port) | {
+            "SPLATMILL_STORAGE": self.storage_url
+        }
 
     def _popen(self, command: list[str], name: str, environment: dict[str, str]) -> subprocess.Popen[bytes]:
         parent = os.getpid()
@@ -333,15 +334,6 @@ def _answers(ask: Callable[[], object]) -> bool:
     except (redis.RedisError, httpx.HTTPError):
         return False
     return True
-
-
-def _aws(port: int) -> dict[str, str]:
-    return {
-        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
-        "AWS_ACCESS_KEY_ID": "soak",
-        "AWS_SECRET_ACCESS_KEY": "soak",
-        "AWS_REGION": "us-east-1",
-    }
 
 
 def _free_port() -> int:
