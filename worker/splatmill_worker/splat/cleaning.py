@@ -44,7 +44,7 @@ LEAST_HARM = 3.0 * HALF_LEVEL**2
 
 COMPARABLE = 0.25
 """Harm of a Gaussian over the largest there is, up from which it goes at the same time. A smaller one may be of the
-larger one's making, and is seen anew without it."""
+larger one's making, and is seen anew without it (decisions: cleaning)."""
 
 
 @dataclass(frozen=True)
