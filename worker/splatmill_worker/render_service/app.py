@@ -11,6 +11,8 @@ import logging
 import os
 import shutil
 import tempfile
+import time
+from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -202,24 +204,36 @@ class RenderApp:
         self, request: Request, model_id: str, body: OrbitFrames, headers: dict[str, str]
     ) -> Response:
         """Render frame by frame, so that images can be rendered in between, and none is rendered for a client that has
-        left."""
+        left.
+
+        The model is not held between two turns, so that all models keep to the bytes of the cache. A turn that had to
+        read it goes on for as long as that took: videos of models that do not fit together would else read them anew
+        for each frame.
+        """
         from splatmill_worker.film import Film
         from splatmill_worker.render_service.encoding import render_frame
 
-        model = await self._queue.run(
-            lambda: self._cache.get(model_id), request.is_disconnected, _client(request)
-        )
         orbit = body.orbit
-        cameras = await run_in_threadpool(self._orbit_cameras, model, orbit)
+        cameras = await self._queue.run(
+            lambda: self._orbit_cameras(self._cache.get(model_id), orbit),
+            request.is_disconnected,
+            _client(request),
+        )
+        waiting = deque(cameras[body.first : body.first + body.count])
         with _video_file() as path:
             film = Film(path, orbit.width, orbit.height, orbit.fps)
 
-            def add(camera: Camera) -> None:
-                film.add(render_frame(model, camera, orbit.background))
+            def add_some() -> None:
+                began = time.monotonic()
+                model = self._cache.get(model_id)
+                read = time.monotonic()
+                film.add(render_frame(model, waiting.popleft(), orbit.background))
+                while waiting and time.monotonic() - read < read - began:
+                    film.add(render_frame(model, waiting.popleft(), orbit.background))
 
             try:
-                for camera in cameras[body.first : body.first + body.count]:
-                    await self._queue.run(partial(add, camera), request.is_disconnected, _client(request))
+                while waiting:
+                    await self._queue.run(add_some, request.is_disconnected, _client(request))
             finally:
                 await run_in_threadpool(film.close)
         return _video_response(path, headers)

@@ -26,7 +26,8 @@ class RenderQueue:
     """Runs one piece of work at a time, so that it has all cores.
 
     Clients take turns: one that asks for a hundred pictures, or for a video, which is as many, delays the first picture
-    of another by one. Those of one client come in order.
+    of another by one. Those of one client come in order. Views of one model are not rendered together, which would gain
+    nothing (decisions: view-batches).
 
     max_waiting: requests that may wait beside the one that is served.
     max_of_client: requests of one client that may be in the queue; None: as many as fit.
