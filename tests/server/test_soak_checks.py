@@ -360,6 +360,16 @@ def test_what_works_again_is_measured_and_a_capture_that_was_made_must_be_kept()
     assert clients.captures == [OTHER]
 
 
+def test_a_job_that_failed_and_was_restarted_waits_as_a_new_one() -> None:
+    service, clients = served("resumes")
+    healed = time.monotonic()
+    assert recovery.missing(service, clients, healed, healed) == {"a"}
+    clients.promises["a"].restarted_at = 2.0
+    assert recovery.missing(service, clients, healed, healed) == set()
+    service.records().append(line("begin", at=3.0))
+    assert recovery.missing(service, clients, healed, healed) == {"a"}
+
+
 def test_an_orphan_after_a_fault_is_named() -> None:
     service, clients = served("orphans")
     _, complaint = recovery.recover(service, clients, 2.0, time.monotonic() - recovery.RESUME_SECONDS + 0.5)

@@ -49,6 +49,7 @@ class Promise:
     state: the last that was seen.
     cancel: whether a client cancels it.
     restarts: how often a client restarted it after a failure whose advice that is.
+    restarted_at: monotonic time of the last restart: before it, the job had ended.
     missing_since: monotonic time since when the service says that there is no such job.
     """
 
@@ -58,6 +59,7 @@ class Promise:
     cancel: bool = False
     state: str = "queued"
     restarts: int = 0
+    restarted_at: float = 0.0
     asked_to_cancel: bool = False
     missing_since: float | None = None
     failure: str | None = None
@@ -205,6 +207,7 @@ class Clients:
         try:
             if self._http.post(f"/v1/jobs/{promise.job}/restart").status_code == 202:
                 promise.restarts += 1
+                promise.restarted_at = time.monotonic()
         except httpx.HTTPError:
             pass  # the next look sees what became of it
 

@@ -83,11 +83,17 @@ def shows(service: Service, clients: Clients) -> bool:
     return answer.status_code == 200 and answer.content.startswith(b"\x89PNG")
 
 
+def interrupted(service: Service, clients: Clients, struck: float) -> set[str]:
+    """Return the jobs that had begun before the fault. One that failed and was restarted since waits as a new one."""
+    restarted = {promise.job: promise.restarted_at for promise in list(clients.promises.values())}
+    records = [line for line in service.records() if line["at"] > restarted.get(line["job"], 0.0)]
+    return attempts.interrupted(records, struck, ())
+
+
 def missing(service: Service, clients: Clients, struck: float, healed: float) -> set[str]:
-    """Return the jobs that were interrupted and have not got on."""
-    ended = [promise.job for promise in list(clients.promises.values()) if promise.state in FINAL]
-    records = service.records()
-    return attempts.interrupted(records, struck, ended) - attempts.got_on(records, healed).keys()
+    """Return the jobs that were interrupted, have not ended and have not got on."""
+    ended = {promise.job for promise in list(clients.promises.values()) if promise.state in FINAL}
+    return interrupted(service, clients, struck) - ended - attempts.got_on(service.records(), healed).keys()
 
 
 def resumed(service: Service, clients: Clients, struck: float, healed: float) -> bool | float:
@@ -95,12 +101,10 @@ def resumed(service: Service, clients: Clients, struck: float, healed: float) ->
 
     A job that has ended without another step, cancelled or stored before, counts from when it is seen: True.
     """
-    records = service.records()
-    on = attempts.got_on(records, healed)
-    interrupted = attempts.interrupted(records, struck, ()) & on.keys()
+    on = attempts.got_on(service.records(), healed)
     if missing(service, clients, struck, healed):
         return False
-    begun = [on[job] for job in interrupted]
+    begun = [on[job] for job in interrupted(service, clients, struck) if job in on]
     if begun:
         return max(begun)
     known = {promise.job for promise in clients.unfinished()}
