@@ -9,9 +9,13 @@ import ast
 import re
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 
 import pytest
+
+from splatmill import schema
 
 ROOT = Path(__file__).parent.parent
 PARTS = {
@@ -69,6 +73,16 @@ def test_importing_stays_cheap(module: str, forbidden: set[str]):
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120
     )
     assert forbidden.isdisjoint(done.stdout.split())
+
+
+def test_a_name_of_the_schema_is_one_thing_in_all_its_modules():
+    """The package takes its names from its modules when the first is used, from whichever has them."""
+    modules = [import_module(f"splatmill.schema.{found.name}") for found in iter_modules(schema.__path__)]
+    for name in schema.__all__:
+        found = {id(vars(module)[name]) for module in modules if name in vars(module)}
+        assert found == {id(getattr(schema, name))}, name
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = schema.no_such_name
 
 
 def test_untrusted_files_are_opened_in_one_place():

@@ -40,7 +40,8 @@ class Command:
         self.script = {"steps": 60, "pause": 0.05, "diary": str(self._diary)} | script
 
     def start(self, *options: str, photos: Path | None = None) -> subprocess.Popen[str]:
-        environment = os.environ | STANDIN | {"STANDIN_SCRIPT": json.dumps(self.script), "NO_COLOR": "1"}
+        environment = os.environ | STANDIN | {"STANDIN_SCRIPT": json.dumps(self.script)}
+        environment |= {"NO_COLOR": "1", "PYTHONUNBUFFERED": "1"}
         environment.pop("SPLATMILL_SERVER", None)
         command = [
             sys.executable,
@@ -136,12 +137,18 @@ def test_the_same_command_goes_on_after_a_signal(command: Command, sent: signal.
 def test_a_second_ctrl_c_loses_only_what_follows_the_last_checkpoint(tmp_path: Path) -> None:
     # The step after the fifth is one call of native code, which cannot save its state.
     command = Command(tmp_path, do="native", at=6)
-    process = command.start()
-    wait_for(lambda: command.steps()[1] == 5, 60)
-    while process.poll() is None:
+    with command.start() as process:
+        wait_for(lambda: command.steps()[1] == 5, 60)
         process.send_signal(signal.SIGINT)
-        time.sleep(2 * ONE_SIGNAL_SECONDS)
-    said, _ = process.communicate()
+        assert process.stdout is not None
+        said = ""
+        while "A second Ctrl-C stops it at once" not in said:
+            line = process.stdout.readline()
+            assert line, said
+            said += line
+        time.sleep(2 * ONE_SIGNAL_SECONDS)  # two signals that come closer are one Ctrl-C
+        process.send_signal(signal.SIGINT)
+        said += process.stdout.read()
     assert process.returncode == Exit.cancelled, said
     command.script["do"] = "nothing"
     code, said = command.run()
