@@ -74,6 +74,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Spoilt:
     return Spoilt(folder / "model.ply", folder / "capture")
 
 
+@pytest.mark.slow
 def test_what_the_photos_do_not_support_goes_and_the_rest_stays(made: Spoilt, tmp_path: Path) -> None:
     out = tmp_path / "cleaned.ply"
     cleaned = clean_file(made.model, out, Wanted(capture=made.capture))
@@ -113,6 +114,7 @@ def test_a_box_and_a_weight_need_no_photos(made: Spoilt, tmp_path: Path) -> None
     assert clean_file(made.model, out, Wanted(min_weight=0.0)).left == OWN + PLANTED
 
 
+@pytest.mark.slow
 def test_photos_alone_take_the_cameras_beside_the_model(made: Spoilt, tmp_path: Path) -> None:
     shutil.copytree(made.capture / "images", tmp_path / "photos")
     shutil.copy(made.model, tmp_path / "model.ply")

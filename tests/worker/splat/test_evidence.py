@@ -52,6 +52,7 @@ def without(gaussians: Gaussians, row: int) -> Gaussians:
     return gaussians.select(torch.arange(gaussians.count) != row)
 
 
+@pytest.mark.slow
 def test_support_is_the_error_that_a_photo_has_more_without_the_gaussian(
     gaussians: Gaussians, photos: list[Target]
 ) -> None:
@@ -66,6 +67,7 @@ def test_support_is_the_error_that_a_photo_has_more_without_the_gaussian(
             assert abs(float(mean[row]) - true) <= 5.0 * float(error[row]) + 2e-3 + 0.01 * abs(true)
 
 
+@pytest.mark.slow
 def test_weights_are_what_the_colour_of_a_gaussian_changes(
     gaussians: Gaussians, photos: list[Target]
 ) -> None:
@@ -107,6 +109,7 @@ def test_others_leave_out_the_photo_that_supports_the_gaussian_most(
     assert bool((2 * alone.photos == twice.photos).all())
 
 
+@pytest.mark.slow
 def test_an_opaque_gaussian_is_not_taken_for_one_that_shows_nothing(photos: list[Target]) -> None:
     """At the clamp of alpha no gradient flows; the passes stay below it."""
     wall = Gaussians(
