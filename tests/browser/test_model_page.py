@@ -126,6 +126,18 @@ def test_files_and_the_orbit_video_are_there(
     shown.get_by_role("button", name="Make the video").click()
     shown.get_by_role("button", name="Stop").click()
     expect(shown.locator("#orbit .hint")).to_have_text("Stopped.")
+    assert service.http.get(f"/v1/models/{model.id}/orbits").json()["orbits"] == []
+    # One that is rendered while no page is open is there when one is opened.
+    wish = {"seconds": 0.5, "fps": 8, "width": 64, "height": 48}
+    made = service.http.post(f"/v1/models/{model.id}/orbits", json=wish).json()
+    shown.reload()
+    shown.get_by_role("button", name="Play 64 x 48, 0.5 seconds").click(timeout=WAIT)
+    video = shown.locator("#orbit video")
+    expect(video).to_have_attribute("src", made["links"]["video"])
+    shown.wait_for_function("() => document.querySelector('#orbit video').duration === 0.5", polling=100)
+    shown.get_by_role("button", name="Delete the video 64 x 48").click()
+    expect(video).to_have_count(0)
+    assert service.http.get(made["links"]["self"]).status_code == 404
 
 
 def test_a_format_is_made_when_it_is_asked_for_and_its_row_is_told_anew(
