@@ -199,9 +199,11 @@ class Models:
             found |= {
                 record.id: _ended(record) for record in each(self._record, others) if record is not None
             }
+            added = lists.Additions()
+            for model_id, record in found.items():
+                lists.add(added, "models", model_id, record.moment, record.owner)
             with connection.pipeline() as pipe:
-                for model_id, record in found.items():
-                    lists.add(pipe, "models", model_id, record.moment, record.owner)
+                added.send(pipe)
                 pipe.execute()
             names = {model_id: _Named(name=record.name) for model_id, record in found.items()}
             self.lists.keep("models", {model_id: _keep(named) for model_id, named in names.items()})

@@ -5,7 +5,7 @@ final states) with and without the owner, and one for each capture. They follow 
 they hold all of it, and is lost with them. A list may name a record that is just being made or deleted; readers check.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from typing import Any, Literal, cast
 
@@ -47,6 +47,28 @@ def on_capture(capture_id: str) -> str:
 def milliseconds(moment: datetime) -> int:
     """Return the score of a record in its lists."""
     return int(moment.timestamp() * 1000)
+
+
+class Additions:
+    """Records that are in no list yet, to be added together: a command for each list, and not several for each record.
+
+    It takes the place of the pipe of `add` and `put_job`.
+    """
+
+    def __init__(self) -> None:
+        self._scores: dict[str, dict[str, int]] = {}
+
+    def zadd(self, named: str, scores: Mapping[str, int]) -> None:
+        """Note additions to a list."""
+        self._scores.setdefault(named, {}).update(scores)
+
+    def zrem(self, named: str, record_id: str) -> None:
+        """Do nothing: the record is in no list."""
+
+    def send(self, pipe: Any) -> None:
+        """Add what was noted, by a connection or a pipeline."""
+        for named, scores in self._scores.items():
+            pipe.zadd(named, scores)
 
 
 def add(pipe: Any, kind: Kind, record_id: str, moment: int, owner: str) -> None:

@@ -166,10 +166,12 @@ class Captures:
             return None
 
     def _list(self, captures: Sequence[Capture]) -> None:
+        added = lists.Additions()
+        for capture in captures:
+            moment = lists.milliseconds(capture.created_at)
+            lists.add(added, "captures", capture.id, moment, capture.owner or DEFAULT_OWNER)
         with self.lists.connection.pipeline() as pipe:
-            for capture in captures:
-                moment = lists.milliseconds(capture.created_at)
-                lists.add(pipe, "captures", capture.id, moment, capture.owner or DEFAULT_OWNER)
+            added.send(pipe)
             pipe.execute()
 
     def unlist(self, capture_id: str, owner: str | None) -> None:

@@ -124,9 +124,11 @@ def _restore_ended(
         end for end in each(lambda job_id: job_log.stored_end(storage, job_id), missing) if end is not None
     ]
     with connection.pipeline() as pipe:
+        added = lists.Additions()
         for end in ends:
-            _restore(pipe, end.job, end.generation)
+            _restore(pipe, added, end.job, end.generation)
             _note(succeeded, end.job)
+        added.send(pipe)
         pipe.execute()
     for job_id in listed.deleted(StoredKind.model, [end.job.id for end in ends]):
         if not storage.exists(layout.job_log(job_id)):
@@ -145,8 +147,8 @@ def _note(succeeded: dict[str, Ended], job: Job) -> None:
         succeeded[job.id] = Ended(moment, job.owner or JobRow.model_fields["owner"].default, job.name)
 
 
-def _restore(pipe: Any, job: Job, generation: int) -> None:
-    """Write the row, the states and the newest progress from which `fold` makes this job."""
+def _restore(pipe: Any, added: lists.Additions, job: Job, generation: int) -> None:
+    """Write the row, the states and the newest progress from which `fold` makes this job, and add it to its lists."""
     ended = job.finished_at or job.created_at
     begun = min(job.started_at, ended) if job.started_at is not None else None
     said: list[tuple[Any, Event]] = []
@@ -190,4 +192,4 @@ def _restore(pipe: Any, job: Job, generation: int) -> None:
         newest = ProgressEvent.model_validate(job.progress.model_dump())
         pipe.hset(keys.latest(job.id), *events.newest_entry(last, generation, job.attempt, newest))
     pipe.set(keys.attempts(job.id), job.attempt)
-    lists.put_job(pipe, job.id, lists.milliseconds(job.created_at), row.owner, job.capture, job.state.value)
+    lists.put_job(added, job.id, lists.milliseconds(job.created_at), row.owner, job.capture, job.state.value)
