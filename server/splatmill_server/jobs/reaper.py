@@ -82,6 +82,11 @@ class Reaper:
         active = self.jobs.active()
         cancelling = [row for row in active if row.cancel_requested_at is not None]
         unfinished = [row for row in cancelling if not _safely(self.cancel, row, True)]
+        for row in cancelling:
+            if (
+                row not in unfinished
+            ):  # stored at once: a Redis that comes back empty would have the job run again
+                self.jobs.retire(row.id)
         self._check([row for row in active if row.cancel_requested_at is None])
         shrinking.shrink_due(self.connection)
         return bool(unfinished)

@@ -207,10 +207,10 @@ class Jobs:
                 if job_id in held and not held[job_id].state.final:
                     found.append(held[job_id].row)
                 elif job_id in held or not self.connection.exists(keys.job(job_id)):
-                    self._retire(job_id)
+                    self.retire(job_id)
         return found
 
-    def _retire(self, job_id: str) -> None:
+    def retire(self, job_id: str) -> None:
         """Store the log of a job that has ended, announce its end, and remove it from the set of active ones.
 
         It stays there if either cannot be stored, so that this is tried again, and if it was restarted meanwhile. The

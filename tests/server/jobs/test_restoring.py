@@ -172,3 +172,12 @@ def test_those_who_ask_while_lists_are_made_are_told_to_come_again(
     app.redis.delete(keys.LISTING)
     assert list(listed(app)) == [job_id]
     assert app.redis.get(keys.LISTED) == lists.VERSION
+
+
+def test_a_cancelled_job_stays_cancelled_where_redis_comes_back_empty_at_once(app: ServedApp) -> None:
+    job_id = app.job()
+    app.http.post(f"/v1/jobs/{job_id}/cancel")
+    app.service.reaper.tick()
+    app.redis.flushall()
+    app.service.reaper.tick()
+    assert app.state(job_id) == "cancelled"
