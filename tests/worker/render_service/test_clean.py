@@ -135,6 +135,16 @@ def test_photos_alone_take_the_cameras_beside_the_model(made: Spoilt, tmp_path: 
     assert cleaned.held_out[0] == 2
 
 
+def test_a_damaged_cameras_json_is_refused(made: Spoilt, tmp_path: Path) -> None:
+    """Without it, photos that training has left out would decide."""
+    shutil.copy(made.model, tmp_path / "model.ply")
+    (tmp_path / "cameras.json").write_text('{"cameras": [')
+    for wanted in (Wanted(capture=made.capture), Wanted(min_weight=1.0)):
+        with pytest.raises(Refusal, match=r"cameras.json is damaged: .+\. It names the photos that were held out"):
+            clean_file(tmp_path / "model.ply", tmp_path / "out.ply", wanted)
+    assert not (tmp_path / "out.ply").exists()
+
+
 def test_a_model_of_another_scene_is_refused(
     made: Spoilt, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,6 +15,7 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor
 
+from splatmill.backplane.records import reason
 from splatmill.schema import EditModel, ModelCameras
 from splatmill_worker.errors import ModelUnreadable, Refusal, StartUnusable
 from splatmill_worker.images.load import load_views
@@ -142,8 +143,8 @@ def clean_file(model: Path, out: Path, wanted: Wanted) -> Cleaned:
 def table(cleaned: Cleaned) -> str:
     """What was removed by reason, and the PSNR before and after."""
     rows = [("removed", "Gaussians", "share")]
-    for reason, count in (*cleaned.removed.items(), ("left", cleaned.left)):
-        rows.append((reason, f"{count:,}", f"{100.0 * count / cleaned.before:.2f} %"))
+    for kind, count in (*cleaned.removed.items(), ("left", cleaned.left)):
+        rows.append((kind, f"{count:,}", f"{100.0 * count / cleaned.before:.2f} %"))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
         f"{first.ljust(widths[0])}  {count.rjust(widths[1])}  {share.rjust(widths[2])}"
@@ -185,7 +186,7 @@ def _by_photos(
         rows = keep.nonzero()[:, 0]
         found = clean(gaussians.select(rows), targets, background, antialias=antialias)
         keep[rows[~found.keep]] = False
-        cleaned.removed |= {f"unsupported: {reason}": count for reason, count in found.removed.items()}
+        cleaned.removed |= {f"unsupported: {kind}": count for kind, count in found.removed.items()}
     left = gaussians.select(keep)
     after = [_mean(left, each, background, antialias) for each in (views.training, views.held_out)]
     cleaned.photos = (len(views.training), before[0], after[0])
@@ -270,11 +271,18 @@ def _split(scene: Scene, stored: ModelCameras | None) -> tuple[Sequence[View], S
 
 
 def _stored(model: Path) -> ModelCameras | None:
-    """The cameras.json beside a model; None where there is none that can be read."""
+    """The cameras.json beside a model; None where there is none. Raises Refusal for one that cannot be read."""
+    path = model.with_name("cameras.json")
     try:
-        return ModelCameras.model_validate_json(model.with_name("cameras.json").read_bytes())
-    except (FileNotFoundError, ValidationError):
+        return ModelCameras.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
         return None
+    except ValidationError as error:
+        raise Refusal(
+            "poses_invalid",
+            f"{path} is damaged: {reason(error)}. It names the photos that were held out. Download it again, or move "
+            "it away to hold out every eighth photo.",
+        ) from error
 
 
 def _longest(stored: ModelCameras) -> int:
