@@ -125,7 +125,7 @@ class WaitTimeout(SplatmillError, TimeoutError):
     """The job, or the orbit video, has not ended within the given time. It continues.
 
     job_id: the id of the job or of the video.
-    state: what it was last seen in.
+    state: the state in which it was last seen.
     """
 
     def __init__(self, job_id: str, state: str, seconds: float, what: str = "job") -> None:

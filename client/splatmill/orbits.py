@@ -44,7 +44,10 @@ class AsyncOrbits:
         return read_answer(Orbit, response)
 
     async def get(self, orbit_id: str) -> Orbit:
-        """Return a video: its state, the frames that are rendered, and at the end its size or the problem."""
+        """Return a video: its state, the frames that are rendered, and at the end its size or the problem.
+
+        Raises NotFound for a video that does not exist.
+        """
         return read_answer(Orbit, await self._connection.request("GET", f"{self._path}/{orbit_id}"))
 
     async def wait(self, orbit_id: str, on_progress: OnProgress | None = None) -> Orbit:
@@ -81,7 +84,10 @@ class AsyncOrbits:
         )
 
     async def delete(self, orbit_id: str) -> None:
-        """Delete a video; one that is not whole is not rendered any further."""
+        """Delete a video; one that is not whole is not rendered any further.
+
+        Raises NotFound for a video that does not exist.
+        """
         await self._connection.request("DELETE", f"{self._path}/{orbit_id}")
 
 

@@ -13,7 +13,8 @@ results/fleet.jsonl, the page to fleet.md, and what it comes to for a service to
 Expected before it was measured: an idle worker makes two round trips a second, a training one ten (four events, each
 with a question before it, one look for onlookers, and heartbeats), and a job takes a hundred. Redis spends 20
 microseconds on each, so that a thousand workers that train take a fifth of a core. What grows with the square of the
-number is dearer: each worker looks every ten seconds whether each other is still recorded, and at its start reads each.
+number costs more: each worker looks every ten seconds whether each other is still recorded, and at its start reads
+each.
 """
 
 from __future__ import annotations

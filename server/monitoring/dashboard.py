@@ -1,7 +1,7 @@
 """Writes `dashboard.json`, the Grafana dashboard of the service: `python server/monitoring/dashboard.py`.
 
 It is built from Grafana's own types, so that mypy checks its fields. A metric that all API processes tell alike is
-aggregated by `max`, one that each counts for itself by `sum` (docs/generate/metrics.py has which).
+aggregated by `max`, one that each counts for itself by `sum` (docs/generate/metrics.py lists which is which).
 """
 
 import json

@@ -67,7 +67,7 @@ def _request_id() -> dict[str, str]:
     return {rendering.REQUEST_HEADER: found} if found else {}
 
 
-class Counted(httpx.AsyncBaseTransport):
+class CountingTransport(httpx.AsyncBaseTransport):
     """Counts the requests that it passes on, by their kind and how they ended."""
 
     def __init__(self, transport: httpx.AsyncBaseTransport, metrics: Metrics) -> None:

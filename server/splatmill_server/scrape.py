@@ -21,7 +21,6 @@ from splatmill_server.metrics import SAME, SMALLEST
 
 _KINDS: tuple[lists.Kind, ...] = ("captures", "jobs", "models")
 
-
 SERVICE_FAULTS = (
     "attempts_exhausted",
     "capture_incomplete",

@@ -31,7 +31,7 @@ from splatmill_server.metrics import Metrics
 from splatmill_server.models import Models
 from splatmill_server.orbits import Orbits
 from splatmill_server.outgoing import Outgoing
-from splatmill_server.renderer import Counted
+from splatmill_server.renderer import CountingTransport
 from splatmill_server.settings import Settings
 from splatmill_server.shares import Shares
 from splatmill_server.space.deletion import Deletion
@@ -119,7 +119,7 @@ class Service:
     def of(cls, settings: Settings) -> "Service":
         """Return the state for these settings. Raises StorageError if storage cannot be opened."""
         metrics = Metrics()
-        storage = Storage(settings.storage, watch=metrics.storage_operation)
+        storage = Storage(settings.storage, on_operation=metrics.storage_operation)
         redis_async = connect_async(settings.redis_url)
         connection = connect(settings.redis_url, timeout=settings.redis_timeout, retries=1)
         lists = Lists(connection)
@@ -194,7 +194,7 @@ def _renderer(settings: Settings, metrics: Metrics) -> httpx.AsyncClient | None:
         return None
     base, socket = rendering.address(settings.renderer_url)
     # The renderer has a private address, so requests to it must not go through a proxy.
-    transport = Counted(httpx.AsyncHTTPTransport(uds=socket, trust_env=False), metrics)
+    transport = CountingTransport(httpx.AsyncHTTPTransport(uds=socket, trust_env=False), metrics)
     return httpx.AsyncClient(base_url=base, transport=transport, trust_env=False)
 
 

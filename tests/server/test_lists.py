@@ -110,10 +110,8 @@ def test_a_page_takes_a_few_round_trips_and_nothing_of_storage(seeded: tuple[Ser
     pages: dict[str, tuple[Page, int]] = {
         "jobs": (jobs(service), 2),
         "jobs of an owner": (jobs(service, JobFilter(owner="owner3")), 2),
-        "jobs in a state": (
-            jobs(service, failed),
-            3,
-        ),  # a glance at those that have not ended tells them apart
+        # One more for a glance at those that have not ended.
+        "jobs in a state": (jobs(service, failed), 3),
         "jobs of a name": (jobs(service, JobFilter(name="job 11")), 3),
         "jobs on a capture": (jobs(service, JobFilter(capture=records.captures[7])), 2),
         "captures": (captures(service), 2),

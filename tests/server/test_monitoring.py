@@ -109,7 +109,9 @@ def test_the_dashboard_is_what_grafanas_types_make_of_it() -> None:
 
 def test_every_alert_is_played_until_it_fires() -> None:
     tested = yaml.safe_load(PLAYED.read_text())["tests"]
-    fired = {case["alertname"] for test in tested for case in test["alert_rule_test"] if case.get("exp_alerts")}
+    fired = {
+        case["alertname"] for test in tested for case in test["alert_rule_test"] if case.get("exp_alerts")
+    }
     assert fired == {rule["alert"] for rule in RULES}
 
 

@@ -41,7 +41,7 @@ _SMALL = 256 * 1024
 _CONCURRENT_BLOCKS = 4
 _DELETED_AT_ONCE = 1000
 
-Watch = Callable[[str, float, StorageError | None], None]
+OnOperation = Callable[[str, float, StorageError | None], None]
 """Called after each operation with its verb (read, write, list, delete), its seconds, and the error that ended it."""
 
 _STAGED = re.compile(r"#\d+\Z", re.ASCII)
@@ -71,7 +71,7 @@ class Storage:
 
     read_only: for a process that only reads, and need not have the right to write to the folder.
     patience: how long a bucket may take.
-    watch: told of each operation. One that is repeated after a break counts once for each time.
+    on_operation: told of each operation. One that is repeated after a break counts once for each time.
     """
 
     def __init__(
@@ -80,10 +80,10 @@ class Storage:
         *,
         read_only: bool = False,
         patience: Patience | None = None,
-        watch: Watch | None = None,
+        on_operation: OnOperation | None = None,
     ) -> None:
         self.url = url
-        self._watch = watch
+        self._on_operation = on_operation
         self.root: Path | None = None
         self._patience = patience or Patience()
         self._slots: Slots | None = None
@@ -136,8 +136,8 @@ class Storage:
         self._tell(verb, time.monotonic() - began, None)
 
     def _tell(self, verb: str, seconds: float, error: StorageError | None) -> None:
-        if self._watch is not None:
-            self._watch(verb, seconds, error)
+        if self._on_operation is not None:
+            self._on_operation(verb, seconds, error)
 
     def local_path(self, path: str) -> Path | None:
         """Return the local path of `path`, or None if storage is remote. The file need not exist."""

@@ -64,7 +64,9 @@ class OrbitFrames(Request):
     @model_validator(mode="after")
     def _of_the_video(self) -> Self:
         if self.first + self.count > self.orbit.frames:
-            raise ValueError(f"the video has {self.orbit.frames} frames")
+            raise ValueError(
+                f"{self.count} frames from {self.first} on are asked for, and the video has {self.orbit.frames}"
+            )
         return self
 
 

@@ -86,9 +86,8 @@ class Captures:
         # Listed first: a crash in between leaves an entry of the list that readers skip, and no capture without one.
         try:
             self._list([capture])
-        except (
-            redis.RedisError
-        ) as error:  # captures can be made and filled without Redis; `space.relisting` lists this one
+        except redis.RedisError as error:
+            # Captures can be made and filled without Redis; `space.relisting` lists this one.
             self.unlisted = True
             log.warning("a capture is not listed yet", capture=capture.id, error=str(error))
         if self.storage.put_new(layout.capture_record(capture.id), record):

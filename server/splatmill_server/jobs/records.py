@@ -465,9 +465,8 @@ class Jobs:
                 pipe.incr(begun)
             pipe.hset(keys.job(job_id), mapping=kept)
             if begins:
-                outcome.retire(
-                    pipe, found, states
-                )  # the end of the former generation, if nobody has seen it yet
+                # The end of the former generation, if nobody has seen it yet.
+                outcome.retire(pipe, found, states)
                 pipe.sadd(keys.ACTIVE, job_id)
                 pipe.zrem(keys.WHOLE, job_id)
                 created = lists.milliseconds(found.created_at)

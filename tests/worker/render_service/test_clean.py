@@ -140,7 +140,9 @@ def test_a_damaged_cameras_json_is_refused(made: Spoilt, tmp_path: Path) -> None
     shutil.copy(made.model, tmp_path / "model.ply")
     (tmp_path / "cameras.json").write_text('{"cameras": [')
     for wanted in (Wanted(capture=made.capture), Wanted(min_weight=1.0)):
-        with pytest.raises(Refusal, match=r"cameras.json is damaged: .+\. It names the photos that were held out"):
+        with pytest.raises(
+            Refusal, match=r"cameras.json is damaged: .+\. It names the photos that were held out"
+        ):
             clean_file(tmp_path / "model.ply", tmp_path / "out.ply", wanted)
     assert not (tmp_path / "out.ply").exists()
 

@@ -30,11 +30,10 @@ def join(parts: Sequence[Path], path: Path) -> int:
                     stream = target.add_stream_from_template(found)
                 elif found.codec_context.extradata != stream.codec_context.extradata:
                     raise ValueError(
-                        f"the part {part.name} was encoded with other settings than those before"
+                        f"the part {part.name} was encoded with other settings than those before it"
                     )
-                frame = int(
-                    1 / (found.average_rate * found.time_base)
-                )  # its duration in units of the time base
+                # The duration of a frame in units of the time base.
+                frame = int(1 / (found.average_rate * found.time_base))
                 for packet in source.demux(found):
                     if packet.dts is None:  # the end of the part
                         continue

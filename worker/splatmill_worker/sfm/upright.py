@@ -94,9 +94,8 @@ def _candidates(x: Float, y: Float) -> Float:
     first, second = random.integers(0, len(x), (2, PAIRS))
     across = np.cross(x[first], x[second])
     lengths = np.linalg.norm(across, axis=1)
-    wide = (
-        lengths > 0.1
-    )  # sine of the angle: nearer to parallel, the roll of the photos decides the direction
+    # Sine of the angle: nearer to parallel, the roll of the photos decides the direction.
+    wide = lengths > 0.1
     across = across[wide] / lengths[wide, None]
     return np.concatenate([across, -across, y])
 

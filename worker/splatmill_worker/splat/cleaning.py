@@ -38,7 +38,6 @@ FLOATER = 0.5
 FIRST_SHARE = 1e-3
 """Share of the Gaussians that are removed first, at least one; each further time, up to twice as many."""
 
-
 LEAST_HARM = 3.0 * HALF_LEVEL**2
 """Squared error of all photos up to which a Gaussian does no harm: that of the rounding to 8 bits at one pixel."""
 
