@@ -30,9 +30,8 @@ def test_every_row_is_measured_and_written(tmp_path: Path, monkeypatch: pytest.M
     assert rate["jobs"] == 6
     assert rate["storage"]["retire"] >= 1
     assert rate["kept_bytes"] < rate["bytes"]
-    # Four events a second in one round trip each, one look for onlookers, and some heartbeats.
-    assert 1 < training["events"] < 5
-    assert training["round_trips"] < 2 * training["events"]
+    # An event is one round trip; beside them there are looks for onlookers and heartbeats.
+    assert 0 < training["events"] < training["round_trips"]
     assert training["page"]["found"] == 3
     origin = {"commit": "c", "machine": "m", "versions": {"python": "3"}}
     for row in found:

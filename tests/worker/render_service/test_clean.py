@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,6 +121,10 @@ def test_photos_alone_take_the_cameras_beside_the_model(made: Spoilt, tmp_path: 
     shutil.copy(made.model, tmp_path / "model.ply")
     wanted = Wanted(capture=tmp_path / "photos", image_size=64)
     with pytest.raises(Refusal, match=r"has no cameras .* no cameras.zip beside model.ply"):
+        clean_file(tmp_path / "model.ply", tmp_path / "out.ply", wanted)
+    with zipfile.ZipFile(tmp_path / "cameras.zip", "w") as archive:
+        archive.writestr("../outside.txt", "one directory up")
+    with pytest.raises(Refusal, match=r"cameras.zip is damaged: .*outside.txt"):
         clean_file(tmp_path / "model.ply", tmp_path / "out.ply", wanted)
     (tmp_path / "cameras.zip").write_bytes(b"none")
     with pytest.raises(Refusal, match="is damaged"):

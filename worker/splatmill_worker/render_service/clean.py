@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-import zipfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -18,6 +17,7 @@ from torch import Tensor
 from splatmill.backplane.records import reason
 from splatmill.schema import EditModel, ModelCameras
 from splatmill_worker.errors import ModelUnreadable, Refusal, StartUnusable
+from splatmill_worker.images.archive import UnsafeArchive, unpack
 from splatmill_worker.images.load import load_views
 from splatmill_worker.render_service.edit import kept
 from splatmill_worker.render_service.encoding import camera_of
@@ -244,9 +244,8 @@ def _scene(capture: Path, model: Path, stack: ExitStack) -> tuple[Scene, bool]:
         images = capture / "images"
         (folder / "images").symlink_to((images if images.is_dir() else capture).resolve())
         try:
-            with zipfile.ZipFile(beside) as archive:
-                archive.extractall(folder / "poses")
-        except zipfile.BadZipFile as error:
+            unpack(beside, folder / "poses")
+        except UnsafeArchive as error:
             raise Refusal("poses_invalid", f"{beside} is damaged: {error}.") from error
         given, own = posed.find(folder), True
     if given is None:
