@@ -274,6 +274,7 @@ def test_the_page_fits_a_phone(service: Up, model: SmallModel, open_window: Open
     page.goto(f"/jobs/{model.id}")
     expect(page.get_by_role("link", name="Open the model")).to_be_visible()
     page.locator("#curve summary").click()
+    expect(page.locator("#curve svg")).to_be_visible()
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
     assert page.evaluate("document.querySelector('#curve svg').getBoundingClientRect().width") <= 340
 

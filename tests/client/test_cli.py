@@ -17,9 +17,11 @@ from pathlib import Path
 
 import pytest
 
+from splatmill.backplane import layout
 from splatmill.cli.app import COMMANDS
 from splatmill.cli.exits import Exit
 from splatmill.cli.follow import ONE_SIGNAL_SECONDS
+from splatmill.cli.models import FILES, OPTIONAL_FILES
 from splatmill.client import Client
 from splatmill.schema import (
     JobState,
@@ -350,3 +352,7 @@ def test_an_interruption_before_the_job_began(peer, reply, photos: Path, tmp_pat
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=30)
     assert (process.returncode, stderr) == (Exit.cancelled, "Stopped.\n")
+
+
+def test_every_file_of_a_model_is_written_but_its_record() -> None:
+    assert {*FILES, *OPTIONAL_FILES} == layout.MODEL_FILES.keys() - {"job.json"}

@@ -109,17 +109,20 @@ class Deliveries:
                 self._running[key] = asyncio.create_task(self._work(key, entry.path))
 
     async def _work(self, key: tuple[str, str], mark: str) -> None:
+        ended = False
         try:
             async with lease(self.connection, "delivery", ".".join(key)) as mine:
                 if mine:
                     await self._attempt(key, mark)
+                    ended = True
         except (StorageError, redis.RedisError) as error:
             log.warning("a delivery waits", webhook=key[0], delivery=key[1], error=str(error))
         except Exception:
             log.exception("a delivery waits", webhook=key[0], delivery=key[1])
         finally:
             self._running.pop(key, None)
-            self._wake.set()
+            if ended:
+                self.wake()  # for the next one of this webhook
 
     async def _attempt(self, key: tuple[str, str], mark: str) -> None:
         """Make the attempt that a mark announces, unless another process has made it, and remove the mark."""

@@ -7,7 +7,8 @@ signature itself (tests/client/test_webhook_signature.py).
 import asyncio
 import itertools
 import json
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -200,6 +201,28 @@ def hurry(app: ServedApp, made: Any) -> None:
     found = found.model_copy(update={"next_at": datetime.now(UTC) - timedelta(seconds=1)})
     service.write_delivery(found)
     service.mark(found)
+
+
+def test_a_delivery_that_another_process_makes_is_not_asked_for_all_the_time(
+    app: ServedApp, peer: ScriptedServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    @asynccontextmanager
+    async def held(connection: object, kind: str, name: str) -> AsyncIterator[bool]:
+        asked.append(name)
+        yield False
+
+    monkeypatch.setattr(deliveries, "lease", held)
+    made = webhook(app, peer)
+    ended(app)
+    wait_for(lambda: asked)
+    monkeypatch.setattr(deliveries, "_LOOK_SECONDS", 3600.0)
+    before = len(asked)
+    for _ in range(20):
+        assert [entry["state"] for entry in log(app, made)] == ["pending"]
+    assert len(asked) <= before + 2  # of the pause that had begun, and of one that had ended
+    assert peer.seen == []
 
 
 def test_an_address_that_fails_for_long_is_disabled_with_its_reason(
