@@ -27,6 +27,7 @@ def test_a_model_says_what_it_is(app: ServedApp, model_id: str) -> None:
     assert model["bytes"] == len(ply.content)
     assert {f["name"] for f in model["files"]} == set(layout.MODEL_FILES) - {
         "cameras.zip",
+        "frame.json",
         "report.png",
         "progress.mp4",
     }
