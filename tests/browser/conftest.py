@@ -17,7 +17,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
 from tests.support import still_life
 from tests.support.made_once import made_once
@@ -180,6 +180,7 @@ def open_window(browser: Browser) -> Iterator[Open]:
             stack.callback(context.close)
             context.add_init_script(REPORTS)
             context.set_default_timeout(20_000)
+            expect.set_options(timeout=20_000)
             watched = Watched(urlsplit(base).netloc)
             context.on("page", watched.watch)
             visits.append(Visit(context.new_page(), context, watched))

@@ -113,7 +113,7 @@ def test_only_the_viewer_alone_can_be_framed_by_a_page_of_others(
         others.page.goto("/")
         inside = others.page.frame_locator("#frame")
         expect(inside.get_by_role("heading", level=1)).to_have_text("still life")
-        expect(inside.locator("#view .view")).to_be_visible(timeout=30_000)
+        expect(inside.locator("#view .view")).to_be_visible()
         expect(others.page.frame_locator("#page").locator("#title")).to_have_count(0)
         assert [text for text in others.watched.complaints if "frame" in text.lower()]
 

@@ -41,6 +41,7 @@ SMALLER = (
         'mkdir demo; cp -r photos demo; make -s -o .venv/.installed -C "$ROOT" demo '
         'OUT="$PWD/demo" PHOTOS="$PWD/demo/photos" ARGS="--novel-view --time-budget 1s --image-size 120"',
     ),
+    (r"^(splatmill clean .*--capture photos)", r"\1 --image-size 60"),
     # The port of the documentation may be in use here; the address is replaced when the service is up.
     (r"^((?:env \S+ )?)splatmill up\b", r'\1splatmill up --port 0 --data "$PWD/data"'),
 )
