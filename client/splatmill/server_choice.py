@@ -7,7 +7,7 @@ from pathlib import Path
 
 from splatmill.errors import ConfigurationInvalid
 from splatmill.profiles import PROFILE_VARIABLE, read_profile
-from splatmill.schema.info import DEFAULT_PORT
+from splatmill.schema.port import DEFAULT_PORT
 
 DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
 SERVER_VARIABLE = "SPLATMILL_SERVER"

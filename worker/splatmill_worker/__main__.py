@@ -7,6 +7,8 @@ import os
 import sys
 from pathlib import Path
 
+from splatmill.garbage import uncollected
+
 SPIN_COUNT = "1000"
 """GOMP_SPINCOUNT: how often a thread polls at a barrier of the kernels before it sleeps. Under OpenMP's default it
 polls for milliseconds, and occupies the core that the awaited thread needs (decisions: SPIN_COUNT)."""
@@ -75,23 +77,28 @@ def main(argv: list[str] | None = None) -> int:
         os.environ.setdefault("GOMP_SPINCOUNT", SPIN_COUNT)  # OpenMP reads it once, when torch is imported
     if chosen.program == "train":
         return_freed_memory()
-        from splatmill_worker.service.command import serve
+        with uncollected():
+            from splatmill_worker.service.command import serve
 
         return serve(chosen.stop_grace, chosen.queues)
     if chosen.program == "renderer":
-        from splatmill_worker.render_service.command import serve as serve_renders
+        with uncollected():
+            from splatmill_worker.render_service.command import serve as serve_renders
 
         return serve_renders(chosen.host, chosen.port, chosen.uds, chosen.backend)
     if chosen.program in ("render-file", "orbit-file"):
-        from splatmill_worker.render_service.local import main as local_main
+        with uncollected():
+            from splatmill_worker.render_service.local import main as local_main
 
         return local_main(chosen)
     if chosen.program == "convert-file":
-        from splatmill_worker.render_service.convert import main as convert_main
+        with uncollected():
+            from splatmill_worker.render_service.convert import main as convert_main
 
         return convert_main(chosen.model, chosen.outs, chosen.photos)
     if chosen.program == "clean-file":
-        from splatmill_worker.render_service.clean import run as clean_run
+        with uncollected():
+            from splatmill_worker.render_service.clean import run as clean_run
 
         return clean_run(chosen)
     if chosen.program == "model-text":
@@ -99,7 +106,8 @@ def main(argv: list[str] | None = None) -> int:
 
         return text_main(chosen.folder)
     if chosen.program == "fit-image":
-        from splatmill_worker.fit_image.command import main as fit_image_main
+        with uncollected():
+            from splatmill_worker.fit_image.command import main as fit_image_main
 
         return fit_image_main(chosen.photo, chosen.out, chosen.options)
     if chosen.program == "doctor":

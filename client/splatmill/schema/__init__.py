@@ -1,7 +1,8 @@
 """The wire schema: every request, response, event, option and problem of the service.
 
-All of it is imported when the first name of this package is used. `photos` and `quantities`, which define no messages,
-can be imported without the others: so the processes that decode photos start with half of the work.
+All of it is imported when the first name of this package is used. `photos`, `port` and `quantities`, which define no
+messages, can be imported without the others: so `splatmill up`, and the processes that decode photos, start with half
+of the work.
 """
 
 from importlib import import_module
@@ -101,7 +102,6 @@ if TYPE_CHECKING:
         ImportState,
     )
     from splatmill.schema.info import (
-        DEFAULT_PORT,
         Accepted,
         Health,
         Info,
@@ -167,6 +167,7 @@ if TYPE_CHECKING:
         PHOTO_SUFFIXES,
         VIDEO_SUFFIXES,
     )
+    from splatmill.schema.port import DEFAULT_PORT
     from splatmill.schema.problems import (
         PROBLEM_MEDIA_TYPE,
         PROBLEMS,

@@ -6,9 +6,6 @@ from pydantic import Field
 
 from splatmill.schema.base import Response, Time
 
-DEFAULT_PORT = 8080
-"""The port that a server listens on and that a client connects to by default."""
-
 
 class WorkerInfo(Response):
     """A worker that is registered with the job queue."""

@@ -9,7 +9,7 @@ import socket
 import sys
 from pathlib import Path
 
-from splatmill.schema import DEFAULT_PORT
+from splatmill.schema.port import DEFAULT_PORT
 from splatmill_server.up.folder import DataFolder, UpError
 from splatmill_server.up.supervisor import Supervisor
 

@@ -6,11 +6,7 @@ The supervisor keeps the socket open, so the port stays taken and requests wait 
 import socket
 import sys
 
-import uvicorn
-
-from splatmill_server.__main__ import Server, allow_open_files, configure_logging
-from splatmill_server.app import create_app
-from splatmill_server.settings import Settings
+from splatmill.garbage import uncollected
 
 STOP_SECONDS = 3
 """Seconds for which running requests may continue after a signal to stop; event streams end at once."""
@@ -18,6 +14,13 @@ STOP_SECONDS = 3
 
 def main(descriptor: int) -> None:
     """Serve on the listening socket with this file descriptor until a signal arrives."""
+    with uncollected():
+        import uvicorn
+
+        from splatmill_server.__main__ import Server, allow_open_files, configure_logging
+        from splatmill_server.app import create_app
+        from splatmill_server.settings import Settings
+
     allow_open_files()
     listener = socket.socket(fileno=descriptor)
     address = listener.getsockname()

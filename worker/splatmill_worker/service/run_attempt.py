@@ -4,7 +4,6 @@ It runs in a process of its own (see rq_worker). Each failure becomes a named pr
 retried. When the process is killed, its parent reports the failure.
 """
 
-import gc
 import importlib
 import logging
 import os
@@ -22,6 +21,7 @@ from splatmill.backplane import row as rows
 from splatmill.backplane.fold import fold
 from splatmill.backplane.row import JobRow
 from splatmill.backplane.storage import Storage, StorageError
+from splatmill.garbage import uncollected
 from splatmill.schema import (
     CamerasEvent,
     Event,
@@ -216,13 +216,9 @@ def _train(attempt: Attempt, row: JobRow, folder: JobFolder, disk: DiskWatch, ou
 
 
 def _pipeline() -> Pipeline:
-    """Import the pipeline. What it imports stays, and is never garbage (decisions: import-without-collection)."""
-    gc.disable()
-    try:
+    """Import the pipeline. What it imports stays, and is never garbage."""
+    with uncollected():
         return cast(Pipeline, importlib.import_module(PIPELINE).run)
-    finally:
-        gc.freeze()
-        gc.enable()
 
 
 def _forward(event: Event, folder: JobFolder, outbox: Outbox) -> None:
