@@ -180,12 +180,17 @@ class StillLife:
     light: np.ndarray
 
 
-@lru_cache(maxsize=1)
 def still_life(seed: int = 0) -> StillLife:
     """The still life; `seed` decides textures, positions and angles.
 
     The last one is kept (115 MB), because painting its textures takes as long as a dozen small photos of it.
     """
+    return _arranged(seed)
+
+
+@lru_cache(maxsize=1)
+def _arranged(seed: int) -> StillLife:
+    """The still life of this seed. The cache would keep the one of a default apart from that of its value."""
     rng = np.random.default_rng(seed)
     solids: list[Solid] = [
         Disc(0.0, 1.9, MipMap(painted(rng, 1024, density=900)), 0.27),

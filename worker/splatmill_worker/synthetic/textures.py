@@ -33,7 +33,8 @@ class MipMap:
             start += size * size
             if size == 1:
                 break
-            level = level.reshape(size // 2, 2, size // 2, 2, 3).mean((1, 3))
+            left, right = level[:, ::2], level[:, 1::2]
+            level = ((left[::2] + right[::2]) + (left[1::2] + right[1::2])) / 4
         self._texels = torch.cat(levels)
         self._starts = torch.tensor(starts)
         self._sizes = torch.tensor(sizes)
@@ -129,9 +130,8 @@ def _noise(rng: np.random.Generator, size: int) -> np.ndarray:
     for octave in range(2, 8):
         cells = 2**octave
         coarse = rng.normal(size=(cells, cells)).astype(np.float32)
-        wide = np.pad(coarse, 2, mode="wrap")
-        step = size // cells
-        image = Image.fromarray(wide).resize(((cells + 4) * step,) * 2, Image.Resampling.BICUBIC)
-        total += np.asarray(image)[2 * step : 2 * step + size, 2 * step : 2 * step + size] * 0.62**octave
+        wide = Image.fromarray(np.pad(coarse, 2, mode="wrap"))
+        inner = (2, 2, cells + 2, cells + 2)
+        total += np.asarray(wide.resize((size, size), Image.Resampling.BICUBIC, inner)) * 0.62**octave
     seamless: np.ndarray = total / total.std()
     return seamless

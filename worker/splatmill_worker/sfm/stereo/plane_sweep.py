@@ -50,6 +50,9 @@ ADJACENT = 2
 MAX_ERROR = 1.0
 """Pixels: largest mean distance between the best position in each agreeing neighbour and the common one."""
 
+_BATCH = 8192
+"""Patches at a depth that are compared at a time; their samples stay in the cache."""
+
 MIN_AHEAD = 1e-6
 """Depth of a patch in the neighbour, in units of its depth in its own photo, up to which it counts as behind."""
 
@@ -212,21 +215,25 @@ def _scores(
     turn = torch.from_numpy(K @ pose[:3, :3]).float()
     shift = torch.from_numpy(K @ pose[:3, 3]).float()
     # Up to scale, a point at inverse depth w is seen at K (R ray + w t).
-    turned = (rays @ turn.T)[:, None]  # [n,1,m,3]
-    moved = inverse[None, :, None] * shift[:, None, None, None]  # [3,1,depths,1]
-    z = turned[..., 2] + moved[2]
-    ahead = z[:, :, z.shape[2] // 2] > MIN_AHEAD
-    grid = torch.stack([turned[..., 0] + moved[0], turned[..., 1] + moved[1]], dim=-1)
-    grid /= z.clamp_min(MIN_AHEAD)[..., None]
-    middle = grid[:, :, grid.shape[2] // 2]
-    shown = ahead & (middle.abs() < 1.0 - 2.0 * RADIUS / min(camera.width, camera.height)).all(-1)
-    n, depths, m, _ = grid.shape
-    sampled = torch.nn.functional.grid_sample(
-        other.grey[None, None], grid.reshape(1, n * depths, m, 2), padding_mode="border", align_corners=False
-    ).reshape(n, depths, m)
-    product = torch.bmm(sampled, patch[:, :, None])[..., 0]
-    variance = sampled.var(dim=2, correction=0).clamp_min((0.5 * MIN_CONTRAST) ** 2)
-    return torch.where(shown, product / (variance * m).sqrt(), -1.0)
+    turned = rays @ turn.T  # [n,m,3]
+    moved = inverse[:, None] * shift  # [depths,3]
+    centre = turned[:, None, turned.shape[1] // 2] + moved  # [n,depths,3]
+    middle = centre[..., :2] / centre[..., 2:].clamp_min(MIN_AHEAD)
+    border = 1.0 - 2.0 * RADIUS / min(camera.width, camera.height)
+    shown = (centre[..., 2] > MIN_AHEAD) & (middle.abs() < border).all(-1)
+    scores = torch.full(shown.shape, -1.0)
+    which, depth = shown.nonzero(as_tuple=True)
+    for start in range(0, len(which), _BATCH):
+        one, at = which[start : start + _BATCH], depth[start : start + _BATCH]
+        local = turned[one] + moved[at][:, None]  # [b,m,3]
+        grid = local[..., :2] / local[..., 2:].clamp_min(MIN_AHEAD)
+        sampled = torch.nn.functional.grid_sample(
+            other.grey[None, None], grid[None], padding_mode="border", align_corners=False
+        )[0, 0]
+        product = (sampled * patch[one]).sum(1)
+        variance = sampled.var(dim=1, correction=0).clamp_min((0.5 * MIN_CONTRAST) ** 2)
+        scores[one, at] = product / (variance * sampled.shape[1]).sqrt()
+    return scores
 
 
 def _peaks(
