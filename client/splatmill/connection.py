@@ -2,6 +2,7 @@
 
 import asyncio
 import random
+import ssl
 from collections.abc import AsyncIterable, AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime
@@ -72,7 +73,10 @@ class Connection:
             headers=sent | dict(headers or {}),
             timeout=timeout,
             transport=transport,
-            verify=ssl_context(choice.verify) if url.scheme == "https" else True,
+            # Without TLS no certificates are needed, and to load them takes longer than a request.
+            verify=ssl_context(choice.verify)
+            if url.scheme == "https"
+            else ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT),
             proxy=choice.proxy,
             # Requests to this machine must not go through a proxy that is set for other hosts.
             trust_env=url.host not in ("127.0.0.1", "localhost", "::1"),

@@ -1,6 +1,7 @@
 """What the endpoints of an app share: connections, settings and records. `create_app` makes one per app."""
 
 import asyncio
+import ssl
 import threading
 import time
 from dataclasses import dataclass, field
@@ -193,8 +194,12 @@ def _renderer(settings: Settings, metrics: Metrics) -> httpx.AsyncClient | None:
     if settings.renderer_url is None:
         return None
     base, socket = rendering.address(settings.renderer_url)
-    # The renderer has a private address, so requests to it must not go through a proxy.
-    transport = CountingTransport(httpx.AsyncHTTPTransport(uds=socket, trust_env=False), metrics)
+    # The renderer has a private address, so requests to it must not go through a proxy. It speaks no TLS, and to load
+    # certificates would take as long as the rest of the app's start.
+    untrusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    transport = CountingTransport(
+        httpx.AsyncHTTPTransport(uds=socket, trust_env=False, verify=untrusting), metrics
+    )
     return httpx.AsyncClient(base_url=base, transport=transport, trust_env=False)
 
 

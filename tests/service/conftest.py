@@ -13,11 +13,18 @@ from tests.support.up import Up
 
 
 @pytest.fixture(scope="session")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
-    """One service for all tests that leave it running."""
-    up = Up(tmp_path_factory.mktemp("up") / "data").start()
+def shared_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
+    up = Up(tmp_path_factory.mktemp("up") / "data")
     yield up
     up.close()
+
+
+@pytest.fixture
+def service(shared_service: Up) -> Up:
+    """One running service for all tests that leave it running, also after they have stopped it."""
+    if shared_service.process is None:
+        shared_service.start()
+    return shared_service
 
 
 @pytest.fixture

@@ -48,7 +48,8 @@ def test_a_killed_worker_takes_its_trainer_along_and_is_followed(service: Up) ->
 
 
 def test_a_worker_killed_again_and_again_does_not_use_up_the_tries_of_a_job_that_gets_on(service: Up) -> None:
-    job_id = service.submit(steps=700, pause=0.05)
+    enough = service.data.parent / "enough"
+    job_id = service.submit(steps=10_000, pause=0.05, until=str(enough))
 
     def nothing_lost() -> bool:
         with service.redis() as connection:
@@ -58,6 +59,7 @@ def test_a_worker_killed_again_and_again_does_not_use_up_the_tries_of_a_job_that
         service.reached(job_id, service.job(job_id)["progress"]["step"] + 5 if service.diary(job_id) else 5)
         wait_for(nothing_lost)  # a heartbeat has seen a new checkpoint
         os.kill(service.worker, signal.SIGKILL)
+    enough.touch()
     job = service.ended(job_id)
     assert job["state"] == "succeeded", job
     assert not any(entry["overlap"] for entry in service.diary(job_id))
@@ -74,24 +76,21 @@ def test_a_job_that_ends_its_worker_each_time_is_given_up(service: Up) -> None:
 
 
 @pytest.mark.parametrize("children", [True, False], ids=["with its children", "alone"])
-def test_a_killed_service_leaves_nothing_and_goes_on_when_started_again(
-    own_service: Up, children: bool
-) -> None:
-    own_service.start()
-    done = own_service.submit(steps=1)
-    own_service.ended(done)
-    job_id = own_service.submit(steps=STEPS)
-    waiting = own_service.submit(steps=2)
-    own_service.reached(job_id, 6)
-    family = own_service.kill(children=children)
+def test_a_killed_service_leaves_nothing_and_goes_on_when_started_again(service: Up, children: bool) -> None:
+    done = service.submit(steps=1)
+    service.ended(done)
+    job_id = service.submit(steps=STEPS)
+    waiting = service.submit(steps=2)
+    service.reached(job_id, 6)
+    family = service.kill(children=children)
     wait_for(lambda: gone(family))
 
-    own_service.start()
-    check_resumed(own_service, job_id)
-    job = own_service.ended(waiting)
+    service.start()
+    check_resumed(service, job_id)
+    job = service.ended(waiting)
     assert job["state"] == "succeeded", job
-    assert own_service.job(done)["state"] == "succeeded"
-    assert own_service.http.get(f"/v1/models/{done}").status_code == 200
+    assert service.job(done)["state"] == "succeeded"
+    assert service.http.get(f"/v1/models/{done}").status_code == 200
 
 
 def test_a_redis_that_comes_back_empty_loses_no_job_and_no_attempt(own_service: Up) -> None:
@@ -119,19 +118,18 @@ def test_a_redis_that_comes_back_empty_loses_no_job_and_no_attempt(own_service: 
     assert {model["id"] for model in models} == {done, running, waiting}
 
 
-def test_a_stopped_service_saves_its_job_and_spends_no_try(own_service: Up) -> None:
-    own_service.start()
-    job_id = own_service.submit(steps=STEPS)
-    own_service.reached(job_id, 6)
-    family = [child.pid for child in own_service.tree()]
-    assert own_service.stop() == 0
+def test_a_stopped_service_saves_its_job_and_spends_no_try(service: Up) -> None:
+    job_id = service.submit(steps=STEPS)
+    service.reached(job_id, 6)
+    family = [child.pid for child in service.tree()]
+    assert service.stop() == 0
     assert gone(family)
 
-    own_service.start()
-    check_resumed(own_service, job_id)
-    lines = own_service.http.get(f"/v1/jobs/{job_id}/logs").json()["lines"]
+    service.start()
+    check_resumed(service, job_id)
+    lines = service.http.get(f"/v1/jobs/{job_id}/logs").json()["lines"]
     assert any(line["message"].startswith("saved at step") for line in lines)
-    with own_service.redis() as connection:
+    with service.redis() as connection:
         entry = entries.open_queue(connection).fetch_job(entries.rq_id(job_id, 1))
     assert entry is not None
     assert entry.retries_left == entries.MAX_RETRIES

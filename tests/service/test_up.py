@@ -109,24 +109,20 @@ def test_a_redis_of_the_operators_own_is_used(redis_server: RedisServer, own_ser
     assert redis_server.connection.exists(f"splatmill:job:{job_id}")
 
 
-def test_a_long_folder_name_still_has_sockets(tmp_path: Path) -> None:
+def test_a_long_folder_name_still_has_sockets_and_ctrl_c_ends_everything(tmp_path: Path) -> None:
     up = Up(tmp_path / ("long-" * 30) / "data")
     up.data.parent.mkdir()
     try:
         up.start()
         assert up.http.get("/readyz").json()["checks"]["redis"] == "ok"
+        assert up.process is not None
+        family = [up.process.pid, *(child.pid for child in up.tree())]
+        assert len(family) == 5  # itself, Redis, API, worker, renderer
+        os.kill(family[0], signal.SIGINT)
+        assert up.process.wait(30) == 0
+        assert gone(family)
     finally:
         up.close()
-
-
-def test_ctrl_c_ends_everything(own_service: Up) -> None:
-    own_service.start()
-    assert own_service.process is not None
-    family = [own_service.process.pid, *(child.pid for child in own_service.tree())]
-    assert len(family) == 5  # itself, Redis, API, worker, renderer
-    os.kill(family[0], signal.SIGINT)
-    assert own_service.process.wait(30) == 0
-    assert gone(family)
 
 
 def test_what_an_operator_sees(tmp_path: Path) -> None:

@@ -3,7 +3,8 @@
 It stores a checkpoint after each step and resumes from it, so that a test can tell a resumed attempt from a new one.
 The capture's `images/script.json` controls it, or without one the environment variable STANDIN_SCRIPT:
 
-    steps: number of steps.
+    steps: number of steps, at most.
+    until: file at whose appearance the steps end; without it, all are taken.
     pause: seconds per step.
     do, at: what happens (see `_act`), and at which step.
     gaussians: number of Gaussians of the model.
@@ -75,6 +76,8 @@ def run(
         if cancelled():
             emit(LogEvent(message=f"saved at step {step}"))
             return SimpleNamespace(ended="cancelled")
+        if "until" in script and Path(script["until"]).exists():
+            break
     (workdir / "preview.jpg").write_bytes(b"\xff\xd8 no picture \xff\xd9")
     emit(PreviewEvent(path="preview.jpg", step=script["steps"]))
     emit(MetricEvent(seconds=1.0, step=script["steps"], psnr=30.0, ssim=0.9, gaussians=len(ball())))

@@ -8,7 +8,7 @@ from splatmill.backplane.process import start_time
 
 Value = TypeVar("Value")
 
-SHORTEST_PAUSE, LONGEST_PAUSE = 0.01, 0.1
+SHORTEST_PAUSE, LONGEST_PAUSE = 0.01, 0.25
 """Seconds between two looks. Most conditions ask a server, which requests every 10 ms keep busy; so the pause grows to
 a tenth of the time that was waited already."""
 
