@@ -26,21 +26,27 @@ from tests.support.paths import DATA
 
 pytestmark = pytest.mark.slow
 
+Run = tuple[pipeline.Outcome, list[Event]]
+
 
 def options(**values: object) -> TrainOptions:
     return TrainOptions.model_validate({"steps": 150, "seed": 1, "max_gaussians": 2000, **values})
 
 
-def run(
-    capture: Path, work: Path, asked: TrainOptions, cancelled: Callable[[], bool] = lambda: False
-) -> tuple[pipeline.Outcome, list[Event]]:
+def run(capture: Path, work: Path, asked: TrainOptions, cancelled: Callable[[], bool] = lambda: False) -> Run:
     events: list[Event] = []
     return pipeline.run(capture, work, asked, events.append, cancelled), events
 
 
-def test_a_posed_capture_becomes_a_model_with_its_reports(tmp_path: Path) -> None:
-    capture = still_life.posed_capture(tmp_path / "capture")
-    outcome, events = run(capture, tmp_path / "work", options())
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run from its beginning to its end, and its events."""
+    folder = tmp_path_factory.mktemp("whole")
+    return run(still_life.posed_capture(folder / "capture"), folder / "work", options())
+
+
+def test_a_posed_capture_becomes_a_model_with_its_reports(whole: Run) -> None:
+    outcome, events = whole
     assert outcome.ended == "succeeded"
     kinds = [event.type for event in events]
     states = [event.state for event in events if event.type == "state"]
@@ -95,9 +101,8 @@ def test_corrected_cameras_are_exported_and_held_out_ones_are_not_touched(tmp_pa
     assert all(1e-6 < moves[camera.name] < 0.2 for camera in cameras if camera.split == "train")
 
 
-def test_the_model_shows_the_photos_at_the_reported_error_in_the_captures_own_world(tmp_path: Path) -> None:
-    capture = still_life.posed_capture(tmp_path / "capture")
-    out = run(capture, tmp_path / "work", options(steps=120))[0].out
+def test_the_model_shows_the_photos_at_the_reported_error_in_the_captures_own_world(whole: Run) -> None:
+    out = whole[0].out
     scene = ply.read(out / "model.ply").gaussians
     assert bool(scene.finite().all())
     cameras = ModelCameras.model_validate_json((out / "cameras.json").read_text()).cameras
@@ -140,11 +145,10 @@ def test_a_cancelled_run_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     assert seconds == sorted(seconds)
 
 
-def test_a_finished_run_asked_again_gives_the_same_model(tmp_path: Path) -> None:
+def test_a_finished_run_asked_again_gives_the_same_model(whole: Run, tmp_path: Path) -> None:
     capture = still_life.posed_capture(tmp_path / "capture")
-    asked = options(steps=60)
-    first = (run(capture, tmp_path / "a", asked)[0].out / "model.ply").read_bytes()
-    assert (run(capture, tmp_path / "b", asked)[0].out / "model.ply").read_bytes() == first
+    again = run(capture, tmp_path / "work", options())[0].out
+    assert (again / "model.ply").read_bytes() == (whole[0].out / "model.ply").read_bytes()
 
 
 def test_nothing_held_out_is_reported_as_such(tmp_path: Path) -> None:
