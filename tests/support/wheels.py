@@ -7,6 +7,7 @@ import sys
 import venv
 import zipfile
 from collections.abc import Iterable
+from dataclasses import dataclass
 from importlib.metadata import Distribution, PathDistribution, distribution
 from pathlib import Path
 
@@ -45,17 +46,25 @@ def run(
     )
 
 
-def build(folder: Path, out: Path, *formats: str) -> Path:
-    """Build the part in `folder` with the tools installed here; returns the wheel, or with `--sdist` the sdist.
+@dataclass(frozen=True)
+class Built:
+    """The two files that a part is distributed as."""
 
-    `formats` are options of `python -m build`: `--sdist`, `--wheel`, or none for an sdist and a wheel made from it.
+    wheel: Path
+    sdist: Path
+
+
+def build(folder: Path, out: Path, *formats: str) -> Built:
+    """Build the part in `folder` with the tools installed here, into `out`.
+
+    `formats` are options of `python -m build`: `--sdist` and `--wheel`, or none for an sdist and a wheel made from it.
     """
     done = run(
         sys.executable, "-m", "build", "--no-isolation", *formats, "--outdir", out, folder, timeout=280
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    (built,) = out.glob("*.tar.gz" if "--sdist" in formats else "*.whl")
-    return built
+    (wheel,), (sdist,) = out.glob("*.whl"), out.glob("*.tar.gz")
+    return Built(wheel, sdist)
 
 
 def metadata(wheel: Path) -> Distribution:
