@@ -6,7 +6,10 @@ tests/kernels.
 
 import json
 import math
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 import av
 import numpy as np
@@ -16,6 +19,7 @@ from PIL import Image
 from splatmill.cli.embedded import ALL_PARTS
 from splatmill.cli.exits import Exit
 from splatmill.schema import CameraSpec
+from splatmill_worker.__main__ import main as worker
 from tests.support.ball import write_ply
 from tests.support.command_line import invoke, spawn
 
@@ -52,10 +56,28 @@ def write_cameras(model: Path, specs: list[CameraSpec]) -> None:
 
 
 def run(*arguments: str | Path) -> tuple[int, str, str]:
+    """Run a command as a process, which becomes that of the worker's program."""
     process = spawn(*arguments)
     stdout, stderr = process.communicate(timeout=120)
     assert "Traceback" not in stderr
     return process.returncode, stdout, stderr
+
+
+@pytest.fixture
+def run_here(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, str, str]]:
+    """Like `run`, but the command and the worker's program run in this process, which has imported torch already."""
+
+    def become(module: str, *arguments: str) -> NoReturn:
+        assert module == "splatmill_worker"
+        sys.exit(worker([*arguments]))
+
+    monkeypatch.setattr("splatmill.cli.local_model.exec_module", become)
+
+    def call(*arguments: str | Path) -> tuple[int, str, str]:
+        done = invoke(*arguments)
+        return done.exit_code, done.stdout, done.stderr
+
+    return call
 
 
 def centre(path: Path) -> list[int]:
@@ -71,9 +93,9 @@ def centre(path: Path) -> list[int]:
     ("chosen", "color"),
     [([], BLUE), (["--view", "a.jpg"], RED), (["--camera", "0"], RED), (["--camera", "1"], BLUE)],
 )
-def test_an_image_from_the_camera_of_a_photo(posed: Path, tmp_path: Path, chosen, color):
+def test_an_image_from_the_camera_of_a_photo(posed: Path, tmp_path: Path, run_here, chosen, color):
     out = tmp_path / "view.png"
-    assert run("render", posed, "-o", out, *chosen) == (0, f"{out}\n", "")
+    assert run_here("render", posed, "-o", out, *chosen) == (0, f"{out}\n", "")
     assert centre(out) == color
 
 
@@ -89,9 +111,9 @@ def test_an_image_from_a_camera_of_ones_own_at_another_width(ball: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_file_of_another_trainer_is_seen_whole(ball: Path, tmp_path: Path):
+def test_a_file_of_another_trainer_is_seen_whole(ball: Path, tmp_path: Path, run_here):
     ball.with_name("cameras.json").write_text('[{"id": 0, "img_name": "a"}]')
-    status, _, stderr = run("render", ball, "-o", tmp_path / "view.png", "--width", "200", "--up=-y")
+    status, _, stderr = run_here("render", ball, "-o", tmp_path / "view.png", "--width", "200", "--up=-y")
     assert status == 0
     assert stderr.splitlines() == [
         f"{ball.with_name('cameras.json')} is not used: it was not written by Splatmill.",
@@ -108,13 +130,13 @@ def test_a_file_of_another_trainer_is_seen_whole(ball: Path, tmp_path: Path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cameras", [False, True])
-def test_a_video_around_the_scene(ball: Path, tmp_path: Path, cameras: bool):
+def test_a_video_around_the_scene(ball: Path, tmp_path: Path, run_here, cameras: bool):
     if cameras:
         turns = [math.tau * n / 6 for n in range(6)]
         ring = [(4 * math.cos(turn), 4 * math.sin(turn), 1.0) for turn in turns]
         write_cameras(ball, [CameraSpec.looking_at(eye, (0, 0, 0), width=64, height=48) for eye in ring])
     size = ("--seconds", "0.5", "--fps", "8", "--width", "64", "--height", "48")
-    status, stdout, stderr = run("orbit", ball, "-o", tmp_path / "o.mp4", *size)
+    status, stdout, stderr = run_here("orbit", ball, "-o", tmp_path / "o.mp4", *size)
     assert (status, stdout) == (0, f"{tmp_path / 'o.mp4'}\n")
     assert ("The camera circles the middle of the Gaussians, with z up." in stderr) is not cameras
     with av.open(str(tmp_path / "o.mp4")) as video:
@@ -164,7 +186,7 @@ def test_where_the_worker_is_not_installed(posed: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.slow
-def test_a_conversion_prints_bytes_and_errors_and_its_file_renders(posed: Path, tmp_path: Path):
+def test_a_conversion_prints_bytes_and_errors_and_its_file_renders(posed: Path, tmp_path: Path, run_here):
     out = tmp_path / "ball.spz"
     status, stdout, stderr = run("convert", posed, out)
     assert (status, stderr) == (0, "")
@@ -174,7 +196,7 @@ def test_a_conversion_prints_bytes_and_errors_and_its_file_renders(posed: Path, 
     assert second.split()[:2] == [str(out), f"{out.stat().st_size:,}"]
     assert float(second.split()[-2]) > 30
     assert said[0].startswith("views: from the cameras of 1 held-out photos")
-    assert run("render", out, "-o", tmp_path / "view.png")[0] == 0
+    assert run_here("render", out, "-o", tmp_path / "view.png")[0] == 0
     assert centre(tmp_path / "view.png") == BLUE
 
 
