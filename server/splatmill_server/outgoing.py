@@ -11,9 +11,11 @@ Private hosts are reached only where the setting SPLATMILL_OUTGOING_ALLOW names 
 import asyncio
 import ipaddress
 import socket
+import ssl
 from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 
 import httpcore
 import httpx
@@ -80,7 +82,20 @@ class Outgoing:
 
     def __init__(self, allow: str = "") -> None:
         self._allowed = allowed_hosts(allow)
-        self._tls = httpx.create_ssl_context()
+
+    @cached_property
+    def _tls(self) -> ssl.SSLContext:
+        """Made with the first request: reading the certificates of the system would take 25 ms of every start.
+
+        Raises NoAnswer.
+        """
+        try:
+            return httpx.create_ssl_context()
+        except OSError as error:  # ssl.SSLError is one
+            raise NoAnswer(
+                f"The certificates to trust cannot be read: {error.strerror or error}. The operator of this server "
+                "can check SSL_CERT_FILE and SSL_CERT_DIR in its environment."
+            ) from error
 
     def checked(self, url: str | httpx.URL) -> httpx.URL:
         """Return the parsed address. Raises AddressRefused for one that cannot be allowed, whatever it resolves to."""

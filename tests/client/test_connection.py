@@ -43,6 +43,15 @@ def test_reading_is_tried_again(peer, reply, trouble):
     assert len(peer.seen) == 3
 
 
+def test_plain_http_reads_no_certificates(peer, reply, monkeypatch):
+    monkeypatch.setattr("certifi.where", lambda: "/nonexistent.pem")
+    peer.script(reply(body=JOB_BYTES))
+    with Client(peer.url) as client:
+        assert client.job("j1").id == "j1"
+    with pytest.raises(FileNotFoundError):
+        Client("https://127.0.0.1:1")
+
+
 def test_it_gives_up_with_the_last_reason(peer, reply):
     peer.answer = lambda _: reply(**problem("queue_unavailable"))
     with Client(peer.url, retries=2) as client, pytest.raises(Unavailable) as error:

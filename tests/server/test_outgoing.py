@@ -248,6 +248,15 @@ def test_proxies_of_the_environment_are_not_used(
     assert fetch(Outgoing(f"127.0.0.1:{port_of(peer)}"), peer.url)[1] == b"direct"
 
 
+def test_certificates_are_read_for_the_first_request_and_named_where_they_cannot_be(
+    peer: ScriptedServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SSL_CERT_FILE", "/nonexistent.pem")
+    outgoing = Outgoing(f"127.0.0.1:{port_of(peer)}")
+    with pytest.raises(NoAnswer, match=r"cannot be read: No such file or directory.*SSL_CERT_FILE"):
+        fetch(outgoing, peer.url)
+
+
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="makes its certificate with openssl")
 def test_tls_checks_the_certificate_against_the_name(
     names: dict[str, list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
