@@ -11,6 +11,7 @@ The capture's `images/script.json` controls it, or without one the environment v
     diary: file to which each attempt appends its process, its first step, and whether another attempt ran beside it.
 """
 
+import ctypes
 import fcntl
 import json
 import multiprocessing
@@ -132,5 +133,8 @@ def _act(script: dict[str, object], step: int) -> None:
             child.start()
             child.join()
         case "native":
-            # One call that does not return to the interpreter for many seconds, like a mapper's.
-            np.linalg.svd(np.random.default_rng(0).normal(size=(6000, 6000)))
+            # One call that does not return to the interpreter, like a mapper's: it waits for what it holds itself.
+            library, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(256)
+            library.pthread_mutex_init(mutex, None)
+            library.pthread_mutex_lock(mutex)
+            library.pthread_mutex_lock(mutex)
