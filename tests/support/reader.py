@@ -33,6 +33,8 @@ SMALLER = (
     (r"\bsteps=\d+", "steps=60"),
     (r"--image-size \d+", "--image-size 120"),
     (r"\bimage_size=\d+", "image_size=120"),
+    (r"\bin range\(100\)", "in range(20)"),
+    (r"\bin range\(1, 101\)", "in range(1, 21)"),
     # A command without a budget gets one, so that it ends.
     (r"(splatmill train (?!.*(?:--time-budget|--steps|--help)).+)", r"\1 --time-budget 1s"),
     # `make demo` writes into this folder instead of the repository's, without a video, from photos that are there.
@@ -50,7 +52,7 @@ ONCE = (
     "splatmill train photos -o splat --time-budget 30s --novel-view\n",
 )
 """Commands of the first page that run once for all pages: the others begin with the `photos` and `splat` they left."""
-ONCE_SMALLER = (" --count 24 --width 240 --height 180 --samples 1", " --image-size 120")
+ONCE_SMALLER = (" --count 24 --width 192 --height 144 --samples 1", " --image-size 120")
 
 
 def smaller(text: str) -> str:
