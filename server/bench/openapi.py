@@ -32,6 +32,8 @@ from _rows import Row, append, footer, lines, origin
 from _still_life import posed_capture
 from _up import served
 
+from splatmill_server.settings import Settings
+
 HERE = Path(__file__).resolve().parent
 ROWS = HERE / "results" / "openapi.jsonl"
 
@@ -135,16 +137,9 @@ def _round(url: str, kept: Row, folder: Path, seed: int, examples: int, phases: 
     command += ["--max-examples", str(examples), "--seed", str(seed), "--generation-database", "none"]
     command += ["--checks", "all", "--exclude-checks", ",".join(LEFT_OUT)]
     command += ["--exclude-path-regex", "/events$", "--continue-on-failure", "--no-shrink", "--no-color"]
-    command += [
-        "--request-timeout",
-        "60",
-        "--max-response-time",
-        "60",
-        "--report",
-        "json",
-        "--report-json-path",
-        str(report),
-    ]
+    longest = str(Settings.model_fields["orbit_timeout"].default)  # what the API itself waits for a video
+    command += ["--request-timeout", longest, "--max-response-time", longest]
+    command += ["--report", "json", "--report-json-path", str(report)]
     ran = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=False)
     if not report.is_file():
         raise SystemExit(
