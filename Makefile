@@ -14,8 +14,8 @@ KERNELS := $(shell find worker/splatmill_worker/kernels/cpu -name '*.[ch]pp' 2>/
 WEB := server/web/package.json server/web/package-lock.json server/web/packages.py
 PARTS := constraints.txt $(wildcard */pyproject.toml) client/splatmill/__init__.py server/setup.py worker/version.py
 # The tests run in this many processes, a file in one process. They wait for servers and browsers a third of the time, so there
-# are two more than cores.
-WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 2)))
+# are three more than cores.
+WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 3)))
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
