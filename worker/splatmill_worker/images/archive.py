@@ -37,7 +37,7 @@ RATIO_FLOOR = 2**20
 _LOCAL_HEADER_BYTES = 30
 """Bytes before a packed file, without its name."""
 
-_DAMAGED = (zipfile.BadZipFile, NotImplementedError, EOFError, zlib.error, lzma.LZMAError, struct.error)
+DAMAGED = (zipfile.BadZipFile, NotImplementedError, EOFError, zlib.error, lzma.LZMAError, struct.error)
 """What zipfile raises for damaged archives and for packing methods that it does not know."""
 
 _DAMAGED_ERRNOS = (None, errno.EINVAL)
@@ -112,7 +112,7 @@ def unpack(
             return written
     except UnsafeArchive:
         raise
-    except (*_DAMAGED, RuntimeError, ValueError) as error:
+    except (*DAMAGED, RuntimeError, ValueError) as error:
         raise UnsafeArchive(f"it is not a complete zip file ({error})") from error
     except OSError as error:
         if error.errno not in _DAMAGED_ERRNOS:

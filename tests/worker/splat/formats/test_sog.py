@@ -138,7 +138,11 @@ def test_what_does_not_fit_is_named(
 def test_damaged_archives_are_named(tmp_path: Path) -> None:
     sog.write(tmp_path / "m.sog", some_gaussians(300, 1))
     data = (tmp_path / "m.sog").read_bytes()
-    for broken in (data[: len(data) // 2], b"", b"PK\x05\x06" + b"\0" * 18, data.replace(b"WEBP", b"WEBQ")):
+    beyond_the_end = data[:28] + b"\xff\xff" + data[30:]  # the first member's extra field is said to be that long
+    list_at = data.index(b"PK\x01\x02")
+    encrypted = data[:6] + b"\x01" + data[7 : list_at + 8] + b"\x01" + data[list_at + 9 :]
+    half, none, empty = data[: len(data) // 2], b"", b"PK\x05\x06" + b"\0" * 18
+    for broken in (half, none, empty, data.replace(b"WEBP", b"WEBQ"), beyond_the_end, encrypted):
         (tmp_path / "m.sog").write_bytes(broken)
         with pytest.raises(ModelUnreadable, match=r"m\.sog"):
             registry.read(tmp_path / "m.sog")

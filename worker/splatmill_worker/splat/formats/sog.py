@@ -24,6 +24,7 @@ from torch import Tensor
 from splatmill.files import replacing
 from splatmill_worker.errors import ModelUnreadable, UnusablePicture
 from splatmill_worker.images import guarded
+from splatmill_worker.images.archive import DAMAGED
 from splatmill_worker.splat.formats import palette
 from splatmill_worker.splat.formats.contents import (
     NO_OFFSET,
@@ -47,6 +48,9 @@ MAX_CENTROIDS = 65536
 GAUSSIANS_PER_CENTROID = 10
 LEAST_CENTROIDS, MOST_CENTROIDS = 1024, 8192
 """Bounds on the number of centroids; between them, a centroid stands for GAUSSIANS_PER_CENTROID (decisions: sog)."""
+
+_ENCRYPTED = 1
+"""The bit of a zip member's flags that says so."""
 
 MAX_META_BYTES = 2**24
 MAX_IMAGE_BYTES = 2**30
@@ -145,7 +149,7 @@ def read(path: Path) -> Contents:
         raise
     except UnusablePicture as error:
         raise ModelUnreadable(f"{path.name} cannot be read: {error.message}") from error
-    except (zipfile.BadZipFile, OSError, ValueError, KeyError, TypeError, NotImplementedError) as error:
+    except (*DAMAGED, OSError, ValueError, KeyError, TypeError) as error:
         raise ModelUnreadable(f"{path.name} could not be read as a SOG model: {_said(error)}") from error
 
 
@@ -237,8 +241,11 @@ def _files(path: Path) -> Iterator[Callable[[str, int], bytes]]:
         with zipfile.ZipFile(path) as archive:
 
             def of_archive(name: str, most: int) -> bytes:
-                if archive.getinfo(name).file_size > most:
+                member = archive.getinfo(name)
+                if member.file_size > most:
                     raise ValueError(f"{name[:80]} has more than {most} bytes")
+                if member.flag_bits & _ENCRYPTED:
+                    raise ValueError(f"{name[:80]} is encrypted")
                 return archive.read(name)
 
             yield of_archive
