@@ -198,3 +198,20 @@ def test_what_was_stored_while_redis_was_away_is_listed_by_the_next_sweep(
     service.sweeper.sweep()
     assert all_pages(captures(service))[0] == sorted(records.captures, reverse=True)
     assert all_pages(models(service, Filter(owner=f"owner{int(model, 16) % OWNERS}")))[0][0] == model
+
+
+def test_a_capture_that_is_stored_while_the_lists_are_made_is_listed(
+    seeded: tuple[Service, Seeded], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service, _ = seeded
+    storage = service.captures.storage
+    put_new = storage.put_new
+
+    def late(path: str, data: bytes) -> bool:
+        service.lists.ensure(0.0)
+        return put_new(path, data)
+
+    monkeypatch.setattr(storage, "put_new", late)
+    made, _ = service.captures.create("late", owner="owner3")
+    assert captures(service, Filter(owner="owner3"))(None)[0][0] == made.id
+    service.captures.delete(made.id)

@@ -84,15 +84,20 @@ class Captures:
         capture = Capture(id=capture_id, name=name, owner=owner, created_at=datetime.now(UTC))
         record = json.dumps(capture.model_dump(mode="json", exclude={"files"}) | {"format": FORMAT}).encode()
         # Listed first: a crash in between leaves an entry of the list that readers skip, and no capture without one.
+        # Listed again, because lists that were made from storage in between lack it.
+        self._list_new(capture)
+        if not self.storage.put_new(layout.capture_record(capture.id), record):
+            return self.record(capture.id), False
+        self._list_new(capture)
+        return capture, True
+
+    def _list_new(self, capture: Capture) -> None:
+        """List a capture. Captures can be made and filled without Redis: `space.relisting` lists those."""
         try:
             self._list([capture])
         except redis.RedisError as error:
-            # Captures can be made and filled without Redis; `space.relisting` lists this one.
             self.unlisted = True
             log.warning("a capture is not listed yet", capture=capture.id, error=str(error))
-        if self.storage.put_new(layout.capture_record(capture.id), record):
-            return capture, True
-        return self.record(capture.id), False
 
     def _is_leftover(self, capture_id: str) -> bool:
         """Return whether there are files without a record: the capture is being deleted, and new files would go too."""
