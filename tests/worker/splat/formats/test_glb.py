@@ -120,6 +120,12 @@ def _primitive(document: dict[str, Any]) -> dict[str, Any]:
     [
         (lambda d: d["accessors"][0].update(count=10**9), "outside of its binary data"),
         (lambda d: d["bufferViews"][2].update(byteOffset=-4), "outside of its binary data"),
+        (lambda d: d["accessors"][4].update(count=20), "has 20 values, and POSITION 30"),
+        (
+            lambda d: (d["accessors"][0].update(count=1), d["bufferViews"][0].update(byteStride=10**30)),
+            "could not be read",
+        ),
+        (lambda d: _primitive(d).update(extras={"offset": [10**400, 0, 0]}), "too large"),
         (lambda d: _primitive(d).update(mode=4), "mode 4"),
         (lambda d: _primitive(d)["extensions"][EXTENSION].update(kernel="box"), "kernel is 'box'"),
         (lambda d: _primitive(d)["extensions"][EXTENSION].update(colorSpace="linear"), "'linear'"),
@@ -147,7 +153,16 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
     path = tmp_path / "m.glb"
     glb.write(path, some_gaussians(30, 1))
     data = path.read_bytes()
-    for broken in (data[:-8], data[:15], b"", b"not glTF" + data[8:], data.replace(b"BIN\0", b"BON\0")):
+    text = b"[" * 10**5
+    nested = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text
+    for broken in (
+        data[:-8],
+        data[:15],
+        b"",
+        b"not glTF" + data[8:],
+        data.replace(b"BIN\0", b"BON\0"),
+        nested,
+    ):
         path.write_bytes(broken)
         with pytest.raises(ModelUnreadable, match=r"m\.glb"):
             glb.read(path)

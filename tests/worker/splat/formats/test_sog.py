@@ -138,7 +138,9 @@ def test_what_does_not_fit_is_named(
 def test_damaged_archives_are_named(tmp_path: Path) -> None:
     sog.write(tmp_path / "m.sog", some_gaussians(300, 1))
     data = (tmp_path / "m.sog").read_bytes()
-    beyond_the_end = data[:28] + b"\xff\xff" + data[30:]  # the first member's extra field is said to be that long
+    beyond_the_end = (
+        data[:28] + b"\xff\xff" + data[30:]
+    )  # the first member's extra field is said to be that long
     list_at = data.index(b"PK\x01\x02")
     encrypted = data[:6] + b"\x01" + data[7 : list_at + 8] + b"\x01" + data[list_at + 9 :]
     half, none, empty = data[: len(data) // 2], b"", b"PK\x05\x06" + b"\0" * 18
@@ -146,5 +148,8 @@ def test_damaged_archives_are_named(tmp_path: Path) -> None:
         (tmp_path / "m.sog").write_bytes(broken)
         with pytest.raises(ModelUnreadable, match=r"m\.sog"):
             registry.read(tmp_path / "m.sog")
+    (tmp_path / "meta.json").write_text("[" * 10**5)
+    with pytest.raises(ModelUnreadable, match="nests too many"):
+        registry.read(tmp_path / "meta.json")
     with pytest.raises(FileNotFoundError):
         registry.read(tmp_path / "none.sog")

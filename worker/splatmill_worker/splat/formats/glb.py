@@ -121,7 +121,19 @@ def read(path: Path) -> Contents:
         raise ModelUnreadable(
             f"{path.name} could not be read as a .glb: {error.args[0]!r:.100} is missing."
         ) from error
-    except (ValueError, OSError, TypeError, IndexError, struct.error, AttributeError) as error:
+    except RecursionError as error:
+        raise ModelUnreadable(
+            f"{path.name} could not be read as a .glb: its JSON nests too many objects or lists."
+        ) from error
+    except (
+        ValueError,
+        OverflowError,
+        OSError,
+        TypeError,
+        IndexError,
+        struct.error,
+        AttributeError,
+    ) as error:
         raise ModelUnreadable(f"{path.name} could not be read as a .glb of Gaussians: {error}.") from error
 
 
@@ -186,10 +198,14 @@ def _contents(path: Path) -> Contents:
     _check(primitive)
     attributes = primitive["attributes"]
 
-    def values(name: str, width: int) -> Tensor:
-        return _accessor(document, data, attributes[name], width, name)
+    means = _accessor(document, data, attributes["POSITION"], 3, "POSITION")
 
-    means = values("POSITION", 3)
+    def values(name: str, width: int) -> Tensor:
+        found = _accessor(document, data, attributes[name], width, name)
+        if len(found) != len(means):
+            raise ValueError(f"{name} has {len(found)} values, and POSITION {len(means)}")
+        return found
+
     degree = max(d for d in range(4) if f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
     sh = [values(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{order}", 3) for d, order in _harmonics(degree)]
     scales = values(f"{EXTENSION}:SCALE", 3)

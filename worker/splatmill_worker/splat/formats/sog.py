@@ -149,7 +149,11 @@ def read(path: Path) -> Contents:
         raise
     except UnusablePicture as error:
         raise ModelUnreadable(f"{path.name} cannot be read: {error.message}") from error
-    except (*DAMAGED, OSError, ValueError, KeyError, TypeError) as error:
+    except RecursionError as error:
+        raise ModelUnreadable(
+            f"{path.name} could not be read as a SOG model: its meta.json nests too many objects or lists"
+        ) from error
+    except (*DAMAGED, OSError, ValueError, OverflowError, KeyError, TypeError) as error:
         raise ModelUnreadable(f"{path.name} could not be read as a SOG model: {_said(error)}") from error
 
 
