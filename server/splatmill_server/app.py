@@ -2,12 +2,14 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
+from functools import cache
 
 import structlog
-from fastapi import FastAPI
+from fastapi import APIRouter, FastAPI
 from fastapi.openapi.utils import get_openapi
 from starlette.middleware import Middleware
+from starlette.routing import BaseRoute
 
 import splatmill
 from splatmill.schema import CreateJob, EventRecord, Problem
@@ -91,6 +93,15 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.service = service
     problems.install(app)
+    app.router.routes.extend(_routes())
+    _describe(app, keyless=settings.local and settings.api_key is None)
+    return app
+
+
+@cache
+def _routes() -> Sequence[BaseRoute]:
+    """Return the endpoints. All apps of a process share them: what FastAPI makes of their signatures is made once."""
+    router = APIRouter()
     modules = (
         captures,
         uploads,
@@ -110,11 +121,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         storage,
     )
     for module in modules:
-        app.include_router(module.router, dependencies=[PERMITTED])
-    app.include_router(shared.router)  # for people without a key
-    app.include_router(pages.router)
-    _describe(app, keyless=settings.local and settings.api_key is None)
-    return app
+        router.include_router(module.router, dependencies=[PERMITTED])
+    router.include_router(shared.router)  # for people without a key
+    router.include_router(pages.router)
+    return router.routes
 
 
 def _describe(app: FastAPI, *, keyless: bool) -> None:

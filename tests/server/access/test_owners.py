@@ -9,7 +9,7 @@ from typing import Any
 
 import httpx
 import pytest
-from fastapi import Request
+from starlette.datastructures import Headers
 
 from splatmill.backplane import keys, layout
 from splatmill.schema import Scope
@@ -19,17 +19,17 @@ from tests.support.served_app import Serve, ServedApp, problem
 pytestmark = pytest.mark.slow  # a server for each case
 
 
-def _caller(request: Request) -> caller.Caller:
-    owner = request.headers.get("x-owner", "default")
+async def _caller(asked: object, headers: Headers) -> caller.Caller:
+    owner = headers.get("x-owner", "default")
     scopes = set(Scope) if owner in ("default", "chief") else {Scope.read, Scope.train}
     return caller.Caller(owner, scopes=frozenset(scopes))
 
 
 @pytest.fixture
-def app(serve: Serve) -> ServedApp:
+def app(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> ServedApp:
     """An app whose callers say who they are in the header X-Owner; `chief` and `default` are admins."""
     served = serve()
-    served.asgi.dependency_overrides[caller._caller] = _caller
+    monkeypatch.setattr(served.service.authentication, "caller", _caller)
     return served
 
 

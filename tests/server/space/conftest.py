@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import httpx
 import pytest
-from fastapi import Request
 from obstore.store import MemoryStore
+from starlette.datastructures import Headers
 
 from splatmill.backplane.storage import Storage
 from splatmill.schema import KeyLimits, Scope
@@ -55,8 +55,8 @@ class Person:
         return {use["owner"]: {"bytes": use["bytes"], **use["by_kind"]} for use in answer["owners"]}
 
 
-def _caller(request: Request) -> caller.Caller:
-    owner, limit = request.headers.get("x-owner", "default"), request.headers.get("x-limit")
+async def _caller(scope: object, headers: Headers) -> caller.Caller:
+    owner, limit = headers.get("x-owner", "default"), headers.get("x-limit")
     scopes = frozenset(Scope) if owner in ("default", "chief") else frozenset({Scope.read, Scope.train})
     limits = KeyLimits(bytes_stored=int(limit) if limit is not None else None)
     return caller.Caller(owner, scopes=scopes, limits=limits)
@@ -66,12 +66,12 @@ ServePeople = Callable[..., ServedApp]
 
 
 @pytest.fixture
-def serve_people(serve: Serve) -> ServePeople:
+def serve_people(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> ServePeople:
     """Start an app whose callers say who they are in the headers X-Owner and X-Limit."""
 
     def start(**settings: object) -> ServedApp:
         served = serve(**settings)
-        served.asgi.dependency_overrides[caller._caller] = _caller
+        monkeypatch.setattr(served.service.authentication, "caller", _caller)
         return served
 
     return start
