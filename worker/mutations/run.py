@@ -52,6 +52,7 @@ PROOFS = {
     "cpu/adam": ["test_adam.py", "test_cpu_step.py"],
     "cpu/loss": ["test_loss.py"],
     "cpu/knn": ["test_knn.py"],
+    "cpu/correlate": ["test_correlate.py"],
     "cpu/pose": ["test_cpu_pose.py"],
     "cpu/step": ["test_cpu_step.py", *GRADIENTS],
     "cpu/threads": ["test_cpu_isa.py", "test_proof_poison.py"],
@@ -63,6 +64,7 @@ PROOFS = {
     "cpu/project": ["test_proof_backward.py", "test_proof_poison.py"],
     "reference/adam": ["test_adam.py"],
     "reference/knn": ["test_knn.py"],
+    "reference/correlate": ["test_correlate.py"],
     "reference/loss": ["test_loss.py"],
     "gpu/adam": [f"{GPU_OPS}adam_agrees_with_the_definition", "test_gpu_step.py"],
     "gpu/bin": [
@@ -98,7 +100,7 @@ FUNCTIONS = "test_functions.py"
 
 ALL = [
     "test_proof_backward.py", "test_proof_forward.py", "test_proof_step.py", "test_cpu_step.py", "test_cpu_pose.py",
-    "test_adam.py", "test_loss.py", "test_knn.py", "test_proof_poison.py", "test_cpu_input.py",
+    "test_adam.py", "test_loss.py", "test_knn.py", "test_correlate.py", "test_proof_poison.py", "test_cpu_input.py",
     "test_reference_order.py", "test_reference_gsplat.py", "test_cpu_isa.py", FUNCTIONS,
 ]  # fmt: skip
 ALL_GPU = [

@@ -24,6 +24,7 @@ __all__ = [
     "backend_for",
     "bin",
     "composite",
+    "correlate",
     "knn",
     "loss",
     "photo_stats",
@@ -218,6 +219,51 @@ def knn(points: Tensor, *, backend: Backend | None = None) -> Tensor:
     name = _backend(backend, points)
     checks.tensor("points", points, (None, 3), **_kind(name, points))
     return cast(Tensor, _op(name, "knn")(points))
+
+
+def correlate(
+    image: Tensor,
+    rays: Tensor,
+    patches: Tensor,
+    inverse_depths: Tensor,
+    turn: Tensor,
+    shift: Tensor,
+    *,
+    margin: float,
+    least_variance: float,
+    backend: Backend | None = None,
+) -> Tensor:
+    """Return the normalised cross-correlation [N,D] of patches with what another image shows at each of D depths.
+
+    image [H,W] grey values, of two rows and columns at least; rays [N,M,3] from the patches' camera to the M points of
+    each patch, at depth 1, the patch's centre in the middle; patches [N,M] grey values of mean 0 and norm 1;
+    inverse_depths [D]; turn [3,3] and shift [3]: the ray r at the inverse depth w is seen at the pixel (x/z, y/z) of
+    turn r + w shift, and the centre of pixel (0, 0) is (0.5, 0.5). The image is read bilinearly, and beyond its border
+    as at its border; what it shows counts as of `least_variance` at least. A patch whose centre is behind the other
+    camera, or at most `margin` pixels from the border, has -1. Not differentiable, and not on gpu.
+    """
+    name = _backend(backend, image)
+    kind = _kind(name, image)
+    checks.tensor("image", image, (None, None), **kind)
+    checks.image_size(image.shape[1], image.shape[0])
+    if min(image.shape) < 2:
+        raise ValueError(f"image: expected two rows and columns at least, got shape {list(image.shape)}")
+    checks.tensor("rays", rays, (None, None, 3), **kind)
+    checks.tensor("patches", patches, (rays.shape[0], rays.shape[1]), **kind)
+    if not rays.shape[1] % 2:
+        raise ValueError(f"rays: expected an odd number of points in a patch, got {rays.shape[1]}")
+    checks.tensor("inverse_depths", inverse_depths, (None,), **kind)
+    checks.tensor("turn", turn, (3, 3), **kind)
+    checks.tensor("shift", shift, (3,), **kind)
+    if not (margin >= 0 and least_variance > 0):
+        raise ValueError(
+            f"margin, least_variance: expected at least 0 and more than 0, got {margin} and {least_variance}"
+        )
+    op = _op(name, "correlate")
+    scores: Tensor = op(
+        image, rays, patches, inverse_depths, turn, shift, margin=margin, least_variance=least_variance
+    )
+    return scores
 
 
 def _backend(asked: Backend | None, tensor: object) -> Backend:

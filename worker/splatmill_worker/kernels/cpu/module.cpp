@@ -9,6 +9,7 @@ namespace splatmill {
 void bind_adam(nb::module_& m);
 void bind_bin(nb::module_& m);
 void bind_composite(nb::module_& m);
+void bind_correlate(nb::module_& m);
 void bind_knn(nb::module_& m);
 void bind_loss(nb::module_& m);
 void bind_pack(nb::module_& m);
@@ -66,6 +67,7 @@ NB_MODULE(SPLATMILL_MODULE, m) {
   bind_adam(m);
   bind_bin(m);
   bind_composite(m);
+  bind_correlate(m);
   bind_knn(m);
   bind_loss(m);
   bind_pack(m);

@@ -3,8 +3,20 @@
 from .adam import adam_, catch_up_
 from .bin import bin
 from .composite import composite
+from .correlate import correlate
 from .knn import knn
 from .loss import PhotoStats, loss, photo_stats
 from .project import project
 
-__all__ = ["PhotoStats", "adam_", "bin", "catch_up_", "composite", "knn", "loss", "photo_stats", "project"]
+__all__ = [
+    "PhotoStats",
+    "adam_",
+    "bin",
+    "catch_up_",
+    "composite",
+    "correlate",
+    "knn",
+    "loss",
+    "photo_stats",
+    "project",
+]

@@ -16,6 +16,7 @@ import numpy.typing as npt
 import torch
 
 from splatmill_worker.images.load import Photo
+from splatmill_worker.kernels import ops
 from splatmill_worker.scene import Camera
 
 Float = npt.NDArray[np.float64]
@@ -49,12 +50,6 @@ ADJACENT = 2
 
 MAX_ERROR = 1.0
 """Pixels: largest mean distance between the best position in each agreeing neighbour and the common one."""
-
-_BATCH = 8192
-"""Patches at a depth that are compared at a time; their samples stay in the cache."""
-
-MIN_AHEAD = 1e-6
-"""Depth of a patch in the neighbour, in units of its depth in its own photo, up to which it counts as behind."""
 
 
 class SweepResult(NamedTuple):
@@ -205,35 +200,21 @@ def _inverse_depths(
 def _scores(
     rays: torch.Tensor, patch: torch.Tensor, inverse: torch.Tensor, pose: Float, other: GreyView
 ) -> torch.Tensor:
-    """Normalised cross-correlation [n,depths] of patches [n,m] with a neighbour at each depth.
+    """Normalised cross-correlation [n,depths] of patches with a neighbour at each depth.
 
     -1 where the patch's centre is behind the neighbour or too near to its border.
     """
-    camera = other.camera
-    K = np.diag([2.0 / camera.width, 2.0 / camera.height, 1.0]) @ camera.K
-    K[:2] -= K[2]  # pixels to grid_sample's -1 to 1
-    turn = torch.from_numpy(K @ pose[:3, :3]).float()
-    shift = torch.from_numpy(K @ pose[:3, 3]).float()
-    # Up to scale, a point at inverse depth w is seen at K (R ray + w t).
-    turned = rays @ turn.T  # [n,m,3]
-    moved = inverse[:, None] * shift  # [depths,3]
-    centre = turned[:, None, turned.shape[1] // 2] + moved  # [n,depths,3]
-    middle = centre[..., :2] / centre[..., 2:].clamp_min(MIN_AHEAD)
-    border = 1.0 - 2.0 * RADIUS / min(camera.width, camera.height)
-    shown = (centre[..., 2] > MIN_AHEAD) & (middle.abs() < border).all(-1)
-    scores = torch.full(shown.shape, -1.0)
-    which, depth = shown.nonzero(as_tuple=True)
-    for start in range(0, len(which), _BATCH):
-        one, at = which[start : start + _BATCH], depth[start : start + _BATCH]
-        local = turned[one] + moved[at][:, None]  # [b,m,3]
-        grid = local[..., :2] / local[..., 2:].clamp_min(MIN_AHEAD)
-        sampled = torch.nn.functional.grid_sample(
-            other.grey[None, None], grid[None], padding_mode="border", align_corners=False
-        )[0, 0]
-        product = (sampled * patch[one]).sum(1)
-        variance = sampled.var(dim=1, correction=0).clamp_min((0.5 * MIN_CONTRAST) ** 2)
-        scores[one, at] = product / (variance * sampled.shape[1]).sqrt()
-    return scores
+    K = other.camera.K
+    return ops.correlate(
+        other.grey,
+        rays,
+        patch,
+        inverse,
+        torch.from_numpy(K @ pose[:3, :3]).float(),
+        torch.from_numpy(K @ pose[:3, 3]).float(),
+        margin=float(RADIUS),
+        least_variance=(0.5 * MIN_CONTRAST) ** 2,
+    )
 
 
 def _peaks(

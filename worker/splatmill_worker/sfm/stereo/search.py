@@ -23,7 +23,7 @@ from splatmill_worker.sfm.stereo.points import StereoPoints, add, observations_p
 
 Float = npt.NDArray[np.float64]
 
-VERSION = 2
+VERSION = 3
 """Version of the method; points stored under another version are searched for anew."""
 
 ENOUGH_OBSERVATIONS = 1000
