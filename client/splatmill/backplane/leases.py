@@ -27,7 +27,7 @@ from splatmill.backplane.entries import (
 LEASE = MONITORING_INTERVAL + HEARTBEAT_SLACK
 """Seconds for which a heartbeat holds an entry."""
 
-MAX_LOST = 4
+MAX_LOST = 6
 """Number of attempts in a row that may end with their worker and without a new checkpoint. Then the job fails, because
 it probably ends the worker itself, by taking all memory of its machine."""
 

@@ -218,7 +218,7 @@ def test_a_job_whose_worker_is_lost_again_and_again_fails_by_name(app: ServedApp
     app.service.reaper.tick()
     problem = app.http.get(f"/v1/jobs/{job_id}").json()["problem"]
     assert problem["code"] == "attempts_exhausted"
-    assert "lost 4 times in a row during features" in problem["detail"]
+    assert f"lost {leases.MAX_LOST} times in a row during features" in problem["detail"]
     assert problem["facts"]["lost_workers"] == leases.MAX_LOST
     # A restart is a new generation, which may lose as many.
     assert app.http.post(f"/v1/jobs/{job_id}/restart").json()["state"] == "queued"

@@ -1,6 +1,6 @@
-"""Proves how an attempt that storage refuses ends: queued again while it can be retried, failed by name when not; that
-photos reach structure from motion from a storage on another file system; and that garbage is collected while a pipeline
-runs, and not while it is imported.
+"""Proves how an attempt that storage refuses ends: queued again while it can be retried, failed by name when not. That
+it waits for a job that Redis has lost. That photos reach structure from motion from a storage on another file system.
+That garbage is collected while a pipeline runs, and not while it is imported.
 
 Does not prove what happens to the processes: tests/service does.
 """
@@ -8,6 +8,9 @@ Does not prove what happens to the processes: tests/service does.
 import gc
 import importlib
 import logging
+import os
+import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -19,6 +22,7 @@ from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import Role
 from splatmill_worker.service import run_attempt as module
 from splatmill_worker.service.attempt import Attempt, start_attempt
+from splatmill_worker.service.process_exit import HANDED_BACK_STATUS
 from splatmill_worker.service.run_attempt import run_attempt
 from tests.support.jobs import CAPTURE, messages, read_job, write_row
 
@@ -56,6 +60,42 @@ def test_a_transient_failure_without_retries_left_is_the_jobs_problem(
     assert job.problem.code == "storage_unavailable"
     assert job.problem.sentence in messages(connection, JOB)
     assert refused.lock.holder() is None
+
+
+@pytest.fixture
+def lost(connection: redis.Redis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Attempt:
+    """An attempt at an unfinished job that Redis has lost, and storage has not."""
+    monkeypatch.setenv("SPLATMILL_STORAGE", (tmp_path / "storage").as_uri())
+    monkeypatch.setattr(logging.getLogger("splatmill_worker"), "level", logging.WARNING)
+    Storage((tmp_path / "storage").as_uri()).put(layout.watched_job(JOB), b"{}")
+    return start_attempt(connection, f"{JOB}-1", "token")
+
+
+def test_a_job_that_redis_has_lost_begins_once_it_is_restored(lost: Attempt, connection: redis.Redis) -> None:
+    restored = threading.Timer(0.3, write_row, (connection, JOB))
+    restored.start()
+    run_attempt(lost, can_retry=False)
+    restored.join()
+    job = read_job(connection, JOB)
+    assert job.attempt == lost.number
+    assert job.state == "failed"  # without photos
+    assert job.problem is not None
+
+
+def test_a_job_that_is_not_restored_goes_back_to_the_queue(
+    lost: Attempt, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "RESTORE_SECONDS", 0.0)
+    monkeypatch.setattr(os, "_exit", sys.exit)
+    with pytest.raises(SystemExit) as ended:
+        run_attempt(lost, can_retry=False)
+    assert ended.value.code == HANDED_BACK_STATUS
+
+
+def test_a_job_that_was_deleted_does_not_begin(lost: Attempt, tmp_path: Path) -> None:
+    Storage((tmp_path / "storage").as_uri()).delete(layout.watched_job(JOB))
+    run_attempt(lost, can_retry=False)
+    assert lost.lock.holder() is None
 
 
 def test_photos_reach_structure_from_motion_from_another_file_system(

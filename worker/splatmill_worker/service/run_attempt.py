@@ -59,6 +59,9 @@ STAGING = "staging"
 SILENT_SECONDS = 0.5
 """Seconds before the first of these events. A capture that is linked, or small, has none."""
 
+RESTORE_SECONDS = 30.0
+"""Seconds that an attempt waits until a server has restored its job, which a Redis that came back empty has lost."""
+
 FLUSH_SECONDS = 5.0
 """Seconds that an attempt which is handed back may spend on sending its last events."""
 
@@ -110,6 +113,8 @@ def run_attempt(attempt: Attempt, can_retry: bool) -> None:
         row = patiently(lambda: _row_to_run(attempt))
     except redis.RedisError as error:
         _exit_unreported(str(error))
+    except HandedBack:
+        os._exit(HANDED_BACK_STATUS)
     if row is not None:
         outbox = Outbox(attempt)
         try:
@@ -125,7 +130,7 @@ def run_attempt(attempt: Attempt, can_retry: bool) -> None:
 
 def _row_to_run(attempt: Attempt) -> JobRow | None:
     """Return the job's row; None when the job was deleted or restarted meanwhile, or has ended."""
-    row = rows.read(attempt.connection, attempt.job_id)
+    row = rows.read(attempt.connection, attempt.job_id) or _restored_row(attempt)
     if row is None or row.generation != attempt.generation:
         return None
     if fold(row, events.read_states(attempt.connection, attempt.job_id)).state.final:
@@ -133,6 +138,27 @@ def _row_to_run(attempt: Attempt) -> JobRow | None:
     if row.cancel_requested_at is not None:
         os._exit(WITHDRAWN_STATUS)
     return row
+
+
+def _restored_row(attempt: Attempt) -> JobRow | None:
+    """Return the row of a job that Redis has lost, once a server has restored it; None for a job that was deleted.
+
+    Raises HandedBack when that takes longer than RESTORE_SECONDS, when the worker stops, and when storage cannot tell:
+    the job then waits in the queue.
+    """
+    end = time.monotonic() + RESTORE_SECONDS
+    try:
+        storage = Storage(storage_url())
+        while storage.exists(layout.watched_job(attempt.job_id)):
+            if (row := rows.read(attempt.connection, attempt.job_id)) is not None:
+                return row
+            if time.monotonic() > end or hand_back.requested():
+                raise HandedBack
+            time.sleep(0.5)
+    except StorageError as error:
+        own_log.warning("storage does not tell whether the job %s exists: %s", attempt.job_id, error)
+        raise HandedBack from error
+    return rows.read(attempt.connection, attempt.job_id)
 
 
 def _run(attempt: Attempt, row: JobRow, outbox: Outbox, can_retry: bool) -> None:

@@ -6,7 +6,9 @@ Does not prove quality or speed on real photos: those are measured by `bench tra
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ from splatmill_worker.splat.plan.budget import Budget, Clock
 from splatmill_worker.splat.plan.rates import Annealing, boost_of
 from splatmill_worker.splat.start import frusta
 from splatmill_worker.splat.start.points import from_points
-from splatmill_worker.splat.train import checkpoint
+from splatmill_worker.splat.train import checkpoint, loop
 from splatmill_worker.splat.train.loop import Hooks, TrainingProgress, train
 from splatmill_worker.splat.train.renderer import evaluation_background
 from splatmill_worker.splat.train.run import TrainingRun
@@ -187,6 +189,22 @@ def test_a_run_that_had_ended_is_evaluated_when_resumed() -> None:
     resumed = train(first_engine(), views, held_out, whole, extent=1.1, resume_from=ended)
     assert resumed.curve[-1].step == resumed.steps
     assert resumed.held_out is not None
+
+
+def test_checkpoints_are_close_at_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop, "FIRST_CHECKPOINT_SECONDS", 0.0)
+    views, held_out = split()
+    stored: list[tuple[float, int]] = []
+    hooks = Hooks(
+        checkpoint=lambda snapshot: stored.append((time.monotonic(), snapshot.step)), checkpoint_seconds=1e9
+    )
+    train(first_engine(), views, held_out, plan(40, densify=False), extent=1.1, hooks=hooks)
+    assert stored[0][1] == 1
+    gaps = [after - before for (before, _), (after, _) in pairwise(stored)]
+    # Each is as far from the last as that one from the beginning, which lies before the first.
+    assert len(gaps) >= 2
+    assert all(gap >= before - stored[0][0] for gap, (before, _) in zip(gaps, stored, strict=False))
+    assert len(stored) < 20
 
 
 def test_a_cancel_is_seen_at_the_next_step() -> None:

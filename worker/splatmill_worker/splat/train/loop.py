@@ -29,7 +29,11 @@ PROGRESS_SECONDS = 0.5
 """Seconds between two reports of progress."""
 
 CHECKPOINT_SECONDS = 20.0
-"""Seconds between two checkpoints."""
+"""Seconds between two checkpoints, at most."""
+
+FIRST_CHECKPOINT_SECONDS = 2.5
+"""Seconds until the first checkpoint. From there to CHECKPOINT_SECONDS, each is as far from the last as that one is
+from the beginning, so that an attempt which is lost early loses half of its work at most."""
 
 FLAT_TAIL = 0.1
 """Share of the time spent so far in which the rates fall to their ends once the curve is flat."""
@@ -73,8 +77,9 @@ class Hooks:
     evaluated: with every new point of the curve.
     warn: with a sentence, when a numerical failure was rolled back.
     cancelled: before every step; training ends when it returns True.
-    checkpoint: with a snapshot to store, every `checkpoint_seconds` and on a cancellation; None: never.
-    checkpoint_seconds: seconds between two checkpoints.
+    checkpoint: with a snapshot to store, every `checkpoint_seconds`, sooner at first (FIRST_CHECKPOINT_SECONDS), and on
+        a cancellation; None: never.
+    checkpoint_seconds: seconds between two checkpoints, at most.
     observers: look at the scene, each at moments of its own.
     """
 
@@ -154,7 +159,7 @@ def train(
     validation = tuple(run.views[index].name for index in sorted(run.set_aside))
     evaluations = Evaluations(run, held_out)
     stopped, failure = "", None
-    last_progress = last_checkpoint = time.monotonic()
+    began = last_progress = last_checkpoint = time.monotonic()
     while not stopped:
         if run.set_aside and (run.shortened or evaluations.last_is_next):
             run.train_on_all()
@@ -183,7 +188,8 @@ def train(
         if now - last_progress >= PROGRESS_SECONDS:
             last_progress = now
             hooks.progress(_progress(run))
-        if hooks.checkpoint is not None and not stopped and now - last_checkpoint >= hooks.checkpoint_seconds:
+        gap = min(hooks.checkpoint_seconds, max(FIRST_CHECKPOINT_SECONDS, last_checkpoint - began))
+        if hooks.checkpoint is not None and not stopped and now - last_checkpoint >= gap:
             with run.clock.stopped():
                 hooks.checkpoint(run.snapshot())
             last_checkpoint = time.monotonic()
