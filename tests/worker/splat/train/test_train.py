@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
-from itertools import pairwise
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -192,19 +193,15 @@ def test_a_run_that_had_ended_is_evaluated_when_resumed() -> None:
 
 
 def test_checkpoints_are_close_at_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop, "FIRST_CHECKPOINT_SECONDS", 0.0)
+    """By a clock that advances a second at each look: one in each step, and one after each checkpoint."""
+    clock = SimpleNamespace(monotonic=count().__next__, perf_counter=time.perf_counter)
+    monkeypatch.setattr(loop, "time", clock)
     views, held_out = split()
-    stored: list[tuple[float, int]] = []
-    hooks = Hooks(
-        checkpoint=lambda snapshot: stored.append((time.monotonic(), snapshot.step)), checkpoint_seconds=1e9
-    )
+    stored: list[int] = []
+    hooks = Hooks(checkpoint=lambda snapshot: stored.append(snapshot.step), checkpoint_seconds=10.0)
     train(first_engine(), views, held_out, plan(40, densify=False), extent=1.1, hooks=hooks)
-    assert stored[0][1] == 1
-    gaps = [after - before for (before, _), (after, _) in pairwise(stored)]
-    # Each is as far from the last as that one from the beginning, which lies before the first.
-    assert len(gaps) >= 2
-    assert all(gap >= before - stored[0][0] for gap, (before, _) in zip(gaps, stored, strict=False))
-    assert len(stored) < 20
+    # After 3 s, the first look past 2.5; after another 4 and 9, as long as since the beginning; then after 10 each.
+    assert stored == [3, 7, 16, 26, 36]
 
 
 def test_a_cancel_is_seen_at_the_next_step() -> None:
