@@ -259,7 +259,7 @@ def document(rows: list[Row]) -> str:
     for label in dict.fromkeys(row["label"] for row in rows):
         of_label = [row for row in rows if row["label"] == label]
         text += [f"## {label}", ""] if label else []
-        whats = list(dict.fromkeys(row["what"] for row in of_label))
+        whats = list(dict.fromkeys(row["what"] for row in of_label if row["requests"]))
         text.append(
             "| clients | " + " | ".join(f"{what}, p50 / p99 ms" for what in whats) + " | requests a second |"
             " errors | API, CPU ms an answer |"

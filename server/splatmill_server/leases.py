@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager, suppress
 import redis
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import keys
+from splatmill.backplane import expiry, keys
 
 SECONDS = 30
 """Seconds until the lease of a process that was killed expires."""
@@ -28,6 +28,7 @@ async def lease(connection: redis.Redis, kind: str, name: str) -> AsyncIterator[
     """
     key, token = keys.lease(kind, name), secrets.token_hex(8)
     if not await run_in_threadpool(lambda: connection.set(key, token, nx=True, ex=SECONDS)):
+        await run_in_threadpool(expiry.shorten, connection, key, SECONDS)
         yield False
         return
     renewal = asyncio.create_task(_renew(connection, key, token))

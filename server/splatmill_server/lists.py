@@ -17,7 +17,7 @@ import structlog
 from redis.exceptions import LockError
 from redis.lock import Lock
 
-from splatmill.backplane import keys, lists
+from splatmill.backplane import expiry, keys, lists
 from splatmill.backplane.lists import NotListed
 from splatmill.schema import StoredKind
 from splatmill_server.paging import read_cursor, write_cursor
@@ -140,15 +140,16 @@ class Lists:
             lock = Lock(self.connection, keys.LISTING, timeout=_LOCK_SECONDS, thread_local=False)
             if lock.acquire(blocking=False):
                 self._make(lock)
-            elif time.monotonic() >= end:
+                continue
+            expiry.shorten(self.connection, keys.LISTING, _LOCK_SECONDS)
+            if time.monotonic() >= end:
                 raise ProblemError(
                     "lists_not_ready",
                     "The lists of captures, jobs and models are being made from storage, because Redis has lost them.",
                     advice="Try again in a minute. What is known by its id can be read and changed meanwhile.",
                     headers={"Retry-After": "10"},
                 )
-            else:
-                time.sleep(0.05)
+            time.sleep(0.05)
 
     def _make(self, lock: Lock) -> None:
         began, done = time.monotonic(), threading.Event()

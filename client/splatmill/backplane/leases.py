@@ -56,8 +56,14 @@ redis.call('ZADD', KEYS[1], now + ARGV[2], ARGV[1])
 return 1
 """
 
+# KEYS: leases. ARGV: seconds of a lease. One that would last longer was made before the clock of Redis was set back.
 _EXPIRED = """
-return redis.call('ZRANGEBYSCORE', KEYS[1], '-inf', redis.call('TIME')[1])
+local now = tonumber(redis.call('TIME')[1])
+local last = now + ARGV[1]
+for _, member in ipairs(redis.call('ZRANGEBYSCORE', KEYS[1], '(' .. last, '+inf')) do
+  redis.call('ZADD', KEYS[1], last, member)
+end
+return redis.call('ZRANGEBYSCORE', KEYS[1], '-inf', now)
 """
 
 # KEYS: leases, RQ's record of the entry, queue, totals. ARGV: member, entry, whether only if expired, limit, seconds to
@@ -210,7 +216,7 @@ class Reclaim:
         """Requeue what has expired, and return what became of each. Raises redis.RedisError."""
         if not self._trusted():
             return []
-        members = cast(list[bytes], self._connection.eval(_EXPIRED, 1, key()))
+        members = cast(list[bytes], self._connection.eval(_EXPIRED, 1, key(), LEASE))
         found: list[tuple[Lease, Requeued]] = []
         for lease in _leases(self._connection, members):
             became = requeue(self._connection, lease, if_expired=True)

@@ -5,8 +5,7 @@
 Of a hundred clients, 80 ask for a job once a second, 10 follow its events, and 10 upload a photo every two seconds.
 Five more look at a model, once a second each, however many the others are. Clients know nothing of each other: each
 begins at a random moment of its own second, where locust starts those of a second together, as one burst that is
-repeated for ever. The last line of the output is JSON: an
-object for each kind of request, and the errors.
+repeated for ever. The last line of the output is JSON: an object for each kind of request, and the errors.
 """
 
 import json

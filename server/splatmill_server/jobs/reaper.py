@@ -15,13 +15,12 @@ import redis
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import entries, keys, leases, lines, queue
+from splatmill.backplane import entries, expiry, keys, leases, lines, queue
 from splatmill.backplane.row import JobRow
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import Problem
-from splatmill_server.jobs import requests, shrinking
+from splatmill_server.jobs import requests, restoring, shrinking
 from splatmill_server.jobs.records import Jobs, last_stage
-from splatmill_server.jobs.restoring import without_row
 from splatmill_server.metrics import Metrics
 from splatmill_server.problems import ProblemError
 from splatmill_server.settings import Settings
@@ -101,7 +100,7 @@ class Reaper:
             if time.monotonic() - self._looked_at < _LOST_SECONDS:
                 return
             self._looked_at = time.monotonic()
-            missing = set(without_row(self.connection, requests.names(self.jobs.storage)))
+            missing = set(restoring.without_row(self.connection, requests.names(self.jobs.storage)))
         except ProblemError:
             return  # another process makes the lists
         except StorageError as error:
@@ -126,6 +125,7 @@ class Reaper:
 
     def _is_restored(self, job_id: str) -> bool:
         """Return whether a job was restored so lately that a process may run it which the queue does not know."""
+        expiry.shorten(self.connection, keys.RESTORED, restoring.GRACE)
         return bool(self.connection.sismember(keys.RESTORED, job_id))
 
     def _check(self, rows: Sequence[JobRow]) -> None:

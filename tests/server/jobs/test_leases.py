@@ -106,6 +106,17 @@ def test_a_heartbeat_at_the_last_moment_keeps_the_entry(taken: Lease, connection
     assert waiting(connection) == 1
 
 
+def test_a_lease_lasts_no_longer_where_the_clock_of_redis_is_set_back(
+    taken: Lease, connection: redis.Redis
+) -> None:
+    reclaim = Reclaim(connection)
+    connection.zadd(
+        leases.key(), {taken.member: connection.time()[0] + 1800}
+    )  # as seen after half an hour back
+    assert reclaim.run() == []
+    assert 0 < expires(connection, taken) - connection.time()[0] <= leases.LEASE
+
+
 def test_an_entry_that_was_deleted_is_not_requeued(taken: Lease, connection: redis.Redis) -> None:
     connection.delete(f"rq:job:{taken.entry}")
     expire(connection, taken)

@@ -55,6 +55,15 @@ def test_queued_jobs_wait_again_when_no_worker_claims_them(app: ServedApp) -> No
     assert listed(app) == before
 
 
+def test_restored_jobs_wait_no_longer_where_the_clock_of_redis_is_set_back(app: ServedApp) -> None:
+    app.job()
+    emptied(app)
+    app.redis.expire(keys.RESTORED, 1800)  # as seen after half an hour back
+    app.service.reaper.tick()
+    grace_over(app)
+    assert waiting(app.redis) == 1
+
+
 def test_ended_jobs_are_as_they_were(app: ServedApp) -> None:
     capture_id = app.capture()
     ends = [JobState.succeeded, JobState.failed, JobState.cancelled]
@@ -163,12 +172,13 @@ def test_those_who_ask_while_lists_are_made_are_told_to_come_again(
     monkeypatch.setattr("splatmill_server.lists.LONGEST_WAIT", 0.0)
     job_id = app.job()
     app.redis.delete(keys.LISTED)
-    app.redis.set(keys.LISTING, "another process")
+    app.redis.set(keys.LISTING, "another process", ex=1800)  # as seen after the clock of Redis was set back
     for path in ("/v1/jobs", "/v1/captures", "/v1/models"):
         answer = app.http.get(path)
         assert problem(answer, 503, "lists_not_ready")["advice"]
         assert answer.headers["retry-after"]
     assert app.state(job_id) == "queued"
+    assert 0 < app.redis.ttl(keys.LISTING) <= 30
     app.redis.delete(keys.LISTING)
     assert list(listed(app)) == [job_id]
     assert app.redis.get(keys.LISTED) == lists.VERSION
