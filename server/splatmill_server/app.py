@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import threading
 from collections.abc import AsyncIterator, Sequence
 from functools import cache
 
@@ -43,6 +44,8 @@ from splatmill_server.web import pages
 
 log = structlog.get_logger()
 
+_STOP_SECONDS = 5.0
+"""Seconds for which threads that work beside the answers may go on after the process was stopped."""
 
 _DESCRIPTION = """Photos in, Gaussian splats out.
 
@@ -80,6 +83,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+            # The process ends with its threads, and a sweep, or lists that are made, may go through all of storage.
+            end = threading.Timer(_STOP_SECONDS, service.storage.close)
+            end.daemon = True
+            end.start()
             await service.close()
 
     app = FastAPI(

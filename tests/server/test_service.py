@@ -4,9 +4,11 @@ Not proved here: that a Prometheus server likes the metrics (their text is parse
 """
 
 import ast
+import threading
 from pathlib import Path
 
 import pytest
+import redis
 from prometheus_client.parser import text_string_to_metric_families
 
 from splatmill.backplane.storage import StorageError
@@ -14,8 +16,34 @@ from splatmill.schema import MAX_PHOTO_PIXELS, MAX_RENDER_PIXELS, TrainOptions
 from splatmill_server import app as app_module
 from splatmill_server.app import create_app
 from splatmill_server.settings import Settings
-from tests.support.served_app import Serve, ServedApp, problem
+from splatmill_server.space import sweeper
+from splatmill_server.space.usage import Usage
+from tests.support.served_app import Serve, ServedApp, problem, served_app
 from tests.support.waiting import wait_for
+
+
+def test_a_stop_does_not_wait_until_all_of_storage_was_gone_through(
+    redis_url: str, connection: redis.Redis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    began, ended = threading.Event(), threading.Event()
+
+    def endless(usage: Usage, lock: object = None) -> None:
+        try:
+            while True:
+                usage.storage.exists("captures/none/capture.json")
+                began.set()
+        finally:
+            ended.set()
+
+    monkeypatch.setattr(Usage, "scan", endless)
+    monkeypatch.setattr(sweeper, "_FIRST_SECONDS", 0.0)
+    monkeypatch.setattr(app_module, "_STOP_SECONDS", 0.1)
+    with served_app(Settings(redis_url=redis_url, data=tmp_path), connection) as app:
+        wait_for(began.is_set)
+        assert not ended.is_set()
+    wait_for(ended.is_set)
+    with pytest.raises(StorageError, match="closed"):
+        app.service.storage.get("captures/none/capture.json")
 
 
 def test_options_are_those_of_the_schema(app: ServedApp) -> None:

@@ -87,6 +87,7 @@ class Storage:
         self.root: Path | None = None
         self._patience = patience or Patience()
         self._slots: Slots | None = None
+        self._closed = False
         parts = urlsplit(url)
         if parts.scheme in ("", "file"):
             self.root = Path(unquote(parts.path)).expanduser().absolute()
@@ -101,6 +102,13 @@ class Storage:
             raise StorageError(
                 f"SPLATMILL_STORAGE={redacted(url)!r} is neither file:///folder nor s3://bucket/prefix; set it to one."
             )
+
+    def close(self) -> None:
+        """Refuse all further operations, so that threads which go through storage come to an end.
+
+        Those that are under way end as they would.
+        """
+        self._closed = True
 
     @contextmanager
     def _operation(self, verb: str, path: str) -> Iterator[None]:
@@ -123,6 +131,8 @@ class Storage:
     @contextmanager
     def _watched(self, verb: str, path: str) -> Iterator[None]:
         """Convert the errors of an operation, and tell of its end."""
+        if self._closed:
+            raise StorageError(f"Storage was closed before it was asked to {verb} {path}: the process ends.")
         began = time.monotonic()
         try:
             with storage_errors(verb, path):

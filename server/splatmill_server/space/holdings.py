@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Entry, Storage
 from splatmill.schema import DEFAULT_OWNER, StoredKind
+from splatmill_server.lists import each
 
 KINDS = {"captures": StoredKind.capture, "jobs": StoredKind.job, "models": StoredKind.model}
 """The kind of record by the name of the folder in storage that holds all records of the kind."""
@@ -121,15 +122,18 @@ def scan(
     """Return all folders in storage with their owners.
 
     entries: all files in storage.
-    known: the folders of an earlier scan by their keys. The owner of a record never changes, so that records are read
-    once.
+    known: folders by their keys, as an earlier scan or the row of a job tells of them. The owner of a record never
+    changes, so that records are read once, and those of jobs that have rows never.
     job_owners: the owners of the jobs that have rows, for folders of jobs and of models that are not finished.
     """
     found = sums(entries)
-    described: dict[tuple[StoredKind, str], Holding] = {}
-    for place, held in found.items():
-        if held.whole:
-            described[place] = _described(storage, held, known.get(held.key))
+    whole = [held for held in found.values() if held.whole]
+    unknown = [held for held in whole if not _is_known(held, known)]
+    records = each(lambda place: _record(storage, place), [_record_of(held) for held in unknown])
+    told = {held.key: _with_facts(held, record) for held, record in zip(unknown, records, strict=True)}
+    described = {
+        (held.kind, held.id): told.get(held.key) or _as_before(held, known[held.key]) for held in whole
+    }
     for (kind, record_id), held in found.items():
         if (kind, record_id) not in described:
             owner = job_owners.get(record_id) if kind is not StoredKind.capture else None
@@ -140,11 +144,17 @@ def scan(
     return list(described.values())
 
 
-def _described(storage: Storage, held: Holding, before: Holding | None) -> Holding:
-    """Return a folder with what its record says: owner, name, and the capture of a model."""
-    if before is None or before.owner is None:
-        record = _record(storage, f"{held.folder}/{_RECORDS[held.kind]}")
-        before = _with_facts(held, record)
+def _is_known(held: Holding, known: Mapping[str, Holding]) -> bool:
+    return held.key in known and known[held.key].owner is not None
+
+
+def _record_of(held: Holding) -> str:
+    """Return the path of the record in a folder."""
+    return f"{held.folder}/{_RECORDS[held.kind]}"
+
+
+def _as_before(held: Holding, before: Holding) -> Holding:
+    """Return a folder with what its record said: owner, name, and the capture of a model."""
     return held.model_copy(update={"owner": before.owner, "name": before.name, "capture": before.capture})
 
 

@@ -10,6 +10,7 @@ import redis
 from splatmill.backplane import keys, layout, lists
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Role
+from splatmill_server.jobs.restoring import without_row
 
 _PAGE = 1000
 
@@ -48,16 +49,22 @@ def tidy_redis(connection: redis.Redis, seconds: float) -> dict[str, int]:
     """
     relisted = unlisted = deleted = 0
     for page in _pages(connection, f"{keys.job('*')}"):
-        for name in page:
-            job_id = keys.job_of(name)
-            if job_id is None or not layout.is_id(job_id):
-                continue
-            if name == keys.job(job_id):
-                relisted += _list_again(connection, job_id)
-            elif not connection.exists(keys.job(job_id)) and _idle(connection, name) >= seconds:
+        jobs = {
+            name: job_id
+            for name in page
+            if (job_id := keys.job_of(name)) is not None and layout.is_id(job_id)
+        }
+        rows = [job_id for name, job_id in jobs.items() if name == keys.job(job_id)]
+        for job_id in _not_listed(connection, rows):
+            relisted += _list_again(connection, job_id)
+        rowless = set(without_row(connection, sorted({*jobs.values()} - {*rows})))
+        for name, job_id in jobs.items():
+            if job_id in rowless and _idle(connection, name) >= seconds:
                 deleted += connection.delete(name)
-    for member in cast(list[bytes], connection.zrange(keys.JOBS, 0, -1)):
-        unlisted += _unlist(connection, member.decode())
+    listed = [member.decode() for member in cast(list[bytes], connection.zrange(keys.JOBS, 0, -1))]
+    for start in range(0, len(listed), _PAGE):
+        for job_id in without_row(connection, listed[start : start + _PAGE]):
+            unlisted += _unlist(connection, job_id)
     return {"rows listed again": relisted, "ids without a row": unlisted, "keys without a row": deleted}
 
 
@@ -78,10 +85,16 @@ def _idle(connection: redis.Redis, name: str) -> float:
         return 0.0
 
 
+def _not_listed(connection: redis.Redis, job_ids: list[str]) -> list[str]:
+    """Return those of the jobs that the list of jobs lacks."""
+    if not job_ids:
+        return []
+    scores = connection.zmscore(keys.JOBS, job_ids)
+    return [job_id for job_id, score in zip(job_ids, scores, strict=True) if score is None]
+
+
 def _list_again(connection: redis.Redis, job_id: str) -> int:
-    """Put a row into the list of jobs if it is missing there, and among the unfinished jobs, which the reaper sorts."""
-    if connection.zscore(keys.JOBS, job_id) is not None:
-        return 0
+    """Put a row into the list of jobs, and among the unfinished jobs, which the reaper sorts."""
 
     def repair(pipe: Any) -> None:
         created = pipe.hget(keys.job(job_id), "created_at")

@@ -14,7 +14,7 @@ from splatmill.backplane import keys
 from splatmill.backplane.storage import Entry, Storage
 from splatmill.schema import OwnerUse, StoredBytes, StoredKind, StoredRecord
 from splatmill_server.space.holdings import Holding, scan, sums
-from splatmill_server.space.job_uses import all_jobs
+from splatmill_server.space.job_uses import JobUse, all_jobs
 from splatmill_server.space.ledger import NOBODY, Account, Ledger
 from splatmill_server.space.snapshot import Snapshot
 
@@ -69,8 +69,9 @@ class Usage:
     def scan(self, lock: Lock | None = None) -> None:
         """List storage, and replace the figures in the ledger. `lock` is renewed meanwhile."""
         began = self.ledger.clock()
-        known = {held.key: held for owner in self.ledger.owners() for held in self.account(owner).holdings}
         jobs = all_jobs(self.connection)
+        known = {held.key: held for job in jobs.values() for held in _told_by(job)}
+        known |= {held.key: held for owner in self.ledger.owners() for held in self.account(owner).holdings}
         first = self.ledger.begin_listing()
         listed = _renewing(lock, self.storage.walk(""))
         found = scan(self.storage, listed, known, {job.id: job.owner for job in jobs.values()})
@@ -146,6 +147,16 @@ def largest(
 def moment(seconds: float) -> datetime:
     """Return seconds since 1970 as a point in time."""
     return datetime.fromtimestamp(seconds, UTC)
+
+
+def _told_by(job: JobUse) -> list[Holding]:
+    """Return the folders of a job and of its model, without their sizes, as the row of the job tells of them."""
+    if not job.readable:
+        return []
+    kinds = (StoredKind.job, StoredKind.model)
+    return [
+        Holding(kind=kind, id=job.id, owner=job.owner, name=job.name, capture=job.capture) for kind in kinds
+    ]
 
 
 def _by_kind(account: Account) -> StoredBytes:

@@ -180,6 +180,32 @@ def test_a_capture_that_is_written_to_while_storage_is_listed_is_counted_once(
     assert usage.ledger.bytes_of("ann") == total > 1500
 
 
+def test_the_records_of_jobs_that_have_rows_are_not_read(
+    people: ServedApp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ann, usage, storage = Person(people.http, "ann"), people.service.usage, people.service.storage
+    capture = ann.capture(50, 60)
+    job_id = ann("POST", "/v1/jobs", json={"capture": capture}).json()["id"]
+    people.begin(job_id)
+    model = _model(people, job_id, "ann", capture=capture)
+    paths: list[str] = []
+    get = storage.get
+
+    def noted(path: str) -> bytes:
+        paths.append(path)
+        return get(path)
+
+    monkeypatch.setattr(storage, "get", noted)
+    usage.scan()
+    assert [path for path in paths if not path.startswith("captures/")] == []
+    (held,) = (held for held in usage.account("ann").holdings if held.kind is StoredKind.model)
+    assert (held.owner, held.size) == ("ann", model)
+    people.redis.flushall()  # the row too: now the record says whose the model is
+    usage.scan()
+    assert layout.job_record(job_id) in paths
+    assert held in usage.account("ann").holdings
+
+
 def test_scans_take_a_small_share_of_the_time_however_often_figures_are_asked_for(
     serve_people: ServePeople, monkeypatch: pytest.MonkeyPatch
 ) -> None:
