@@ -4,8 +4,8 @@
 
 Of a hundred clients, 80 ask for a job once a second, 10 follow its events, and 10 upload a photo every two seconds.
 Five more look at a model, once a second each, however many the others are. Clients know nothing of each other: each
-begins at a random moment of its own second, where locust starts those of a second together, as one burst that is
-repeated for ever. The last line of the output is JSON: an object for each kind of request, and the errors.
+begins at a random moment, and waits for half to one and a half of its time. With equal waits, those that one stall had
+brought together would come together for ever, once a second. The last line of the output is JSON: an object for each kind of request, and the errors.
 """
 
 import json
@@ -18,7 +18,7 @@ import gevent.monkey
 
 gevent.monkey.patch_all()
 
-from locust import FastHttpUser, constant_pacing, events, task  # noqa: E402  # after the sockets are replaced
+from locust import FastHttpUser, between, constant, events, task  # noqa: E402  # after the sockets are replaced
 from locust.env import Environment  # noqa: E402
 from locust.stats import StatsEntry  # noqa: E402
 
@@ -46,7 +46,7 @@ class Poller(Client):
     """Asks for the state of the job that trains."""
 
     weight = 80
-    wait_time = constant_pacing(1)
+    wait_time = between(0.5, 1.5)
 
     @task
     def poll(self) -> None:
@@ -57,7 +57,7 @@ class Follower(Client):
     """Follows the events of that job for as long as the stream lasts; what counts is the time to its first event."""
 
     weight = 10
-    wait_time = constant_pacing(1)
+    wait_time = constant(1)
     network_timeout = 600.0
 
     @task
@@ -88,7 +88,7 @@ class Uploader(Client):
     """Uploads photos to captures of its own."""
 
     weight = 10
-    wait_time = constant_pacing(2)
+    wait_time = between(1, 3)
 
     def on_start(self) -> None:
         super().on_start()
@@ -108,7 +108,7 @@ class Viewer(Client):
     """Looks at a model."""
 
     fixed_count = VIEWERS
-    wait_time = constant_pacing(1)
+    wait_time = between(0.5, 1.5)
 
     @task
     def view(self) -> None:
