@@ -5,7 +5,8 @@
 Of a hundred clients, 80 ask for a job once a second, 10 follow its events, and 10 upload a photo every two seconds.
 Five more look at a model, once a second each, however many the others are. Clients know nothing of each other: each
 begins at a random moment, and waits for half to one and a half of its time. With equal waits, those that one stall had
-brought together would come together for ever, once a second. The last line of the output is JSON: an object for each kind of request, and the errors.
+brought together would come together for ever, once a second. The last line of the output is JSON: an object for each
+kind of request, and the errors.
 """
 
 import json
