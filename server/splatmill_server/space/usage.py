@@ -10,7 +10,7 @@ import structlog
 from redis.exceptions import LockError
 from redis.lock import Lock
 
-from splatmill.backplane import keys
+from splatmill.backplane import expiry, keys
 from splatmill.backplane.storage import Entry, Storage
 from splatmill.schema import OwnerUse, StoredBytes, StoredKind, StoredRecord
 from splatmill_server.space.holdings import Holding, scan, sums
@@ -58,6 +58,8 @@ class Usage:
                     self.scan(lock)
             finally:
                 _release(lock)
+        else:
+            expiry.shorten(self.connection, keys.SCAN_LOCK, _LOCK_SECONDS)
 
     def _is_due(self, oldest: float) -> bool:
         last = self.ledger.last_scan()

@@ -227,6 +227,16 @@ def test_scans_take_a_small_share_of_the_time_however_often_figures_are_asked_fo
     assert last.began == 11_101.0
 
 
+def test_a_scan_that_died_delays_the_next_no_longer_where_the_clock_of_redis_is_set_back(
+    serve_people: ServePeople,
+) -> None:
+    app = serve_people()
+    app.service.usage.scan()
+    app.redis.set(keys.SCAN_LOCK, "a process that was killed", ex=1800)  # as seen after half an hour back
+    app.service.usage.refresh(-1.0)
+    assert 0 < app.redis.ttl(keys.SCAN_LOCK) <= 30
+
+
 def test_of_two_processes_that_know_nothing_one_scans_and_the_other_waits(
     serve_people: ServePeople, monkeypatch: pytest.MonkeyPatch
 ) -> None:
