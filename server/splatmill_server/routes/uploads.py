@@ -98,6 +98,7 @@ async def begin(
 @router.options("/{capture_id}/{role}/{name:path}", status_code=204, responses=problems("capture_not_found"))
 def get_upload_limits(service: Shared, capture_id: CaptureId, role: Role, name: str) -> Response:
     """Tell that files can be uploaded in several requests, and the limits."""
+    service.captures.record(capture_id)
     headers = {"Accept-Patch": PARTIAL_UPLOAD, "Allow": "PUT, OPTIONS", UPLOAD_LIMIT: _limits(service)}
     return Response(status_code=204, headers=headers)
 

@@ -316,6 +316,8 @@ def test_requests_that_are_not_understood_are_named(app: ServedApp) -> None:
     options = app.http.options(f"/v1/captures/{capture_id}/images/a.mp4")
     assert options.headers["accept-patch"] == "application/partial-upload"
     assert "max-size=" in options.headers["upload-limit"]
+    assert app.http.delete(f"/v1/captures/{capture_id}").status_code == 204
+    problem(app.http.options(f"/v1/captures/{capture_id}/images/a.mp4"), 404, "capture_not_found")
 
 
 def test_a_taken_name_is_refused_before_a_byte_is_sent(app: ServedApp) -> None:
