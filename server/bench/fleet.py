@@ -257,7 +257,7 @@ def _training(fleet: Fleet, api: Api, connection: redis.Redis, folder: Path, sec
     entry = _entry_bytes(connection)
     looked, page = (
         min((api.look() for _ in range(3)), key=lambda row: row["round_trips"]),
-        api.page("training"),
+        min((api.page("training") for _ in range(3)), key=lambda row: row["cpu_seconds"]),
     )
     over.touch()
     with api.looking():
