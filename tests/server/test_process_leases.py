@@ -27,8 +27,7 @@ def test_one_process_holds_a_lease_at_a_time(connection: redis.Redis) -> None:
 
 
 def test_a_lease_lasts_no_longer_where_the_clock_of_redis_is_set_back(connection: redis.Redis) -> None:
-    connection.set(
-        keys.lease("work", "a"), "a process that was killed", ex=1800
-    )  # as seen after half an hour back
+    name = keys.lease("work", "a")
+    connection.set(name, "a process that was killed", ex=1800)  # as seen after half an hour back
     assert not asyncio.run(taken(connection))
-    assert 0 < connection.ttl(keys.lease("work", "a")) <= leases.SECONDS
+    assert 0 < connection.ttl(name) <= leases.SECONDS

@@ -27,6 +27,8 @@ AFTER = 200
 """Requests after which the ids of records are asked for again."""
 
 LONG_VIDEOS, VIDEO_PIXELS = 3, 2e6
+"""How many videos of more pixels, in all their frames, are rendered whole in a round. They may take a minute each."""
+
 _VIDEO = {"seconds": 6.0, "fps": 24, "width": 640, "height": 480}
 """What a video is without these fields."""
 

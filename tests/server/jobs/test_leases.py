@@ -110,9 +110,8 @@ def test_a_lease_lasts_no_longer_where_the_clock_of_redis_is_set_back(
     taken: Lease, connection: redis.Redis
 ) -> None:
     reclaim = Reclaim(connection)
-    connection.zadd(
-        leases.key(), {taken.member: connection.time()[0] + 1800}
-    )  # as seen after half an hour back
+    half_an_hour_back = connection.time()[0] + 1800
+    connection.zadd(leases.key(), {taken.member: half_an_hour_back})
     assert reclaim.run() == []
     assert 0 < expires(connection, taken) - connection.time()[0] <= leases.LEASE
 
