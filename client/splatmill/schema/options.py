@@ -174,7 +174,7 @@ class TrainOptions(Request):
         ge=2,
         le=2000,
         description=(
-            "Largest number of frames taken from a video: the sharpest one from each of as many equal parts. "
+            "Largest number of frames taken from a video: sharp ones, at equal distances of what the picture moves. "
             "Raise it for a long video."
         ),
         json_schema_extra=_PHOTOS,

@@ -116,7 +116,7 @@ def test_a_picture_that_takes_too_long_is_given_up(photos: Path, confinement: De
 def test_reading_a_video_is_cancelled(photos: Path, tmp_path: Path, confinement: Decoders) -> None:
     (photos / "walk.mp4").write_bytes(video(frames=600))
     with pytest.raises(Cancelled):
-        decoders.sharpest_frames(photos / "walk.mp4", tmp_path / "work" / "frames", 5, cancelled=lambda: True)
+        decoders.keyframes(photos / "walk.mp4", tmp_path / "work" / "frames", 5, cancelled=lambda: True)
     assert children() == []
 
 

@@ -1,5 +1,5 @@
 """Proves which files count as photos and how their pixels reach the trainer: formats, refusals by name, size,
-orientation, alpha, masks, videos, zips, undistortion.
+orientation, alpha, masks, zips, undistortion. Videos are in test_video.
 
 Not proven here: colour management (profiles are ignored by design) and cameras' raw formats.
 """
@@ -12,7 +12,6 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -139,23 +138,6 @@ def test_masks_are_found_in_their_folder_and_beside_the_photo(photos: Path, tmp_
         loaded = load_view(View(photo.name, camera, photo.path, photo.mask), 32)
         assert loaded.mask is not None
         np.testing.assert_array_equal(loaded.mask, half[::2, ::2] > 0)
-
-
-def test_a_video_gives_its_sharpest_frames(photos: Path, tmp_path: Path) -> None:
-    sharp = [np.asarray(picture(96, 64, seed=seed)) for seed in range(4)]
-    blurred = np.full((64, 96, 3), 127, np.uint8)
-    with av.open(str(photos / "walk.mp4"), "w") as container:
-        stream = container.add_stream("libx264", rate=10)
-        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
-        for number in range(40):
-            frame = av.VideoFrame.from_ndarray(
-                sharp[number // 10] if number % 10 == 4 else blurred, format="rgb24"
-            )
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    result = prepare(photos, None, tmp_path / "work", frames=4)
-    assert [photo.name for photo in result.photos] == [f"walk_{number:06d}.jpg" for number in (4, 14, 24, 34)]
-    assert all(photo.sequence == "walk.mp4" for photo in result.photos)
 
 
 def test_a_zip_is_unpacked(photos: Path, tmp_path: Path) -> None:

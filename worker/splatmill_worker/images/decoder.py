@@ -85,7 +85,7 @@ def _answers() -> dict[str, Callable[[dict[str, Any]], Answer]]:
     from splatmill_worker.images.decode import decode, sizes
     from splatmill_worker.images.examine import examine
     from splatmill_worker.images.masks import mask_fault
-    from splatmill_worker.images.video import sharpest_frames
+    from splatmill_worker.images.video import keyframes
 
     def decoded(given: dict[str, Any]) -> Answer:
         least = given["at_least"]
@@ -107,7 +107,7 @@ def _answers() -> dict[str, Callable[[dict[str, Any]], Answer]]:
         }, b""
 
     def frames(given: dict[str, Any]) -> Answer:
-        written = sharpest_frames(Path(given["path"]), Path(given["target"]), given["count"])
+        written = keyframes(Path(given["path"]), Path(given["target"]), given["count"])
         return {"names": [path.name for path in written]}, b""
 
     return {
@@ -115,7 +115,7 @@ def _answers() -> dict[str, Callable[[dict[str, Any]], Answer]]:
         "sizes": sized,
         "examine": examined,
         "mask_fault": fault,
-        "sharpest_frames": frames,
+        "keyframes": frames,
     }
 
 

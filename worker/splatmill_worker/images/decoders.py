@@ -122,15 +122,15 @@ def mask_fault(mask: Path, photo: tuple[int, int], *, upright: bool = True) -> s
     return _FAULT.validate_python(answer["fault"])
 
 
-def sharpest_frames(
+def keyframes(
     path: Path, target: Path, count: int, *, cancelled: Callable[[], bool] = lambda: False
 ) -> list[Path]:
-    """Like `splatmill_worker.images.video.sharpest_frames`."""
+    """Like `splatmill_worker.images.video.keyframes`."""
     if _active is None:
-        return video.sharpest_frames(path, target, count, cancelled=cancelled)
+        return video.keyframes(path, target, count, cancelled=cancelled)
     target.mkdir(parents=True, exist_ok=True)
     given = {"path": str(path), "target": str(target), "count": count}
-    answer, _ = _active.call(path, "sharpest_frames", given, guarded.MAX_READING_SECONDS, cancelled)
+    answer, _ = _active.call(path, "keyframes", given, guarded.MAX_READING_SECONDS, cancelled)
     return [target / Path(str(name)).name for name in answer["names"]]
 
 
@@ -176,7 +176,7 @@ class Decoders:
             answer = process.ask({"name": name, "arguments": arguments}, seconds, cancelled)
         except _Died as error:
             process = None
-            kind = UnusableVideo if name == "sharpest_frames" else _unusable_picture
+            kind = UnusableVideo if name == "keyframes" else _unusable_picture
             raise kind(path.name, str(error)) from error
         except BaseException:
             if process is not None:

@@ -195,7 +195,7 @@ def _expand(
         elif suffix in VIDEO_SUFFIXES:
             folder = _filled_once(
                 workdir / "frames" / f"{_sha256(path)[:24]}_{frames}",
-                lambda place: decoders.sharpest_frames(path, place, frames, cancelled=cancelled),
+                lambda place: decoders.keyframes(path, place, frames, cancelled=cancelled),
             )
             pictures = given_files(folder)
             prefix = Path(name).with_suffix("").as_posix()

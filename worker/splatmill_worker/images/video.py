@@ -1,9 +1,15 @@
-"""Takes the sharpest frames of a video, one from each of several intervals of equal length."""
+"""Takes frames of a video for structure from motion: sharp ones, at equal distances of what the picture moves.
+
+A video has many frames where the camera went slowly, and equal ones where it stood. Frames at equal distances show the
+scene from as many sides with fewer photos, and leave no hole where the camera went fast (decisions: keyframes).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import av
 import numpy as np
@@ -12,9 +18,22 @@ from PIL import Image
 
 from splatmill_worker.errors import Cancelled, UnusableVideo
 from splatmill_worker.images import guarded
+from splatmill_worker.images.flow import Grey, displacement
 
 SHARPNESS_SIDE = 480
 """Pixels of the longest side of the reduced frame on which sharpness is measured."""
+
+MOTION_SIDE = 96
+"""Pixels of the longest side of the reduced frame on which motion is measured."""
+
+CANDIDATES = 4
+"""Frames that are looked at for each that is taken: the sharpest of as many intervals of equal length."""
+
+STILL = 0.01
+"""Share of the longer side by which the picture has to move from one frame that is taken to the next."""
+
+FEWEST = 30
+"""Number of frames that are taken even where the picture hardly moves, as before a turntable."""
 
 QUALITY = 95
 """JPEG quality of the frames."""
@@ -23,59 +42,123 @@ DEFAULT_RATE = 30.0
 """Frames per second assumed for videos without time stamps."""
 
 
-def sharpest_frames(
-    path: Path,
-    target: Path,
-    count: int,
-    *,
-    cancelled: Callable[[], bool] = lambda: False,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Path]:
-    """Write `count` frames of the video at `path` as JPEGs in `target`, and return their paths in order.
+class Candidate(NamedTuple):
+    """A frame that may be taken.
 
-    The frame with the largest variance of its Laplacian is taken from each of `count` intervals of equal length; a
-    video with fewer frames gives all of them. The files are called <stem>_<frame number>.jpg. The rotation in the video
-    is applied. Of a video with a damaged end, the frames before the damage are used.
+    number: its position in the video, from 0.
+    sharpness: as `sharpness` says.
+    moved: by how much the picture moved since the candidate before, as a share of the longer side.
+    """
+
+    number: int
+    sharpness: float
+    moved: float
+
+
+def keyframes(
+    path: Path, target: Path, count: int, *, cancelled: Callable[[], bool] = lambda: False
+) -> list[Path]:
+    """Write at most `count` frames of the video at `path` as JPEGs in `target`, and return their paths in order.
+
+    The files are called <stem>_<frame number>.jpg. The rotation in the video is applied. Of a video with a damaged end,
+    the frames before the damage are used. The video is decoded twice: to choose the frames, and to write them.
 
     Raises UnusableVideo when the file has no video that decodes or exceeds a limit, and Cancelled.
     """
     if count < 1:
         raise ValueError(f"{count} frames were asked for; ask for at least 1.")
     target.mkdir(parents=True, exist_ok=True)
+    numbers = chosen(_candidates(path, CANDIDATES * count, cancelled), count)
     written: list[Path] = []
+    with _decoded(path, cancelled) as (_, frames):
+        for number, frame in frames:
+            if number == numbers[len(written)]:
+                written.append(_save(frame, target / f"{path.stem}_{number:06d}.jpg"))
+                if len(written) == len(numbers):
+                    break
+    return written
+
+
+def chosen(candidates: Sequence[Candidate], count: int) -> list[int]:
+    """The numbers of at most `count` frames, in order: the sharpest of each of as many stretches of equal motion.
+
+    Stretches are no shorter than STILL, as long as there are FEWEST of them.
+    """
+    path = np.cumsum([candidate.moved for candidate in candidates])
+    stretches = min(count, max(min(count, FEWEST), int(path[-1] / STILL)))
+    # A thousandth more, so that the last candidate does not begin a stretch of its own.
+    of = np.floor(path / max(path[-1] * 1.001 / stretches, 1e-12)).astype(int)
+    best: dict[int, Candidate] = {}
+    for stretch, candidate in zip(of.tolist(), candidates, strict=True):
+        if stretch not in best or candidate.sharpness > best[stretch].sharpness:
+            best[stretch] = candidate
+    return [candidate.number for candidate in best.values()]
+
+
+def sharpness(grey: Grey) -> float:
+    """The variance of the Laplacian of a grey image [H,W]; motion blur and defocus lower it."""
+    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4.0 * grey[1:-1, 1:-1]
+    return float(laplacian.var()) if laplacian.size else 0.0
+
+
+def _candidates(path: Path, count: int, cancelled: Callable[[], bool]) -> list[Candidate]:
+    """The sharpest frame of each of `count` intervals of equal length, or all frames where there are fewer."""
+    found: list[Candidate] = []
+    best: tuple[float, int, Grey] | None = None
+    last: Grey | None = None
+
+    def close() -> None:
+        nonlocal last
+        assert best is not None
+        score, number, small = best
+        found.append(Candidate(number, score, 0.0 if last is None else displacement(last, small)))
+        last = small
+
+    with _decoded(path, cancelled) as (length, frames):
+        interval = 0
+        for number, frame in frames:
+            time = frame.time if frame.time is not None else number / DEFAULT_RATE
+            at = min(count - 1, max(interval, int(time / length * count)))
+            if at != interval and best is not None:
+                close()
+                best = None
+            interval = at
+            score = sharpness(_grey(frame, SHARPNESS_SIDE))
+            if best is None or score > best[0]:
+                best = score, number, _grey(frame, MOTION_SIDE)
+    if best is not None:
+        close()
+    if not found:
+        raise UnusableVideo(path.name, "it contains no frame")
+    return found
+
+
+@contextmanager
+def _decoded(
+    path: Path, cancelled: Callable[[], bool]
+) -> Iterator[tuple[float, Iterator[tuple[int, av.VideoFrame]]]]:
+    """The length of the video in seconds, and its frames with their numbers, up to where it is damaged.
+
+    Raises UnusableVideo where no frame decodes or a limit is exceeded, and Cancelled.
+    """
+    seen = 0
+
+    def frames() -> Iterator[tuple[int, av.VideoFrame]]:
+        nonlocal seen
+        for number, frame in enumerate(guarded.frames(path.name, container, stream)):
+            if cancelled():
+                raise Cancelled("Reading the video was cancelled.")
+            seen = number + 1
+            yield number, frame
+
     try:
         with guarded.opened_video(path) as (container, stream):
             length = _duration(path, container, stream)
             guarded.check_length(path.name, length)
-            best: tuple[float, av.VideoFrame, int] | None = None
-            interval = 0
-            for number, frame in enumerate(guarded.frames(path.name, container, stream)):
-                if cancelled():
-                    raise Cancelled("Reading the video was cancelled.")
-                time = frame.time if frame.time is not None else number / DEFAULT_RATE
-                at = min(count - 1, max(interval, int(time / length * count)))
-                if at != interval and best is not None:
-                    written.append(_save(best, target, path.stem))
-                    on_progress(len(written), count)
-                    best = None
-                interval = at
-                score = sharpness(_grey(frame))
-                if best is None or score > best[0]:
-                    best = score, frame, number
-            if best is not None:
-                written.append(_save(best, target, path.stem))
+            yield length, frames()
     except av.FFmpegError as error:
-        if not written:
+        if not seen:
             raise UnusableVideo(path.name, f"it does not decode as video ({error})") from error
-    if not written:
-        raise UnusableVideo(path.name, "it contains no frame")
-    return written
-
-
-def sharpness(grey: npt.NDArray[np.float32]) -> float:
-    """The variance of the Laplacian of a grey image [H,W]; motion blur and defocus lower it."""
-    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4.0 * grey[1:-1, 1:-1]
-    return float(laplacian.var()) if laplacian.size else 0.0
 
 
 def _duration(path: Path, container: av.container.InputContainer, stream: av.VideoStream) -> float:
@@ -103,16 +186,17 @@ def _measured(path: Path, rate: float) -> float:
     return last + 1.0 / rate
 
 
-def _grey(frame: av.VideoFrame) -> npt.NDArray[np.float32]:
-    """The frame in grey [H,W], reduced to SHARPNESS_SIDE."""
-    factor = min(1.0, SHARPNESS_SIDE / max(frame.width, frame.height))
+def _grey(frame: av.VideoFrame, side: int) -> Grey:
+    """The frame in grey [H,W], reduced to a longest side of `side` pixels."""
+    factor = min(1.0, side / max(frame.width, frame.height))
     width, height = max(3, int(frame.width * factor)), max(3, int(frame.height * factor))
-    return frame.reformat(width=width, height=height, format="gray").to_ndarray().astype(np.float32)
+    small = frame.reformat(width=width, height=height, format="gray", interpolation="AREA")
+    grey: npt.NDArray[np.float32] = small.to_ndarray().astype(np.float32)
+    return grey
 
 
-def _save(best: tuple[float, av.VideoFrame, int], target: Path, stem: str) -> Path:
-    """Write the frame of (sharpness, frame, number), upright."""
-    _, frame, number = best
+def _save(frame: av.VideoFrame, place: Path) -> Path:
+    """Write a frame, upright."""
     image: Image.Image = frame.to_image()  # type: ignore[no-untyped-call]  # PyAV leaves it untyped
     turn = {
         90: Image.Transpose.ROTATE_90,
@@ -121,6 +205,5 @@ def _save(best: tuple[float, av.VideoFrame, int], target: Path, stem: str) -> Pa
     }.get(round(frame.rotation) % 360)
     if turn is not None:
         image = image.transpose(turn)
-    place = target / f"{stem}_{number:06d}.jpg"
     image.save(place, quality=QUALITY, subsampling=0)
     return place
