@@ -15,7 +15,7 @@ from torch import Tensor
 from splatmill_worker.kernels.reference.project import rotation
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.train.density import prune
-from splatmill_worker.splat.train.density.clone_split import Change, decayed, densify
+from splatmill_worker.splat.train.density.densify import Change, densify, halves, scaled
 
 
 def gaussians(n: int, scale: float = 0.05, opacity: float = 0.5) -> Gaussians:
@@ -68,41 +68,58 @@ class Held:
         self.exp_avg, self.exp_avg_sq = exp_avg, exp_avg_sq
 
 
-def random() -> torch.Generator:
-    return torch.Generator().manual_seed(3)
+def split(engine: Held, allowed: int = 1000) -> Change:
+    return densify(engine, allowed=allowed)  # type: ignore[arg-type]  # a stand-in with what densify reads
 
 
-def doubled(engine: Held, allowed: int = 1000) -> Change:
-    return densify(engine, random(), extent=1.0, allowed=allowed)  # type: ignore[arg-type]  # a stand-in with what densify reads
-
-
-def test_small_ones_are_cloned_and_keep_their_moments() -> None:
-    engine = Held(gaussians(6, scale=0.005), torch.tensor([0.0, 1e-3, 0.0, 0.0, 3e-4, 1e-4]))
-    change = doubled(engine)
+def test_a_split_gaussian_gives_way_to_two_and_the_others_keep_their_moments() -> None:
+    before = gaussians(6)
+    engine = Held(before, torch.tensor([0.0, 1e-3, 0.0, 0.0, 3e-4, 1e-4]))
+    change = split(engine)
     assert (change.added, change.removed) == (2, 0)
     assert engine.count == 8
-    assert torch.equal(engine.held.means[6:], engine.held.means[[1, 4]])
-    assert torch.equal(engine.exp_avg[:6, 0], torch.arange(6.0))
-    assert torch.equal(engine.exp_avg[6:], torch.zeros(2, 59))
+    assert torch.equal(engine.held.means[:4], before.means[[0, 2, 3, 5]])
+    assert engine.exp_avg[:4, 0].tolist() == [0.0, 2.0, 3.0, 5.0]
+    assert torch.equal(engine.exp_avg[4:], torch.zeros(4, 59))
+    assert torch.equal(engine.exp_avg_sq[4:], torch.zeros(4, 59))
 
 
-def test_large_ones_are_split_in_two_smaller_ones() -> None:
-    before = gaussians(4, scale=0.05)
-    engine = Held(before, torch.tensor([0.0, 1e-3, 0.0, 0.0]))
-    doubled(engine)
-    assert engine.count == 5
-    assert torch.equal(engine.held.means[:3], before.means[[0, 2, 3]])
-    assert torch.allclose(engine.held.log_scales[3:].exp(), torch.tensor(0.05 / 1.6))
-    apart = (engine.held.means[3:] - before.means[1]).norm(dim=1)
-    assert bool((apart > 0).all())
-    assert bool((apart < 5 * 0.05).all())
+def test_halves_lie_side_by_side_on_the_longest_axis() -> None:
+    """Of a Gaussian that is longest along its own y, which a quarter turn about z makes the world's -x."""
+    whole = gaussians(1)
+    whole.quats[0] = torch.tensor([math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4)])
+    whole.log_scales[0] = torch.tensor([0.1, 0.4, 0.2]).log()
+    two = halves(whole)
+    apart = two.means - whole.means
+    assert apart[0].tolist() == pytest.approx([-0.4, 0.0, 0.0], abs=1e-6)
+    assert torch.allclose(apart[1], -apart[0], atol=1e-6)
+    assert torch.allclose(two.log_scales.exp(), torch.tensor([0.085, 0.2, 0.17]).expand(2, 3))
+    assert torch.allclose(torch.sigmoid(two.logit_opacities), torch.tensor(0.3))
+    assert torch.equal(two.sh, whole.sh.expand(2, -1, -1))
+    assert torch.equal(two.quats, whole.quats.expand(2, -1))
+
+
+def test_halves_of_a_ball_of_nothing_and_of_many_are_defined() -> None:
+    """Equal axes: one of them is taken. None: there are no halves. An opacity of 1: the halves are not opaque."""
+    assert torch.isfinite(halves(gaussians(5)).means).all()
+    assert halves(gaussians(0)).count == 0
+    opaque = gaussians(3)
+    opaque.logit_opacities[:] = 50.0
+    assert torch.allclose(torch.sigmoid(halves(opaque).logit_opacities), torch.tensor(0.6))
+
+
+def test_halves_come_first_halves_first() -> None:
+    three = gaussians(3)
+    two = halves(three)
+    assert torch.allclose((two.means[:3] + two.means[3:]) / 2, three.means, atol=1e-6)
 
 
 def test_the_budget_takes_the_largest_scores() -> None:
-    engine = Held(gaussians(8, scale=0.005), torch.arange(8) * 1e-3)
-    doubled(engine, allowed=10)
+    before = gaussians(8)
+    engine = Held(before, torch.arange(8) * 1e-3)
+    split(engine, allowed=10)
     assert engine.count == 10
-    assert torch.equal(engine.held.means[8:], engine.held.means[[6, 7]])
+    assert torch.equal(engine.held.means[:6], before.means[:6])
 
 
 def test_what_cannot_be_seen_goes() -> None:
@@ -117,18 +134,18 @@ def test_what_cannot_be_seen_goes() -> None:
 
 def test_decayed_opacities_are_multiplied() -> None:
     logits = torch.tensor([-2.0, 0.0, 3.0])
-    assert torch.allclose(torch.sigmoid(decayed(logits, 0.9)), 0.9 * torch.sigmoid(logits), atol=1e-6)
+    assert torch.allclose(torch.sigmoid(scaled(logits, 0.9)), 0.9 * torch.sigmoid(logits), atol=1e-6)
 
 
 def test_what_is_far_keeps_its_opacity() -> None:
     engine = Held(gaussians(4), torch.zeros(4))
     engine.held.means[:] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 9.0, 0.0], [2.0, 2.0, 0.0], [-8.0, 0.0, 0.0]])
-    densify(engine, random(), extent=1.0, allowed=4, opacity_decay=0.9, decay_within=5.0)  # type: ignore[arg-type]  # a stand-in with what densify reads
+    densify(engine, allowed=4, opacity_decay=0.9, decay_within=5.0)  # type: ignore[arg-type]  # a stand-in with what densify reads
     assert torch.sigmoid(engine.held.logit_opacities).tolist() == pytest.approx([0.45, 0.5, 0.45, 0.5])
 
 
 def test_quaternions_become_rotations() -> None:
-    turn = rotation(torch.randn(50, 4, generator=random()).double())
+    turn = rotation(torch.randn(50, 4, generator=torch.Generator().manual_seed(3)).double())
     identity = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
     assert torch.allclose(turn @ turn.transpose(1, 2), identity, atol=1e-12)
     assert torch.allclose(torch.linalg.det(turn), torch.ones(50, dtype=torch.float64))

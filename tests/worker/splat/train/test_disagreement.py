@@ -15,7 +15,7 @@ from tests.support.training import first_engine, plan
 
 
 def judged(views: list[TrainingView]) -> tuple[Disagreement, ...]:
-    return train(first_engine(), views, [], plan(200), extent=1.1).disagreements
+    return train(first_engine(), views, [], plan(300), extent=1.1).disagreements
 
 
 def test_what_passes_by_is_found_in_the_photos_that_show_it() -> None:

@@ -16,7 +16,7 @@ from splatmill_worker.splat.plan.budget import Clock
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
 from splatmill_worker.splat.train.curve import CurvePoint
-from splatmill_worker.splat.train.density import clone_split
+from splatmill_worker.splat.train.density.densify import densify
 from splatmill_worker.splat.train.health import LossHealth
 from splatmill_worker.splat.train.pace import Pace
 from splatmill_worker.splat.train.poses import Poses
@@ -260,10 +260,8 @@ class TrainingRun:
             allowed = min(allowed, self.plan.gaussians_within(self.plan.max_memory))
         within = self.plan.schedule.decay_within
         try:
-            clone_split.densify(
+            densify(
                 self.engine,
-                self._random,
-                extent=self.extent,
                 allowed=allowed,
                 opacity_decay=self.plan.schedule.opacity_decay,
                 decay_within=math.inf if within is None else within,

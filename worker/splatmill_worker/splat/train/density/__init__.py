@@ -1,1 +1,1 @@
-"""Adaptive density control: cloning, splitting and pruning of Gaussians."""
+"""Adaptive density control: splitting and pruning of Gaussians."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splatmill_worker.kernels.reference.project import rotation
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.gaussians import Gaussians, concatenate
 
@@ -46,10 +45,3 @@ class Rows:
     def into(self, engine: Engine) -> None:
         """Replace the scene and the moments of `engine`; its scores start at zero."""
         engine.replace(self.gaussians.parameters(), self.exp_avg, self.exp_avg_sq)
-
-
-def offsets(gaussians: Gaussians, random: torch.Generator) -> Tensor:
-    """One random displacement per Gaussian [N, 3], drawn from the Gaussian itself."""
-    # Drawn on the CPU, so that a seed means the same on every device.
-    local = torch.randn(gaussians.count, 3, generator=random).to(gaussians.means)
-    return torch.einsum("nij,nj->ni", rotation(gaussians.quats), local * gaussians.log_scales.exp())
