@@ -15,12 +15,15 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch import Tensor
 
 from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.__main__ import main
+from splatmill_worker.scene import Camera
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.disagreement import Disagreement
+from splatmill_worker.splat.views import Target, TrainingView
 from tests.support import still_life
 from tests.support.paths import BENCH
 
@@ -67,6 +70,7 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> Any:
                 "budgets",
                 "configurations",
                 "outliers",
+                "perceived",
                 "rows",
                 "scenes",
                 "spread",
@@ -91,6 +95,8 @@ def test_a_row_says_what_was_run_and_what_came_out(place: Path) -> None:
     assert row["curve"][-1]["psnr"] == pytest.approx(row["psnr"], abs=1e-3)
     assert 0 < row["curve"][0]["seconds"] < row["curve"][-1]["seconds"] <= row["seconds"]["train"]
     assert row["seconds"]["train"] < row["wall_seconds"]
+    assert 0.0 < row["flip"] < 0.5
+    assert row["ms_ssim"] is None, "its photos have too few pixels"
     assert row["peak_memory"] > 10**8
     assert row["cpu_seconds"] > 0
     assert {"commit", "code", "machine", "versions", "backend"} <= row.keys()
@@ -123,6 +129,7 @@ def test_a_peers_model_is_judged_as_the_run_that_made_it(place: Path, trained: p
     # The .ply holds float32 in another frame; that is all that lies between the two.
     assert row["psnr"] == pytest.approx(score.psnr, abs=0.02)
     assert row["ssim"] == pytest.approx(score.ssim, abs=1e-3)
+    assert 0.0 < row["flip"] < 0.5
     assert "itself" in (place / "rows.md").read_text()
 
 
@@ -362,3 +369,26 @@ def test_outliers_are_judged_by_pixels_where_movers_were_planted(parts: Any, tmp
     }
     nothing = photos[0]._replace(share=0.0, outliers=torch.zeros(20, 30, dtype=torch.bool))
     assert judged(tmp_path / "truth", [nothing])["precision"] is None
+
+
+def test_what_people_see_is_measured_on_whole_photos(parts: Any) -> None:
+    """Nothing, a shift of all colours, then noise; masked and small photos have no figure, and no photos have none."""
+    perceived = parts["_train.perceived"].perceived
+    random = torch.Generator().manual_seed(0)
+    photo = torch.randint(0, 256, (168, 200, 3), generator=random, dtype=torch.uint8)
+    camera = Camera(200, 168, 200.0, 200.0, 100.0, 84.0, np.eye(4))
+
+    def of(rgb: Tensor, mask: Tensor | None = None) -> TrainingView:
+        return TrainingView("a.jpg", {1: Target(camera, torch.eye(4), torch.eye(3), rgb, None, mask)})
+
+    def measured(change: Tensor | float, view: TrainingView = of(photo)) -> Row:
+        return perceived(lambda target, _: target.rgb / 255.0 + change, [view], torch.zeros(3))
+
+    assert measured(0.0) == {"flip": pytest.approx(0.0, abs=1e-3), "ms_ssim": pytest.approx(1.0, abs=1e-5)}
+    noise = 0.3 * torch.randn(photo.shape, generator=random)
+    assert measured(0.02)["flip"] < measured(0.1)["flip"]
+    assert measured(noise)["ms_ssim"] < measured(0.1)["ms_ssim"] < 1.0
+    small, masked = of(photo[:150]), of(photo, torch.ones(168, 200, dtype=torch.bool))
+    assert measured(0.1, small)["flip"] > 0.0
+    assert measured(0.1, small)["ms_ssim"] is None
+    assert measured(0.1, masked) == perceived(None, [], torch.zeros(3)) == {"flip": None, "ms_ssim": None}

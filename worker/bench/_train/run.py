@@ -19,6 +19,7 @@ from torch import Tensor
 from _train import bare
 from _train.configurations import revised
 from _train.outliers import judged
+from _train.perceived import perceived
 from _train.rows import code_version
 from _train.scenes import MADE
 from splatmill.schema import TrainOptions
@@ -29,8 +30,9 @@ from splatmill_worker.errors import ModelUnreadable, Refusal, TrainingFailed
 from splatmill_worker.images.load import load_views
 from splatmill_worker.scene import Normalization, Scene
 from splatmill_worker.sfm import posed
-from splatmill_worker.splat.evaluate import benchmark_background, evaluate
+from splatmill_worker.splat.evaluate import Renderer, benchmark_background, evaluate
 from splatmill_worker.splat.formats import ply
+from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.render import render
 from splatmill_worker.splat.report.report import plain
@@ -98,6 +100,7 @@ def measure(job: Row) -> Row:
         others = max(0.0, worked() - machine - cpu)
         report = json.loads((outcome.out / "report.json").read_text())
         found = None if outcome.trained is None else judged(capture / TRUTH, outcome.trained.disagreements)
+        seen = {} if outcome.trained is None else _perceived(job, options, outcome.trained.gaussians)
     result, seconds = report["result"], report["seconds"]
     recovered = report["sfm"].get("seconds", {})
     values = {
@@ -114,6 +117,7 @@ def measure(job: Row) -> Row:
         "plan": {name: value for name, value in report["plan"].items() if name != "reasons"},
         "warnings": report["warnings"],
         "disagreement": found,
+        **seen,
         "curve": report["curve"],
     }  # fmt: skip
     measured: Row = rounded(values)
@@ -135,11 +139,7 @@ def judge(job: Row) -> Row:
         return {"failure": f"{job['scene']} holds out no view, so that nothing can be judged on it."}
     # The training world, for the same near plane and the same float32 rounding as a run's own evaluation.
     moved = gaussians.moved(frame.scale, torch.from_numpy(frame.translation))
-    backend = choose_kernels(options)
-
-    def draw(target: Target, background: Tensor) -> Tensor:
-        return render(moved, target.camera, background=background, backend=backend).color
-
+    draw = _drawing(moved, options)
     with torch.no_grad():
         score = evaluate(draw, views, benchmark_background(views))
     judged: Row = rounded(
@@ -152,6 +152,7 @@ def judge(job: Row) -> Row:
             "psnr": score.psnr,
             "ssim": score.ssim,
             "mse": score.mse,
+            **perceived(draw, views, benchmark_background(views)),
             "gaussians": gaussians.count,
             "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
             "code": code_version(),
@@ -167,6 +168,24 @@ def held_out(job: Row, options: TrainOptions, image_size: int) -> tuple[Normaliz
     _, test = split_views(scene, options)
     frame = Normalization.of(scene)
     return frame, [TrainingView.of(photo, frame) for photo in load_views(test, image_size)]
+
+
+def _perceived(job: Row, options: TrainOptions, gaussians: Gaussians) -> Row:
+    """What `perceived` says of a scene in the training world, on the held-out views of a run."""
+    if options.image_size is None:
+        return {}
+    _, views = held_out(job, options, options.image_size)
+    return perceived(_drawing(gaussians, options), views, benchmark_background(views))
+
+
+def _drawing(gaussians: Gaussians, options: TrainOptions) -> Renderer:
+    """A renderer of a scene in the training world."""
+    backend = choose_kernels(options)
+
+    def draw(target: Target, background: Tensor) -> Tensor:
+        return render(gaussians, target.camera, background=background, backend=backend).color
+
+    return draw
 
 
 JOBS: dict[str, Callable[[Row], Row]] = {"prepare": prepare, "measure": measure, "judge": judge}

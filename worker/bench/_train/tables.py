@@ -48,7 +48,10 @@ def document(rows: list[Row], references: list[Row], rows_at: Path, here: Path, 
 def budgets(timed: list[Row]) -> str:
     """A table of the result of each time budget, and whether runs ended in time and never got worse with more time."""
     groups = grouped((row for row in whole(timed) if by_time(row)), "scene", "budget")
-    head = "scene|budget|seeds|training s|PSNR dB|SSIM|Gaussians|steps|all wall s|all CPU s|peak MB|cameras s"
+    quality_of = "PSNR dB|SSIM|MS-SSIM|FLIP"
+    head = (
+        f"scene|budget|seeds|training s|{quality_of}|Gaussians|steps|all wall s|all CPU s|peak MB|cameras s"
+    )
     lines, late, worse, busy = [], [], [], []
     course: dict[str, list[tuple[float, float, str]]] = {}
     for (scene, budget), group in groups.items():
@@ -69,6 +72,7 @@ def budgets(timed: list[Row]) -> str:
                 spent.text(1),
                 quality.text(2),
                 Spread.of(row["ssim"] for row in group).text(4),
+                *(_median(group, name) for name in ("ms_ssim", "flip")),
                 *(f"{Spread.of(row[name] for row in group).median:.0f}" for name in ("gaussians", "steps")),
                 *(
                     f"{Spread.of(row[name] for row in group).median:.0f}"
@@ -211,6 +215,12 @@ def sources(references: list[Row]) -> str:
     """The sources of published figures."""
     known = {row["who"]: row["source"] for row in references if row["kind"] == "reference"}
     return "\n".join(f"- {who}: {source}." for who, source in known.items())
+
+
+def _median(group: list[Row], name: str) -> str:
+    """The median of a value; nothing where rows were measured before it was."""
+    known = [row[name] for row in group if row.get(name) is not None]
+    return f"{Spread.of(known).median:.4f}" if known else ""
 
 
 def _of_scene(rows: list[Row], scene: str) -> list[Row]:
