@@ -102,35 +102,35 @@ def sharpness(grey: Grey) -> float:
 
 
 def _candidates(path: Path, count: int, cancelled: Callable[[], bool]) -> list[Candidate]:
-    """The sharpest frame of each of `count` intervals of equal length, or all frames where there are fewer."""
+    """The sharpest frame of each of `count` intervals, with its motion. Raises UnusableVideo where there is none."""
     found: list[Candidate] = []
-    best: tuple[float, int, Grey] | None = None
     last: Grey | None = None
-
-    def close() -> None:
-        nonlocal last
-        assert best is not None
-        score, number, small = best
+    for number, score, small in _sharpest(path, count, cancelled):
         found.append(Candidate(number, score, 0.0 if last is None else displacement(last, small)))
         last = small
+    if not found:
+        raise UnusableVideo(path.name, "it contains no frame")
+    return found
 
+
+def _sharpest(path: Path, count: int, cancelled: Callable[[], bool]) -> Iterator[tuple[int, float, Grey]]:
+    """Number, sharpness and small picture of the sharpest frame of each of `count` intervals of equal length that has
+    one: of all frames where there are fewer."""
+    best: tuple[int, float, Grey] | None = None
+    interval = 0
     with _decoded(path, cancelled) as (length, frames):
-        interval = 0
         for number, frame in frames:
             time = frame.time if frame.time is not None else number / DEFAULT_RATE
             at = min(count - 1, max(interval, int(time / length * count)))
             if at != interval and best is not None:
-                close()
+                yield best
                 best = None
             interval = at
             score = sharpness(_grey(frame, SHARPNESS_SIDE))
-            if best is None or score > best[0]:
-                best = score, number, _grey(frame, MOTION_SIDE)
+            if best is None or score > best[1]:
+                best = number, score, _grey(frame, MOTION_SIDE)
     if best is not None:
-        close()
-    if not found:
-        raise UnusableVideo(path.name, "it contains no frame")
-    return found
+        yield best
 
 
 @contextmanager
