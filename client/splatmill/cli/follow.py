@@ -8,16 +8,20 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from types import FrameType
 
 from splatmill.cli.progress import Display, make_display, show
 from splatmill.client import JobHandle, ModelHandle
 from splatmill.errors import Conflict
 from splatmill.schema import EventRecord
+
+SIGNAL_SECONDS = 0.25
+"""Longest time for which a signal is not noticed. One that arrives just before a wait in C begins does not end it, nor
+does one that another thread receives."""
 
 ONE_SIGNAL_SECONDS = 0.5
 """Two signals within this time count as one: timeout(1) signals both the process and its group."""
@@ -74,7 +78,7 @@ def _until_ended(
 ) -> None:
     cancelling: Interruption | None = None
     while True:
-        item = inbox.get()
+        item = _next(inbox)
         if isinstance(item, EventRecord):
             if since is None or item.at >= since:
                 show(item, display, verbose=verbose)
@@ -91,6 +95,13 @@ def _until_ended(
             cancelling = item
             display.print(f"Cancelling the job {job.id} ...")
             _in_background(lambda: _cancel(job, inbox))
+
+
+def _next(inbox: SimpleQueue[Item]) -> Item:
+    """The next item; handlers of signals, which put items too, run at least every SIGNAL_SECONDS."""
+    while True:
+        with suppress(Empty):
+            return inbox.get(timeout=SIGNAL_SECONDS)
 
 
 def _read_events(job: JobHandle, inbox: SimpleQueue[Item]) -> None:
