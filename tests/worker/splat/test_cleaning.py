@@ -36,7 +36,7 @@ def planted(kind: Reason, views: list[TrainingView]) -> Gaussians:
         depth, scales, opacity = {
             "giant": (0.6, (-1.2, -1.2, -1.2), 0.5),
             "needle": (0.8, (-2.0, -6.0, -6.0), 0.9),
-            "island": (0.75, (-4.5, -4.5, -4.5), 0.9),
+            "island": (0.65, (-4.5, -4.5, -4.5), 0.9),
             "floater": (0.25, (-4.0, -4.0, -4.0), 0.7),
         }[kind]
         rows.append(
@@ -71,7 +71,7 @@ class Trained:
 def life() -> Trained:
     training, held_out = split()
     engine = first_engine()
-    train(engine, training, held_out, plan(300), extent=1.1)
+    train(engine, training, held_out, plan(500), extent=1.1)
     return Trained(gaussians_of(engine).padded(1), training, held_out)
 
 
