@@ -99,6 +99,7 @@ TAKEN_OUT = {
     "sky": "a far shell of Gaussians where photos show sky, and only there",
     "no-sky": "no such shell where photos show sky",
     "mcmc": "MCMC relocation and noise (Kheradmand et al. 2024)",
+    "clone-split": "small Gaussians are cloned, large ones split at random (Kerbl et al. 2023)",
     "sh-at-once": "the last SH degree from the start, as now, against one after the other (Kerbl et al. 2023)",
 }
 """Names of switches that rows have but the code no longer has."""
