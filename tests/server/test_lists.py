@@ -13,6 +13,7 @@ from _capacity.operations import counted
 from _capacity.seed import OWNERS, Seeded, seed
 
 from splatmill.backplane import keys, lists
+from splatmill.backplane.storage import StorageError, StorageFullError
 from splatmill.schema import JobState
 from splatmill_server.filters import Filter, JobFilter
 from splatmill_server.service import Service
@@ -214,4 +215,58 @@ def test_a_capture_that_is_stored_while_the_lists_are_made_is_listed(
     monkeypatch.setattr(storage, "put_new", late)
     made, _ = service.captures.create("late", owner="owner3")
     assert captures(service, Filter(owner="owner3"))(None)[0][0] == made.id
+    service.captures.delete(made.id)
+
+
+def test_a_capture_that_storage_refuses_is_in_no_list(
+    seeded: tuple[Service, Seeded], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service, records = seeded
+    service.lists.ensure(0.0)
+
+    def full(path: str, data: bytes) -> bool:
+        raise StorageFullError("no space left")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(service.captures.storage, "put_new", full)
+        with pytest.raises(StorageFullError):
+            service.captures.create(owner="owner3")
+    assert service.redis.zcard(lists.name("captures")) == len(records.captures)
+    mine = [name for name in records.captures if int(name, 16) % OWNERS == 3]
+    assert service.redis.zcard(lists.name("captures", owner="owner3")) == len(mine)
+
+
+def test_a_capture_of_which_storage_did_not_tell_that_it_was_stored_is_listed(
+    seeded: tuple[Service, Seeded], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service, records = seeded
+    service.lists.ensure(0.0)
+    service.relisting.look()
+    put_new = service.captures.storage.put_new
+
+    def cut(path: str, data: bytes) -> bool:
+        put_new(path, data)
+        raise StorageError("the connection broke before the answer")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(service.captures.storage, "put_new", cut)
+        with pytest.raises(StorageError):
+            service.captures.create(owner="owner3")
+    assert service.relisting.look() == 1
+    (made,) = set(all_pages(captures(service))[0]) - set(records.captures)
+    service.captures.delete(made)
+
+
+def test_a_capture_that_was_stored_and_not_listed_is_listed_when_its_key_is_repeated(
+    seeded: tuple[Service, Seeded], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that is killed between the two leaves such a capture."""
+    service, _ = seeded
+    service.lists.ensure(0.0)
+    with monkeypatch.context() as killed:
+        killed.setattr(service.captures, "_list", lambda made: None)
+        made, _ = service.captures.create(owner="owner3", key="digest of the photos")
+    assert captures(service)(None)[0][0] != made.id
+    assert service.captures.create(owner="owner3", key="digest of the photos") == (made, False)
+    assert captures(service)(None)[0][0] == made.id
     service.captures.delete(made.id)

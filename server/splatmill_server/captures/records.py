@@ -63,7 +63,7 @@ class Captures:
         self.settings = settings
         self.metrics = metrics
         self.unlisted = False
-        """Whether a capture was made that could not be listed."""
+        """Whether a capture was made, or may have been, and is not listed."""
         self.digests = Digests(storage)
         self._recent: dict[str, tuple[float, Capture]] = {}
         # Number of files per capture, as last seen: listing the folder at each upload would take quadratic time.
@@ -79,17 +79,22 @@ class Captures:
             ids = [_id_of_key(owner, key, number) for number in range(_IDS_OF_KEY)]
             for known in ids:
                 if self.storage.exists(layout.capture_record(known)):
-                    return self.record(known), False
+                    found = self.record(known)
+                    self._list_new(found)  # whoever made it may have been killed before that
+                    return found, False
             capture_id = next((known for known in ids if not self._is_leftover(known)), capture_id)
         capture = Capture(id=capture_id, name=name, owner=owner, created_at=datetime.now(UTC))
         record = json.dumps(capture.model_dump(mode="json", exclude={"files"}) | {"format": FORMAT}).encode()
-        # Listed first: a crash in between leaves an entry of the list that readers skip, and no capture without one.
-        # Listed again, because lists that were made from storage in between lack it.
+        # Listed last: of a capture that could not be stored, or not with certainty, no entry of the list may stay.
+        try:
+            made = self.storage.put_new(layout.capture_record(capture.id), record)
+        except StorageError:
+            self.unlisted = True
+            raise
+        if not made:
+            capture = self.record(capture_id)
         self._list_new(capture)
-        if not self.storage.put_new(layout.capture_record(capture.id), record):
-            return self.record(capture.id), False
-        self._list_new(capture)
-        return capture, True
+        return capture, made
 
     def _list_new(self, capture: Capture) -> None:
         """List a capture. Captures can be made and filled without Redis: `space.relisting` lists those."""

@@ -18,7 +18,7 @@ log = structlog.get_logger()
 
 class Relisting:
     """Compares storage with the lists when this process starts, whenever Redis was started anew, and when a capture
-    could not be listed. Each takes a listing of storage, and a read for each record that is missing.
+    may have been made and is not listed. Each takes a listing of storage, and a read for each record that is missing.
 
     interval: seconds between two looks whether there is a reason.
     """
