@@ -46,7 +46,10 @@ return 1
 # ARGV: member, seconds of the lease, entry, execution, worker, then fields and values of the entry's record.
 _REJOIN = """
 if redis.call('ZSCORE', KEYS[1], ARGV[1]) then return 1 end
-if redis.call('EXISTS', KEYS[3]) == 1 or redis.call('HEXISTS', KEYS[4], ARGV[3]) == 1 then return 0 end
+if redis.call('HEXISTS', KEYS[4], ARGV[3]) == 1 then return 0 end
+local known = redis.call('HMGET', KEYS[3], 'status', 'worker_name')
+local own = known[1] == 'started' and known[2] == ARGV[5]  -- the attempt began after the loss, and RQ recorded that
+if redis.call('EXISTS', KEYS[3]) == 1 and not own then return 0 end
 local now = tonumber(redis.call('TIME')[1])
 for index = 6, #ARGV, 2 do redis.call('HSET', KEYS[3], ARGV[index], ARGV[index + 1]) end
 redis.call('HSET', KEYS[3], 'status', 'started', 'worker_name', ARGV[5])
@@ -54,6 +57,15 @@ redis.call('HSET', KEYS[2], 'id', ARGV[4], 'created_at', now, 'last_heartbeat', 
 redis.call('EXPIRE', KEYS[2], ARGV[2])
 redis.call('ZADD', KEYS[1], now + ARGV[2], ARGV[1])
 return 1
+"""
+
+# KEYS: leases, RQ's record of the entry. ARGV: entry.
+_DROP_UNHELD = """
+if redis.call('HGET', KEYS[2], 'status') ~= 'started' then return 0 end
+for _, member in ipairs(redis.call('ZRANGE', KEYS[1], 0, -1)) do
+  if string.sub(member, 1, #ARGV[1] + 1) == ARGV[1] .. ':' then return 0 end
+end
+return redis.call('DEL', KEYS[2])
 """
 
 # KEYS: leases. ARGV: seconds of a lease. One that would last longer was made before the clock of Redis was set back.
@@ -121,7 +133,8 @@ def rejoin(connection: redis.Redis, lease: Lease, worker: str, record: Mapping[A
     worker: the name of the worker that runs the entry.
     record: RQ's record of the entry, as the worker knows it.
 
-    It is not taken again from another worker, nor while the entry waits: Redis then knows the entry.
+    It is not taken again from another worker, nor while the entry waits: Redis then knows the entry, as something else
+    than started by this worker.
     """
     fields = [part for field in record.items() for part in field]
     execution, entry = f"rq:execution:{lease.member}", f"rq:job:{lease.entry}"
@@ -150,6 +163,14 @@ def drop(connection: redis.Redis, lease: Lease) -> None:
         pipe.delete(f"rq:job:{lease.entry}")
         pipe.zrem(key(), lease.member)
         pipe.execute()
+
+
+def drop_unheld(connection: redis.Redis, entry: str) -> bool:
+    """Delete RQ's record of an entry that says that an attempt has started while nobody holds a lease of the entry.
+
+    Return whether it was deleted. The reaper then enqueues its job anew.
+    """
+    return bool(connection.eval(_DROP_UNHELD, 2, key(), f"rq:job:{entry}", entry))
 
 
 def held(connection: redis.Redis) -> list[Lease]:

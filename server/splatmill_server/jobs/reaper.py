@@ -8,7 +8,7 @@ few round trips however many jobs wait or run, and some more for each job that n
 
 import asyncio
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
 import redis
@@ -48,6 +48,8 @@ class Reaper:
         self._wake = asyncio.Event()
         # Jobs whose attempt had ended without a final state at the last check: the state may still arrive.
         self._unreported: set[tuple[str, int]] = set()
+        # Entries that had started, and of which nobody held a lease, at the last look.
+        self._unheld: set[str] = set()
         # Jobs that are in storage and had no row at the last look.
         self._missing: set[str] = set()
         self._looked_at = float("-inf")
@@ -79,6 +81,8 @@ class Reaper:
         if self.leases.run():
             lines.sort(self.connection)
         active = self.jobs.active()
+        states = queue.states(self.connection, [(row.id, row.generation) for row in active])
+        self._drop_unheld([row for row, state in zip(active, states, strict=True) if state == "running"])
         cancelling = [row for row in active if row.cancel_requested_at is not None]
         unfinished = [row for row in cancelling if not _safely(self.cancel, row, True)]
         for row in cancelling:
@@ -86,7 +90,11 @@ class Reaper:
                 row not in unfinished
             ):  # stored at once: a Redis that comes back empty would have the job run again
                 self.jobs.retire(row.id)
-        self._check([row for row in active if row.cancel_requested_at is None])
+        self._check(
+            row
+            for row, state in zip(active, states, strict=True)
+            if row.cancel_requested_at is None and state not in ("waiting", "running")
+        )
         shrinking.shrink_due(self.connection)
         return bool(unfinished)
 
@@ -109,6 +117,21 @@ class Reaper:
         self.jobs.restore(sorted(missing & self._missing))
         self._missing = missing
 
+    def _drop_unheld(self, running: Sequence[JobRow]) -> None:
+        """Have the queue forget attempts that it takes for running, and that no worker holds.
+
+        A worker that is killed soon after Redis came back empty leaves one: RQ records that its attempt has started,
+        and its lease is lost. Two looks in a row have to find it, because an attempt may just begin or end.
+        """
+        rows = {entries.rq_id(row.id, row.generation): row for row in running}
+        held = {lease.entry for lease in leases.held(self.connection)} if rows else set()
+        unheld = rows.keys() - held
+        for entry in sorted(unheld & self._unheld):
+            # Of a job that was just restored, a worker takes the lease again.
+            if not self._is_restored(rows[entry].id) and leases.drop_unheld(self.connection, entry):
+                log.warning("nobody runs what the queue takes for running", job=rows[entry].id)
+        self._unheld = unheld
+
     def cancel(self, row: JobRow) -> bool:
         """Take the next step of a cancellation; return True once no process is left and the job has ended."""
         found = queue.status(self.connection, row.id, row.generation)
@@ -128,11 +151,9 @@ class Reaper:
         expiry.shorten(self.connection, keys.RESTORED, restoring.GRACE)
         return bool(self.connection.sismember(keys.RESTORED, job_id))
 
-    def _check(self, rows: Sequence[JobRow]) -> None:
+    def _check(self, rows: Iterable[JobRow]) -> None:
         # In the order in which they were queued, since that becomes their order in the queue.
-        rows = sorted(rows, key=lambda row: row.queued_at)
-        states = queue.states(self.connection, [(row.id, row.generation) for row in rows])
-        looked = [row for row, state in zip(rows, states, strict=True) if state not in ("waiting", "running")]
+        looked = sorted(rows, key=lambda row: row.queued_at)
         self._unreported = {
             mark for row in looked if (mark := _safely(self._check_one, row, None)) is not None
         }

@@ -190,6 +190,28 @@ def test_a_job_the_queue_forgot_is_queued_again_once(app: ServedApp) -> None:
     assert app.state(other) == "cancelled"
 
 
+def test_what_seems_to_run_and_is_held_by_nobody_is_queued_again(app: ServedApp) -> None:
+    """What RQ records of an attempt that began in an emptied Redis, and whose worker was killed."""
+    job_id = app.job()
+    lease = take(app.redis)
+
+    def look() -> list[queue.QueueState]:
+        app.service.reaper.tick()
+        return queue.states(app.redis, [(job_id, 1)])
+
+    app.redis.delete(f"rq:job:{lease.entry}")
+    app.redis.hset(f"rq:job:{lease.entry}", mapping={"status": "started", "worker_name": "killed"})
+    assert [look() for _ in range(3)] == [["running"]] * 3, "the lease has not expired"
+    app.redis.zrem(leases.key(), lease.member)
+    assert look() == ["running"], "it may just end"
+    app.redis.sadd(keys.RESTORED, job_id)
+    app.redis.expire(keys.RESTORED, 15)
+    assert look() == ["running"], "a worker may take the lease again"
+    app.redis.delete(keys.RESTORED)
+    assert [look(), look()] == [["absent"], ["waiting"]]
+    assert waiting(app.redis) == 1
+
+
 def test_a_wish_that_outlived_the_server_is_fulfilled_by_the_next_one(serve: Serve) -> None:
     app = serve()
     job_id = app.job()

@@ -55,3 +55,20 @@ def test_a_lease_that_is_held_stays_as_it_is(connection: redis.Redis) -> None:
     before = connection.zscore(leases.key(), lease.member)
     assert leases.rejoin(connection, lease, "tester", record)
     assert connection.zscore(leases.key(), lease.member) == before
+
+
+def test_an_attempt_that_began_after_the_loss_takes_its_lease_again(connection: redis.Redis) -> None:
+    """RQ records when an attempt begins, also where Redis has lost the rest of its entry."""
+    lease, record = taken(connection)
+    connection.flushall()
+    began: dict[Any, Any] = {
+        "status": "started",
+        "worker_name": "tester",
+        "started_at": "2026-11-23T13:02:44.654434Z",
+    }
+    connection.hset(f"rq:job:{ENTRY}", mapping=began)
+    assert not leases.rejoin(connection, lease, "another", record)
+    assert leases.rejoin(connection, lease, "tester", record)
+    assert leases.held(connection) == [lease]
+    again = entries.QueueEntry.fetch(ENTRY, connection=connection, serializer=entries.SERIALIZER)
+    assert again.retries_left == record["retries_left"]
