@@ -251,12 +251,12 @@ def _training(fleet: Fleet, api: Api, connection: redis.Redis, folder: Path, sec
     over = folder / "over"
     capture, idle = api.capture(over), meter.look(connection)
     api.create(capture, jobs)
-    _until(lambda: connection.zcard(leases.key()) == jobs)
-    time.sleep(1.0)  # the last attempts stage their capture
+    _until(lambda: connection.zcard(leases.key()) == jobs and _under_way(connection))
+    time.sleep(1.0)  # for streams of more than one entry
     found = _window(fleet, connection, seconds)
     entry = _entry_bytes(connection)
     looked, page = (
-        min((api.look() for _ in range(3)), key=lambda row: row["round_trips"]),
+        min((api.look() for _ in range(3)), key=lambda row: (row["round_trips"], row["cpu_seconds"])),
         min((api.page("training") for _ in range(3)), key=lambda row: row["cpu_seconds"]),
     )
     over.touch()
@@ -264,6 +264,14 @@ def _training(fleet: Fleet, api: Api, connection: redis.Redis, folder: Path, sec
         _until(lambda: connection.scard(keys.ACTIVE) == 0)
     more = {"jobs": jobs, "bytes_each": (found["bytes"] - idle.memory) / jobs, "entry_bytes": entry}
     return {**found, **more, "look": looked, "page": page}
+
+
+def _under_way(connection: redis.Redis) -> bool:
+    """Return whether every attempt has sent progress: it has staged its capture."""
+    with connection.pipeline(transaction=False) as pipe:
+        for lease in leases.held(connection):
+            pipe.exists(keys.progress(split_rq_id(lease.entry)[0]))
+        return all(pipe.execute())
 
 
 def _entry_bytes(connection: redis.Redis) -> float:
