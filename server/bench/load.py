@@ -13,11 +13,11 @@ Clients arrive independently of each other. When they began together, second by 
 clients was the wait for those that had come with it; with equal waits, 40 % of 200 clients came within 80 ms of each
 second, and a job was answered in 40 ms where it is now in 5.
 
-The figures at 200 clients differ between runs: p99 of a job was 31 ms where they came after 10, 50 and 100 clients, and
-100 and 140 ms where they were asked alone, soon after the training had begun. Asked alone, one run each of 20 seconds,
-p99 of a job and of a view: 140 and 370 ms; with a niceness of 5 for attempts 88 and 260, of 19 85 and 270, with
-SCHED_IDLE 48 and 180; without a training 35 and 160. Attempts run at the priority of their worker all the same: beside
-any other program that computes, a training with SCHED_IDLE would stand still.
+The figures at 200 clients differ between runs: p99 of a job was 31 and 42 ms where they came after 10, 50 and 100
+clients, and 100 and 140 ms where they were asked alone, soon after the training had begun. Asked alone, one run each of
+20 seconds, p99 of a job and of a view: 140 and 370 ms; with a niceness of 5 for attempts 88 and 260, of 19 85 and 270,
+with SCHED_IDLE 48 and 180; without a training 35 and 160. Attempts run at the priority of their worker all the same:
+beside any other program that computes, a training with SCHED_IDLE would stand still.
 
 The CPU time that the API takes for an answer is told too, because other programs on the machine disturb it least.
 
