@@ -231,6 +231,7 @@ def test_a_capture_that_storage_refuses_is_in_no_list(
         broken.setattr(service.captures.storage, "put_new", full)
         with pytest.raises(StorageFullError):
             service.captures.create(owner="owner3")
+    assert not service.captures.unlisted, "nothing was stored, so that storage need not be looked through"
     assert service.redis.zcard(lists.name("captures")) == len(records.captures)
     mine = [name for name in records.captures if int(name, 16) % OWNERS == 3]
     assert service.redis.zcard(lists.name("captures", owner="owner3")) == len(mine)

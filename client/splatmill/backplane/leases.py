@@ -42,11 +42,22 @@ if redis.call('EXISTS', KEYS[2]) == 1 then redis.call('EXPIRE', KEYS[2], ARGV[2]
 return 1
 """
 
+_IS_HELD = """
+local function held(leases, entry)
+  for _, member in ipairs(redis.call('ZRANGE', leases, 0, -1)) do
+    if string.sub(member, 1, #entry + 1) == entry .. ':' then return true end
+  end
+  return false
+end
+"""
+
 # KEYS: leases, RQ's record of the execution, RQ's record of the entry, places of the entries that wait.
 # ARGV: member, seconds of the lease, entry, execution, worker, then fields and values of the entry's record.
-_REJOIN = """
+_REJOIN = (
+    _IS_HELD
+    + """
 if redis.call('ZSCORE', KEYS[1], ARGV[1]) then return 1 end
-if redis.call('HEXISTS', KEYS[4], ARGV[3]) == 1 then return 0 end
+if redis.call('HEXISTS', KEYS[4], ARGV[3]) == 1 or held(KEYS[1], ARGV[3]) then return 0 end
 local known = redis.call('HMGET', KEYS[3], 'status', 'worker_name')
 local own = known[1] == 'started' and known[2] == ARGV[5]  -- the attempt began after the loss, and RQ recorded that
 if redis.call('EXISTS', KEYS[3]) == 1 and not own then return 0 end
@@ -58,15 +69,16 @@ redis.call('EXPIRE', KEYS[2], ARGV[2])
 redis.call('ZADD', KEYS[1], now + ARGV[2], ARGV[1])
 return 1
 """
+)
 
 # KEYS: leases, RQ's record of the entry. ARGV: entry.
-_DROP_UNHELD = """
-if redis.call('HGET', KEYS[2], 'status') ~= 'started' then return 0 end
-for _, member in ipairs(redis.call('ZRANGE', KEYS[1], 0, -1)) do
-  if string.sub(member, 1, #ARGV[1] + 1) == ARGV[1] .. ':' then return 0 end
-end
+_DROP_UNHELD = (
+    _IS_HELD
+    + """
+if redis.call('HGET', KEYS[2], 'status') ~= 'started' or held(KEYS[1], ARGV[1]) then return 0 end
 return redis.call('DEL', KEYS[2])
 """
+)
 
 # KEYS: leases. ARGV: seconds of a lease. One that would last longer was made before the clock of Redis was set back.
 _EXPIRED = """
@@ -133,8 +145,8 @@ def rejoin(connection: redis.Redis, lease: Lease, worker: str, record: Mapping[A
     worker: the name of the worker that runs the entry.
     record: RQ's record of the entry, as the worker knows it.
 
-    It is not taken again from another worker, nor while the entry waits: Redis then knows the entry, as something else
-    than started by this worker.
+    It is not taken again while another execution holds one, nor where Redis knows the entry as anything else than
+    started by this worker: as waiting, for example.
     """
     fields = [part for field in record.items() for part in field]
     execution, entry = f"rq:execution:{lease.member}", f"rq:job:{lease.entry}"
@@ -166,7 +178,7 @@ def drop(connection: redis.Redis, lease: Lease) -> None:
 
 
 def drop_unheld(connection: redis.Redis, entry: str) -> bool:
-    """Delete RQ's record of an entry that says that an attempt has started while nobody holds a lease of the entry.
+    """Delete RQ's record of an entry that is marked as started and that no worker holds a lease on.
 
     Return whether it was deleted. The reaper then enqueues its job anew.
     """

@@ -16,7 +16,8 @@ from starlette.concurrency import run_in_threadpool
 from splatmill.backplane import keys, layout, lists
 from splatmill.backplane.bucket import BLOCK
 from splatmill.backplane.records import FORMAT, UnreadableRecord, check_format, reason, warn
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.storage import Storage, StorageError, StorageFullError
+from splatmill.backplane.storage_errors import StorageBusyError
 from splatmill.schema import (
     DEFAULT_OWNER,
     PHOTO_SUFFIXES,
@@ -85,9 +86,12 @@ class Captures:
             capture_id = next((known for known in ids if not self._is_leftover(known)), capture_id)
         capture = Capture(id=capture_id, name=name, owner=owner, created_at=datetime.now(UTC))
         record = json.dumps(capture.model_dump(mode="json", exclude={"files"}) | {"format": FORMAT}).encode()
-        # Listed last: of a capture that could not be stored, or not with certainty, no entry of the list may stay.
+        # Listed only once it is stored, so that a refused capture leaves no entry in the lists. Where storage does not
+        # tell whether it stored the record, `space.relisting` finds out.
         try:
             made = self.storage.put_new(layout.capture_record(capture.id), record)
+        except (StorageFullError, StorageBusyError):
+            raise  # nothing was stored
         except StorageError:
             self.unlisted = True
             raise

@@ -8,7 +8,7 @@ few round trips however many jobs wait or run, and some more for each job that n
 
 import asyncio
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import TypeVar
 
 import redis
@@ -48,8 +48,6 @@ class Reaper:
         self._wake = asyncio.Event()
         # Jobs whose attempt had ended without a final state at the last check: the state may still arrive.
         self._unreported: set[tuple[str, int]] = set()
-        # Entries that had started, and of which nobody held a lease, at the last look.
-        self._unheld: set[str] = set()
         # Jobs that are in storage and had no row at the last look.
         self._missing: set[str] = set()
         self._looked_at = float("-inf")
@@ -80,10 +78,16 @@ class Reaper:
         self._restore()
         if self.leases.run():
             lines.sort(self.connection)
-        active = self.jobs.active()
-        states = queue.states(self.connection, [(row.id, row.generation) for row in active])
-        self._drop_unheld([row for row, state in zip(active, states, strict=True) if state == "running"])
-        cancelling = [row for row in active if row.cancel_requested_at is not None]
+        rows = {entries.rq_id(row.id, row.generation): row for row in self.jobs.active()}
+        states = dict(
+            zip(
+                rows,
+                queue.states(self.connection, [(row.id, row.generation) for row in rows.values()]),
+                strict=True,
+            )
+        )
+        self._drop_unheld(rows, states)
+        cancelling = [row for row in rows.values() if row.cancel_requested_at is not None]
         unfinished = [row for row in cancelling if not _safely(self.cancel, row, True)]
         for row in cancelling:
             if (
@@ -92,8 +96,8 @@ class Reaper:
                 self.jobs.retire(row.id)
         self._check(
             row
-            for row, state in zip(active, states, strict=True)
-            if row.cancel_requested_at is None and state not in ("waiting", "running")
+            for entry, row in rows.items()
+            if row.cancel_requested_at is None and states[entry] not in ("waiting", "running")
         )
         shrinking.shrink_due(self.connection)
         return bool(unfinished)
@@ -117,20 +121,23 @@ class Reaper:
         self.jobs.restore(sorted(missing & self._missing))
         self._missing = missing
 
-    def _drop_unheld(self, running: Sequence[JobRow]) -> None:
-        """Have the queue forget attempts that it takes for running, and that no worker holds.
+    def _drop_unheld(self, rows: Mapping[str, JobRow], states: dict[str, queue.QueueState]) -> None:
+        """Delete RQ's records of the entries that are marked as started and that no worker holds a lease on.
+
+        rows, states: of unfinished jobs, by entry. The states of the deleted ones become "absent".
 
         A worker that is killed soon after Redis came back empty leaves one: RQ records that its attempt has started,
-        and its lease is lost. Two looks in a row have to find it, because an attempt may just begin or end.
+        and its lease is lost.
         """
-        rows = {entries.rq_id(row.id, row.generation): row for row in running}
-        held = {lease.entry for lease in leases.held(self.connection)} if rows else set()
-        unheld = rows.keys() - held
-        for entry in sorted(unheld & self._unheld):
-            # Of a job that was just restored, a worker takes the lease again.
+        running = {entry for entry, state in states.items() if state == "running"}
+        held = {lease.entry for lease in leases.held(self.connection)} if running else set()
+        for entry in sorted(running - held):
+            # The worker of a job that was just restored may take its lease again.
             if not self._is_restored(rows[entry].id) and leases.drop_unheld(self.connection, entry):
-                log.warning("nobody runs what the queue takes for running", job=rows[entry].id)
-        self._unheld = unheld
+                states[entry] = "absent"
+                log.warning(
+                    "the queue lists a job as running, but no worker holds a lease on it", job=rows[entry].id
+                )
 
     def cancel(self, row: JobRow) -> bool:
         """Take the next step of a cancellation; return True once no process is left and the job has ended."""
