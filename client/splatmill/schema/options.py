@@ -174,8 +174,8 @@ class TrainOptions(Request):
         ge=2,
         le=2000,
         description=(
-            "Largest number of frames taken from a video: sharp ones, at equal distances of what the picture moves. "
-            "Raise it for a long video."
+            "Largest number of frames taken from a video. Frames are spaced by equal amounts of image motion, and the "
+            "sharpest one near each position is taken. Raise it for a long video."
         ),
         json_schema_extra=_PHOTOS,
     )

@@ -197,6 +197,14 @@ def test_the_limits_of_a_video_name_it(
         (archives.encrypted(), "encrypted"),
         (archives.wrong_checksum(), "CRC"),
         (archives.packed({"a.jpg": pictures.photo()})[:-30], "not a complete zip"),
+        (
+            archives.packed({"a.jpg": pictures.photo()}).replace(b"a.jpg", b"\0.jpg"),
+            "the name '' is not a file name",
+        ),
+        (archives.packed({"a": b"1", "a/b.jpg": pictures.photo()}), "name 'a/b.jpg'"),
+        (archives.packed({"a/b.jpg": pictures.photo(), "a": b"1"}), "name 'a'"),
+        (archives.packed({"a" * 300 + ".jpg": pictures.photo()}), "too long"),
+        (archives.packed({"d/" * 3000 + "a.jpg": pictures.photo()}), "too long"),
     ],
 )
 def test_zips_that_cheat_are_refused(tmp_path: Path, data: bytes, said: str) -> None:

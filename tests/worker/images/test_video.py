@@ -4,6 +4,7 @@ equal distances of it and are sharp, and what becomes of videos that stand, are 
 Not proven here: hostile files (test_guarded), and what better frames are worth (decisions: keyframes).
 """
 
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -147,6 +148,35 @@ def test_of_a_video_with_a_damaged_end_the_frames_before_it_are_used(tmp_path: P
     taken = numbers(video.keyframes(path, tmp_path / "out", 20))
     assert 10 <= len(taken) <= 20
     assert 40 < taken[-1] < 75
+
+
+def frame_size(path: Path) -> tuple[int, int]:
+    with Image.open(path) as frame:
+        return frame.size
+
+
+def turned(path: Path) -> Path:
+    """A video of a phone that is turned while it records: 20 frames of 320x240 pixels, then 20 of 240x320."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mjpeg", rate=30)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuvj420p"
+        for number in range(40):
+            frame = seen(10.0 * number)
+            encoder = av.CodecContext.create("mjpeg", "w")
+            encoder.width, encoder.height = frame.size if number < 20 else frame.size[::-1]
+            encoder.pix_fmt, encoder.time_base = "yuvj420p", Fraction(1, 30)
+            upright = frame if number < 20 else frame.transpose(Image.Transpose.ROTATE_90)
+            for packet in encoder.encode(av.VideoFrame.from_image(upright).reformat(format="yuvj420p")):
+                packet.stream, packet.pts, packet.dts = stream, number, number
+                packet.time_base = encoder.time_base
+                container.mux(packet)
+    return path
+
+
+def test_a_video_whose_frames_change_their_size_gives_frames_of_both(tmp_path: Path) -> None:
+    found = video.keyframes(turned(tmp_path / "walk.avi"), tmp_path / "out", 10)
+    assert len(found) == 10
+    assert {frame_size(path) for path in found} == {(WIDTH, HEIGHT), (HEIGHT, WIDTH)}
 
 
 def test_reading_is_cancelled_in_both_passes(tmp_path: Path) -> None:

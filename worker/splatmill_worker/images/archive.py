@@ -43,6 +43,10 @@ DAMAGED = (zipfile.BadZipFile, NotImplementedError, EOFError, zlib.error, lzma.L
 _DAMAGED_ERRNOS = (None, errno.EINVAL)
 """Of the OSErrors that bz2 raises for damaged data, and that places outside of the file lead to."""
 
+_NAME_ERRNOS = (errno.EEXIST, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EILSEQ)
+"""Of the OSErrors that creating a file under a name raises for the name: it is too long, has characters that the file
+system does not know, or is that of a file and of a folder."""
+
 CHUNK = 2**20
 """Bytes written at a time; size and cancellation are checked in between."""
 
@@ -88,14 +92,14 @@ def unpack(
     The declared sizes are checked before anything is written, and the real ones while writing. Hidden files and the
     resource forks of macOS are left out. What is written is taken from `allowance`, before it is written.
 
-    Raises UnsafeArchive for absolute names, names with `..`, links, encrypted files, files that overlap, zip bombs, too
-    many files, and files that are no complete zip; Refusal when the allowance is exceeded; Cancelled when
-    `cancelled()` turns true.
+    Raises UnsafeArchive for absolute names, names with `..`, names that no file can have, links, encrypted files, files
+    that overlap, zip bombs, too many files, and files that are no complete zip; Refusal when the allowance is exceeded;
+    Cancelled when `cancelled()` turns true.
     """
     try:
         with _BoundedReads(io.FileIO(path)) as file, zipfile.ZipFile(cast(IO[bytes], file)) as archive:
             _check_places(archive)
-            entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+            entries = [entry for entry in archive.infolist() if not entry.filename.endswith("/")]
             _check_declared(entries)
             if allowance is not None:
                 allowance.take(path.name, len(entries), sum(entry.file_size for entry in entries))
@@ -106,8 +110,15 @@ def unpack(
                 if any(part.startswith((".", "__MACOSX")) for part in name.parts):
                     continue
                 place = target / name
-                place.parent.mkdir(parents=True, exist_ok=True)
-                total = _write(archive, entry, place, total, cancelled)
+                try:
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    total = _write(archive, entry, place, total, cancelled)
+                except OSError as error:
+                    if error.errno not in _NAME_ERRNOS:
+                        raise
+                    raise UnsafeArchive(
+                        f"no file can have the name {entry.filename[:200]!r} ({error.strerror})"
+                    ) from error
                 written.append(place)
             return written
     except UnsafeArchive:

@@ -130,7 +130,7 @@ def keyframes(
         return video.keyframes(path, target, count, cancelled=cancelled)
     target.mkdir(parents=True, exist_ok=True)
     given = {"path": str(path), "target": str(target), "count": count}
-    answer, _ = _active.call(path, "keyframes", given, guarded.MAX_READING_SECONDS, cancelled)
+    answer, _ = _active.call(path, "keyframes", given, 2 * guarded.MAX_READING_SECONDS, cancelled)
     return [target / Path(str(name)).name for name in answer["names"]]
 
 

@@ -15,8 +15,8 @@ RADIUS = 3
 """Half side, in pixels, of the window within which all pixels are taken to move alike."""
 
 NOISE = 4.0
-"""Squared grey levels per pixel of a gradient that is taken for noise: where there is no more, a pixel moves with those
-around it on the next coarser level."""
+"""Squared gradient, in (grey levels per pixel) squared, that noise alone produces. It is added to the diagonal of the
+normal equations, so that where gradients are weaker the flow stays at that of the coarser level."""
 
 COARSEST = 16
 """Least number of pixels of the shorter side of a halved picture: on it, a motion of a quarter of the picture is some

@@ -49,7 +49,7 @@ MAX_VIDEO_FRAMES = 1_000_000
 """Frames of a video: more than four hours at 60 frames per second."""
 
 MAX_READING_SECONDS = 3600.0
-"""Wall time that reading one video may take."""
+"""Wall time that one pass over a video may take. Two are made: to choose frames, and to write them."""
 
 _BYTES_PER_PIXEL = 4
 DECODE_ERRORS = (

@@ -1,7 +1,8 @@
-"""Takes frames of a video for structure from motion: sharp ones, at equal distances of what the picture moves.
+"""Takes frames of a video for structure from motion: sharp ones, spaced by how far the image moves and not by time.
 
-A video has many frames where the camera went slowly, and equal ones where it stood. Frames at equal distances show the
-scene from as many sides with fewer photos, and leave no hole where the camera went fast (decisions: keyframes).
+A video has many frames where the camera went slowly, and equal ones where it stood. Frames that are spaced by image
+motion show the scene from as many sides with fewer photos, and leave no hole where the camera went fast (decisions:
+keyframes).
 """
 
 from __future__ import annotations
@@ -30,10 +31,11 @@ CANDIDATES = 4
 """Frames that are looked at for each that is taken: the sharpest of as many intervals of equal length."""
 
 STILL = 0.01
-"""Share of the longer side by which the picture has to move from one frame that is taken to the next."""
+"""Least length of a stretch of motion, as a share of the longer side, as long as there are FEWEST of them or more."""
 
 FEWEST = 30
-"""Number of frames that are taken even where the picture hardly moves, as before a turntable."""
+"""Least number of stretches that the motion is divided into, however small it is, as before a turntable. A stretch
+without a candidate gives no frame."""
 
 QUALITY = 95
 """JPEG quality of the frames."""
@@ -80,10 +82,7 @@ def keyframes(
 
 
 def chosen(candidates: Sequence[Candidate], count: int) -> list[int]:
-    """The numbers of at most `count` frames, in order: the sharpest of each of as many stretches of equal motion.
-
-    Stretches are no shorter than STILL, as long as there are FEWEST of them.
-    """
+    """The numbers of at most `count` frames, in order: the sharpest of each of as many stretches of equal motion."""
     path = np.cumsum([candidate.moved for candidate in candidates])
     stretches = min(count, max(min(count, FEWEST), int(path[-1] / STILL)))
     # A thousandth more, so that the last candidate does not begin a stretch of its own.
@@ -102,11 +101,15 @@ def sharpness(grey: Grey) -> float:
 
 
 def _candidates(path: Path, count: int, cancelled: Callable[[], bool]) -> list[Candidate]:
-    """The sharpest frame of each of `count` intervals, with its motion. Raises UnusableVideo where there is none."""
+    """The sharpest frame of each of `count` intervals, with its motion. Raises UnusableVideo where there is none.
+
+    The motion to a frame of another size, as when a phone is turned while it records, is not known and counts as none.
+    """
     found: list[Candidate] = []
     last: Grey | None = None
     for number, score, small in _sharpest(path, count, cancelled):
-        found.append(Candidate(number, score, 0.0 if last is None else displacement(last, small)))
+        moved = displacement(last, small) if last is not None and last.shape == small.shape else 0.0
+        found.append(Candidate(number, score, moved))
         last = small
     if not found:
         raise UnusableVideo(path.name, "it contains no frame")
@@ -114,8 +117,8 @@ def _candidates(path: Path, count: int, cancelled: Callable[[], bool]) -> list[C
 
 
 def _sharpest(path: Path, count: int, cancelled: Callable[[], bool]) -> Iterator[tuple[int, float, Grey]]:
-    """Number, sharpness and small picture of the sharpest frame of each of `count` intervals of equal length that has
-    one: of all frames where there are fewer."""
+    """Number, sharpness and small picture of the sharpest frame of each of `count` intervals of equal length; intervals
+    without a frame are skipped."""
     best: tuple[int, float, Grey] | None = None
     interval = 0
     with _decoded(path, cancelled) as (length, frames):
