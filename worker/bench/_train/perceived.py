@@ -30,8 +30,8 @@ def perceived(render: Renderer, views: Sequence[TrainingView], background: torch
         return {"flip": None, "ms_ssim": None}
     flips, similarities = [], []
     for view in views:
-        shown = render(view.full, background).detach().float().clamp(0.0, 1.0)
-        photo = view.full.over(background).float() / 255.0
+        shown = render(view.full, background).detach().float().cpu().clamp(0.0, 1.0)
+        photo = view.full.over(background).float().cpu() / 255.0
         _, error, _ = flip.evaluate(photo.numpy(), shown.numpy(), "LDR", applyMagma=False)
         flips.append(float(error))
         if min(photo.shape[:2]) >= LEAST_SIDE:

@@ -181,9 +181,10 @@ def _perceived(job: Row, options: TrainOptions, gaussians: Gaussians) -> Row:
 def _drawing(gaussians: Gaussians, options: TrainOptions) -> Renderer:
     """A renderer of a scene in the training world."""
     backend = choose_kernels(options)
+    shown = gaussians.map(lambda tensor: tensor.cuda()) if backend == "gpu" else gaussians
 
     def draw(target: Target, background: Tensor) -> Tensor:
-        return render(gaussians, target.camera, background=background, backend=backend).color
+        return render(shown, target.camera, background=background, backend=backend).color
 
     return draw
 
