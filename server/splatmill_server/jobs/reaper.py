@@ -45,6 +45,8 @@ class Reaper:
         self.leases = leases.Reclaim(connection)
         self.interval = settings.reaper_interval
         self.stop_interval = settings.stop_interval
+        self.pause = self.interval
+        """Seconds after which to look again, as the last look found."""
         self._wake = asyncio.Event()
         # Jobs whose attempt had ended without a final state at the last check: the state may still arrive.
         self._unreported: set[tuple[str, int]] = set()
@@ -59,22 +61,21 @@ class Reaper:
     async def run(self) -> None:
         """Check the jobs until this task is cancelled, also while Redis cannot be reached."""
         while True:
-            cancelling = False
             try:
-                cancelling = await run_in_threadpool(self.tick)
+                await run_in_threadpool(self.tick)
             except redis.RedisError as error:
                 log.warning("reaper cannot reach Redis", error=str(error))
             except Exception:
                 log.exception("reaper tick failed")
-            pause = self.stop_interval if cancelling else self.interval
             try:
-                await asyncio.wait_for(self._wake.wait(), pause)
+                await asyncio.wait_for(self._wake.wait(), self.pause)
             except TimeoutError:
                 continue
             self._wake.clear()
 
     def tick(self) -> bool:
         """Check every unfinished job once; return True while one is being cancelled."""
+        self.pause = self.interval
         self._restore()
         if self.leases.run():
             lines.sort(self.connection)
@@ -100,6 +101,8 @@ class Reaper:
             if row.cancel_requested_at is None and states[entry] not in ("waiting", "running")
         )
         shrinking.shrink_due(self.connection)
+        if unfinished:
+            self.pause = self.stop_interval
         return bool(unfinished)
 
     def _restore(self) -> None:
@@ -154,9 +157,15 @@ class Reaper:
         return False
 
     def _is_restored(self, job_id: str) -> bool:
-        """Return whether a job was restored so lately that a process may run it which the queue does not know."""
+        """Return whether a job was restored so lately that a process may run it which the queue does not know.
+
+        The next look then comes when that time is over.
+        """
         expiry.shorten(self.connection, keys.RESTORED, restoring.GRACE)
-        return bool(self.connection.sismember(keys.RESTORED, job_id))
+        if not self.connection.sismember(keys.RESTORED, job_id):
+            return False
+        self.pause = min(self.pause, max(self.connection.pttl(keys.RESTORED), 0) / 1000 + 0.01)
+        return True
 
     def _check(self, rows: Iterable[JobRow]) -> None:
         # In the order in which they were queued, since that becomes their order in the queue.

@@ -50,7 +50,9 @@ def test_queued_jobs_wait_again_when_no_worker_claims_them(app: ServedApp) -> No
     after = listed(app)
     assert set(after) == set(jobs)
     assert waiting(app.redis) == 0, "a worker that runs one of them has time to say so"
+    assert 0 < app.service.reaper.pause <= leases.LEASE + 0.01, "it looks again when that time is over"
     grace_over(app)
+    assert app.service.reaper.pause == app.service.reaper.interval
     assert waiting(app.redis) == 3
     assert listed(app) == before
 
