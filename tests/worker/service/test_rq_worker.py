@@ -131,6 +131,9 @@ def test_log_lines_are_objects_that_name_worker_job_attempt_and_request(
     with (tmp_path / "log").open("wb") as log, worker(redis_server, storage, tmp_path, stderr=log):
         ends = [wait_for(partial(ended, redis_server, job_id)).state for job_id in ("job00001", "job00002")]
         wait_for(lambda: (tmp_path / "log").read_text().count("has ended") == 2)
+        wait_for(
+            lambda: [connection.hget(key, "state") for key in connection.smembers("rq:workers")] == [b"idle"]
+        )
     assert ends == ["succeeded", "failed"]
     lines = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
     assert len({line["worker"] for line in lines if "worker" in line}) == 1

@@ -327,8 +327,8 @@ class AttemptWorker(Worker):
             self.monitor_work_horse(job, queue)
         finally:
             self._entry_id = None
-        self._until_redis_works(lambda: self.set_state("idle"))
         log_lines.bind(job=None, request=None)
+        self._until_redis_works(lambda: self.set_state("idle"))
 
     def _bind_log(self, job: Job) -> None:
         """Name the job, and the request that asked for it, in all lines until the attempt has ended."""
