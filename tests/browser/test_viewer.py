@@ -51,7 +51,10 @@ MOUNT = """async ([model, options]) => {
 }"""
 
 RESTED = """() => {
-  globalThis.looks = view.frames > 0 && view.frames === globalThis.before ? globalThis.looks + 1 : 0;
+  const cameras = [...(view.surface?.app?.renderer.gsplatDirector.camerasMap.values() ?? [])];
+  const sorters = cameras.flatMap((each) => [...each.layersMap.values()]).map((each) => each.gsplatManager?.cpuSorter);
+  const busy = view.pending || sorters.some((sorter) => sorter?.jobsInFlight > 0);
+  globalThis.looks = !busy && view.frames > 0 && view.frames === globalThis.before ? globalThis.looks + 1 : 0;
   globalThis.before = view.frames;
   return globalThis.looks >= 2;
 }"""
@@ -66,7 +69,10 @@ def mount(page: Page, model: SmallModel, **options: Any) -> str:
 
 
 def rest(page: Page) -> None:
-    """Wait until no frame was drawn between three looks: on a busy machine the order of the Gaussians comes late."""
+    """Wait until nothing is being sorted or waits to be drawn, and no frame was drawn between three looks.
+
+    PlayCanvas sorts beside the page, and on a busy machine the order of the Gaussians comes seconds after the frame.
+    """
     page.evaluate("globalThis.before = -1; globalThis.looks = 0")
     page.wait_for_function(RESTED, polling=200)
 
