@@ -252,6 +252,36 @@ def test_budgets_are_judged_by_all_their_runs(parts: Any, place: Path) -> None:
     assert "failed: divergence" in parts["_train.tables"].failures([*good, again, broken])
 
 
+def test_cameras_without_points_stand_beside_the_same_capture_with_them(parts: Any, place: Path) -> None:
+    without = parts["_train.tables"].without_points
+    row = next(row for row in rows_of(place) if row["kind"] == "run") | {"config": "default"}
+    given = [like(row, scene="fox", seed=seed, psnr=30.0 + seed) for seed in (0, 1, 2)]
+    alone = [like(row, scene="fox-blender", seed=seed, psnr=29.5 + seed) for seed in (0, 1, 2)]
+    text = without([*given, *alone])
+    assert (
+        "| fox-blender | 30steps | 3 | 30.50 (29.50 to 31.50) | fox | 31.00 (30.00 to 32.00) | -0.50 |"
+        in text
+    )
+    assert without(alone) == "", "fox was not measured"
+    assert without([*given, *(each | {"code": "newer"} for each in alone)]) == "", (
+        "fox was measured with older code"
+    )
+
+
+def test_the_share_of_planted_pixels_that_was_found(parts: Any, place: Path) -> None:
+    found = parts["_train.tables"].found
+    row = next(row for row in rows_of(place) if row["kind"] == "run") | {"config": "default"}
+    assert found([row]) == "", "nothing was planted there"
+    seen = {"planted": 0.012, "precision": 0.8, "recall": 0.1}
+    planted = [like(row, seed=seed, disagreement={**seen, "recall": 0.1 * (seed + 1)}) for seed in (0, 1)]
+    older = like(row, code="older", disagreement={**seen, "recall": 0.9})
+    assert found([older, *planted]).endswith(
+        "| 30steps | 2 | 1.2 (1.2 to 1.2) | 80.0 (80.0 to 80.0) | 15.0 (10.0 to 20.0) |"
+    )
+    none = like(row, disagreement={"planted": 0.012, "precision": None, "recall": 0.0})
+    assert found([none]).endswith("| 1.2 |  | 0.0 |"), "without outliers there is no precision"
+
+
 def test_switches_are_compared_seed_by_seed_on_the_same_code(parts: Any, place: Path) -> None:
     ablation = parts["_train.ablation"].ablation
     row = next(row for row in rows_of(place) if row["kind"] == "run")

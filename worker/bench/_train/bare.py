@@ -18,9 +18,17 @@ from splatmill_worker.scene import Camera
 
 FOX = SHARED / FOLDERS["fox"]
 
-SCENES = ("fox-no-points", "fox-text-no-points", "fox-transforms", "fox-blender", "synthetic-posed")
-"""fox as a COLMAP model without points3D, binary and as text, as transforms.json without a cloud and as a Blender data
-set; and the still life with its true cameras as transforms.json."""
+WITH_POINTS = {
+    "fox-no-points": "fox",
+    "fox-text-no-points": "fox",
+    "fox-transforms": "fox",
+    "fox-blender": "fox",
+    "synthetic-posed": "synthetic",
+}
+"""The scene with points that each is compared with. fox is a COLMAP model without points3D, binary and as text, a
+transforms.json without a cloud, and a Blender data set; the still life has its true cameras as transforms.json."""
+
+SCENES = tuple(WITH_POINTS)
 
 
 def available(name: str) -> bool:

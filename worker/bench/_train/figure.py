@@ -13,7 +13,7 @@ from matplotlib.axis import Axis
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from _train.rows import failed, latest_default
-from _train.scenes import ALL, PLANTED
+from _train.scenes import ALL, COMPARED
 from _train.spread import Spread
 
 PEERS = "DP*Xhv<>"
@@ -22,8 +22,7 @@ COLORS = {name: f"C{number}" for number, name in enumerate(ALL)}
 
 def draw(rows: list[Row], references: list[Row], path: Path) -> None:
     """Plot held-out PSNR (with the mean squared error on the other axis) and 1 - SSIM over training seconds."""
-    # Planted light is for one switch; how soon it is learnt says nothing beside scenes without.
-    timed = [row for row in latest_default(rows) if row["scene"] not in PLANTED]
+    timed = [row for row in latest_default(rows) if row["scene"] not in COMPARED]
     figure, (quality, structure) = _plot.axes(2, width=6.4, height=5.0)
     for scene in dict.fromkeys(row["scene"] for row in timed):
         mine = [row for row in timed if row["scene"] == scene and not failed(row) and row["psnr"] is not None]

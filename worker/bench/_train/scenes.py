@@ -42,7 +42,10 @@ with darker corners, and with local tone mapping. And with things that stand in 
 MADE: dict[str, dict[str, Any]] = {"synthetic": {}, **PLANTED}
 """What is planted in the photos of each built-in scene: arguments of `synthetic.capture`."""
 
-ALL = (*KNOWN, *PLANTED, *bare.SCENES)
+COMPARED = (*PLANTED, *bare.SCENES)
+"""Made for one comparison each; how soon they are learnt says nothing beside the captures that they are made of."""
+
+ALL = (*KNOWN, *COMPARED)
 
 
 def named(text: str, work: Path) -> Scene:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from _rows import Row, footer
 
+from _train import bare
 from _train.ablation import ablation
 from _train.configurations import DEFAULT
 from _train.markdown import beside, section, table
@@ -37,6 +38,8 @@ def document(rows: list[Row], references: list[Row], rows_at: Path, here: Path, 
         *section("Time to a quality", levels(timed, references)),
         *section("Goals", goals(timed, references)),
         *section("Other trainers' models, judged on the same views", peers(rows)),
+        *section("Cameras without points", without_points(rows)),
+        *section("Photos that disagree", found(rows)),
         *section("One switch at a time", ablation(rows)),
         *section("What was left out", left_out(rows)),
         *section("Failed runs, which get no point", failures(rows)),
@@ -186,6 +189,36 @@ def peers(rows: list[Row]) -> str:
     )
 
 
+def without_points(rows: list[Row]) -> str:
+    """A table of captures that have cameras and no points, each beside the same capture with its points."""
+    ours = whole(once([row for row in rows if row["kind"] == "run" and row["config"] == DEFAULT]))
+    groups = grouped(ours, "scene", "budget", "code")
+    last = {(scene, budget): code for scene, budget, code in groups if scene in bare.WITH_POINTS}
+    lines = []
+    for (scene, budget), code in last.items():
+        having = bare.WITH_POINTS[scene]
+        without, given = groups[scene, budget, code], groups.get((having, budget, code))
+        if given:
+            mine, theirs = (Spread.of(row["psnr"] for row in group) for group in (without, given))
+            loss = f"{mine.median - theirs.median:+.2f}"
+            lines.append([scene, budget, len(without), mine.text(2), having, theirs.text(2), loss])
+    head = "cameras alone|budget|seeds|PSNR dB|the same with points|PSNR dB|difference, dB"
+    return table(head, lines) if lines else ""
+
+
+def found(rows: list[Row]) -> str:
+    """A table of how many of the planted pixels the default's runs found."""
+    ours = once([row for row in rows if row["kind"] == "run" and row["config"] == DEFAULT])
+    planted = [row for row in ours if row.get("disagreement")]
+    last = {(row["scene"], row["budget"]): row["code"] for row in planted}
+    lines = [
+        [scene, budget, len(group), *(_share(group, name) for name in ("planted", "precision", "recall"))]
+        for (scene, budget, code), group in grouped(planted, "scene", "budget", "code").items()
+        if code == last[scene, budget]
+    ]
+    return table("scene|budget|seeds|planted, %|precision, %|recall, %", lines) if lines else ""
+
+
 def left_out(rows: list[Row]) -> str:
     """A table of what each scene's plan left out, from its last default row."""
     last = {
@@ -221,6 +254,12 @@ def _median(group: list[Row], name: str) -> str:
     """The median of a value; nothing where rows were measured before it was."""
     known = [row[name] for row in group if row.get(name) is not None]
     return f"{Spread.of(known).median:.4f}" if known else ""
+
+
+def _share(group: list[Row], name: str) -> str:
+    """The spread of a share in percent; nothing where none is known, as the precision where no pixel was found."""
+    known = [100 * row["disagreement"][name] for row in group if row["disagreement"][name] is not None]
+    return Spread.of(known).text(1) if known else ""
 
 
 def _of_scene(rows: list[Row], scene: str) -> list[Row]:
