@@ -90,7 +90,7 @@ def main(argv: list[str]) -> int:
         for sentence in wanted.absent:
             print(sentence, file=sys.stderr)
         try:
-            whole = _measure(wanted, files.rows, asked.work) and not wanted.absent
+            whole = _measure(wanted, files.rows, asked.work, asked.lpips) and not wanted.absent
         except KeyboardInterrupt:
             print(f"\nStopped. Finished rows are in {files.rows}; the same command goes on.", file=sys.stderr)
             return 130
@@ -112,6 +112,10 @@ def _wanted(asked: argparse.Namespace) -> Wanted:
             known.append(scenes.named(name, asked.work))
         except FileNotFoundError as error:
             absent.append(str(error))
+    if asked.lpips:
+        from _train.lpips import Lpips  # loads torch
+
+        Lpips(*asked.lpips)  # what is wrong with the files is said before anything is measured
     names = _split(asked.configs) or [configurations.DEFAULT]
     if names == ["all"]:
         names = list(configurations.CONFIGURATIONS)
@@ -126,7 +130,7 @@ def _wanted(asked: argparse.Namespace) -> Wanted:
     return Wanted(runs_of(known, dict.fromkeys(names), limits, dict.fromkeys(seeds)), [], absent)
 
 
-def _measure(wanted: Wanted, path: Path, work: Path) -> bool:
+def _measure(wanted: Wanted, path: Path, work: Path, lpips: list[Path]) -> bool:
     """Measure and append the rows that the file at `path` lacks; False where one could not be measured."""
     found = lines(path)
     todo = [run for run in missing(wanted.runs, found) if not idle(run, found)]
@@ -144,7 +148,7 @@ def _measure(wanted: Wanted, path: Path, work: Path) -> bool:
             print(f"[{number + 1}/{len(todo)}] {run}: the default's plan already, nothing to measure")
             continue
         try:
-            row = child.measured(run, work)
+            row = child.measured(run, work, lpips)
         except child.Fault as fault:
             print(f"{run}: {fault}", file=sys.stderr)
             whole = False
@@ -254,6 +258,15 @@ def _parser() -> argparse.ArgumentParser:
         help="judge another trainer's finished model on the held-out views of the one scene named, as a point of the "
         "figure; it has to be in the frame of the scene's own cameras (for tools that move the scene, ask them to "
         "keep its coordinates); nothing is trained then",
+    )
+    parser.add_argument(
+        "--lpips",
+        nargs=2,
+        type=Path,
+        default=[],
+        metavar=("VGG16.pth", "LINEAR.pth"),
+        help="measure LPIPS too, with these files of weights: torchvision's vgg16-397923af.pth, and "
+        "weights/v0.1/vgg.pth of the package lpips",
     )
     parser.add_argument(
         "--plot-only", action="store_true", help="draw tables and figure from the rows there are"

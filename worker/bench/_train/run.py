@@ -18,6 +18,7 @@ from torch import Tensor
 
 from _train import bare
 from _train.configurations import revised
+from _train.lpips import Lpips
 from _train.outliers import judged
 from _train.perceived import perceived
 from _train.rows import code_version
@@ -175,7 +176,8 @@ def _perceived(job: Row, options: TrainOptions, gaussians: Gaussians) -> Row:
     if options.image_size is None:
         return {}
     _, views = held_out(job, options, options.image_size)
-    return perceived(_drawing(gaussians, options), views, benchmark_background(views))
+    distance = Lpips(*map(Path, job["lpips"])) if job.get("lpips") else None
+    return perceived(_drawing(gaussians, options), views, benchmark_background(views), distance)
 
 
 def _drawing(gaussians: Gaussians, options: TrainOptions) -> Renderer:

@@ -19,6 +19,9 @@ TOLERANCE = 0.05
 
 COMMAND = "splatmill bench train"
 
+SEEN = ("ms_ssim", "flip")
+"""Errors as people see them. LPIPS is shown beside them where a row has it."""
+
 RULES = """Seconds are training seconds: cameras, loading and evaluation are clocked apart. Held-out views are the
 data set's own, else every 8th photo by name. Medians over seeds, least and largest in brackets. Every row is a run of
 its own in a process of its own, laid out for its budget; each budget is shown as the last code measured it."""
@@ -51,7 +54,8 @@ def document(rows: list[Row], references: list[Row], rows_at: Path, here: Path, 
 def budgets(timed: list[Row]) -> str:
     """A table of the result of each time budget, and whether runs ended in time and never got worse with more time."""
     groups = grouped((row for row in whole(timed) if by_time(row)), "scene", "budget")
-    quality_of = "PSNR dB|SSIM|MS-SSIM|FLIP"
+    seen = [*SEEN, *(["lpips"] if any(row.get("lpips") is not None for row in timed) else [])]
+    quality_of = "|".join(["PSNR dB|SSIM", *(name.upper().replace("_", "-") for name in seen)])
     head = (
         f"scene|budget|seeds|training s|{quality_of}|Gaussians|steps|all wall s|all CPU s|peak MB|cameras s"
     )
@@ -75,7 +79,7 @@ def budgets(timed: list[Row]) -> str:
                 spent.text(1),
                 quality.text(2),
                 Spread.of(row["ssim"] for row in group).text(4),
-                *(_median(group, name) for name in ("ms_ssim", "flip")),
+                *(_median(group, name) for name in seen),
                 *(f"{Spread.of(row[name] for row in group).median:.0f}" for name in ("gaussians", "steps")),
                 *(
                     f"{Spread.of(row[name] for row in group).median:.0f}"
