@@ -1,10 +1,12 @@
-"""Proves that a higher effort keeps the features and pairs of photos that are not extracted anew, and the cache's keys.
+"""Proves that a higher effort keeps the features and pairs of photos that are not extracted anew, the cache's keys, and
+which mappers are tried.
 
 Proven on the database of generated photos. Does not prove that a higher effort registers more photos.
 """
 
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,8 +14,9 @@ import pytest
 
 from splatmill_worker import sfm, synthetic
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.sfm import features
+from splatmill_worker.sfm import effort, features
 from splatmill_worker.sfm.features import FeatureStore
+from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching import pairs
 
 pytestmark = pytest.mark.slow
@@ -74,3 +77,36 @@ def test_another_seed_or_matcher_has_a_database_of_its_own(tmp_path: Path) -> No
                 tmp_path / "images", None, tmp_path / "work", options, lambda *_: None, lambda: False
             )
     assert len(list((tmp_path / "work").rglob("database.db"))) == 3
+
+
+@pytest.mark.parametrize(
+    ("registered", "tried"),
+    [
+        (7, [("incremental", False)]),
+        (6, [("incremental", False), ("global", False), ("incremental", True)]),
+        (0, [("incremental", False), ("global", False), ("incremental", True)]),
+    ],
+)
+def test_no_other_mapper_is_tried_for_photos_that_nothing_connects(
+    registered: int, tried: list[tuple[str, bool]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of ten photos seven are connected, so that no mapper registers more."""
+    calls = []
+
+    def run(name: mapper.Mapper, *_: object, relaxed: bool, **__: object) -> mapper.Mapped:
+        calls.append((name, relaxed))
+        return mapper.Mapped(name, (), 0)
+
+    monkeypatch.setattr(mapper, "run", run)
+    monkeypatch.setattr(effort, "registered_counts", lambda _: (registered, registered))
+    asked: Any = SimpleNamespace(
+        options=sfm.SfmOptions(), best_mapper=None, count=10, threads=1, show=None, cancelled=None,
+        clock=lambda _: nullcontext(),
+    )  # fmt: skip
+    found: Any = SimpleNamespace(
+        matched={(first, first + 1): SimpleNamespace(inliers=100) for first in range(6)}
+        | {(7, 8): SimpleNamespace(inliers=3)},
+        store=FeatureStore(tmp_path),
+    )
+    effort._map(asked, found)
+    assert calls == tried

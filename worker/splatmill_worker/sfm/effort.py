@@ -17,7 +17,8 @@ CONNECTING_ROUNDS = 2
 """Largest number of times that more pairs are matched to connect the components of the view graph."""
 
 ENOUGH_REGISTERED = 0.9
-"""Share of the photos, reliably registered, from which neither another mapper nor a higher effort is tried."""
+"""Share of the photos, reliably registered, from which no higher effort is tried; and of those that the view graph
+connects, from which no other mapper is."""
 
 RETRY_PARTNERS = 4
 """Likely partners of each photo without a reliable pose whose features are extracted anew, together with its own."""
@@ -212,8 +213,13 @@ def _connect(run: SfmRun, result: EffortResult, database: pycolmap.Database) -> 
 
 
 def _map(run: SfmRun, result: EffortResult) -> mapper.Mapped:
-    """The best of up to three mappings: with the likelier mapper, with the other one, and with relaxed settings."""
+    """The best of up to three mappings: with the likelier mapper, with the other one, and with relaxed settings.
+
+    No mapper registers photos that the view graph does not connect, so the next one is not tried where the last
+    registered ENOUGH_REGISTERED of the photos that are connected.
+    """
     asked = run.options.mapper
+    connected = len(pairs.connected_components(run.count, verified_pairs(result))[0])
     first: mapper.Mapper = "incremental"
     if asked != "auto":
         first = asked
@@ -244,7 +250,7 @@ def _map(run: SfmRun, result: EffortResult) -> mapper.Mapped:
             rank = registered_counts(mapped)
             if best is None or rank > best_rank:
                 best, best_rank = mapped, rank
-            if best_rank[0] >= ENOUGH_REGISTERED * run.count:
+            if best_rank[0] >= ENOUGH_REGISTERED * connected:
                 break
     assert best is not None  # there is at least one trial
     run.best_mapper = best.mapper
