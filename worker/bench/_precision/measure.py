@@ -18,6 +18,7 @@ from _precision.variants import EXACT, PLAIN, Variant
 from splatmill_worker.kernels.cpu.loss import photo_stats
 from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.kernels.records import GROUPS, Rates
+from splatmill_worker.kernels.reference.adam import BETA2
 
 STILL = Rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Everything is computed and written and nothing moves: each round is the same work."""
@@ -124,7 +125,7 @@ def _drawn(
 def decay(variant: Variant, modules: Modules, after: Sequence[int]) -> list[Row]:
     """How far the second moments of Gaussians that are out of view have fallen after so many steps.
 
-    Exactly, they fall by 0.999 a step. The row has the mean over all values of their share of what they were, and the
+    Exactly, they fall by BETA2 a step. The row has the mean over all values of their share of what they were, and the
     share of those that are exactly what they were.
     """
     generator = torch.Generator().manual_seed(0)
@@ -153,7 +154,7 @@ def decay(variant: Variant, modules: Modules, after: Sequence[int]) -> list[Row]
                 now = step.moments()[1]
                 share = now[values].double() / before[values].double()
                 unmoved = float((now[values] == before[values]).double().mean())
-                row: Row = {"kind": "decay", "variant": variant.name, "steps": t, "exact": 0.999**t}
+                row: Row = {"kind": "decay", "variant": variant.name, "steps": t, "exact": BETA2**t}
                 rows.append(
                     row | {"share": float(share.mean()), "unmoved": unmoved, "values": int(values.sum())}
                 )

@@ -11,6 +11,7 @@
 
 namespace splatmill {
 
+// As in reference/adam.py.
 inline constexpr double kBeta1 = 0.9, kBeta2 = 0.999;
 inline constexpr float kAdamEps = 1e-15f;
 

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
+"""Factors on the first and the second moment at each step, and the least divisor (decisions: second-moment)."""
+
 MEMORY = 256
 """Missed steps whose drift is computed: the terms of later ones are below (0.9 / sqrt 0.999)^256 = 2e-12."""
 
@@ -25,7 +27,7 @@ def adam_(
     visible: Tensor | None = None,
     last_step: Tensor | None = None,
 ) -> int:
-    """Take one Adam step in place (Kingma & Ba 2015; betas 0.9, 0.999, eps 1e-15) on groups [N, ...] with a rate each.
+    """Take one Adam step in place (Kingma & Ba 2015; BETA1, BETA2 and EPS) on groups [N, ...] with a rate each.
 
     step counts from 1; the bias is corrected by it for all rows, whenever they came (decisions: bias-correction). With
     visible [N] (bool) only those rows move; last_step int32 [N] is the step up to which each row is current, and a row

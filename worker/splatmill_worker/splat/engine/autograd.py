@@ -9,15 +9,13 @@ from torch import Tensor
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import Rates
+from splatmill_worker.kernels.reference.adam import BETA1, BETA2, EPS
 from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.motion import motion
 from splatmill_worker.splat.views import over
 
 BACKEND: ops.Backend = "reference"
-
-BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
-"""Adam's decay of the first and second moment, and the term that keeps its divisor above 0."""
 
 
 class AutogradEngine:
@@ -175,7 +173,7 @@ class AutogradEngine:
             average, square = self._exp_avg[name], self._exp_avg_sq[name]
             average.lerp_(gradient, 1.0 - BETA1)
             square.mul_(BETA2).addcmul_(gradient, gradient, value=1.0 - BETA2)
-            move = correction * average / (square.sqrt() + EPSILON)
+            move = correction * average / (square.sqrt() + EPS)
             with torch.no_grad():
                 if name == "sh":
                     value[:, :1] -= rates.sh_dc * move[:, :1]

@@ -19,7 +19,8 @@ from splatmill_worker.splat.train.density import prune
 from splatmill_worker.splat.train.density.rows import Rows
 
 THRESHOLD = 2e-4
-"""Mean gradient of the projected mean, in NDC units, above which a Gaussian is split. The value of Kerbl et al."""
+"""Mean gradient of the projected mean, in NDC units, above which a Gaussian is split. The value of Kerbl et al.
+(decisions: densification-score)."""
 
 OFFSET = 1.0
 """Distance of each half from the mean of the Gaussian, along its longest axis, over its standard deviation there."""
