@@ -19,7 +19,7 @@ WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 3)))
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: help install demo quick test coverage check wheels docs screenshots bench soak capacity fleet load fuzz serve sanitize clean
+.PHONY: help install demo quick test coverage check wheels docs screenshots pictures bench soak capacity fleet load fuzz serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -55,6 +55,9 @@ docs: $(VENV)/.installed-dev ## build the documentation into docs/build/html, wi
 
 screenshots: $(VENV)/.installed-dev ## make the documentation's pictures of the web page (needs a browser; some minutes)
 	$(BIN)/python docs/screenshots.py
+
+pictures: $(VENV)/.installed ## make the documentation's pictures of what photos do to a model (some minutes)
+	$(BIN)/python docs/pictures.py
 
 bench: install ## error against run time: kernels, functions, stability, worst inputs, stiffness, SfM, training, formats (long)
 	for name in kernels functions stability worst stiffness sfm train live formats; do $(BIN)/splatmill bench $$name || exit 1; done

@@ -1,6 +1,6 @@
 """Cameras against time: scenes x settings, pose error, registered share, and what a short training makes of them.
 
-    python -m splatmill_worker bench sfm                          # all scenes, with training; about 12 minutes
+    python -m splatmill_worker bench sfm                          # all scenes, with training; about 20 minutes
     python -m splatmill_worker bench sfm --scenes fox kermit --settings auto --again --no-train
     python -m splatmill_worker bench sfm --growth                 # 25 to 200 generated photos, and the fit
 
@@ -10,9 +10,10 @@ Rules: photos come from ../shared/data, and a scene that is not there gets no ro
 folder; a failed run gets no point in the figure and is named in the table. A row during which other programs took
 more than a tenth of the machine's time is marked "busy": its seconds are too high and its PSNR too low.
 Pose errors are medians after the best similarity to the reference: for fox COLMAP's model of the full-size photos
-(itself no truth: its principal point was held), for generated photos the true cameras, for lund the GPS places (10 m
-accurate), positions only. Held-out PSNR is that of the default pipeline trained for --train seconds on the cameras
-with the points of structure from motion, longest side 480; stereo adds to them where the pipeline would.
+(itself no truth: its principal point was held), for beer the COLMAP model that came with it, for generated photos the
+true cameras, for lund the GPS places (10 m accurate), positions only. Held-out PSNR is that of the default pipeline
+trained for --train seconds on the cameras with the points of structure from motion, longest side 480; stereo adds to
+them where the pipeline would.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ from splatmill_worker.sfm.posed.files import ImageFiles
 from splatmill_worker.synthetic import textures
 
 Float = npt.NDArray[np.float64]
-FOLDERS = {name: _data.FOLDERS[name] for name in ("fox", "lund", "kermit", "unrelated", "rotation")}
+NAMES = ("fox", "lund", "kermit", "beer", "snowmiku", "unrelated", "rotation")
+FOLDERS = {name: _data.FOLDERS[name] for name in NAMES}
 GROWTH = (25, 50, 100, 200)
 GROWTH_WIDTH, GROWTH_HEIGHT = 480, 360
 TRAIN_SIDE = 480

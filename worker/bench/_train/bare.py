@@ -9,12 +9,12 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 from _data import FOLDERS, SHARED
 
 from splatmill_worker import synthetic
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.scene import Camera
+from splatmill_worker.scene import View
+from splatmill_worker.sfm.posed.written import transforms_of
 
 FOX = SHARED / FOLDERS["fox"]
 
@@ -44,7 +44,9 @@ def make(name: str, capture: Path, photos: int) -> None:
     if name == "synthetic-posed":
         (part / "images").mkdir()
         truth = synthetic.capture(part / "images", photos)
-        (part / "poses" / "transforms.json").write_text(json.dumps(_transforms(truth)))
+        views = [View(photo, camera, part / "images" / photo) for photo, camera in truth.items()]
+        document = transforms_of(views, frozenset())
+        (part / "poses" / "transforms.json").write_text(json.dumps(document))
     else:
         (part / "images").symlink_to(FOX / "images")
         _fox(name, part / "poses")
@@ -69,23 +71,3 @@ def _fox(name: str, poses: Path) -> None:
         parts = {"test": frames[::8], "train": [each for at, each in enumerate(frames) if at % 8]}
         for split, own in parts.items():
             (poses / f"transforms_{split}.json").write_text(json.dumps({**document, "frames": own}))
-
-
-def _transforms(truth: dict[str, Camera]) -> dict[str, object]:
-    """nerfstudio's transforms.json of cameras by the names of their photos."""
-    frames = []
-    for name, camera in truth.items():
-        matrix = np.eye(4)
-        matrix[:3, :3] = camera.viewmat[:3, :3].T @ np.diag([1.0, -1.0, -1.0])
-        matrix[:3, 3] = camera.center
-        frames.append({"file_path": f"images/{name}", "transform_matrix": matrix.tolist()})
-    some = next(iter(truth.values()))
-    return {
-        "w": some.width,
-        "h": some.height,
-        "fl_x": some.fx,
-        "fl_y": some.fy,
-        "cx": some.cx,
-        "cy": some.cy,
-        "frames": frames,
-    }

@@ -1,14 +1,18 @@
-"""Proves that photos which disagree with the others come first, with the reason and the pixels, at the end of a run.
+"""Proves that photos which disagree with the others come first, with the reason and the pixels, and when in a run they
+are compared.
 
 Does not prove how much is found in photos of real size: `splatmill bench train --scenes passed-by` measures that.
 """
 
 from __future__ import annotations
 
+import pytest
 import torch
 
+from splatmill_worker.splat.train import disagreement
 from splatmill_worker.splat.train.disagreement import Disagreement
 from splatmill_worker.splat.train.loop import train
+from splatmill_worker.splat.train.run import TrainingRun
 from splatmill_worker.splat.views import TrainingView
 from tests.support import still_life
 from tests.support.training import first_engine, plan
@@ -38,6 +42,22 @@ def test_other_light_is_told_from_another_camera() -> None:
     reasons = {each.name: each.reason for each in judged(views)}
     assert reasons[views[6].name] == "other light"
     assert reasons[views[10].name] == "wrong camera or blur"
+
+
+@pytest.mark.parametrize(("photos", "steps", "at"), [(12, 60, 18), (3, 150, 30), (3, 1, 1)])
+def test_photos_are_compared_once_before_they_are_learnt_by_heart(
+    photos: int, steps: int, at: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After ten steps on each photo, after three tenths of the run, or at its end, whichever comes first."""
+    compared = []
+
+    def record(run: TrainingRun) -> tuple[Disagreement, ...]:
+        compared.append(run.step)
+        return ()
+
+    monkeypatch.setattr(disagreement, "disagreements", record)
+    train(first_engine(), still_life.training_views()[:photos], [], plan(steps), extent=1.1)
+    assert compared == [at]
 
 
 def test_too_few_photos_are_not_compared() -> None:

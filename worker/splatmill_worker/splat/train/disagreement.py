@@ -1,7 +1,11 @@
-"""How far each training photo disagrees with those around it, at the end of a run, and what that looks like."""
+"""How far each training photo disagrees with those around it, and what that looks like.
+
+The photos are compared in the course of a run. At its end, a long one has learnt by heart what single photos show.
+"""
 
 from __future__ import annotations
 
+import time
 from typing import Literal, NamedTuple
 
 from torch import Tensor
@@ -12,6 +16,13 @@ from splatmill_worker.splat.train.run import TrainingRun
 
 Reason = Literal["moving things", "other light", "wrong camera or blur"]
 """What makes a photo disagree with the others."""
+
+VISITS = 10
+"""Steps on each photo after which the photos are compared: what all show is learnt by then, and what one photo alone
+shows is not yet (decisions: disagreement)."""
+
+LATEST = 0.3
+"""Share of the budget after which they are compared in any case, before the rates fall (decisions: disagreement)."""
 
 FEWEST_PHOTOS = 3
 """Photos below which none has two others to be compared with."""
@@ -24,8 +35,7 @@ WHOLLY_OFF = 1.3
 it is the reason: half of the photo is worse (decisions: disagreement)."""
 
 THING = 0.01
-"""Share of a photo's pixels that no other agrees with, from which it is named, if its residuals are larger than the
-others' too (decisions: disagreement)."""
+"""Share of a photo's pixels that no other agrees with, from which it is named (decisions: disagreement)."""
 
 
 class Disagreement(NamedTuple):
@@ -43,6 +53,36 @@ class Disagreement(NamedTuple):
     share: float
     reason: Reason | None
     outliers: Tensor
+
+
+class Look:
+    """Compares the photos of a run once, in its course.
+
+    seconds: what the comparison took.
+    """
+
+    def __init__(self, run: TrainingRun) -> None:
+        self._run = run
+        self._found: tuple[Disagreement, ...] | None = None
+        self.seconds = 0.0
+
+    @property
+    def is_due(self) -> bool:
+        """Whether to compare them now. A run that goes on from a checkpoint compares them again."""
+        run = self._run
+        return self._found is None and (run.step >= VISITS * len(run.views) or run.progress >= LATEST)
+
+    def take(self) -> None:
+        """Compare the photos with what the run's engine holds."""
+        started = time.perf_counter()
+        self._found = disagreements(self._run)
+        self.seconds = time.perf_counter() - started
+
+    def finish(self) -> tuple[Disagreement, ...]:
+        """What was found; of the end of the run where it ended before the photos were compared."""
+        if self._found is None:
+            self.take()
+        return self._found or ()
 
 
 def disagreements(run: TrainingRun) -> tuple[Disagreement, ...]:
@@ -68,8 +108,10 @@ def _judged(name: str, seen: Glance, comparison: Comparison, usual: float) -> Di
     reason: Reason | None = None
     if seen.light >= OTHER_LIGHT:
         reason = "other light"
+    elif comparison.decibels <= 0.0:
+        reason = None
     elif usual > 0.0 and comparison.median >= WHOLLY_OFF * usual:
         reason = "wrong camera or blur"
-    elif share >= THING and comparison.decibels > 0.0:
+    elif share >= THING:
         reason = "moving things"
     return Disagreement(name, comparison.decibels, share, reason, comparison.outliers)

@@ -14,7 +14,7 @@ from splatmill_worker.splat.evaluate import Score
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.curve import CurvePoint, is_flat
-from splatmill_worker.splat.train.disagreement import Disagreement, disagreements
+from splatmill_worker.splat.train.disagreement import Disagreement, Look
 from splatmill_worker.splat.train.evaluations import Evaluations, corrected
 from splatmill_worker.splat.train.poses import Poses, mean_depth
 from splatmill_worker.splat.train.renderer import render_view
@@ -157,7 +157,7 @@ def train(
     if resume_from is not None:
         run.resume(resume_from)
     validation = tuple(run.views[index].name for index in sorted(run.set_aside))
-    evaluations = Evaluations(run, held_out)
+    evaluations, look = Evaluations(run, held_out), Look(run)
     stopped, failure = "", None
     began = last_progress = last_checkpoint = time.monotonic()
     while not stopped:
@@ -180,6 +180,9 @@ def train(
             with run.clock.stopped():
                 hooks.evaluated(evaluations.evaluate(), engine)
             stopped = _reason_to_stop(run)
+        if look.is_due:
+            with run.clock.stopped():
+                look.take()
         for observer in hooks.observers:
             if observer.is_due(run.progress):
                 with run.clock.stopped():
@@ -193,12 +196,13 @@ def train(
             with run.clock.stopped():
                 hooks.checkpoint(run.snapshot())
             last_checkpoint = time.monotonic()
-    return _result(run, evaluations, stopped, failure, validation)
+    return _result(run, evaluations, look, stopped, failure, validation)
 
 
 def _result(
     run: TrainingRun,
     evaluations: Evaluations,
+    look: Look,
     stopped: str,
     failure: TrainingFailed | None,
     validation: tuple[str, ...],
@@ -209,9 +213,7 @@ def _result(
     if failure is not None:
         evaluations.final = None
     final = evaluations.finish()
-    started = time.perf_counter()
-    found = disagreements(run)
-    evaluations.seconds += time.perf_counter() - started
+    found = look.finish()
     return Trained(
         gaussians=gaussians_of(run.engine).padded(run.plan.schedule.degree),
         curve=tuple(run.curve),
@@ -219,7 +221,7 @@ def _result(
         on_training=final.on_training,
         steps=run.step,
         seconds=seconds,
-        evaluate_seconds=evaluations.seconds,
+        evaluate_seconds=evaluations.seconds + look.seconds,
         stopped=stopped,
         failure=failure,
         recoveries=run.recoveries,
