@@ -6,6 +6,8 @@ Does not prove how much is found in photos of real size: `splatmill bench train 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -58,6 +60,16 @@ def test_photos_are_compared_once_before_they_are_learnt_by_heart(
     monkeypatch.setattr(disagreement, "disagreements", record)
     train(first_engine(), still_life.training_views()[:photos], [], plan(steps), extent=1.1)
     assert compared == [at]
+
+
+def test_photos_that_are_set_aside_are_not_compared() -> None:
+    """They are not learnt when the others are compared, which is no disagreement."""
+    views = still_life.training_views()
+    found = train(first_engine(), views, [], replace(plan(40), validation=2), extent=1.1)
+    assert len(found.validation) == 2
+    assert {each.name for each in found.disagreements} == {view.name for view in views} - set(
+        found.validation
+    )
 
 
 def test_too_few_photos_are_not_compared() -> None:

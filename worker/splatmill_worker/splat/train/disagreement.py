@@ -70,7 +70,8 @@ class Look:
     def is_due(self) -> bool:
         """Whether to compare them now. A run that goes on from a checkpoint compares them again."""
         run = self._run
-        return self._found is None and (run.step >= VISITS * len(run.views) or run.progress >= LATEST)
+        seen = len(run.views) - len(run.set_aside)
+        return self._found is None and (run.step >= VISITS * seen or run.progress >= LATEST)
 
     def take(self) -> None:
         """Compare the photos with what the run's engine holds."""
@@ -86,19 +87,25 @@ class Look:
 
 
 def disagreements(run: TrainingRun) -> tuple[Disagreement, ...]:
-    """All training photos of a run, that which disagrees most first; none where there are too few to be compared."""
-    if len(run.views) < FEWEST_PHOTOS:
+    """All photos that a run takes steps on, that which disagrees most first; none where they are too few to compare.
+
+    Photos that are set aside are not learnt, and would disagree for that reason alone.
+    """
+    seen_in_steps = [index for index in range(len(run.views)) if index not in run.set_aside]
+    views = [run.views[index] for index in seen_in_steps]
+    if len(views) < FEWEST_PHOTOS:
         return ()
     background = evaluation_background(run.plan, run.views)
-    targets = [small(view) for view in run.views]
+    targets = [small(view) for view in views]
     if run.poses is not None:
-        targets = [target._replace(viewmat=run.poses.viewmat(index)) for index, target in enumerate(targets)]
+        moved = [run.poses.viewmat(index) for index in seen_in_steps]
+        targets = [target._replace(viewmat=viewmat) for target, viewmat in zip(targets, moved, strict=True)]
     glances = [glance(run.engine, run.plan, target, background) for target in targets]
     found = compared(glances)
     usual = sorted(comparison.median for comparison in found)[len(found) // 2]
     judged = [
         _judged(view.name, seen, comparison, usual)
-        for view, seen, comparison in zip(run.views, glances, found, strict=True)
+        for view, seen, comparison in zip(views, glances, found, strict=True)
     ]
     return tuple(sorted(judged, key=lambda each: -each.decibels))
 

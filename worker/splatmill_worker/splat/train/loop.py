@@ -109,7 +109,7 @@ class Trained:
     views: the training views with their cameras as the run left them.
     cameras_moved: median correction of the cameras, pixels; None where they are not refined.
     validation: names of the training views that were set aside for decisions.
-    disagreements: how far each training photo disagrees with those around it, the largest first.
+    disagreements: how far each training photo disagrees with those around it, the largest first; without `validation`.
     """
 
     gaussians: Gaussians
