@@ -10,6 +10,7 @@ import torch
 
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.engine.open import open_engine
+from splatmill_worker.splat.plan import schedule as schedule_module
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.schedule import Schedule
@@ -40,10 +41,10 @@ def views() -> list[TrainingView]:
     return found
 
 
-def run(kernels: Kernels) -> Trained:
+def run(kernels: Kernels, dropout: float) -> Trained:
     schedule = Schedule(
         budget=Budget(STEPS, None), resolution=((0, 1),), degree=1, densify_from=2, densify_every=2,
-        densify_until=0.9, expected_steps=STEPS,
+        densify_until=0.9, expected_steps=STEPS, dropout=dropout,
     )  # fmt: skip
     plan = Plan(
         schedule=schedule, image_size=replica.WIDTH, max_gaussians=14, densify=True, initial="points",
@@ -54,8 +55,18 @@ def run(kernels: Kernels) -> Trained:
     return train(open_engine(replica.scene(), kernels), shown[1:], shown[:1], plan, extent=1.1)
 
 
-def test_training_on_the_gpu_engine_ends_where_the_cpu_engine_ends() -> None:
-    gpu, cpu = run("gpu"), run("cpu")
+@pytest.mark.parametrize(
+    "dropout",
+    [
+        0.0,
+        pytest.param(0.5, marks=pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU draws others")),
+    ],
+)
+def test_training_on_the_gpu_engine_ends_where_the_cpu_engine_ends(
+    dropout: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(schedule_module, "MANY_VISITS", 0.1)  # so that the first steps leave Gaussians out
+    gpu, cpu = run("gpu", dropout), run("cpu", dropout)
     assert gpu.steps == cpu.steps == STEPS
     assert gpu.gaussians.count == cpu.gaussians.count > replica.scene().count, "nothing was densified"
     for name, value in cpu.gaussians.parameters().items():

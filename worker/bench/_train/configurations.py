@@ -56,6 +56,9 @@ CONFIGURATIONS = {
     "no-opacity-decay": Configuration(
         "opacities stay as they are when Gaussians are added", plan={"schedule.opacity_decay": 1.0}
     ),
+    "no-dropout": Configuration(
+        "all Gaussians in every step, however often photos come", plan={"schedule.dropout": 0.0}
+    ),
     "sh-0": Configuration("colour does not change with the view", {"sh_degree": 0}, {"schedule.degree": 0}),
     "sh-3": Configuration("SH degree 3 whatever the views' angles", {"sh_degree": 3}, {"schedule.degree": 3}),
     "no-annealing": Configuration(

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from splatmill_worker.splat.plan.decide import DROPOUT
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import Annealing
 from splatmill_worker.splat.start.given_model import GivenModel
@@ -147,6 +148,12 @@ def test_the_far_shell_keeps_its_opacities() -> None:
 def test_opacities_decay_only_where_gaussians_are_added() -> None:
     assert planned().schedule.opacity_decay == 0.9
     assert planned(densify="off").schedule.opacity_decay == 1.0
+
+
+def test_the_plan_says_how_often_each_photo_comes() -> None:
+    course = planned(changed(views=30), steps=3000)
+    assert course.schedule.dropout == DROPOUT
+    assert "3000 steps show each of 30 photos 100 times" in course.reasons["dropout"]
 
 
 def test_a_given_model_is_trained_at_full_size_with_the_papers_rates() -> None:

@@ -21,6 +21,14 @@ def test_the_schedule_goes_from_coarse_to_fine() -> None:
     assert events == [300, 400, 500, 600]
 
 
+def test_gaussians_are_left_out_once_each_photo_came_often() -> None:
+    schedule = Schedule(Budget(1000), ((0, 1),), 3, 300, 100, 0.7, 1000, dropout=0.2)
+    assert [schedule.left_out(visits) for visits in (0, 1, 99.9, 100)] == [0.0] * 4
+    assert schedule.left_out(150) == pytest.approx(0.1)
+    assert schedule.left_out(200) == schedule.left_out(1e9) == 0.2
+    assert Schedule(Budget(1000), ((0, 1),), 3, 300, 100, 0.7, 1000).left_out(1e9) == 0.0
+
+
 def test_rates_fall_to_their_ends() -> None:
     rates = RateSchedule(extent=2.0)
     start, end = rates.at(0.0), rates.at(1.0)

@@ -136,6 +136,11 @@ class Step:
             blocks.unpack_rows(self.exp_avg_sq, self.count, self.threads),
         )
 
+    @property
+    def logit_opacities(self) -> Tensor:
+        """View [blocks, 16] of the logits of the opacities, to be written to between steps."""
+        return self.blocks[:, blocks.FIRST["logit_opacities"], :]
+
     # Densification scores: views [N] that add up over steps until `replace` or `clear_scores`. The norm of the gradient
     # is in NDC units (the image is 2 wide and 2 high), as published thresholds are.
 

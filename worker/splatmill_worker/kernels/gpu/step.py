@@ -213,6 +213,11 @@ class Step:
     def max_extent(self) -> Tensor:
         return self._scores[MAX_EXTENT]
 
+    @property
+    def logit_opacities(self) -> Tensor:
+        """View [1, N] of the logits of the opacities, without the steps missed, to be written to between steps."""
+        return self._params[PLANES["logit_opacities"]]
+
     def clear_scores(self) -> None:
         """Set the scores to 0."""
         self._scores.zero_()

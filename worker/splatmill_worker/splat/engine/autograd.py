@@ -38,6 +38,10 @@ class AutogradEngine:
     def count(self) -> int:
         return self._gaussians.count
 
+    @property
+    def logit_opacities(self) -> Tensor:
+        return self._gaussians.logit_opacities.detach()
+
     def parameters(self) -> dict[str, Tensor]:
         return {name: value.detach().float() for name, value in self._gaussians.parameters().items()}
 

@@ -32,6 +32,7 @@ class Engine(Protocol):
     plain_sum: [N], sum over steps of the norm of the gradient of the projected mean, in NDC units.
     visible_count: [N], steps whose photo showed the Gaussian.
     max_extent: [N], largest half side of its box in a photo, in halves of the photo's longer side.
+    logit_opacities: the logits of the opacities themselves, in the engine's layout, to be written to between steps.
 
     The scores are sums and a maximum over the steps since the last `replace`.
     """
@@ -48,6 +49,8 @@ class Engine(Protocol):
     def visible_count(self) -> Tensor: ...
     @property
     def max_extent(self) -> Tensor: ...
+    @property
+    def logit_opacities(self) -> Tensor: ...
 
     def parameters(self) -> dict[str, Tensor]:
         """Copies of the parameters by name, as in `Gaussians`; sh has 16 coefficients."""

@@ -20,13 +20,16 @@ from splatmill_worker.splat.plan.photos import (
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.rates import PAPER_STEPS, Annealing, boost_of
 from splatmill_worker.splat.plan.reasons import Reasons
-from splatmill_worker.splat.plan.schedule import Schedule
+from splatmill_worker.splat.plan.schedule import MANY_VISITS, Schedule
 from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS
 from splatmill_worker.splat.start.given_model import GivenModel
 from splatmill_worker.splat.start.points import ENOUGH_POINTS
 
 OPACITY_DECAY = 0.9
 """Factor on opacities at each densification (decisions: OPACITY_DECAY)."""
+
+DROPOUT = 0.2
+"""Largest share of the Gaussians that a step leaves out: the value of Park et al. 2025 (decisions: dropout)."""
 
 
 def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
@@ -118,6 +121,7 @@ def _schedule(
         # Half way to the shell, so that all of the shell is spared and most of the scene is not.
         decay_within=0.5 * facts.shell_distance if needs.far_shell and facts.shell_distance else None,
         annealing=_annealing(options, steps, reasons),
+        dropout=_dropout(facts, steps, reasons),
         expected_steps=steps,
     )
     return schedule if facts.start is None else _warm_start(schedule, facts.start, reasons)
@@ -157,6 +161,16 @@ def _annealing(options: TrainOptions, steps: int, reasons: Reasons) -> Annealing
         return Annealing(boost=boost)
     reasons.chosen["rates"] = f"{because}; the factor follows the number of steps that the time allows."
     return Annealing(boost=None)
+
+
+def _dropout(facts: Facts, steps: int, reasons: Reasons) -> float:
+    """Largest share of the Gaussians that a step leaves out: else what few photos show is learnt by heart."""
+    visits = steps / max(1, facts.views)
+    reasons.chosen["dropout"] = (
+        f"About {steps} steps show each of {facts.views} photos {visits:.0f} times; from {MANY_VISITS} times on, steps "
+        f"leave out a random part of the Gaussians, up to {100 * DROPOUT:.0f} %."
+    )
+    return DROPOUT
 
 
 def _warm_start(schedule: Schedule, model: GivenModel, reasons: Reasons) -> Schedule:

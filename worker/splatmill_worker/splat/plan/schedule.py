@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.rates import Annealing
 
+MANY_VISITS = 100
+"""Steps on each photo after which training begins to learn the photos by heart (decisions: dropout)."""
+
 
 @dataclass(frozen=True)
 class Schedule:
@@ -25,6 +28,7 @@ class Schedule:
     decay_within: distance from the origin of the training world, in its units, beyond which no opacity decays: most
         of the far shell is hidden from the photos, and decay would remove it. None: no such distance.
     annealing: how the learning rates fall.
+    dropout: largest share of the Gaussians that a step leaves out at random; see `left_out`.
     """
 
     budget: Budget
@@ -37,10 +41,18 @@ class Schedule:
     opacity_decay: float = 1.0
     decay_within: float | None = None
     annealing: Annealing = field(default_factory=Annealing)
+    dropout: float = 0.0
 
     def reduction(self, step: int) -> int:
         """The factor by which photos are reduced at `step` (1-based)."""
         return [factor for first, factor in self.resolution if first < step][-1]
+
+    def left_out(self, visits: float) -> float:
+        """The share of the Gaussians that a step leaves out at random after `visits` steps on each photo.
+
+        It grows from 0 at MANY_VISITS to `dropout` at twice as many.
+        """
+        return self.dropout * min(1.0, max(0.0, visits / MANY_VISITS - 1.0))
 
     def densifies(self, step: int, progress: float) -> bool:
         """Whether Gaussians may be added after `step`, at which the share `progress` of the budget is spent."""

@@ -17,6 +17,7 @@ from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
 from splatmill_worker.splat.train.curve import CurvePoint
 from splatmill_worker.splat.train.density.densify import densify
+from splatmill_worker.splat.train.dropout import dropout
 from splatmill_worker.splat.train.health import LossHealth
 from splatmill_worker.splat.train.pace import Pace
 from splatmill_worker.splat.train.poses import Poses
@@ -30,6 +31,9 @@ SNAPSHOT_SHARE = 0.04
 
 MEMORY_SHRINK = 0.8
 """Share of the Gaussians that is kept after memory ran out."""
+
+STREAM = 1_000_003
+"""Steps between the random choices of two seeds of a run: longer than any run."""
 
 
 class TrainingRun:
@@ -224,20 +228,22 @@ class TrainingRun:
         """One optimisation step on photo number `index`, at the reduction of this step."""
         target = self.views[index].reduced(self.reduction)
         background = self._background()
+        share = self.plan.schedule.left_out(self.step / max(1, len(self.views) - len(self.set_aside)))
         try:
-            return self.engine.train_photo(
-                target.viewmat if self.poses is None else self.poses.viewmat(index),
-                target.K,
-                target.rgb,
-                degree=self.plan.schedule.degree,
-                rates=rates,
-                step=self.step,
-                background=background,
-                alpha=target.alpha,
-                mask=target.mask,
-                antialias=self.plan.antialias,
-                key=(index, self.reduction),
-            )
+            with dropout(self.engine.logit_opacities, share, seed=self.plan.seed * STREAM + self.step):
+                return self.engine.train_photo(
+                    target.viewmat if self.poses is None else self.poses.viewmat(index),
+                    target.K,
+                    target.rgb,
+                    degree=self.plan.schedule.degree,
+                    rates=rates,
+                    step=self.step,
+                    background=background,
+                    alpha=target.alpha,
+                    mask=target.mask,
+                    antialias=self.plan.antialias,
+                    key=(index, self.reduction),
+                )
         except MemoryError as short:
             raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
 
