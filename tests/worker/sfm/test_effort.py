@@ -14,7 +14,7 @@ import pytest
 
 from splatmill_worker import sfm, synthetic
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.sfm import effort, features
+from splatmill_worker.sfm import features, trials
 from splatmill_worker.sfm.features import FeatureStore
 from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching import pairs
@@ -98,15 +98,10 @@ def test_no_other_mapper_is_tried_for_photos_that_nothing_connects(
         return mapper.Mapped(name, (), 0)
 
     monkeypatch.setattr(mapper, "run", run)
-    monkeypatch.setattr(effort, "registered_counts", lambda _: (registered, registered))
+    monkeypatch.setattr(trials, "registered_counts", lambda _: (registered, registered))
     asked: Any = SimpleNamespace(
         options=sfm.SfmOptions(), best_mapper=None, count=10, threads=1, show=None, cancelled=None,
         clock=lambda _: nullcontext(),
     )  # fmt: skip
-    found: Any = SimpleNamespace(
-        matched={(first, first + 1): SimpleNamespace(inliers=100) for first in range(6)}
-        | {(7, 8): SimpleNamespace(inliers=3)},
-        store=FeatureStore(tmp_path),
-    )
-    effort._map(asked, found)
+    trials.best_mapping(asked, tmp_path / "database.db", [(first, first + 1) for first in range(6)])
     assert calls == tried

@@ -22,6 +22,7 @@ from splatmill_worker import sfm, synthetic
 from splatmill_worker.errors import Cancelled, Refusal
 from splatmill_worker.scene import Camera, Scene, Similarity
 from tests.support.paths import DATA
+from tests.support.poses import pose_errors
 
 pytestmark = pytest.mark.slow
 
@@ -34,23 +35,6 @@ def quiet(stage: str, done: int, total: int, note: str) -> None:
 
 def reconstruct(images: Path, workdir: Path, **options: Any) -> Scene:
     return sfm.reconstruct(images, None, workdir, sfm.SfmOptions(**options), quiet, lambda: False)
-
-
-def errors(scene: Scene, truth: dict[str, Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation errors in degrees and position errors over the cameras' spread, after the best similarity (Umeyama)."""
-    ours = np.array([view.camera.center for view in scene.views])
-    theirs = np.array([truth[view.name].center for view in scene.views])
-    a, b = ours - ours.mean(0), theirs - theirs.mean(0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    turn = u @ sign @ vt
-    scale = np.trace(np.diag(s) @ sign) / (a**2).sum()
-    moved = scale * a @ turn.T
-    rotations = []
-    for view in scene.views:
-        delta = view.camera.viewmat[:3, :3] @ turn.T @ truth[view.name].viewmat[:3, :3].T
-        rotations.append(math.degrees(math.acos(np.clip((np.trace(delta) - 1.0) / 2.0, -1.0, 1.0))))
-    return np.array(rotations), np.linalg.norm(moved - b, axis=1) / np.linalg.norm(b, axis=1).max()
 
 
 @pytest.fixture(scope="module")
@@ -72,12 +56,13 @@ def test_cameras_of_generated_photos_match_the_truth(
 ) -> None:
     scene, _ = solved
     assert len(scene.views) == 16
-    rotations, positions = errors(scene, still_life[1])
+    rotations, positions = pose_errors(scene, still_life[1])
     assert np.median(rotations) < 0.3
     assert np.median(positions) < 0.01
     true = next(iter(still_life[1].values()))
     assert scene.views[0].camera.fx == pytest.approx(true.fx, rel=0.03)
     assert scene.facts["registered"] == 16
+    assert scene.facts["pairs_alike"] == 0
     assert scene.colors.std() > 10  # painted from the photos, not left black
     assert scene.point_views is not None
     assert scene.point_views.views.max() < 16
@@ -190,7 +175,7 @@ def test_the_global_mapper_finds_the_cameras_too(
     scene = reconstruct(still_life[0], solved[1], mapper="global", stereo=False)
     assert scene.facts["mapper"] == "global"
     assert len(scene.views) >= 14
-    assert np.median(errors(scene, still_life[1])[0]) < 0.5
+    assert np.median(pose_errors(scene, still_life[1])[0]) < 0.5
 
 
 def test_too_few_photos_are_refused(tmp_path: Path) -> None:

@@ -28,7 +28,10 @@ class Scene:
 
 
 KNOWN = ("fox", "lego", "lund", "kermit", "synthetic", "beer", "snowmiku")
-"""Trained by default. fox, lego and beer bring their cameras; the others' are recovered once, then kept."""
+"""Trained by default. fox and lego bring their cameras; the others' are recovered once, then kept."""
+
+FOLDED = "beer-folded"
+"""beer with the cameras that came with it, which lay two sides of the room on each other (decisions: unfold)."""
 
 PLANTED: dict[str, dict[str, Any]] = {
     "unequal": {"light": Light(exposures=0.3)},
@@ -42,7 +45,7 @@ with darker corners, and with local tone mapping. And with things that stand in 
 MADE: dict[str, dict[str, Any]] = {"synthetic": {}, **PLANTED}
 """What is planted in the photos of each built-in scene: arguments of `synthetic.capture`."""
 
-COMPARED = (*PLANTED, *bare.SCENES)
+COMPARED = (*PLANTED, *bare.SCENES, FOLDED)
 """Made for one comparison each; how soon they are learnt says nothing beside the captures that they are made of."""
 
 ALL = (*KNOWN, *COMPARED)
@@ -61,12 +64,15 @@ def named(text: str, work: Path) -> Scene:
                 f"{text} is left out: fox is not in ../shared/data, and no part of the project."
             )
         return Scene(text, work / text / "capture", made=text)
-    if text in KNOWN:
-        folder = SHARED / FOLDERS[text]
+    if text in (*KNOWN, FOLDED):
+        shared = FOLDERS["beer" if text == FOLDED else text]
+        folder = SHARED / shared
         if not folder.is_dir():
             raise FileNotFoundError(
-                f"{text} is left out: {FOLDERS[text]} is not in ../shared/data, and no part of the project."
+                f"{text} is left out: {shared} is not in ../shared/data, and no part of the project."
             )
+        if text == "beer":
+            return Scene(text, _photos_alone(folder, work / text / "capture"))
         if text == "lego":
             return Scene(text, folder, {"image_size": 400, "holdout": 8}, transparent=True, points=False)
         return Scene(text, folder)
@@ -75,3 +81,11 @@ def named(text: str, work: Path) -> Scene:
         raise ValueError(f"{text!r} is neither a scene ({', '.join(ALL)}) nor a folder with a capture.")
     folder = folder.resolve()
     return Scene(f"{folder.name} (folder)" if folder.name in ALL else folder.name, folder)
+
+
+def _photos_alone(folder: Path, capture: Path) -> Path:
+    """The new or kept folder `capture`, which links to the photos of a capture and not to its cameras."""
+    if not capture.is_dir():
+        capture.mkdir(parents=True)
+        (capture / "images").symlink_to(folder / "images")
+    return capture

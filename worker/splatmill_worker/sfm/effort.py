@@ -8,29 +8,19 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.sfm import checks, features
 from splatmill_worker.sfm.features import FeatureStore
-from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching import pairs, two_view
 from splatmill_worker.sfm.options import LEAN, Effort
 from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest
+from splatmill_worker.sfm.trials import best_mapping, registered_counts
 
 CONNECTING_ROUNDS = 2
 """Largest number of times that more pairs are matched to connect the components of the view graph."""
-
-ENOUGH_REGISTERED = 0.9
-"""Share of the photos, reliably registered, from which no higher effort is tried; and of those that the view graph
-connects, from which no other mapper is."""
 
 RETRY_PARTNERS = 4
 """Likely partners of each photo without a reliable pose whose features are extracted anew, together with its own."""
 
 RETRY_ALL = 0.8
 """Share of the photos: where more would be extracted anew, all of them are."""
-
-GLOBAL_MIN_PHOTOS = 400
-"""Photos from which the global mapper is tried first, where the view graph is dense."""
-
-GLOBAL_MIN_DEGREE = 5
-"""Verified pairs per photo from which a view graph counts as dense."""
 
 
 def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> EffortResult:
@@ -76,29 +66,17 @@ def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> Effor
         _require_features(run, result)
         _match(run, result, _select_pairs(run, result), database)
         _connect(run, result, database)
-        if not verified_pairs(result):
+        if not result.verified:
             return result
-        result.mapped = _map(run, result)
+        result.mapped = best_mapping(run, result.store.database, result.verified)
         left = _unregistered(run, result)
         if left and _match_unregistered(run, result, left, database):
-            again = _map(run, result)
+            again = best_mapping(run, result.store.database, result.verified)
             if registered_counts(again) > registered_counts(result.mapped):
                 result.mapped = again
     finally:
         database.close()
     return result
-
-
-def verified_pairs(result: EffortResult) -> list[pairs.Pair]:
-    """The edges of the view graph: pairs with enough inliers."""
-    return [pair for pair, found in result.matched.items() if found.inliers >= two_view.MIN_INLIERS]
-
-
-def registered_counts(mapped: mapper.Mapped | None) -> tuple[int, int]:
-    """Number of photos registered reliably in the largest model, and number of all those registered in it."""
-    if mapped is None:
-        return 0, 0
-    return len(checks.reliably_registered(mapped.largest)), mapped.registered
 
 
 def registered_photos(model: pycolmap.Reconstruction) -> set[int]:
@@ -203,58 +181,13 @@ def _match(run: SfmRun, result: EffortResult, chosen: set[pairs.Pair], database:
 def _connect(run: SfmRun, result: EffortResult, database: pycolmap.Database) -> None:
     """Match more pairs between the components of the view graph, while there are several."""
     for _ in range(CONNECTING_ROUNDS):
-        components = pairs.connected_components(run.count, verified_pairs(result))
+        components = pairs.connected_components(run.count, result.verified)
         if len(components) == 1:
             return
         more = pairs.connecting_pairs(components, run.scores, set(result.matched), result.effort.partners)
         if not more:
             return
         _match(run, result, more, database)
-
-
-def _map(run: SfmRun, result: EffortResult) -> mapper.Mapped:
-    """The best of up to three mappings: with the likelier mapper, with the other one, and with relaxed settings.
-
-    No mapper registers photos that the view graph does not connect, so the next one is not tried where the last
-    registered ENOUGH_REGISTERED of the photos that are connected.
-    """
-    asked = run.options.mapper
-    connected = len(pairs.connected_components(run.count, verified_pairs(result))[0])
-    first: mapper.Mapper = "incremental"
-    if asked != "auto":
-        first = asked
-    elif run.best_mapper is not None:
-        first = run.best_mapper
-    elif run.count >= GLOBAL_MIN_PHOTOS and len(verified_pairs(result)) >= GLOBAL_MIN_DEGREE * run.count:
-        first = "global"
-    trials: list[tuple[mapper.Mapper, bool]] = [(first, False)]
-    if asked == "auto":
-        trials.append(("global" if first == "incremental" else "incremental", False))
-    if asked != "global":
-        trials.append(("incremental", True))
-    best: mapper.Mapped | None = None
-    best_rank = 0, 0
-    with run.clock("mapping"):
-        for name, relaxed in trials:
-            mapped = mapper.run(
-                name,
-                result.store.database,
-                run.count,
-                run.threads,
-                run.options.seed,
-                relaxed=relaxed,
-                on_progress=lambda done, total: run.on_progress("mapping", done, total, "photos registered"),
-                on_model=run.show,
-                cancelled=run.cancelled,
-            )
-            rank = registered_counts(mapped)
-            if best is None or rank > best_rank:
-                best, best_rank = mapped, rank
-            if best_rank[0] >= ENOUGH_REGISTERED * connected:
-                break
-    assert best is not None  # there is at least one trial
-    run.best_mapper = best.mapper
-    return best
 
 
 def _unregistered(run: SfmRun, result: EffortResult) -> list[int]:
@@ -272,6 +205,6 @@ def _match_unregistered(
     more = pairs.connecting_pairs(parts, run.scores, set(result.matched), 2 * result.effort.partners)
     if not more:
         return False
-    before = len(verified_pairs(result))
+    before = len(result.verified)
     _match(run, result, more, database)
-    return len(verified_pairs(result)) > before
+    return len(result.verified) > before

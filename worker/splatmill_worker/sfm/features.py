@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -155,6 +155,19 @@ def carry_over(source: FeatureStore, target: FeatureStore, retried: set[int]) ->
             new.executemany(f"DELETE FROM {table} WHERE pair_id = ?", stale)
         for table in ("keypoints", "descriptors"):
             new.executemany(f"DELETE FROM {table} WHERE image_id = ?", [(number,) for number in dropped])
+        new.commit()
+
+
+def copy_without_pairs(source: Path, target: Path, left_out: Iterable[tuple[int, int]]) -> None:
+    """Copy COLMAP's database without the two-view geometries of the pairs `left_out`, given by COLMAP's image ids."""
+    with (
+        replacing(target) as part,
+        closing(sqlite3.connect(source)) as old,
+        closing(sqlite3.connect(part)) as new,
+    ):
+        old.backup(new)
+        numbers = [(MAX_IMAGES * min(pair) + max(pair),) for pair in left_out]
+        new.executemany("DELETE FROM two_view_geometries WHERE pair_id = ?", numbers)
         new.commit()
 
 

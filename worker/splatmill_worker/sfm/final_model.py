@@ -11,7 +11,7 @@ import numpy as np
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.sfm import checks, features
-from splatmill_worker.sfm.effort import registered_photos, verified_pairs
+from splatmill_worker.sfm.effort import registered_photos
 from splatmill_worker.sfm.mapping import adjust, mapper
 from splatmill_worker.sfm.run import EffortResult, SfmRun
 
@@ -35,6 +35,7 @@ class FinalModel:
 def final_model(run: SfmRun, result: EffortResult) -> FinalModel:
     """Complete the largest model of `result`; raises SfmFailed when it is not usable, and Cancelled."""
     facts = checks.pair_facts(result.matched) | {"effort": result.effort.name}
+    facts["pairs_alike"] = len(result.left_out)
     if result.mapped is None or result.mapped.largest is None:
         checks.require_usable(checks.model_facts(None, run.count) | facts)
         raise AssertionError("a result without a model is never usable")
@@ -71,7 +72,7 @@ def _with_plausible_intrinsics(
     with run.clock("mapping"):
         again = mapper.run(
             "incremental",
-            result.store.database,
+            result.view_graph,
             run.count,
             run.threads,
             run.options.seed,
@@ -121,7 +122,7 @@ def _reasons(
     """Why each unregistered photo has no camera: no match, too weak ones, or a separate model."""
     registered = registered_photos(model)
     partners: dict[int, int] = {}
-    for pair in verified_pairs(result):
+    for pair in result.verified:
         for index in pair:
             partners[index] = partners.get(index, 0) + 1
     reasons = {}

@@ -19,12 +19,15 @@ from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.features import Features, FeatureStore
 from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching.pairs import Pair
-from splatmill_worker.sfm.matching.two_view import TwoView
+from splatmill_worker.sfm.matching.two_view import MIN_INLIERS, TwoView
 from splatmill_worker.sfm.options import Effort, SfmOptions
 from splatmill_worker.sfm.placed import PlacingObserver, placed
 
-VERSION = 4
+VERSION = 5
 """Version of everything that is cached; a cache with another version is not read."""
+
+UNFOLDED = "unfolded.db"
+"""Name of COLMAP's database without the pairs that show things which look alike."""
 
 
 @dataclass
@@ -37,6 +40,7 @@ class EffortResult:
     features: of each photo.
     matched: outcome of each pair that was matched.
     mapped: the models; None before mapping.
+    left_out: verified pairs that `mapped` was made without, because they show two things that look alike.
     """
 
     effort: Effort
@@ -45,6 +49,17 @@ class EffortResult:
     features: list[Features] = field(default_factory=list)
     matched: dict[Pair, TwoView] = field(default_factory=dict)
     mapped: mapper.Mapped | None = None
+    left_out: frozenset[Pair] = frozenset()
+
+    @property
+    def verified(self) -> list[Pair]:
+        """The edges of the view graph: pairs with enough inliers."""
+        return [pair for pair, found in self.matched.items() if found.inliers >= MIN_INLIERS]
+
+    @property
+    def view_graph(self) -> Path:
+        """COLMAP's database that `mapped` was made from: without the pairs `left_out`."""
+        return self.store.folder / UNFOLDED if self.left_out else self.store.database
 
 
 @dataclass

@@ -19,13 +19,15 @@ from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.scene import Scene
 from splatmill_worker.sfm import cameras, checks, stereo
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if
-from splatmill_worker.sfm.effort import ENOUGH_REGISTERED, registered_counts, solve_at, verified_pairs
+from splatmill_worker.sfm.effort import solve_at
 from splatmill_worker.sfm.final_model import final_model
 from splatmill_worker.sfm.frame import require_photos
 from splatmill_worker.sfm.model_store import is_stored, load_model, store_model
 from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions, fitted
 from splatmill_worker.sfm.placed import PlacingObserver
 from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest, torch_threads
+from splatmill_worker.sfm.trials import ENOUGH_REGISTERED, registered_counts
+from splatmill_worker.sfm.unfold import unfold
 
 log = logging.getLogger("splatmill_worker")
 
@@ -144,7 +146,8 @@ def _solve(run: SfmRun) -> EffortResult:
             best, best_counts = result, counts
         if best_counts[0] >= ENOUGH_REGISTERED * run.count:
             break
-        if effort.name != LEAN.name and not verified_pairs(result):
+        if effort.name != LEAN.name and not result.verified:
             break  # the standard effort has about three times the lean one's features; even more would not match
     assert best is not None  # _efforts returns at least one
+    unfold(run, best)
     return best

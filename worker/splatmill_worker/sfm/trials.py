@@ -1,0 +1,75 @@
+"""The best of up to three mappings of the same view graph."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from splatmill_worker.sfm import checks
+from splatmill_worker.sfm.mapping import mapper
+from splatmill_worker.sfm.matching import pairs
+from splatmill_worker.sfm.run import SfmRun
+
+ENOUGH_REGISTERED = 0.9
+"""Share of the photos, reliably registered, from which no higher effort is tried; and of those that the view graph
+connects, from which no other mapper is."""
+
+GLOBAL_MIN_PHOTOS = 400
+"""Photos from which the global mapper is tried first, where the view graph is dense."""
+
+GLOBAL_MIN_DEGREE = 5
+"""Verified pairs per photo from which a view graph counts as dense."""
+
+
+def registered_counts(mapped: mapper.Mapped | None) -> tuple[int, int]:
+    """Number of photos registered reliably in the largest model, and number of all those registered in it."""
+    if mapped is None:
+        return 0, 0
+    return len(checks.reliably_registered(mapped.largest)), mapped.registered
+
+
+def best_mapping(run: SfmRun, database: Path, verified: Collection[pairs.Pair]) -> mapper.Mapped:
+    """The best of up to three mappings: with the likelier mapper, with the other one, and with relaxed settings.
+
+    No mapper registers photos that the view graph does not connect, so the next one is not tried where the last
+    registered ENOUGH_REGISTERED of the photos that are connected.
+
+    database: COLMAP's, with the two-view geometries of the `verified` pairs.
+    """
+    asked = run.options.mapper
+    connected = len(pairs.connected_components(run.count, verified)[0])
+    first: mapper.Mapper = "incremental"
+    if asked != "auto":
+        first = asked
+    elif run.best_mapper is not None:
+        first = run.best_mapper
+    elif run.count >= GLOBAL_MIN_PHOTOS and len(verified) >= GLOBAL_MIN_DEGREE * run.count:
+        first = "global"
+    trials: list[tuple[mapper.Mapper, bool]] = [(first, False)]
+    if asked == "auto":
+        trials.append(("global" if first == "incremental" else "incremental", False))
+    if asked != "global":
+        trials.append(("incremental", True))
+    best: mapper.Mapped | None = None
+    best_rank = 0, 0
+    with run.clock("mapping"):
+        for name, relaxed in trials:
+            mapped = mapper.run(
+                name,
+                database,
+                run.count,
+                run.threads,
+                run.options.seed,
+                relaxed=relaxed,
+                on_progress=lambda done, total: run.on_progress("mapping", done, total, "photos registered"),
+                on_model=run.show,
+                cancelled=run.cancelled,
+            )
+            rank = registered_counts(mapped)
+            if best is None or rank > best_rank:
+                best, best_rank = mapped, rank
+            if best_rank[0] >= ENOUGH_REGISTERED * connected:
+                break
+    assert best is not None  # there is at least one trial
+    run.best_mapper = best.mapper
+    return best
