@@ -24,6 +24,11 @@ class Poses:
             for number in model.reg_image_ids()
         }
 
+    @property
+    def photos(self) -> set[int]:
+        """Indices of the registered photos."""
+        return set(self._images)
+
     def have(self, pair: Pair) -> bool:
         """Whether both photos are registered."""
         return pair[0] in self._images and pair[1] in self._images

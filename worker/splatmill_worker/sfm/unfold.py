@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -52,12 +53,12 @@ KEPT_REGISTERED = 0.9
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A mapping without the pairs `left_out`, and the witnesses that it contradicts."""
+    """A mapping without the pairs `left_out`, the witnesses that it contradicts, and COLMAP's database of it."""
 
     mapped: mapper.Mapped
     left_out: frozenset[Pair]
     contradicted: frozenset[Pair]
-    name: str
+    database: Path
 
 
 def unfold(run: SfmRun, result: EffortResult) -> None:
@@ -107,38 +108,46 @@ class _Unfolding:
         for reach in CHAIN_REACHES:
             neighbours = _within(self._orders, reach)
             chain = self._mapped_without(self._verified - neighbours, "chain.db")
-            if chain.mapped.registered >= enough:
+            links = [Poses(model) for model in chain.mapped.models]
+            if self._in_one_piece(links) >= enough:
                 break
-        pieces = [_Placement(self._folded, Poses(model), self._orders) for model in chain.mapped.models]
+        pieces = [_Placement(self._folded, poses, self._orders) for poses in links]
         leaps = [
             pair
             for pair in against
             if any(piece.holds(pair) and piece.is_elsewhere(pair, 1.0) for piece in pieces)
         ]
-        if not leaps:
-            return
-        alike = frozenset(
-            pair
-            for pair in self._verified - neighbours
-            if not any(self._keeps(piece, pair) for piece in pieces)
-        )
+        alike = frozenset(pair for pair in self._verified - neighbours if not self._keeps(pieces, pair))
         tried = [chain]
-        if alike:
+        if leaps and alike:
             tried.insert(0, self._mapped_without(alike, "without-alike.db"))
-        best = min(tried, key=lambda candidate: len(candidate.contradicted))
-        better = len(best.contradicted) < len(against) and registered_counts(best.mapped)[0] >= enough
-        self._note(leaps, len(alike), better)
-        if better:
-            (self._result.store.folder / best.name).replace(self._result.store.folder / UNFOLDED)
-            self._result.mapped, self._result.left_out = best.mapped, best.left_out
+            kept = [each for each in tried if registered_counts(each.mapped)[0] >= enough]
+            best = min(kept, key=lambda each: len(each.contradicted), default=None)
+            if best is not None and len(best.contradicted) < len(against):
+                best.database.replace(self._result.store.folder / UNFOLDED)
+                self._result.mapped, self._result.left_out = best.mapped, best.left_out
+            self._note(min(leaps), len(self._result.left_out or alike), bool(self._result.left_out))
+        for each in tried:
+            each.database.unlink(missing_ok=True)
 
-    def _keeps(self, piece: _Placement, pair: Pair) -> bool:
-        """Whether a model of the chain speaks for a pair."""
-        if not piece.holds(pair):
-            return False
-        if self._share(piece.chain, pair) >= EXPLAINED:
-            return True
-        return not piece.is_elsewhere(pair, MAX_SHIFT) and self._share(self._folded, pair) >= EXPLAINED
+    def _in_one_piece(self, links: list[Poses]) -> int:
+        """Number of photos in the largest piece of each order."""
+        return sum(
+            max((len(poses.photos.intersection(order)) for poses in links), default=0)
+            for order in self._orders
+        )
+
+    def _keeps(self, pieces: list[_Placement], pair: Pair) -> bool:
+        """Whether the chain speaks for a pair, or the folded model does and the chain says nothing."""
+        explained = self._folded.have(pair) and self._share(self._folded, pair) >= EXPLAINED
+        holding = [piece for piece in pieces if piece.holds(pair)]
+        if not holding:
+            return explained
+        return any(
+            (explained and not piece.is_elsewhere(pair, MAX_SHIFT))
+            or self._share(piece.chain, pair) >= EXPLAINED
+            for piece in holding
+        )
 
     def _share(self, poses: Poses, pair: Pair) -> float:
         return agreement(poses, self._result, self._database, pair)
@@ -160,10 +169,10 @@ class _Unfolding:
         contradicted = (
             self._contradicted_by(Poses(largest)) if largest is not None else frozenset(self._witnesses)
         )
-        return _Candidate(mapped, left_out, contradicted, name)
+        return _Candidate(mapped, left_out, contradicted, path)
 
-    def _note(self, leaps: list[Pair], alike: int, better: bool) -> None:
-        first, second = (self._run.prepared.photos[photo].name for photo in min(leaps))
+    def _note(self, leap: Pair, alike: int, better: bool) -> None:
+        first, second = (self._run.prepared.photos[photo].name for photo in leap)
         found = (
             f"Sides of the scene look alike: {alike} pairs of photos match because of it, and the cameras that they "
             f"led to leap between photos that were taken one after the other (first {first} and {second})."
