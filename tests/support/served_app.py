@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import socket
 import struct
 import threading
@@ -174,7 +175,11 @@ def raw(
 
 
 def stored(app: ServedApp) -> list[str]:
-    """Every file in storage."""
+    """Every file in storage. Folders may go while they are read, as the server removes them."""
     root = app.service.storage.root
     assert root is not None
-    return sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.is_file())
+    return sorted(
+        os.path.relpath(os.path.join(folder, name), root)
+        for folder, _, names in os.walk(root)
+        for name in names
+    )

@@ -82,12 +82,14 @@ class Resumption:
 
     obstore repeats a reading itself, but only until a fixed time after its first request, which a long download or a
     slow reader exceeds. Here every byte that comes makes the count of repetitions begin anew.
+
+    version: of the file to read, as storage names it; None for that which the first request finds.
     """
 
-    def __init__(self, start: int, end: int | None, retries: int) -> None:
+    def __init__(self, start: int, end: int | None, retries: int, version: str | None = None) -> None:
         self.position = start
         self._end = end
-        self._etag: str | None = None
+        self._etag = version
         self._retries = retries
         self._failures = 0
 

@@ -55,12 +55,14 @@ class Entry:
     size: in bytes.
     etag: without quotes.
     modified: time of the last write.
+    version: the name that storage itself has for these contents; None where it has none.
     """
 
     path: str
     size: int
     etag: str
     modified: datetime
+    version: str | None = None
 
 
 class Storage:
@@ -208,16 +210,19 @@ class Storage:
                 if ended:
                     await obstore.put_async(self.bulk, path, first, use_multipart=False)
                     return
-                chunks = _joined(first, chunks)
+                chunks = joined(first, chunks)
             await obstore.put_async(self.bulk, path, chunks, chunk_size=BLOCK, max_concurrency=2)
 
-    async def stream_get(self, path: str, start: int = 0, end: int | None = None) -> AsyncIterator[bytes]:
-        """Yield the bytes [start, end) in pieces of about CHUNK. Raises FileNotFoundError before the first piece.
+    async def stream_get(
+        self, path: str, start: int = 0, end: int | None = None, version: str | None = None
+    ) -> AsyncIterator[bytes]:
+        """Yield the bytes [start, end) in pieces of about CHUNK. Raises FileNotFoundError before the first piece, and
+        StorageChangedError where the file is no longer of the `version` that an Entry tells.
 
         A reading that breaks off goes on behind the last piece, as long as it makes progress. A reader that is slow
         delays nothing and holds a few pieces in memory.
         """
-        reading = Resumption(start, end, self._patience.retries)
+        reading = Resumption(start, end, self._patience.retries, version)
         while True:
             try:
                 with self._watched("read", path):
@@ -377,7 +382,8 @@ async def _first_block(chunks: AsyncIterator[bytes]) -> tuple[bytes, bool]:
     return bytes(first), True
 
 
-async def _joined(first: bytes, rest: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+async def joined(first: bytes, rest: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    """Yield `first`, then what `rest` yields."""
     yield first
     async for chunk in rest:
         yield chunk
@@ -385,4 +391,4 @@ async def _joined(first: bytes, rest: AsyncIterator[bytes]) -> AsyncIterator[byt
 
 def _entry(meta: "obstore.ObjectMeta") -> Entry:
     etag = (meta["e_tag"] or f"{meta['size']:x}-{meta['last_modified'].timestamp()}").removeprefix("W/")
-    return Entry(meta["path"], meta["size"], etag.strip('"'), meta["last_modified"])
+    return Entry(meta["path"], meta["size"], etag.strip('"'), meta["last_modified"], meta["e_tag"])

@@ -1,6 +1,5 @@
 """Responses with stored files: ETag, If-None-Match, Range and HEAD (RFC 9110). Files are streamed."""
 
-from collections.abc import AsyncIterator
 from datetime import UTC
 from email.utils import format_datetime
 from urllib.parse import quote
@@ -9,8 +8,12 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
-from splatmill.backplane.storage import Entry, Storage
+from splatmill.backplane.storage import Entry, Storage, joined
+from splatmill.backplane.storage_errors import StorageChangedError
 from splatmill_server.problems import ProblemError
+
+_LOOKS = 3
+"""How often a file is looked up that is replaced each time before it is read."""
 
 
 async def file_response(
@@ -23,9 +26,23 @@ async def file_response(
 ) -> Response:
     """Return a response with the file at `path`, or with the requested range of it.
 
-    With `download_name`, browsers save the file under that name. Raises a 404 problem if there is no such file, and a
-    416 problem for a range outside of it.
+    With `download_name`, browsers save the file under that name. A file that is replaced before its first byte was
+    read, as previews are, is looked up again. Raises a 404 problem if there is no such file, and a 416 problem for a
+    range outside of it.
     """
+    for left in reversed(range(_LOOKS)):
+        try:
+            return await _response(request, storage, path, media_type, download_name)
+        except StorageChangedError:
+            if not left:
+                raise
+    raise AssertionError("the last look returns or raises")
+
+
+async def _response(
+    request: Request, storage: Storage, path: str, media_type: str, download_name: str | None
+) -> Response:
+    """Return the response for the file as it is now. Raises StorageChangedError if it is replaced meanwhile."""
     entry = await run_in_threadpool(storage.head, path)
     if entry is None:
         raise ProblemError("file_not_found", f"There is no file at {request.url.path}.")
@@ -54,13 +71,13 @@ async def file_response(
     status = 200 if wanted is None else 206
     if request.method == "HEAD" or start == end:
         return Response(status_code=status, headers=headers)
-    return StreamingResponse(_read(storage, entry, start, end), status, headers)
-
-
-async def _read(storage: Storage, entry: Entry, start: int, end: int) -> AsyncIterator[bytes]:
     whole = start == 0 and end == entry.size
-    async for chunk in storage.stream_get(entry.path, start, None if whole else end):
-        yield chunk
+    chunks = storage.stream_get(entry.path, start, None if whole else end, entry.version)
+    try:
+        first = await anext(chunks)
+    except FileNotFoundError:
+        raise ProblemError("file_not_found", f"There is no file at {request.url.path}.") from None
+    return StreamingResponse(joined(first, chunks), status, headers)
 
 
 def matches(header: str | None, etag: str) -> bool:
