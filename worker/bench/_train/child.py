@@ -11,8 +11,9 @@ from pathlib import Path
 
 from _rows import Row
 
+from _train import few
 from _train.rows import BenchRun
-from _train.scenes import Scene
+from _train.scenes import Scene, named
 
 LAST_WORDS = 2000
 """Characters of a failed process's standard error that are shown."""
@@ -47,9 +48,13 @@ def judged(scene: Scene, name: str, model: Path, seconds: float, work: Path) -> 
 
 
 def located(scene: Scene, work: Path) -> Row:
-    """Where a job finds the capture of a scene, and keeps its cameras."""
+    """Where a job finds the capture of a scene and keeps its cameras, and so for the scene that it is a part of."""
     kept = work / scene.name / "sfm"
-    return {"capture": str(scene.folder), "made": scene.made, "sfm": str(kept.resolve())}
+    place: Row = {"capture": str(scene.folder), "made": scene.made, "sfm": str(kept.resolve())}
+    if scene.name in few.SCENES:
+        whole = named(few.SCENES[scene.name][0], work)
+        place["whole"] = {**located(whole, work), "options": whole.options}
+    return place
 
 
 def _ask(job: Row) -> Row:

@@ -16,7 +16,7 @@ import torch
 from _rows import Row, origin, worked
 from torch import Tensor
 
-from _train import bare
+from _train import bare, few
 from _train.configurations import revised
 from _train.lpips import Lpips
 from _train.outliers import judged
@@ -211,6 +211,11 @@ def _posed(job: Row, options: TrainOptions) -> Scene:
     if job["made"] in bare.SCENES:
         if not capture.is_dir():
             bare.make(job["made"], capture, PHOTOS)
+    elif job["made"] in few.SCENES:
+        if not capture.is_dir():
+            whole = TrainOptions.model_validate(job["whole"]["options"])
+            scene = _posed(job["whole"], whole)
+            few.make(job["made"], capture, scene, *split_views(scene, whole))
     elif job["made"] and not (capture / "images").is_dir():
         part = capture / "images.part"
         synthetic.capture(part, PHOTOS, **MADE[job["made"]], truth=capture / TRUTH)
