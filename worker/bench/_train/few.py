@@ -15,7 +15,7 @@ from splatmill_worker.sfm.posed.written import model_of
 COUNTS = (9, 16)
 """Training photos that are left: as many as kermit has, and more than FEW_VIEWS."""
 
-HELD_OUT = {"fox": 7, "lund": 4, "synthetic": 5, "beer": 9, "snowmiku": 12}
+HELD_OUT = {"fox": 7, "lund": 4, "synthetic": 5, "beer": 9, "snowmiku": 12, "unequal": 5, "tone-mapped": 5}
 """The scenes, and their held-out photos, all of which are kept. Those with points and more than 16 training photos."""
 
 SCENES = {f"{whole}-{count}": (whole, count) for whole in HELD_OUT for count in COUNTS}

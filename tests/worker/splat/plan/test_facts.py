@@ -170,6 +170,8 @@ def test_geometry_is_measured() -> None:
     assert seen.distance_ratio is not None
     assert 1.0 <= seen.distance_ratio < 4.0
     assert (seen.views, seen.held_out, seen.width, seen.height) == (14, 2, 96, 72)
+    directions = np.array([view.full.camera.viewmat[2, :3] for view in views])
+    assert seen.alignment == pytest.approx(float(np.sqrt((directions @ directions.T).mean())))
     without = measure(still_life.scene(), still_life.training_views(), 0, None)
     assert without.exposure_spread is None
     assert without.view_angle is None

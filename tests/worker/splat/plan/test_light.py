@@ -97,6 +97,24 @@ def test_light_that_follows_the_camera_is_left_in_and_a_jump_is_taken_out() -> N
     assert departing.departures[17].mean() == pytest.approx(0.3, abs=0.04)
 
 
+def test_what_photos_tell_of_one_another_falls_with_their_distance() -> None:
+    """By a simulation of the same light: what the best linear prediction from all other photos leaves."""
+    assert on_a_ring(36, np.zeros((36, 3))).unseen < 0.02
+    assert on_a_ring(4, np.zeros((4, 3))).unseen > 0.95
+    found = on_a_ring(12, np.zeros((12, 3)))
+    rng = np.random.default_rng(0)
+    turns = 2 * np.pi * np.arange(12) / 12
+    # Places and directions lie on the same circle, so that squared distances count twice.
+    apart = 2 * (2 - 2 * np.cos(turns[:, None] - turns[None]))
+    smooth = np.exp(-0.5 * apart / 0.5**2) + 1e-9 * np.eye(12)
+    values = rng.multivariate_normal(np.zeros(12), smooth, size=20_000) + 5.0
+    others = np.delete(values, 0, axis=1) + 0.1 * rng.standard_normal((20_000, 11))
+    rest = others - others.mean(axis=1, keepdims=True)
+    target = values[:, 0] - others.mean(axis=1)
+    left = target - rest @ np.linalg.lstsq(rest, target, rcond=None)[0]
+    assert found.unseen == pytest.approx(left.var(), rel=0.05)
+
+
 def test_exposures_drawn_apart_are_taken_out_whole() -> None:
     drawn = np.repeat(0.3 * np.random.default_rng(1).standard_normal(36)[:, None], 3, axis=1)
     found = on_a_ring(36, drawn)

@@ -22,6 +22,9 @@ BARE: dict[str, Any] = {"gap_share": 0.4, "gap_points": 500, "sightings": 80.0}
         ({"sky_share": 0.0}, True),
         ({"sky_share": 0.01, "views": 11}, False),
         ({"sky_share": 0.3, "views": 11}, True),
+        ({"sky_share": 0.01, "views": 11, "alignment": 0.6}, True),
+        ({"sky_share": 0.01, "views": 11, "alignment": 0.65}, False),
+        ({"sky_share": 0.01, "views": 12, "alignment": 0.65}, True),
         ({"sky_share": None}, False),
         ({"sky_share": None, "transparent": 43}, False),
         ({"sky_share": 0.3, "start": MODEL}, False),
@@ -42,6 +45,14 @@ def test_gaps_are_left_when_few_photos_could_correct_a_guess() -> None:
     few = planned(changed(**BARE, views=11))
     assert not few.gaps
     assert "11 photos are too few" in few.left_out["gaps"]
+
+
+def test_gaps_are_left_where_photos_of_the_other_side_look_through_them() -> None:
+    assert planned(changed(**BARE, alignment=0.65)).gaps
+    around = planned(changed(**BARE, alignment=0.6))
+    assert not around.gaps
+    assert "more than half a turn" in around.left_out["gaps"]
+    assert planned(changed(**BARE, alignment=0.6), gaps="on").gaps
 
 
 def test_gaussians_added_beside_points_count_among_the_first_ones() -> None:

@@ -58,6 +58,14 @@ def test_light_is_evened_where_one_photo_in_ten_departs_from_those_around_it() -
     assert not planned(changed(light_tail=float("nan"))).exposure
 
 
+def test_light_is_left_where_photos_are_too_far_apart_to_tell_of_one_another() -> None:
+    assert planned(changed(light_tail=0.3, light_unseen=0.2)).exposure
+    apart = planned(changed(light_tail=0.3, light_unseen=0.3))
+    assert not apart.exposure
+    assert "too far apart" in apart.left_out["exposure"]
+    assert planned(changed(light_tail=0.3, light_unseen=0.3), exposure="on").exposure
+
+
 def test_light_that_cannot_be_compared_is_not_evened_on_demand() -> None:
     assert "cannot be compared" in planned(changed(light_tail=None)).left_out["exposure"]
     with pytest.raises(ValueError, match="points that several photos show"):

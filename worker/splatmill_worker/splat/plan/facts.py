@@ -71,7 +71,10 @@ class Facts:
     light_tail: departure of a photo's exposure or white balance from what the photos around it predict, natural
         logarithm; nine photos in ten depart less.
     light_error: median standard error of the photos' exposures, natural logarithm.
+    light_unseen: share of smooth light that the photos around do not predict, because they are too far away, 0 to 1.
     lens_residual: largest displacement of a pixel by lens distortion, pixels.
+    alignment: length of the mean viewing direction: 1 where all photos look the same way, 2 over pi where they look
+        evenly over half a turn, 0 over a whole turn.
     sightings: median number of points that a photo shows.
     sky_share: share of the photos' area that looks like sky and shows no point, 0 to 1.
     gap_share: share of the photos' area, sky excluded, with no point in or beside it, 0 to 1.
@@ -103,7 +106,9 @@ class Facts:
     tint_spread: float | None = None
     light_tail: float | None = None
     light_error: float | None = None
+    light_unseen: float | None = None
     lens_residual: float | None = None
+    alignment: float | None = None
     sightings: float | None = None
     sky_share: float | None = None
     gap_share: float | None = None
@@ -145,6 +150,8 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
         tint_spread=None if light is None else light.tint_spread,
         light_tail=None if light is None else light.tail,
         light_error=None if light is None else light.error,
+        light_unseen=None if light is None else light.unseen,
+        alignment=_alignment(views),
         view_angle=None if seen is None else seen.view_angle(_own_points(scene)),
         distance_ratio=None if seen is None else seen.distance_ratio(),
         reprojection=_reprojection(scene, max(width, height)),
@@ -165,6 +172,13 @@ def halving_loss(rgb: torch.Tensor) -> float:
     small = torch.nn.functional.interpolate(planes, size=(height // 2, width // 2), mode="area")
     again = torch.nn.functional.interpolate(small, size=(height, width), mode="bicubic", align_corners=False)
     return float((again - planes).square().mean().sqrt())
+
+
+def _alignment(views: Sequence[TrainingView]) -> float | None:
+    """`Facts.alignment`; None without photos."""
+    if not views:
+        return None
+    return float(np.linalg.norm(np.mean([view.full.camera.viewmat[2, :3] for view in views], axis=0)))
 
 
 def _coverage(scene: Scene, views: Sequence[TrainingView]) -> dict[str, Any]:

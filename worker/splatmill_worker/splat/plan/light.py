@@ -36,6 +36,12 @@ chord between the directions. The one that predicts best is taken."""
 SHARES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Variances of what is not smooth, over the variance of what is. The one that predicts best is taken."""
 
+SMOOTH_REACH = 0.5
+"""The shortest of REACHES that predicts best where light is smooth (decisions: LIGHT_UNSEEN)."""
+
+SMOOTH_NOISE = 0.01
+"""Share, as in SHARES, that goes with it."""
+
 CLEAR = 2.0
 """Standard errors by which the prediction has to be better than a constant: one of many may be so by chance."""
 
@@ -50,11 +56,14 @@ class Light:
     exposures: [n, 3]; their mean over photos is zero. Zero for a photo that shows too few points.
     departures: the part of them [n, 3] that the photos around do not predict; its mean is zero too.
     errors: standard error of an exposure [n], from the spread of the photo's points; infinite without an exposure.
+    unseen: share of the variance of light that is smooth over SMOOTH_REACH which the photos around would leave
+        unpredicted: 0 where photos are close to one another, 1 where none tells anything of another.
     """
 
     exposures: Float
     departures: Float
     errors: Float
+    unseen: float
 
     @property
     def spread(self) -> float:
@@ -114,9 +123,10 @@ def compared(seen: Observations, views: Sequence[TrainingView]) -> Light | None:
     places -= places.mean(axis=0)
     places /= max(float(np.linalg.norm(places, axis=1).max()), 1e-12)
     directions = np.array([camera.viewmat[2, :3] for camera in cameras])
+    apart = _squared_distances(places) + _squared_distances(directions)
     departures = np.zeros_like(exposures)
-    departures[known] = _unpredicted(exposures[known], places, directions)
-    return Light(exposures, departures, errors)
+    departures[known] = _unpredicted(exposures[known], apart)
+    return Light(exposures, departures, errors, _unseen(apart))
 
 
 def _exposures(seen: Observations) -> tuple[Float, Float]:
@@ -147,17 +157,18 @@ def _exposures(seen: Observations) -> tuple[Float, Float]:
     return exposures, errors
 
 
-def _unpredicted(exposures: Float, places: Float, directions: Float) -> Float:
-    """What the exposures [n, 3] differ by from those that a smooth function of the other photos' cameras predicts."""
-    apart = _squared_distances(places) + _squared_distances(directions)
+def _unpredicted(exposures: Float, apart: Float) -> Float:
+    """What the exposures [n, 3] differ by from those that a smooth function of the other photos' cameras predicts.
+
+    apart: squared distances of the cameras [n, n].
+    """
     count = len(exposures)
-    constant = np.full((count, count), 1e3)  # a prior so wide that the mean is free
     brightness = exposures.mean(axis=1)
     kernels = [(np.zeros((count, count)), 1.0)]  # a constant alone
     kernels += [(np.exp(-0.5 * apart / reach**2), share) for reach in REACHES for share in SHARES]
     found: list[tuple[Float, Float]] = []
     for kernel, share in kernels:
-        inverse = np.linalg.inv(kernel + constant + share * np.eye(count))
+        inverse = _precision(kernel, share)
         left = inverse / np.diag(inverse)[:, None]  # times the values: the error of each from all others
         found.append((np.abs(left @ brightness), left @ exposures))
     (plain, by_constant), (least, rest) = found[0], min(found, key=lambda each: float(each[0].mean()))
@@ -166,6 +177,21 @@ def _unpredicted(exposures: Float, places: Float, directions: Float) -> Float:
         rest = by_constant
     centred: Float = rest - rest.mean(axis=0)
     return centred
+
+
+def _unseen(apart: Float) -> float:
+    """`Light.unseen` of cameras whose squared distances are `apart` [n, n]."""
+    precision = _precision(np.exp(-0.5 * apart / SMOOTH_REACH**2), SMOOTH_NOISE)
+    # What is left of a value that all others predict has one over the diagonal as its variance, noise included.
+    left = 1.0 / np.diag(precision) - SMOOTH_NOISE
+    return float(np.clip(np.median(left), 0.0, 1.0))
+
+
+def _precision(kernel: Float, noise: float) -> Float:
+    """Inverse covariance [n, n] of a Gaussian process with `kernel`, a free mean, and noise."""
+    wide = 1e3  # variance of the mean: so large that it is free
+    covariance: Float = kernel + wide + noise * np.eye(len(kernel))
+    return np.asarray(np.linalg.inv(covariance), np.float64)
 
 
 def _squared_distances(points: Float) -> Float:

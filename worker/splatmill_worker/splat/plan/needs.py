@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from splatmill.schema import Switch, TrainOptions
@@ -17,6 +18,9 @@ MANY_GAPS = 0.1
 
 FEW_VIEWS = 12
 """Number of training photos below which training does not correct guessed depths (decisions: FEW_VIEWS)."""
+
+HALF_TURN = 2 / math.pi
+"""Alignment of photos that look evenly over half a turn (decisions: FEW_VIEWS, gaps)."""
 
 MIN_POSE_ERROR = 1.0
 """Reprojection error, in pixels at the training size, from which cameras are corrected: the photos do not resolve
@@ -103,10 +107,11 @@ def _far_shell(facts: Facts) -> tuple[bool, str]:
     if facts.sky_share is None:
         return False, "There are too few points to tell how far the scene extends."
     seen = f"{100 * facts.sky_share:.0f} % of the photos look like sky"
-    if facts.views < FEW_VIEWS and facts.sky_share < MUCH_SKY:
+    to_one_side = facts.alignment is None or facts.alignment > HALF_TURN
+    if facts.views < FEW_VIEWS and facts.sky_share < MUCH_SKY and to_one_side:
         return (
             False,
-            f"{seen}, and {facts.views} photos are too few to tell whether anything else is as far away.",
+            f"{seen}, and {facts.views} photos to one side are too few to tell whether anything else is as far away.",
         )
     return (
         True,
@@ -131,6 +136,11 @@ def _gaps(facts: Facts) -> tuple[bool, str]:
         return False, f"Only {seen}."
     if facts.views < FEW_VIEWS:
         return False, f"{seen}, but {facts.views} photos are too few to correct guessed depths."
+    if facts.alignment is not None and facts.alignment <= HALF_TURN:
+        return False, (
+            f"{seen}, but the photos look over more than half a turn, so that those of one side would look through what is "
+            "guessed from the other; the far shell stands behind."
+        )
     return True, f"{seen}: {facts.gap_points} Gaussians are added there, at the depth of the nearest points."
 
 

@@ -27,6 +27,10 @@ LIGHT_DEPARTS = 0.075
 """Natural logarithm: where one photo in ten departs more from the light of the photos around it, departures are taken
 out (decisions: LIGHT_DEPARTS)."""
 
+LIGHT_UNSEEN = 0.25
+"""Share of smooth light that the photos around may leave unpredicted, half of it in standard deviations: where they
+tell less, what departs from them may be smooth, and held-out photos share it (decisions: LIGHT_UNSEEN)."""
+
 CERTAIN = 3.0
 """Standard errors of an exposure that a departure exceeds at least, to be one."""
 
@@ -129,6 +133,11 @@ def _exposure(facts: Facts) -> tuple[bool, str]:
         return False, f"{seen}; exposures are corrected from {100 * LIGHT_DEPARTS:.0f} %."
     if not tail >= CERTAIN * error:
         return False, f"{seen}, which an error of {100 * error:.1f} % of their exposures may explain."
+    if facts.light_unseen is None or facts.light_unseen > LIGHT_UNSEEN:
+        return False, (
+            f"{seen}, but the photos are too far apart to tell a change of exposure from light that changes with the "
+            "direction of view."
+        )
     return True, f"{seen}, so exposure and white balance of the training photos are corrected."
 
 
