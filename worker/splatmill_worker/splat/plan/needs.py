@@ -138,8 +138,8 @@ def _gaps(facts: Facts) -> tuple[bool, str]:
         return False, f"{seen}, but {facts.views} photos are too few to correct guessed depths."
     if facts.alignment is not None and facts.alignment <= HALF_TURN:
         return False, (
-            f"{seen}, but the photos look over more than half a turn, so that those of one side would look through what is "
-            "guessed from the other; the far shell stands behind."
+            f"{seen}, but the photos look over more than half a turn, so that those of one side would look through "
+            "what is guessed from the other; the far shell stands behind."
         )
     return True, f"{seen}: {facts.gap_points} Gaussians are added there, at the depth of the nearest points."
 
