@@ -50,10 +50,10 @@ def make(name: str, capture: Path, scene: Scene, train: Sequence[View], test: Se
     for folder in ("images", "poses"):
         (part / folder).mkdir(parents=True)
     names = [*(f"train-{at:02d}.jpg" for at in range(count)), *kept_out]
-    for photo, view in zip(names, (*chosen, *test), strict=True):
-        (part / "images" / photo).symlink_to(view.image.resolve())
+    views = [replace(view, name=name) for name, view in zip(names, (*chosen, *test), strict=True)]
+    for view in views:
+        (part / "images" / view.name).symlink_to(view.image.resolve())
     thinned = _thinned(scene, chosen)
-    views = [replace(view, name=photo) for photo, view in zip(names, (*chosen, *test), strict=True)]
     model_of(views, thinned.points, thinned).write_binary(part / "poses")
     part.rename(capture)
 

@@ -73,8 +73,8 @@ class Facts:
     light_error: median standard error of the photos' exposures, natural logarithm.
     light_unseen: share of smooth light that the photos around do not predict, because they are too far away, 0 to 1.
     lens_residual: largest displacement of a pixel by lens distortion, pixels.
-    alignment: length of the mean viewing direction: 1 where all photos look the same way, 2 over pi where they look
-        evenly over half a turn, 0 over a whole turn.
+    alignment: length of the mean viewing direction: 1 where all photos look the same way; of those that look level, 2
+        over pi where they look evenly over half a turn, and 0 over a whole turn.
     sightings: median number of points that a photo shows.
     sky_share: share of the photos' area that looks like sky and shows no point, 0 to 1.
     gap_share: share of the photos' area, sky excluded, with no point in or beside it, 0 to 1.

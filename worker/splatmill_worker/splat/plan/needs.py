@@ -20,7 +20,7 @@ FEW_VIEWS = 12
 """Number of training photos below which training does not correct guessed depths (decisions: FEW_VIEWS)."""
 
 HALF_TURN = 2 / math.pi
-"""Alignment of photos that look evenly over half a turn (decisions: FEW_VIEWS, gaps)."""
+"""Alignment of photos that look level and evenly over half a turn (decisions: FEW_VIEWS, gaps)."""
 
 MIN_POSE_ERROR = 1.0
 """Reprojection error, in pixels at the training size, from which cameras are corrected: the photos do not resolve
@@ -139,7 +139,7 @@ def _gaps(facts: Facts) -> tuple[bool, str]:
     if facts.alignment is not None and facts.alignment <= HALF_TURN:
         return False, (
             f"{seen}, but the photos look over more than half a turn, so that those of one side would look through "
-            "what is guessed from the other; the far shell stands behind."
+            "what is guessed from the other."
         )
     return True, f"{seen}: {facts.gap_points} Gaussians are added there, at the depth of the nearest points."
 
