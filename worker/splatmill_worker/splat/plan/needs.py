@@ -20,7 +20,7 @@ FEW_VIEWS = 12
 """Number of training photos below which training does not correct guessed depths (decisions: FEW_VIEWS)."""
 
 HALF_TURN = 2 / math.pi
-"""Alignment of photos that look level and evenly over half a turn (decisions: FEW_VIEWS, gaps)."""
+"""Alignment of photos that look level and evenly over half a turn (decisions: FEW_VIEWS)."""
 
 MIN_POSE_ERROR = 1.0
 """Reprojection error, in pixels at the training size, from which cameras are corrected: the photos do not resolve
