@@ -32,6 +32,7 @@ from splatmill_worker.sfm.posed.written import write_cameras
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.plan.capacity import resolved
 from splatmill_worker.splat.plan.decide import decide
 from splatmill_worker.splat.plan.facts import Facts, measure
 from splatmill_worker.splat.plan.light import light_of
@@ -287,7 +288,9 @@ def _measure_facts(
     task: Task, cameras: Cameras, photos: Photos, gaussians: Gaussians, start: GivenModel | None
 ) -> Facts:
     """What can be measured before training: the scene, and how fast this machine trains it."""
-    speed = probe(open_engine(gaussians, task.kernels), photos.training)
+    pixels = photos.training[0].full.rgb[..., 0].numel()
+    most = resolved(pixels, len(photos.training))
+    speed = probe(open_engine(gaussians, task.kernels), photos.training, most=most)
     facts = replace(measure(cameras.world, photos.training, len(photos.held_out), speed), start=start)
     card = describe() if task.kernels == "gpu" else None
     return facts if card is None else replace(facts, memory_available=card.free_bytes)

@@ -18,9 +18,6 @@ GAUSSIANS_PER_ROOT_STEP = 1550.0
 PIXELS_PER_GAUSSIAN = 50
 """Pixels of all training photos for each Gaussian that they resolve (decisions: PIXELS_PER_GAUSSIAN)."""
 
-MEAN_STEP = 0.8
-"""Time of the mean step over that of the last: early steps have smaller photos and fewer Gaussians."""
-
 ASSUMED_SPEED = Speed(per_pixel=3e-8, per_gaussian=1e-7)
 """Speed of a machine that was not probed."""
 
@@ -82,8 +79,13 @@ def decide_densification(
     return reasons.switch("densify", options.densify, initial < most, because)
 
 
+def resolved(pixels: float, views: int) -> int:
+    """Gaussians that so many training photos of so many pixels resolve."""
+    return round(pixels * views / PIXELS_PER_GAUSSIAN)
+
+
 def _limits(facts: Facts, options: TrainOptions, kernels: Kernels, pixels: float, initial: int) -> _Limits:
-    by_photos = round(pixels * facts.views / PIXELS_PER_GAUSSIAN)
+    by_photos = resolved(pixels, facts.views)
     if kernels == "gpu":
         photo_bytes = round(3 * pixels * (facts.views + facts.held_out))
         by_memory = largest_budget(options.max_memory or facts.memory_available, round(pixels), photo_bytes)
@@ -134,11 +136,15 @@ def _time_budget(
 
 
 def _affordable_steps(seconds: float, speed: Speed, pixels: float, initial: int, most: int) -> int:
-    """Steps in `seconds` when the number of Gaussians grows with the steps from `initial`, up to `most`."""
+    """Steps in `seconds` when the number of Gaussians grows with the steps from `initial`, up to `most`.
+
+    Each is charged as the last one: that early steps have fewer Gaussians and smaller photos, and that photos of a
+    trained scene take longer than those of the probe, make up for one another (decisions: forecast).
+    """
 
     def fits(steps: int) -> bool:
         gaussians = min(most, max(initial, _trainable(steps)))
-        return MEAN_STEP * steps * speed.step(pixels, gaussians) <= seconds
+        return steps * speed.step(pixels, gaussians) <= seconds
 
     few, many = 10, 10**7
     while few + 1 < many:

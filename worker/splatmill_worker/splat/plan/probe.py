@@ -2,45 +2,88 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 
 import torch
 
 from splatmill_worker.kernels.records import Rates
+from splatmill_worker.splat.engine.open import gaussians_of
 from splatmill_worker.splat.engine.protocol import Engine
+from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.facts import Speed
 from splatmill_worker.splat.views import Target, TrainingView
 
 ZERO_RATES = Rates(means=0.0, log_scales=0.0, quats=0.0, logit_opacities=0.0, sh_dc=0.0, sh_rest=0.0)
 """Steps with these rates change no parameter."""
 
-REPEATS = 3
-"""Steps per size after the first one, which also warms up; the fastest of all counts."""
+GROWN = 32_768
+"""Gaussians of the scene that is timed: a step on the few Gaussians of the start is mostly fixed costs, and their
+large ellipses overlap unlike those of a trained scene (decisions: forecast)."""
+
+GROWN_OPACITY = 0.3
+"""Opacity of the Gaussians of the scene that is timed; that of the start, 0.1, makes lists longer than in training."""
+
+PHOTOS = 4
+"""Photos that are timed, evenly chosen."""
+
+REPEATS = 2
+"""Steps per photo and size after the first one, which also warms up; the fastest of all counts."""
 
 SMALL = 4
-"""Reduction of the photo of the second measurement."""
+"""Reduction of the photos of the second measurement."""
 
 
-def probe(engine: Engine, views: Sequence[TrainingView]) -> Speed:
+def probe(engine: Engine, views: Sequence[TrainingView], *, most: int = GROWN) -> Speed:
     """The time of a training step, divided into a part per pixel and a part per Gaussian.
 
-    The parameters of the engine are the same afterwards.
+    engine: holds the first Gaussians. Its parameters are the same afterwards.
+    most: number of Gaussians that the photos resolve; a scene is not timed with more, unless it starts with more.
 
-    Two sizes of the same photo are timed: the difference is the pixels' part, the rest is the Gaussians'. The
-    fastest of a few steps counts, since other programs can only add to the time.
+    What is timed is a scene that has grown from the first Gaussians, as training makes it (`grown`). Two sizes of the
+    same photos are timed: the difference is the pixels' part, the rest is the Gaussians'. The fastest of a few steps
+    counts, since other programs can only add to the time.
     """
-    view = views[len(views) // 2]
-    small, full = view.reduced(SMALL), view.full
     parameters = engine.parameters()
-    fast, slow = _seconds(engine, small), _seconds(engine, full)
+    engine.replace(grown(gaussians_of(engine), min(GROWN, most)).parameters(), None, None)
+    chosen = [views[(2 * at + 1) * len(views) // (2 * PHOTOS)] for at in range(PHOTOS)]
+    full, small = [view.full for view in chosen], [view.reduced(SMALL) for view in chosen]
+    slow, fast = _mean_seconds(engine, full), _mean_seconds(engine, small)
+    count = engine.count
     engine.replace(parameters, None, None)
-    pixels = full.camera.width * full.camera.height
-    small_pixels = small.camera.width * small.camera.height
+    for view in chosen:
+        view.forget_reduced()
+    pixels, small_pixels = _mean_pixels(full), _mean_pixels(small)
     # The lower bounds keep both parts positive when the noise of the timing exceeds their difference.
-    per_pixel = max(slow - fast, 1e-3 * slow) / max(1, pixels - small_pixels)
-    per_gaussian = max(fast - per_pixel * small_pixels, 0.05 * fast) / max(1, engine.count)
+    per_pixel = max(slow - fast, 1e-3 * slow) / max(1.0, pixels - small_pixels)
+    per_gaussian = max(fast - per_pixel * small_pixels, 0.05 * fast) / max(1, count)
     return Speed(per_pixel, per_gaussian)
+
+
+def grown(first: Gaussians, count: int) -> Gaussians:
+    """About `count` Gaussians that cover what `first` cover: copies, scattered by their own size and smaller by the
+    root of their number. `first` itself, of degree 3, where it has as many already.
+    """
+    copies = count // max(1, first.count)
+    whole = first.padded(3)
+    if copies < 2:
+        return whole
+    dice = torch.Generator().manual_seed(0)
+    many = whole.map(lambda value: value.repeat(copies, *[1] * (value.dim() - 1)))
+    scatter = torch.randn(many.means.shape, generator=dice).to(many.means)
+    many.means.add_(scatter * many.log_scales.exp())
+    many.log_scales.sub_(0.5 * math.log(copies))
+    many.logit_opacities.fill_(math.log(GROWN_OPACITY / (1.0 - GROWN_OPACITY)))
+    return many
+
+
+def _mean_seconds(engine: Engine, targets: Sequence[Target]) -> float:
+    return sum(_seconds(engine, target) for target in targets) / len(targets)
+
+
+def _mean_pixels(targets: Sequence[Target]) -> float:
+    return sum(target.camera.width * target.camera.height for target in targets) / len(targets)
 
 
 def _seconds(engine: Engine, target: Target) -> float:
@@ -48,7 +91,7 @@ def _seconds(engine: Engine, target: Target) -> float:
     for step in range(1, REPEATS + 2):
         started = time.perf_counter()
         engine.train_photo(
-            target.viewmat, target.K, target.rgb, degree=0, rates=ZERO_RATES, step=step, mask=target.mask
+            target.viewmat, target.K, target.rgb, degree=3, rates=ZERO_RATES, step=step, mask=target.mask
         )
         if torch.cuda.is_available():
             torch.cuda.synchronize()  # a GPU's step is only enqueued
