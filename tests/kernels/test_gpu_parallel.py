@@ -99,7 +99,7 @@ def alone(steps: int) -> tuple[dict[str, torch.Tensor], list[float], torch.Tenso
             [x.grad if x.grad is not None else torch.zeros_like(x) for x in leaves],
             exp_avg,
             exp_avg_sq,
-            astuple(replica.RATES),
+            astuple(replica.RATES)[:6],
             step=step,
         )
         losses.append(total.item() / 2)

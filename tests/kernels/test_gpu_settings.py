@@ -36,8 +36,7 @@ from splatmill_worker.kernels.gpu import (
 )
 from splatmill_worker.kernels.gpu.blended import SEGMENT
 from splatmill_worker.kernels.gpu.step import Step
-from splatmill_worker.kernels.records import GROUPS, Rates
-from splatmill_worker.kernels.reference.adam import BETA1
+from splatmill_worker.kernels.records import BETA1, GROUPS, Rates
 from splatmill_worker.splat.views import over
 from tests.support.kernels.cases import scene
 from tests.support.kernels.launches import Launch, watch

@@ -33,7 +33,10 @@ DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 WIDTH, HEIGHT = 20, 12
 
 
-RATES = Rates(means=1e-3, log_scales=5e-3, quats=1e-3, logit_opacities=5e-2, sh_dc=2.5e-3, sh_rest=1e-4)
+RATES = Rates(
+    means=1e-3, log_scales=5e-3, quats=1e-3, logit_opacities=5e-2, sh_dc=2.5e-3, sh_rest=1e-4, beta2=0.99
+)
+SIX = astuple(RATES)[:6]
 
 
 @pytest.fixture
@@ -86,7 +89,7 @@ class Exact:
         )
         reference.adam_(
             self.params, [torch.zeros_like(x) if x.grad is None else x.grad for x in leaves], self.exp_avg,
-            self.exp_avg_sq, astuple(RATES), step=step, visible=visible, last_step=self.last,
+            self.exp_avg_sq, SIX, step=step, visible=visible, last_step=self.last, beta2=RATES.beta2,
         )  # fmt: skip
         return loss.item(), int(visible.sum())
 
@@ -96,10 +99,11 @@ class Exact:
             self.params,
             self.exp_avg,
             self.exp_avg_sq,
-            astuple(RATES),
+            SIX,
             step=step,
             rows=everyone,
             last_step=self.last,
+            beta2=RATES.beta2,
         )
 
 

@@ -79,7 +79,7 @@ def measure(place: Place) -> Iterator[Row]:
     from splatmill_worker.kernels.gpu.project import project_records
     from splatmill_worker.kernels.gpu.project_backward import project_backward
     from splatmill_worker.kernels.gpu.step import Step
-    from splatmill_worker.kernels.records import TILE, Rates
+    from splatmill_worker.kernels.records import BETA2, TILE, Rates
 
     n, side = (6, 12) if place.dry else (1_000_000, 1024)
     view = cloud(n, side, side)
@@ -111,8 +111,10 @@ def measure(place: Place) -> Iterator[Row]:
     scored = step._shown(view.viewmat, view.K, *size, DEGREE, None, False, 0.01, depth=False, whole=False)
 
     def update() -> None:
-        missed = adam.CatchUp(seen, last, 1)
-        adam.apply_planes(step._params, step._gradient, first, second, [0.0] * 6, FLOATS, 1, refused, missed)
+        missed = adam.CatchUp(seen, last, 1, BETA2)
+        adam.apply_planes(
+            step._params, step._gradient, first, second, [0.0] * 6, FLOATS, 1, BETA2, refused, missed
+        )  # fmt: skip
 
     works: dict[str, Callable[[], object]] = {
         "project": project,

@@ -17,8 +17,7 @@ from _precision.builds import using
 from _precision.variants import EXACT, PLAIN, Variant
 from splatmill_worker.kernels.cpu.loss import photo_stats
 from splatmill_worker.kernels.cpu.step import Step
-from splatmill_worker.kernels.records import GROUPS, Rates
-from splatmill_worker.kernels.reference.adam import BETA2
+from splatmill_worker.kernels.records import BETA2, GROUPS, Rates
 
 STILL = Rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Everything is computed and written and nothing moves: each round is the same work."""

@@ -22,8 +22,7 @@ from torch import Tensor
 
 from splatmill_worker.kernels.cpu.loss import PhotoStats, loss, photo_stats
 from splatmill_worker.kernels.cpu.step import Step
-from splatmill_worker.kernels.records import GROUPS, PARAMETERS, Rates
-from splatmill_worker.kernels.reference.adam import BETA1, BETA2, EPS
+from splatmill_worker.kernels.records import BETA1, EPS, GROUPS, PARAMETERS, Rates
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.renderer import fixed_background
 from splatmill_worker.splat.views import TrainingView
@@ -168,7 +167,7 @@ class Metric:
     @staticmethod
     def of(exp_avg_sq: Tensor, rates: Rates, step: int) -> Metric:
         """The metric after `step` steps that left the second moments [N, 59]."""
-        square = exp_avg_sq.double() / (1.0 - BETA2**step)
+        square = exp_avg_sq.double() / (1.0 - rates.beta2**step)
         row = torch.tensor(rates.rows(), dtype=torch.float64)
         root = torch.where(square > 0, torch.sqrt(row / (torch.sqrt(square) + EPS)), 0.0)
         return Metric(root, row)

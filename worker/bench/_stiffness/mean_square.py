@@ -14,7 +14,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splatmill_worker.kernels.reference.adam import BETA1
+from splatmill_worker.kernels.records import BETA1
 
 
 def growth(curvatures: Tensor) -> float:

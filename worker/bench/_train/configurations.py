@@ -59,6 +59,9 @@ CONFIGURATIONS = {
     "no-dropout": Configuration(
         "all Gaussians in every step, however often photos come", plan={"schedule.dropout": 0.0}
     ),
+    "long-average": Configuration(
+        "squared gradients averaged over a thousand steps", plan={"schedule.annealing.beta2": 0.999}
+    ),
     "sh-0": Configuration("colour does not change with the view", {"sh_degree": 0}, {"schedule.degree": 0}),
     "sh-3": Configuration("SH degree 3 whatever the views' angles", {"sh_degree": 3}, {"schedule.degree": 3}),
     "no-annealing": Configuration(

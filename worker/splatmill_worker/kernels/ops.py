@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from . import checks
-from .records import TILE, Bins, Projected
+from .records import BETA2, LEAST_BETA2, TILE, Bins, Projected
 
 __all__ = [
     "Backend",
@@ -168,17 +168,21 @@ def adam_(
     step: int,
     visible: Tensor | None = None,
     last_step: Tensor | None = None,
+    beta2: float = BETA2,
     backend: Backend | None = None,
 ) -> int:
     """Take one Adam step in place on groups [N, ...] with a rate each; return how many gradient values were refused.
 
     step counts from 1. With visible [N] (bool) only those rows move, and first make up for the steps since last_step
-    (int32 [N]), which is updated. `reference.adam_` has the definition.
+    (int32 [N]), which is updated. beta2, the factor on the second moments, is the same in every step. `reference.adam_`
+    has the definition.
     """
     if not len(params) == len(grads) == len(exp_avg) == len(exp_avg_sq) == len(rates):
         raise ValueError("params, grads, exp_avg, exp_avg_sq, rates: one of each per group")
     if step < 1:
         raise ValueError(f"step: counts from 1, got {step}")
+    if not LEAST_BETA2 <= beta2 < 1.0:
+        raise ValueError(f"beta2: expected at least {LEAST_BETA2} and less than 1, got {beta2}")
     if not params:
         return 0
     name = _backend(backend, params[0])
@@ -209,9 +213,8 @@ def adam_(
             device=kind["device"],
         )
     op = _op(name, "adam", "adam_")
-    return cast(
-        int, op(params, grads, exp_avg, exp_avg_sq, rates, step=step, visible=visible, last_step=last_step)
-    )
+    late = {"visible": visible, "last_step": last_step}
+    return cast(int, op(params, grads, exp_avg, exp_avg_sq, rates, step=step, beta2=beta2, **late))
 
 
 def knn(points: Tensor, *, backend: Backend | None = None) -> Tensor:

@@ -32,6 +32,15 @@ PARAMETERS = sum(GROUPS.values())
 """Values of a Gaussian: 59. Where groups are joined, as in moments, they follow in the order of `GROUPS`."""
 
 
+BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
+"""Adam's factors on the first and the second moment at each step, and the least divisor (Kingma & Ba 2015; Kerbl et al.
+2023). A run may choose another second factor: `Rates.beta2`."""
+
+LEAST_BETA2 = 0.95
+"""Smallest second factor: what a Gaussian makes up for after a pause is summed over 256 steps
+(`reference.adam.MEMORY`), whose terms fall by beta1 / sqrt(beta2) each. 2e-9 of the sum is left out with this one."""
+
+
 MOST_PAIRS = 2**31 - 1
 """(tile, Gaussian) pairs of a view at most: places in its lists are numbered in 31 bits."""
 
@@ -72,7 +81,11 @@ class Bins(NamedTuple):
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rate of each parameter group; those of the means are in world units."""
+    """Adam's learning rate of each parameter group; those of the means are in world units.
+
+    beta2: factor on the second moments at each step; the same in every step of a run, since the bias correction and
+        what unseen Gaussians make up for follow from it and the number of the step.
+    """
 
     means: float
     log_scales: float
@@ -80,6 +93,7 @@ class Rates:
     logit_opacities: float
     sh_dc: float
     sh_rest: float
+    beta2: float = BETA2
 
     def rows(self) -> list[float]:
         """Return the rate of each of a Gaussian's 59 parameters."""

@@ -15,7 +15,7 @@ import pytest
 
 from splatmill_worker.splat.plan.decide import DROPOUT
 from splatmill_worker.splat.plan.plan import Plan
-from splatmill_worker.splat.plan.rates import Annealing
+from splatmill_worker.splat.plan.rates import Annealing, beta2_of
 from splatmill_worker.splat.start.given_model import GivenModel
 from tests.support.facts import FACTS, changed, planned
 
@@ -123,6 +123,14 @@ def test_the_degree_follows_from_the_angles_between_views(angle: float | None, d
 def test_short_runs_take_longer_steps() -> None:
     boosts = [planned(steps=steps).schedule.annealing.boost for steps in (300, 600, 3000, 30_000, 100_000)]
     assert boosts == pytest.approx([8.0, math.sqrt(50), math.sqrt(10), 1.0, 1.0])
+
+
+def test_squared_gradients_are_averaged_over_a_part_of_the_steps_that_are_expected() -> None:
+    assert planned(steps=600).schedule.annealing.beta2 == pytest.approx(0.99)
+    assert "averaged over 100 of them" in planned(steps=600).reasons["rates"]
+    assert planned(changed(views=11), steps=600).schedule.annealing.beta2 == 0.999
+    timed = planned(time_budget=20)
+    assert timed.schedule.annealing.beta2 == beta2_of(timed.schedule.expected_steps) < 0.999
 
 
 def test_a_time_budget_leaves_the_length_of_steps_to_the_run() -> None:

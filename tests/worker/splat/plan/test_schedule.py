@@ -10,7 +10,7 @@ import math
 import pytest
 
 from splatmill_worker.splat.plan.budget import Budget
-from splatmill_worker.splat.plan.rates import Annealing, RateSchedule, boost_of
+from splatmill_worker.splat.plan.rates import Annealing, RateSchedule, beta2_of, boost_of
 from splatmill_worker.splat.plan.schedule import Schedule
 
 
@@ -65,6 +65,13 @@ def test_view_dependent_colour_travels_as_far_in_any_run_of_3300_to_30000_steps(
 
     assert [reach(steps) for steps in (3334, 10_000)] == pytest.approx([reach(30_000)] * 2)
     assert reach(1000) < reach(30_000)
+
+
+def test_squared_gradients_are_averaged_over_a_sixth_of_a_short_run() -> None:
+    windows = [1 / (1 - beta2_of(steps)) for steps in (10, 300, 600, 3000, 6000, 30_000)]
+    assert windows == pytest.approx([50, 50, 100, 500, 1000, 1000])
+    assert RateSchedule(2.0, Annealing(beta2=beta2_of(600))).at(0.5).beta2 == pytest.approx(0.99)
+    assert RateSchedule(2.0).at(0.5).beta2 == 0.999
 
 
 def test_a_boost_left_to_the_run_is_no_rate() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from splatmill_worker.kernels import cpu
+from splatmill_worker.kernels.records import BETA2
 
 
 def adam_(
@@ -19,6 +20,7 @@ def adam_(
     step: int,
     visible: Tensor | None = None,
     last_step: Tensor | None = None,
+    beta2: float = BETA2,
 ) -> int:
     """Take one Adam step in place, as `reference.adam_` defines it, on contiguous float32 tensors."""
 
@@ -26,6 +28,14 @@ def adam_(
         return [t.detach().unsqueeze(1).flatten(1) for t in tensors]
 
     refused: int = cpu.engine.adam(
-        rows(params), rows(grads), rows(exp_avg), rows(exp_avg_sq), list(rates), step, visible, last_step
+        rows(params),
+        rows(grads),
+        rows(exp_avg),
+        rows(exp_avg_sq),
+        list(rates),
+        step,
+        visible,
+        last_step,
+        beta2,
     )
     return refused

@@ -31,7 +31,7 @@ struct Scene {
 struct Update {
   float *params = nullptr, *exp_avg = nullptr, *exp_avg_sq = nullptr;
   float rates[kRows] = {};  // with the bias correction of the first moment
-  float root = 0;           // bias correction of the second
+  AdamStep adam;            // what it does to the second
   int64_t step = 0;
   float* gradients = nullptr;
   float* scores = nullptr;  // [kScoreRows][score_stride]; null where none are kept
@@ -135,7 +135,7 @@ int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& sc
     for (int r = 0; r < rows; ++r) {
       Float x = r < kSh ? row(p, r) : sh_row(p, r), m = FirstMoment::load(at.exp_avg(r)), v = SecondMoment::load(at.exp_avg_sq(r));
       const Float slope = seen ? keep(visible, load(gradient + r * kLanes)) : splat(0.0f);
-      const Mask good = adam_update(x, m, v, slope, splat(update.rates[r]), splat(update.root));
+      const Mask good = adam_update(x, m, v, slope, splat(update.rates[r]), update.adam);
       refused += kLanes - __builtin_popcount(bits(good));
       if (r < kSh)
         Float32::store(at.param(r), x, noise);
@@ -213,13 +213,12 @@ void bind_step(nb::module_& m) {
   m.def(
       "update",
       [](Frame& frame, Blocks params, Blocks exp_avg, Blocks exp_avg_sq, int degree, Image image, Image gradient,
-         const std::vector<float>& rates, int64_t step, std::optional<ScoreRows> scores, int threads,
+         const std::vector<float>& rates, double beta2, int64_t step, std::optional<ScoreRows> scores, int threads,
          std::optional<Twist> pose) {
         Update update;
         update.params = params.data(), update.exp_avg = exp_avg.data(), update.exp_avg_sq = exp_avg_sq.data();
-        const AdamStep scale(step);
-        for (int r = 0; r < kRows; ++r) update.rates[r] = rates.at(r) * scale.size;
-        update.root = scale.root;
+        update.adam = AdamStep(step, beta2);
+        for (int r = 0; r < kRows; ++r) update.rates[r] = rates.at(r) * update.adam.size;
         update.step = step;
         const ImageGradient g{planes_of(image, frame.camera), planes_of(gradient, frame.camera), gradient.shape(0) == 5};
         if (scores) update.scores = scores->data(), update.score_stride = static_cast<int64_t>(scores->shape(1));
@@ -240,7 +239,7 @@ void bind_step(nb::module_& m) {
         return refused;
       },
       "frame"_a, "params"_a.noconvert(), "exp_avg"_a.noconvert(), "exp_avg_sq"_a.noconvert(), "degree"_a,
-      "image"_a.noconvert(), "gradient"_a.noconvert(), "rates"_a, "step"_a,
+      "image"_a.noconvert(), "gradient"_a.noconvert(), "rates"_a, "beta2"_a, "step"_a,
       "scores"_a.noconvert().none(), "threads"_a, "pose"_a.noconvert().none() = nb::none(),
       "Backward pass of the last render and one Adam step; returns how many gradient values were refused as not finite. Adds to "
       "`scores` [3, Gaussians] and fills `pose` [6] with the gradient to a motion of the camera (pose.hpp), where given.");

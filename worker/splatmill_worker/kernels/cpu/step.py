@@ -317,6 +317,7 @@ class Step:
             self._image,
             gradient,
             rates.rows(),
+            rates.beta2,
             step,
             self._scores if self.keep_scores else None,
             self.threads,

@@ -13,16 +13,15 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ..records import GROUPS
-from ..reference.adam import BETA1, BETA2, EPS, MEMORY
+from ..records import BETA1, BETA2, EPS, GROUPS
+from ..reference.adam import MEMORY
 from . import device
 from .argument import Bytes, Float, Floats, Int, Ints
 from .constant import LARGEST, constant
 from .transfer import to_device
 
-B1, B2, EPSILON = constant(BETA1), constant(BETA2), constant(EPS)
-LOG2_B1, LOG2_B2 = constant(math.log2(BETA1)), constant(math.log2(BETA2))
-RATIO = constant(BETA1 / math.sqrt(BETA2))
+B1, EPSILON = constant(BETA1), constant(EPS)
+LOG2_B1 = constant(math.log2(BETA1))
 LONGEST = constant(MEMORY)
 BLOCK = 256
 """Gaussians per program."""
@@ -34,25 +33,25 @@ DC = constant(_ENDS[3] + 3)
 
 
 @lru_cache(maxsize=4)
-def correction(room: int, where: torch.device) -> Tensor:
+def correction(room: int, where: torch.device, beta2: float) -> Tensor:
     """Return sqrt(1 - beta2^s) / (1 - beta1^s) for s = 0 .. room - 1 (0 at 0) as float32.
 
     Computed in float64, because 1 - 0.999 has few significant digits in float32.
     """
     s = torch.arange(1, room, dtype=torch.float64)
-    values = torch.sqrt(1 - BETA2**s) / (1 - BETA1**s)
+    values = torch.sqrt(1 - beta2**s) / (1 - BETA1**s)
     return to_device(torch.cat([torch.zeros(1, dtype=torch.float64), values]).float(), where)
 
 
 @triton.jit
 def drift_kernel(
     last_step: Ints, seen: Bytes, table: Floats, travel: Floats, decay1: Floats, decay2: Floats, count: Int, step: Int,
-    BLOCK: tl.constexpr,
+    ratio: Float, log2_beta2: Float, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write what the steps that each Gaussian missed before `step` amount to, and mark every seen one as current.
 
     travel is `reference.adam.drift` in units of rate * m / sqrt(v): the sum over the missed steps s = last + j of
-    (beta1 / sqrt(beta2))^j * correction(s). decay1 and decay2 are the factors on the two moments.
+    ratio^j * correction(s), where ratio is beta1 / sqrt(beta2). decay1 and decay2 are the factors on the two moments.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
@@ -64,20 +63,20 @@ def drift_kernel(
     power = tl.zeros([BLOCK], tl.float32) + 1.0
     j = 1
     while j <= most:
-        power = power * RATIO
+        power = power * ratio
         term = tl.load(table + last + j, mask=shown & (j <= missed), other=0.0)
         total += power * term
         j += 1
     tl.store(travel + i, total, mask=here)
     tl.store(decay1 + i, tl.exp2(LOG2_B1 * missed), mask=here)
-    tl.store(decay2 + i, tl.exp2(LOG2_B2 * missed), mask=here)
+    tl.store(decay2 + i, tl.exp2(log2_beta2 * missed), mask=here)
     tl.store(last_step + i, tl.where(shown, step, last), mask=here)
 
 
 @triton.jit
 def adam_kernel(
     params: Floats, grads: Floats, exp_avg: Floats, exp_avg_sq: Floats, seen: Bytes, travel: Floats, decay1: Floats,
-    decay2: Floats, refused: Ints, count: Int, rate: Float, size: Float, root: Float,
+    decay2: Floats, refused: Ints, count: Int, rate: Float, size: Float, root: Float, keep: Float, add: Float,
     CHANNELS: tl.constexpr, VISIBLE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """One step on rows [N, CHANNELS]. An entry whose gradient, or its square, is not finite stays and is counted."""
@@ -95,7 +94,7 @@ def adam_kernel(
         p -= rate * gone * tl.where(v > 0.0, m / tl.sqrt_rn(v), 0.0)
         m *= tl.load(decay1 + i, mask=shown, other=1.0)
         v *= tl.load(decay2 + i, mask=shown, other=1.0)
-    p, m, v, bad = advance(p, g, m, v, rate, size, root)
+    p, m, v, bad = advance(p, g, m, v, rate, size, root, keep, add)
     tl.store(params + e, p, mask=shown)
     tl.store(exp_avg + e, m, mask=shown)
     tl.store(exp_avg_sq + e, v, mask=shown)
@@ -105,12 +104,12 @@ def adam_kernel(
 
 
 @triton.jit
-def advance(p, g, m, v, rate, size, root):
-    """Adam's arithmetic: size = 1 / (1 - beta1^step), root = 1 / sqrt(1 - beta2^step)."""
+def advance(p, g, m, v, rate, size, root, keep, add):
+    """Adam's arithmetic; the last four are 1 / (1 - beta1^step), 1 / sqrt(1 - beta2^step), beta2 and 1 - beta2."""
     good = g * g <= LARGEST
     g = tl.where(good, g, 0.0)
     m_new = B1 * m + (1.0 - B1) * g
-    v_new = B2 * v + (1.0 - B2) * g * g
+    v_new = keep * v + add * g * g
     moved = p - rate * size * m_new / (root * tl.sqrt_rn(v_new) + EPSILON)
     return tl.where(good, moved, p), tl.where(good, m_new, m), tl.where(good, v_new, v), ~good
 
@@ -119,8 +118,8 @@ def advance(p, g, m, v, rate, size, root):
 def planes_kernel(
     params: Floats, grads: Floats, exp_avg: Floats, exp_avg_sq: Floats, seen: Bytes, travel: Floats, decay1: Floats,
     decay2: Floats, refused: Ints, count: Int, stride: Int, channels: Int, means_rate: Float, scales_rate: Float,
-    quats_rate: Float, opacity_rate: Float, dc_rate: Float, rest_rate: Float, size: Float, root: Float,
-    BLOCK: tl.constexpr,
+    quats_rate: Float, opacity_rate: Float, dc_rate: Float, rest_rate: Float, size: Float, root: Float, keep: Float,
+    add: Float, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """One step on the first `channels` of a scene's planes [59, stride], for the Gaussians seen."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -140,7 +139,7 @@ def planes_kernel(
         m = tl.load(exp_avg + place, mask=shown, other=0.0)
         v = tl.load(exp_avg_sq + place, mask=shown, other=0.0)
         p -= rate * gone * tl.where(v > 0.0, m / tl.sqrt_rn(v), 0.0)
-        p, m, v, bad = advance(p, g, m * keep1, v * keep2, rate, size, root)
+        p, m, v, bad = advance(p, g, m * keep1, v * keep2, rate, size, root, keep, add)
         tl.store(params + place, p, mask=shown)
         tl.store(exp_avg + place, m, mask=shown)
         tl.store(exp_avg_sq + place, v, mask=shown)
@@ -156,46 +155,50 @@ class CatchUp:
     Marks the rows of seen (uint8 [N]) as current in last_step (int32 [N]).
     """
 
-    def __init__(self, seen: Tensor, last_step: Tensor, step: int) -> None:
+    def __init__(self, seen: Tensor, last_step: Tensor, step: int, beta2: float) -> None:
         count = seen.shape[0]
         like: dict[str, Any] = {"device": seen.device, "dtype": torch.float32}
         self.seen = seen
         self.travel, self.decay1, self.decay2 = (torch.empty(count, **like) for _ in range(3))
-        table = correction(max(1024, 1 << step.bit_length()), seen.device)  # a new table per doubling
+        table = correction(max(1024, 1 << step.bit_length()), seen.device, beta2)  # a new table per doubling
         if count:
             drift_kernel[(triton.cdiv(count, BLOCK),)](
-                last_step, seen, table, self.travel, self.decay1, self.decay2, count, step, BLOCK=BLOCK
-            )
+                last_step, seen, table, self.travel, self.decay1, self.decay2, count, step,
+                BETA1 / math.sqrt(beta2), math.log2(beta2), BLOCK=BLOCK,
+            )  # fmt: skip
+
+
+def _scale(step: int, beta2: float) -> tuple[float, float, float, float]:
+    """What `advance` needs of a step: size, root, keep and add."""
+    return 1 / (1 - BETA1**step), 1 / math.sqrt(1 - beta2**step), beta2, 1 - beta2
 
 
 def apply(
-    param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, step: int, refused: Tensor,
-    missed: CatchUp | None,
+    param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, step: int, beta2: float,
+    refused: Tensor, missed: CatchUp | None,
 ) -> None:  # fmt: skip
     """One step of one contiguous group [N, ...] in place; adds the entries that were refused to refused, int32 [1]."""
     count = param.shape[0]
     entries = param.numel()
     if not entries:
         return
-    size, root = 1 / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step)
     late = (None,) * 4 if missed is None else (missed.seen, missed.travel, missed.decay1, missed.decay2)
     adam_kernel[(triton.cdiv(entries, 4 * BLOCK),)](
-        param, grad.contiguous(), exp_avg, exp_avg_sq, *late, refused, count, rate, size, root,
+        param, grad.contiguous(), exp_avg, exp_avg_sq, *late, refused, count, rate, *_scale(step, beta2),
         CHANNELS=entries // count, VISIBLE=missed is not None, BLOCK=4 * BLOCK,
     )  # fmt: skip
 
 
 def apply_planes(
     params: Tensor, grads: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rates: Sequence[float],
-    channels: int, step: int, refused: Tensor, missed: CatchUp,
+    channels: int, step: int, beta2: float, refused: Tensor, missed: CatchUp,
 ) -> None:  # fmt: skip
     """One step in place on the first `channels` of planes [59, N]; six rates, in the order of `Rates`."""
     count = params.shape[1]
-    size, root = 1 / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step)
     if count:
         planes_kernel[(triton.cdiv(count, BLOCK),)](
             params, grads, exp_avg, exp_avg_sq, missed.seen, missed.travel, missed.decay1, missed.decay2, refused,
-            count, count, channels, *rates, size, root, BLOCK=BLOCK,
+            count, count, channels, *rates, *_scale(step, beta2), BLOCK=BLOCK,
         )  # fmt: skip
 
 
@@ -210,6 +213,7 @@ def adam_(
     step: int,
     visible: Tensor | None = None,
     last_step: Tensor | None = None,
+    beta2: float = BETA2,
 ) -> int:
     """One Adam step in place, as `reference.adam_` defines it; returns how many entries were refused.
 
@@ -221,7 +225,7 @@ def adam_(
     if visible is not None:
         if last_step is None:
             raise ValueError("last_step: needed with visible, to know how many steps a row missed")
-        missed = CatchUp(visible.to(torch.uint8), last_step, step)
+        missed = CatchUp(visible.to(torch.uint8), last_step, step, beta2)
     for p, g, m, v, rate in zip(params, grads, exp_avg, exp_avg_sq, rates, strict=True):
-        apply(p, g, m, v, rate, step, refused, missed)
+        apply(p, g, m, v, rate, step, beta2, refused, missed)
     return int(refused)

@@ -13,7 +13,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from splatmill_worker.kernels.records import GROUPS, MOST_PAIRS, PARAMETERS, Rates
+from splatmill_worker.kernels.records import BETA2, GROUPS, MOST_PAIRS, PARAMETERS, Rates
 
 from . import adam, device
 from .argument import Float, Floats, Int
@@ -178,7 +178,7 @@ class Step:
         self._rooms: dict[ViewKey, Room] = {}
         self._photos = Photos(self.device, device.room_for_stats(self.device))
         self._readback = Readback(steady=together is not None)
-        self._steps = 0
+        self._steps, self._beta2 = 0, BETA2
         # Counts `replace`: list sizes that arrive from before the last one say nothing of the room needed now.
         self._generation = 0
         self.overflowed = 0
@@ -479,8 +479,8 @@ class Step:
         self._rates = (
             rates.means, rates.log_scales, rates.quats, rates.logit_opacities, rates.sh_dc, rates.sh_rest,
         )  # fmt: skip
-        self._steps = step
-        missed = adam.CatchUp(seen, self._last, step)
+        self._steps, self._beta2 = step, rates.beta2
+        missed = adam.CatchUp(seen, self._last, step, rates.beta2)
         adam.apply_planes(
             self._params,
             self._gradient,
@@ -489,6 +489,7 @@ class Step:
             self._rates,
             channels,
             step,
+            rates.beta2,
             refused,
             missed,
         )
@@ -498,7 +499,7 @@ class Step:
         if self._rates is None or not self.count:
             return
         everyone = torch.ones(self.count, dtype=torch.uint8, device=self.device)
-        missed = adam.CatchUp(everyone, self._last, self._steps + 1)
+        missed = adam.CatchUp(everyone, self._last, self._steps + 1, self._beta2)
         self._last.fill_(self._steps)
         channels = [*list(GROUPS.values())[:-1], 3, GROUPS["sh"] - 3]
         by_plane = [rate for rate, number in zip(self._rates, channels, strict=True) for _ in range(number)]

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.kernels.records import Rates
-from splatmill_worker.kernels.reference.adam import BETA1, BETA2, EPS
+from splatmill_worker.kernels.records import BETA1, EPS, Rates
 from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.motion import motion
@@ -171,12 +170,12 @@ class AutogradEngine:
 
     def _adam(self, rates: Rates, step: int) -> None:
         """One step of Adam (Kingma & Ba 2015) with bias correction, on every parameter group."""
-        correction = (1.0 - BETA2**step) ** 0.5 / (1.0 - BETA1**step)
+        correction = (1.0 - rates.beta2**step) ** 0.5 / (1.0 - BETA1**step)
         for name, value in self._gaussians.parameters().items():
             gradient = torch.zeros_like(value) if value.grad is None else value.grad
             average, square = self._exp_avg[name], self._exp_avg_sq[name]
             average.lerp_(gradient, 1.0 - BETA1)
-            square.mul_(BETA2).addcmul_(gradient, gradient, value=1.0 - BETA2)
+            square.mul_(rates.beta2).addcmul_(gradient, gradient, value=1.0 - rates.beta2)
             move = correction * average / (square.sqrt() + EPS)
             with torch.no_grad():
                 if name == "sh":

@@ -6,9 +6,10 @@ from dataclasses import replace
 from typing import Literal, NamedTuple
 
 from splatmill.schema import TrainOptions
+from splatmill_worker.kernels.records import BETA2
 from splatmill_worker.splat.plan.capacity import Capacity, decide_capacity, decide_densification
 from splatmill_worker.splat.plan.facts import Facts
-from splatmill_worker.splat.plan.needs import Needs, needs_of
+from splatmill_worker.splat.plan.needs import FEW_VIEWS, Needs, needs_of
 from splatmill_worker.splat.plan.photos import (
     decide_antialias,
     decide_background,
@@ -18,7 +19,7 @@ from splatmill_worker.splat.plan.photos import (
     explain_undistortion,
 )
 from splatmill_worker.splat.plan.plan import Kernels, Plan
-from splatmill_worker.splat.plan.rates import PAPER_STEPS, Annealing, boost_of
+from splatmill_worker.splat.plan.rates import PAPER_STEPS, Annealing, beta2_of, boost_of
 from splatmill_worker.splat.plan.reasons import Reasons
 from splatmill_worker.splat.plan.schedule import MANY_VISITS, Schedule
 from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS
@@ -120,7 +121,7 @@ def _schedule(
         opacity_decay=OPACITY_DECAY if densify else 1.0,
         # Half way to the shell, so that all of the shell is spared and most of the scene is not.
         decay_within=0.5 * facts.shell_distance if needs.far_shell and facts.shell_distance else None,
-        annealing=_annealing(options, steps, reasons),
+        annealing=_annealing(facts, options, steps, reasons),
         dropout=_dropout(facts, steps, reasons),
         expected_steps=steps,
     )
@@ -153,14 +154,19 @@ def _degree(facts: Facts, options: TrainOptions, reasons: Reasons) -> int:
     return 1 if angle < 6.0 else 2 if angle < 12.0 else 3
 
 
-def _annealing(options: TrainOptions, steps: int, reasons: Reasons) -> Annealing:
+def _annealing(facts: Facts, options: TrainOptions, steps: int, reasons: Reasons) -> Annealing:
     boost = boost_of(steps)
-    because = f"For {steps} steps, learning rates are {boost:.1f} times those of a run of {PAPER_STEPS} steps"
+    # Few photos lose by steps that stay long (decisions: second-moment).
+    beta2 = beta2_of(steps) if facts.views >= FEW_VIEWS else BETA2
+    because = (
+        f"For {steps} steps, squared gradients are averaged over {round(1.0 / (1.0 - beta2))} of them, and learning "
+        f"rates are {boost:.1f} times those of a run of {PAPER_STEPS} steps"
+    )
     if options.time_budget is None:
         reasons.chosen["rates"] = f"{because}."
-        return Annealing(boost=boost)
+        return Annealing(boost=boost, beta2=beta2)
     reasons.chosen["rates"] = f"{because}; the factor follows the number of steps that the time allows."
-    return Annealing(boost=None)
+    return Annealing(boost=None, beta2=beta2)
 
 
 def _dropout(facts: Facts, steps: int, reasons: Reasons) -> float:
@@ -186,6 +192,4 @@ def _warm_start(schedule: Schedule, model: GivenModel, reasons: Reasons) -> Sche
     if "sh_degree" not in reasons.forced and model.degree > degree:
         degree = model.degree
         reasons.chosen["sh_degree"] = f"The given model has spherical harmonics of degree {degree}."
-    return replace(
-        schedule, resolution=((0, 1),), annealing=replace(schedule.annealing, boost=1.0), degree=degree
-    )
+    return replace(schedule, resolution=((0, 1),), annealing=Annealing(boost=1.0), degree=degree)

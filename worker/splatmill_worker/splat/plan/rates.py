@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from splatmill_worker.kernels.records import Rates
+from splatmill_worker.kernels.records import BETA2, Rates
 
 POSITION_START = 1.6e-4
 """Rate of the positions at the first step, per unit of scene extent (Kerbl et al. 2023, supplement)."""
@@ -24,6 +24,14 @@ MOST_SH, SH_SHARE = 2.0, 2.0 / 3.0
 From 3300 to 30,000 steps, the product of this rate and the number of steps is then the same in every run."""
 
 
+AVERAGED = 1.0 / 6.0
+"""Share of a run over which Adam averages squared gradients, where that is less than the thousand steps of BETA2: the
+first gradients are large, and a short run would divide its steps by them to its end (decisions: second-moment)."""
+
+FEWEST_AVERAGED = 50
+"""Steps over which squared gradients are averaged at least."""
+
+
 @dataclass(frozen=True)
 class Annealing:
     """How the learning rates fall over a run.
@@ -38,17 +46,24 @@ class Annealing:
     position_fall: last rate of the positions over the first.
     hold: share of the budget for which the other rates stay constant.
     rest_fall: last value of the other rates over the first.
+    beta2: Adam's factor on the second moments at each step.
     """
 
     boost: float | None = 1.0
     position_fall: float = 0.01
     hold: float = 0.6
     rest_fall: float = 0.1
+    beta2: float = BETA2
 
 
 def boost_of(steps: int) -> float:
     """The factor on the paper's rates for a run of so many steps: the root of the ratio, from 1 to MOST_BOOST."""
     return min(MOST_BOOST, max(1.0, math.sqrt(PAPER_STEPS / steps)))
+
+
+def beta2_of(steps: int) -> float:
+    """Adam's factor on the second moments in a run of so many steps."""
+    return min(BETA2, 1.0 - 1.0 / max(FEWEST_AVERAGED, AVERAGED * steps))
 
 
 @dataclass(frozen=True)
@@ -82,4 +97,5 @@ class RateSchedule:
             logit_opacities=rest / math.sqrt(boost) * 5e-2,
             sh_dc=rest * 2.5e-3,
             sh_rest=rest * SH_REST * min(MOST_SH, SH_SHARE * boost),
+            beta2=fall.beta2,
         )
