@@ -59,11 +59,11 @@ def test_light_is_evened_where_one_photo_in_ten_departs_from_those_around_it() -
 
 
 def test_light_is_left_where_photos_are_too_far_apart_to_tell_of_one_another() -> None:
-    assert planned(changed(light_tail=0.3, light_unseen=0.2)).exposure
-    apart = planned(changed(light_tail=0.3, light_unseen=0.3))
+    assert planned(changed(light_tail=0.3, light_unseen=0.1)).exposure
+    apart = planned(changed(light_tail=0.3, light_unseen=0.2))
     assert not apart.exposure
     assert "too far apart" in apart.left_out["exposure"]
-    assert planned(changed(light_tail=0.3, light_unseen=0.3), exposure="on").exposure
+    assert planned(changed(light_tail=0.3, light_unseen=0.2), exposure="on").exposure
 
 
 def test_light_that_cannot_be_compared_is_not_evened_on_demand() -> None:

@@ -23,13 +23,13 @@ BLURRED = 1.5
 HALVED_FROM = 256
 """Pixels: photos whose longest side is shorter are not halved."""
 
-LIGHT_DEPARTS = 0.075
+LIGHT_DEPARTS = 0.033
 """Natural logarithm: where one photo in ten departs more from the light of the photos around it, departures are taken
 out (decisions: LIGHT_DEPARTS)."""
 
-LIGHT_UNSEEN = 0.25
-"""Share of smooth light that the photos around may leave unpredicted, half of it in standard deviations: where they
-tell less, what departs from them may be smooth, and held-out photos share it (decisions: LIGHT_UNSEEN)."""
+LIGHT_UNSEEN = 0.125
+"""Share of the variance of smooth light that the photos around may leave unpredicted: where they tell less, what
+departs from them may be smooth, and held-out photos share it (decisions: LIGHT_UNSEEN)."""
 
 CERTAIN = 3.0
 """Standard errors of an exposure that a departure exceeds at least, to be one."""
@@ -130,7 +130,7 @@ def _exposure(facts: Facts) -> tuple[bool, str]:
         )
     seen = f"One photo in ten departs by {100 * tail:.1f} % or more from the light of the photos around it"
     if not tail >= LIGHT_DEPARTS:
-        return False, f"{seen}; exposures are corrected from {100 * LIGHT_DEPARTS:.0f} %."
+        return False, f"{seen}; exposures are corrected from {100 * LIGHT_DEPARTS:.1f} %."
     if not tail >= CERTAIN * error:
         return False, f"{seen}, which an error of {100 * error:.1f} % of their exposures may explain."
     if facts.light_unseen is None or facts.light_unseen > LIGHT_UNSEEN:
