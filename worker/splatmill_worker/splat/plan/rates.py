@@ -24,9 +24,9 @@ MOST_SH, SH_SHARE = 2.0, 2.0 / 3.0
 From 3300 to 30,000 steps, the product of this rate and the number of steps is then the same in every run."""
 
 
-AVERAGED = 1.0 / 6.0
-"""Share of a run over which Adam averages squared gradients, where that is less than the thousand steps of BETA2: the
-first gradients are large, and a short run would divide its steps by them to its end (decisions: second-moment)."""
+SHORT = 3000
+"""Steps of a run below which Adam averages squared gradients over fewer than the thousand steps of BETA2: the first
+gradients are large, and a short run would divide its steps by them to its end (decisions: second-moment)."""
 
 FEWEST_AVERAGED = 50
 """Steps over which squared gradients are averaged at least."""
@@ -62,8 +62,10 @@ def boost_of(steps: int) -> float:
 
 
 def beta2_of(steps: int) -> float:
-    """Adam's factor on the second moments in a run of so many steps."""
-    return min(BETA2, 1.0 - 1.0 / max(FEWEST_AVERAGED, AVERAGED * steps))
+    """Adam's factor on the second moments in a run of so many steps: that of an average over 1 / (1 - BETA2) steps from
+    SHORT on, and below over fewer, as the power 3/2 of the steps; a sixth of 600 and a third of 3000.
+    """
+    return min(BETA2, 1.0 - 1.0 / max(FEWEST_AVERAGED, (steps / SHORT) ** 1.5 / (1.0 - BETA2)))
 
 
 @dataclass(frozen=True)
