@@ -91,7 +91,7 @@ class RateSchedule:
         position = POSITION_START * self.extent * math.exp(math.log(fall.position_fall) * progress)
         late = min(1.0, max(0.0, (progress - fall.hold) / (1.0 - fall.hold)))
         rest = factor * (fall.rest_fall + (1.0 - fall.rest_fall) * 0.5 * (1.0 + math.cos(math.pi * late)))
-        # The constants are the rates of Kerbl et al. 2023.
+        # The constants are the rates of Kerbl et al. 2023 (decisions: group-rates).
         return Rates(
             means=factor * position,
             log_scales=rest * 5e-3,
