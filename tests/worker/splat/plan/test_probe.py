@@ -6,12 +6,14 @@ Does not prove that the times are right: they depend on what else runs, and `ben
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
 
 from splatmill_worker.splat.engine.open import gaussians_of
-from splatmill_worker.splat.plan.probe import GROWN, grown, probe
+from splatmill_worker.splat.engine.protocol import StepResult
+from splatmill_worker.splat.plan.probe import GROWN, PHOTOS, grown, probe
 from tests.support.training import first_engine, split
 
 
@@ -33,6 +35,23 @@ def test_a_probe_leaves_the_engine_as_it_was() -> None:
 def test_fewer_photos_than_are_timed_are_timed_more_than_once(photos: int) -> None:
     views, _ = split()
     assert probe(first_engine(), views[:photos], most=2000).per_pixel > 0
+
+
+def test_no_further_photo_is_timed_once_the_time_is_spent(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine, (views, _) = first_engine(), split()
+    taken: list[object] = []
+    step = engine.train_photo
+
+    def counted(*arguments: Any, **named: Any) -> StepResult:
+        taken.append(arguments)
+        return step(*arguments, **named)
+
+    monkeypatch.setattr(engine, "train_photo", counted)
+    probe(engine, views, most=2000)
+    whole = len(taken)
+    monkeypatch.setattr("splatmill_worker.splat.plan.probe.LONGEST", 0.0)
+    probe(engine, views, most=2000)
+    assert len(taken) - whole == whole // PHOTOS > 0
 
 
 def test_a_scene_that_has_grown_covers_what_the_first_gaussians_covered() -> None:

@@ -26,7 +26,11 @@ GROWN_OPACITY = 0.3
 """Opacity of the Gaussians of the scene that is timed; that of the start, 0.1, makes lists longer than in training."""
 
 PHOTOS = 4
-"""Photos that are timed, evenly chosen."""
+"""Photos that are timed, evenly chosen, while LONGEST has time for them."""
+
+LONGEST = 2.0
+"""Seconds after which no further photo is timed: where steps take long, as those of the reference or on large photos,
+noise is a small part of them."""
 
 REPEATS = 2
 """Steps per photo and size after the first one, which also warms up; the fastest of all counts."""
@@ -47,14 +51,18 @@ def probe(engine: Engine, views: Sequence[TrainingView], *, most: int = GROWN) -
     """
     parameters = engine.parameters()
     engine.replace(grown(gaussians_of(engine), min(GROWN, most)).parameters(), None, None)
-    chosen = [views[(2 * at + 1) * len(views) // (2 * PHOTOS)] for at in range(PHOTOS)]
-    full, small = [view.full for view in chosen], [view.reduced(SMALL) for view in chosen]
-    slow, fast = _mean_seconds(engine, full), _mean_seconds(engine, small)
+    began = time.perf_counter()
+    timed: list[tuple[float, float, float, float]] = []
+    for at in range(PHOTOS):
+        view = views[(2 * at + 1) * len(views) // (2 * PHOTOS)]
+        full, small = view.full, view.reduced(SMALL)
+        timed.append((_seconds(engine, full), _seconds(engine, small), _pixels(full), _pixels(small)))
+        view.forget_reduced()
+        if time.perf_counter() - began > LONGEST:
+            break
     count = engine.count
     engine.replace(parameters, None, None)
-    for view in chosen:
-        view.forget_reduced()
-    pixels, small_pixels = _mean_pixels(full), _mean_pixels(small)
+    slow, fast, pixels, small_pixels = (sum(each) / len(timed) for each in zip(*timed, strict=True))
     # The lower bounds keep both parts positive when the noise of the timing exceeds their difference.
     per_pixel = max(slow - fast, 1e-3 * slow) / max(1.0, pixels - small_pixels)
     per_gaussian = max(fast - per_pixel * small_pixels, 0.05 * fast) / max(1, count)
@@ -78,12 +86,8 @@ def grown(first: Gaussians, count: int) -> Gaussians:
     return many
 
 
-def _mean_seconds(engine: Engine, targets: Sequence[Target]) -> float:
-    return sum(_seconds(engine, target) for target in targets) / len(targets)
-
-
-def _mean_pixels(targets: Sequence[Target]) -> float:
-    return sum(target.camera.width * target.camera.height for target in targets) / len(targets)
+def _pixels(target: Target) -> float:
+    return target.camera.width * target.camera.height
 
 
 def _seconds(engine: Engine, target: Target) -> float:

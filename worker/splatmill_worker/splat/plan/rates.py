@@ -65,7 +65,7 @@ def beta2_of(steps: int) -> float:
     """Adam's factor on the second moments in a run of so many steps: that of an average over 1 / (1 - BETA2) steps from
     SHORT on, and below over fewer, as the power 3/2 of the steps; a sixth of 600 and a third of 3000.
     """
-    return min(BETA2, 1.0 - 1.0 / max(FEWEST_AVERAGED, (steps / SHORT) ** 1.5 / (1.0 - BETA2)))
+    return min(BETA2, 1.0 - 1.0 / max(FEWEST_AVERAGED, math.pow(steps / SHORT, 1.5) / (1.0 - BETA2)))
 
 
 @dataclass(frozen=True)
