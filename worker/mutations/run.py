@@ -268,10 +268,11 @@ def write(found: dict[tuple[str, str], Row]) -> None:
         ROWS.write_text("".join(json.dumps(row) + "\n" for row in known))
     caught = sum(bool(row["caught_by"]) for row in known)
     listed = [*MUTANTS, *NEXT]
+    builds = " and ".join(sorted({row["build"] for row in known}))
     lines = [
         "# Mutations of the kernels", "",
         f"{caught} of the {len(known)} tried are caught; {len(listed) - len(known)} were not tried. Generated "
-        f"by `python worker/mutations/run.py`, on the build {ISA}; Triton's kernels run in its interpreter.", "",
+        f"by `python worker/mutations/run.py`, on {builds}; Triton's kernels run in its interpreter.", "",
         "| fault | file | caught by |", "|---|---|---|",
         *(f"| {m.name} | {m.file} | {shown(rows.get((m.file, m.name)))} |" for m in listed),
         "",
