@@ -128,6 +128,7 @@ def test_short_runs_take_longer_steps() -> None:
 def test_squared_gradients_are_averaged_over_a_part_of_the_steps_that_are_expected() -> None:
     assert planned(steps=750).schedule.annealing.beta2 == pytest.approx(0.992)
     assert "averaged over 125 of them" in planned(steps=750).reasons["rates"]
+    assert "averaged over 750 of them" in planned(changed(views=11), steps=750).reasons["rates"]
     assert planned(changed(views=11), steps=750).schedule.annealing.beta2 == 0.999
     timed = planned(time_budget=20)
     assert timed.schedule.annealing.beta2 == beta2_of(timed.schedule.expected_steps) < 0.999

@@ -47,6 +47,7 @@ def test_no_further_photo_is_timed_once_the_time_is_spent(monkeypatch: pytest.Mo
         return step(*arguments, **named)
 
     monkeypatch.setattr(engine, "train_photo", counted)
+    monkeypatch.setattr("splatmill_worker.splat.plan.probe.LONGEST", math.inf)
     probe(engine, views, most=2000)
     whole = len(taken)
     monkeypatch.setattr("splatmill_worker.splat.plan.probe.LONGEST", 0.0)

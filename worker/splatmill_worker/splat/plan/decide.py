@@ -158,8 +158,9 @@ def _annealing(facts: Facts, options: TrainOptions, steps: int, reasons: Reasons
     boost = boost_of(steps)
     # Few photos lose by steps that stay long (decisions: second-moment).
     beta2 = beta2_of(steps) if facts.views >= FEW_VIEWS else BETA2
+    averaged = min(steps, round(1.0 / (1.0 - beta2)))
     because = (
-        f"For {steps} steps, squared gradients are averaged over {round(1.0 / (1.0 - beta2))} of them, and learning "
+        f"For {steps} steps, squared gradients are averaged over {averaged} of them, and learning "
         f"rates are {boost:.1f} times those of a run of {PAPER_STEPS} steps"
     )
     if options.time_budget is None:
