@@ -6,12 +6,14 @@ Does not prove how much is found in photos of real size: `splatmill bench train 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
 import torch
 
 from splatmill_worker.splat.train import disagreement
+from splatmill_worker.splat.train.consensus import Comparison, Glance
 from splatmill_worker.splat.train.disagreement import Disagreement
 from splatmill_worker.splat.train.loop import train
 from splatmill_worker.splat.train.run import TrainingRun
@@ -44,6 +46,36 @@ def test_other_light_is_told_from_another_camera() -> None:
     reasons = {each.name: each.reason for each in judged(views)}
     assert reasons[views[6].name] == "other light"
     assert reasons[views[10].name] == "wrong camera or blur"
+
+
+@pytest.mark.parametrize(
+    ("decibels", "reason"),
+    [(0.2, None), (2.2, None), (2.3, "wrong camera or blur"), (10.0, "wrong camera or blur")],
+)
+def test_a_photo_that_is_hardly_worse_has_no_wrong_camera(
+    decibels: float, reason: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of its pixels are 1.5 times as bad as usual, which says little where all residuals are small."""
+
+    def compared(glances: Sequence[Glance]) -> list[Comparison]:
+        return [
+            Comparison(
+                ratio=torch.ones(seen.residual.shape),
+                median=1.5 if number == 4 else 1.0,
+                outliers=torch.zeros(seen.residual.shape, dtype=torch.bool),
+                decibels=decibels if number == 4 else -1.0,
+            )
+            for number, seen in enumerate(glances)
+        ]
+
+    monkeypatch.setattr(disagreement, "compared", compared)
+    views = still_life.training_views()
+    reasons = {
+        each.name: each.reason
+        for each in train(first_engine(), views, [], plan(300), extent=1.1).disagreements
+    }
+    assert reasons.pop(views[4].name) == reason
+    assert set(reasons.values()) == {None}
 
 
 @pytest.mark.parametrize(("photos", "steps", "at"), [(12, 60, 18), (3, 150, 30), (3, 1, 1)])

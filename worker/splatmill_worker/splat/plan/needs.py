@@ -115,7 +115,8 @@ def _far_shell(facts: Facts) -> tuple[bool, str]:
         )
     return (
         True,
-        f"{seen}: {facts.shell_points} Gaussians on a far shell represent the sky and what shows through holes.",
+        f"{facts.shell_points} Gaussians stand on a far shell behind the scene, for what shows through its holes and "
+        f"for sky; {seen}.",
     )
 
 

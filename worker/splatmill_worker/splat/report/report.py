@@ -206,7 +206,8 @@ def _unplaced(scene: Scene) -> list[str]:
     names = [name for name, _ in scene.left_out]
     shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     photos = len(names) + len(scene.views)
-    return [f"{len(names)} of {photos} photos are not used: {shown}. The report lists the reasons."]
+    verb = "is" if len(names) == 1 else "are"
+    return [f"{len(names)} of {photos} photos {verb} not used: {shown}. The report lists the reasons."]
 
 
 def _misfits(trained: Trained) -> list[str]:

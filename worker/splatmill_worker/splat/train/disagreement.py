@@ -5,6 +5,7 @@ The photos are compared in the course of a run. At its end, a long one has learn
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Literal, NamedTuple
 
@@ -31,8 +32,8 @@ OTHER_LIGHT = 3.0
 """dB that a fit of its colours gains on a photo with another light."""
 
 WHOLLY_OFF = 1.3
-"""Median ratio of a photo's residuals to those of the others, over the same of the median photo, from which no thing in
-it is the reason: half of the photo is worse (decisions: disagreement)."""
+"""Ratio of a photo's residuals to those of the others from which no thing in it is the reason, but all of it is off: of
+the median pixel, over the same of the median photo, and of their root mean square (decisions: disagreement)."""
 
 THING = 0.01
 """Share of a photo's pixels that no other agrees with, from which it is named (decisions: disagreement)."""
@@ -117,7 +118,9 @@ def _judged(name: str, seen: Glance, comparison: Comparison, usual: float) -> Di
         reason = "other light"
     elif comparison.decibels <= 0.0:
         reason = None
-    elif usual > 0.0 and comparison.median >= WHOLLY_OFF * usual:
+    elif 0.0 < WHOLLY_OFF * usual <= comparison.median and comparison.decibels >= 20.0 * math.log10(
+        WHOLLY_OFF
+    ):
         reason = "wrong camera or blur"
     elif share >= THING:
         reason = "moving things"
