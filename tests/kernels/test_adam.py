@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops, reference
+from splatmill_worker.kernels.records import Rates
 from tests.support.kernels.proof import EPS, backends, use
 
 SHAPES = [(3,), (3,), (4,), (), (1, 3), (15, 3)]
@@ -194,3 +195,9 @@ def test_bad_input_is_named(change: dict[str, Any], named: str) -> None:
     arguments = {"step": 1, **change}
     with pytest.raises((TypeError, ValueError), match=f"^{named}"):
         ops.adam_(x, x, x, x, [0.1], backend="cpu", **arguments)
+
+
+@pytest.mark.parametrize("beta2", [0.94, 1.0, float("nan")])
+def test_rates_refuse_a_factor_that_no_backend_can_follow(beta2: float) -> None:
+    with pytest.raises(ValueError, match=r"^beta2: expected at least 0\.95 and less than 1"):
+        Rates(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, beta2)

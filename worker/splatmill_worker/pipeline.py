@@ -289,7 +289,7 @@ def _measure_facts(
 ) -> Facts:
     """What can be measured before training: the scene, and how fast this machine trains it."""
     pixels = photos.training[0].full.rgb[..., 0].numel()
-    most = resolved(pixels, len(photos.training))
+    most = resolved(pixels, len(photos.training)) if start is None else 0
     speed = probe(open_engine(gaussians, task.kernels), photos.training, most=most)
     facts = replace(measure(cameras.world, photos.training, len(photos.held_out), speed), start=start)
     card = describe() if task.kernels == "gpu" else None

@@ -224,7 +224,7 @@ class TrainOptions(Request):
         default=Switch.auto,
         description=(
             "Add a distant shell of Gaussians around the scene, for the sky and for what is seen through "
-            "holes. With auto, opaque photos get one, unless they are few and show little sky."
+            "holes. With auto, opaque photos get one, unless they are few, look to one side and show little sky."
         ),
         json_schema_extra=_PHOTOS,
     )
@@ -232,9 +232,8 @@ class TrainOptions(Request):
         default=Switch.auto,
         description=(
             "Add Gaussians before training where the photos show surfaces on which the reconstruction has no "
-            "points. With auto, this is done where such surfaces fill much of the photos and "
-            "there are enough "
-            "photos to correct the guessed depths."
+            "points. With auto, this is done where such surfaces fill much of the photos, there are enough "
+            "photos to correct the guessed depths, and these look over half a turn at most."
         ),
         json_schema_extra=_PHOTOS,
     )
@@ -297,8 +296,8 @@ class TrainOptions(Request):
     densify: Switch = Field(
         default=Switch.auto,
         description=(
-            "Add Gaussians during training by cloning and splitting. With auto, this is done unless the "
-            "training starts with as many as it may have."
+            "Add Gaussians during training by splitting them along their longest axis. With auto, this is done "
+            "unless the training starts with as many as it may have."
         ),
         json_schema_extra=_ENGINE,
     )

@@ -38,7 +38,8 @@ BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
 
 LEAST_BETA2 = 0.95
 """Smallest second factor: what a Gaussian makes up for after a pause is summed over 256 steps
-(`reference.adam.MEMORY`), whose terms fall by beta1 / sqrt(beta2) each. 2e-9 of the sum is left out with this one."""
+(`reference.adam.MEMORY`), whose terms fall by beta1 / sqrt(beta2) each. With this one, less than 2e-9 of
+the sum is left out."""
 
 
 MOST_PAIRS = 2**31 - 1
@@ -81,10 +82,12 @@ class Bins(NamedTuple):
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rate of each parameter group; those of the means are in world units.
+    """Adam's learning rate of each parameter group, and its factor on the second moments.
 
-    beta2: factor on the second moments at each step; the same in every step of a run, since the bias correction and
-        what unseen Gaussians make up for follow from it and the number of the step.
+    means: world units.
+    log_scales, quats, logit_opacities, sh_dc, sh_rest: units of the parameter.
+    beta2: LEAST_BETA2 or more and below 1; the same in every step of a run, since the bias correction and what unseen
+        Gaussians make up for follow from it and the number of the step. Another value raises ValueError.
     """
 
     means: float
@@ -94,6 +97,10 @@ class Rates:
     sh_dc: float
     sh_rest: float
     beta2: float = BETA2
+
+    def __post_init__(self) -> None:
+        if not LEAST_BETA2 <= self.beta2 < 1.0:
+            raise ValueError(f"beta2: expected at least {LEAST_BETA2} and less than 1, got {self.beta2}")
 
     def rows(self) -> list[float]:
         """Return the rate of each of a Gaussian's 59 parameters."""

@@ -14,7 +14,7 @@ import torch
 
 from splatmill_worker.splat.train import disagreement
 from splatmill_worker.splat.train.consensus import Comparison, Glance
-from splatmill_worker.splat.train.disagreement import Disagreement
+from splatmill_worker.splat.train.disagreement import Disagreement, Look
 from splatmill_worker.splat.train.loop import train
 from splatmill_worker.splat.train.run import TrainingRun
 from splatmill_worker.splat.views import TrainingView
@@ -85,7 +85,8 @@ def test_photos_are_compared_once_before_they_are_learnt_by_heart(
     """After ten steps on each photo, after three tenths of the run, or at its end, whichever comes first."""
     compared = []
 
-    def record(run: TrainingRun) -> tuple[Disagreement, ...]:
+    def record(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disagreement, ...]:
+        assert list(learnt) == list(range(photos))
         compared.append(run.step)
         return ()
 
@@ -102,6 +103,17 @@ def test_photos_that_are_set_aside_are_not_compared() -> None:
     assert {each.name for each in found.disagreements} == {view.name for view in views} - set(
         found.validation
     )
+
+
+def test_photos_that_were_set_aside_are_not_compared_once_they_are_trained_on() -> None:
+    """An attempt may go on from a checkpoint so late that it takes steps on all photos before it compares them."""
+    views = still_life.training_views()
+    run = TrainingRun(first_engine(), replace(plan(40), validation=2), views, 1.1)
+    aside = {views[index].name for index in run.set_aside}
+    assert len(aside) == 2
+    look = Look(run)
+    run.train_on_all()
+    assert {each.name for each in look.finish()} == {view.name for view in views} - aside
 
 
 def test_too_few_photos_are_not_compared() -> None:

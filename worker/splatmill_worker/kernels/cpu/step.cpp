@@ -31,7 +31,7 @@ struct Scene {
 struct Update {
   float *params = nullptr, *exp_avg = nullptr, *exp_avg_sq = nullptr;
   float rates[kRows] = {};  // with the bias correction of the first moment
-  AdamStep adam;            // what it does to the second
+  AdamStep adam;            // weights and bias correction of the second moment; its `size` is in `rates` already
   int64_t step = 0;
   float* gradients = nullptr;
   float* scores = nullptr;  // [kScoreRows][score_stride]; null where none are kept

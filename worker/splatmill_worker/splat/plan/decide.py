@@ -156,7 +156,7 @@ def _degree(facts: Facts, options: TrainOptions, reasons: Reasons) -> int:
 
 def _annealing(facts: Facts, options: TrainOptions, steps: int, reasons: Reasons) -> Annealing:
     boost = boost_of(steps)
-    # Few photos lose by steps that stay long (decisions: second-moment).
+    # A shorter average keeps steps large, and few photos lose by that (decisions: second-moment).
     beta2 = beta2_of(steps) if facts.views >= FEW_VIEWS else BETA2
     averaged = min(steps, round(1.0 / (1.0 - beta2)))
     because = (
@@ -187,7 +187,8 @@ def _warm_start(schedule: Schedule, model: GivenModel, reasons: Reasons) -> Sche
     """
     reasons.left_out["coarse_to_fine"] = "The given model is trained already; reduced photos would blur it."
     reasons.chosen["rates"] = (
-        f"The given model is trained already, so learning rates are those of a run of {PAPER_STEPS} steps."
+        f"The given model is trained already, so learning rates and the average of squared gradients are those of a "
+        f"run of {PAPER_STEPS} steps."
     )
     degree = schedule.degree
     if "sh_degree" not in reasons.forced and model.degree > degree:

@@ -71,7 +71,8 @@ class Facts:
     light_tail: departure of a photo's exposure or white balance from what the photos around it predict, natural
         logarithm; nine photos in ten depart less.
     light_error: median standard error of the photos' exposures, natural logarithm.
-    light_unseen: share of smooth light that the photos around do not predict, because they are too far away, 0 to 1.
+    light_unseen: share of the variance of smooth light that the photos around do not predict, because they are too far
+        away, 0 to 1.
     lens_residual: largest displacement of a pixel by lens distortion, pixels.
     alignment: length of the mean viewing direction: 1 where all photos look the same way; of those that look level, 2
         over pi where they look evenly over half a turn, and 0 over a whole turn.
@@ -129,7 +130,10 @@ class Facts:
 
 
 def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: Speed | None) -> Facts:
-    """Facts of `scene`, whose training photos are `views` in the same world, of any origin and unit."""
+    """Facts of `scene`, whose training photos are `views` in the same world, of any origin and unit.
+
+    held_out: number of held-out photos. speed: of this machine; None where it was not probed.
+    """
     sizes = np.array([[view.full.camera.width, view.full.camera.height] for view in views])
     width, height = (int(value) for value in np.median(sizes, axis=0))
     seen = Observations.of(scene, views)

@@ -39,7 +39,8 @@ class Plan:
     far_shell: Gaussians stand behind the scene, wherever photos look.
     gaps: Gaussians are added where photos show something that no point describes.
     pose_refinement: the cameras of training photos are corrected.
-    validation: number of training photos that are set aside for these two decisions; None: neither is made.
+    validation: number of training photos that are set aside for `target_psnr` and `stops_when_flat`; None: neither is
+        asked for.
     reasons: a sentence for each field of the plan.
     left_out: a sentence for each thing that this scene does not need.
     forced: names of what an option fixed.

@@ -43,7 +43,8 @@ def probe(engine: Engine, views: Sequence[TrainingView], *, most: int = GROWN) -
     """The time of a training step, divided into a part per pixel and a part per Gaussian.
 
     engine: holds the first Gaussians. Its parameters are the same afterwards.
-    most: number of Gaussians that the photos resolve; a scene is not timed with more, unless it starts with more.
+    most: number of Gaussians that the photos resolve; a scene is not timed with more, unless it starts with more. 0: it
+        is timed as it is, as a model that is trained already.
 
     What is timed is a scene that has grown from the first Gaussians, as training makes it (`grown`). Two sizes of the
     same photos are timed: the difference is the pixels' part, the rest is the Gaussians'. The fastest of a few steps
@@ -70,18 +71,18 @@ def probe(engine: Engine, views: Sequence[TrainingView], *, most: int = GROWN) -
 
 
 def grown(first: Gaussians, count: int) -> Gaussians:
-    """About `count` Gaussians that cover what `first` cover: copies, scattered by their own size and smaller by the
-    root of their number. `first` itself, of degree 3, where it has as many already.
+    """`count` Gaussians that cover what `first` cover: copies, equally many of each but for one, scattered by their own
+    size and smaller by the root of their number. `first` itself, of degree 3, where it has as many already.
     """
-    copies = count // max(1, first.count)
     whole = first.padded(3)
-    if copies < 2:
+    if not 0 < first.count < count:
         return whole
     dice = torch.Generator().manual_seed(0)
-    many = whole.map(lambda value: value.repeat(copies, *[1] * (value.dim() - 1)))
+    original = torch.arange(count) * first.count // count
+    many = whole.map(lambda value: value[original.to(value.device)])
     scatter = torch.randn(many.means.shape, generator=dice).to(many.means)
     many.means.add_(scatter * many.log_scales.exp())
-    many.log_scales.sub_(0.5 * math.log(copies))
+    many.log_scales.sub_(0.5 * math.log(count / first.count))
     many.logit_opacities.fill_(math.log(GROWN_OPACITY / (1.0 - GROWN_OPACITY)))
     return many
 

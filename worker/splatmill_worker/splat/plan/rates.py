@@ -29,7 +29,7 @@ SHORT = 3000
 gradients are large, and a short run would divide its steps by them to its end (decisions: second-moment)."""
 
 FEWEST_AVERAGED = 50
-"""Steps over which squared gradients are averaged at least."""
+"""Steps over which squared gradients are averaged at least, in runs of up to 407 (decisions: second-moment)."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def boost_of(steps: int) -> float:
 
 def beta2_of(steps: int) -> float:
     """Adam's factor on the second moments in a run of so many steps: that of an average over 1 / (1 - BETA2) steps from
-    SHORT on, and below over fewer, as the power 3/2 of the steps; a sixth of 600 and a third of 3000.
+    SHORT on. Below, the number falls as the power 3/2 of the steps: 354 at 1500, 89 at 600, FEWEST_AVERAGED at least.
     """
     return min(BETA2, 1.0 - 1.0 / max(FEWEST_AVERAGED, math.pow(steps / SHORT, 1.5) / (1.0 - BETA2)))
 

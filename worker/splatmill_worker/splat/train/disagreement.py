@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from torch import Tensor
@@ -32,8 +33,9 @@ OTHER_LIGHT = 3.0
 """dB that a fit of its colours gains on a photo with another light."""
 
 WHOLLY_OFF = 1.3
-"""Ratio of a photo's residuals to those of the others from which no thing in it is the reason, but all of it is off: of
-the median pixel, over the same of the median photo, and of their root mean square (decisions: disagreement)."""
+"""A photo has a wrong camera or is blurred where its residuals are this many times those of the others by two measures:
+the median over its pixels, relative to that of the median photo, and the root mean square; 1.3 is 2.3 dB (decisions:
+disagreement)."""
 
 THING = 0.01
 """Share of a photo's pixels that no other agrees with, from which it is named (decisions: disagreement)."""
@@ -57,13 +59,14 @@ class Disagreement(NamedTuple):
 
 
 class Look:
-    """Compares the photos of a run once, in its course.
+    """Compares the photos of a run once, in its course: those that are not set aside when it begins or goes on.
 
     seconds: what the comparison took.
     """
 
     def __init__(self, run: TrainingRun) -> None:
         self._run = run
+        self._compared = [index for index in range(len(run.views)) if index not in run.set_aside]
         self._found: tuple[Disagreement, ...] | None = None
         self.seconds = 0.0
 
@@ -71,13 +74,12 @@ class Look:
     def is_due(self) -> bool:
         """Whether to compare them now. A run that goes on from a checkpoint compares them again."""
         run = self._run
-        seen = len(run.views) - len(run.set_aside)
-        return self._found is None and (run.step >= VISITS * seen or run.progress >= LATEST)
+        return self._found is None and (run.step >= VISITS * len(self._compared) or run.progress >= LATEST)
 
     def take(self) -> None:
         """Compare the photos with what the run's engine holds."""
         started = time.perf_counter()
-        self._found = disagreements(self._run)
+        self._found = disagreements(self._run, self._compared)
         self.seconds = time.perf_counter() - started
 
     def finish(self) -> tuple[Disagreement, ...]:
@@ -87,19 +89,18 @@ class Look:
         return self._found or ()
 
 
-def disagreements(run: TrainingRun) -> tuple[Disagreement, ...]:
-    """All photos that a run takes steps on, that which disagrees most first; none where they are too few to compare.
+def disagreements(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disagreement, ...]:
+    """The photos with the indices `learnt`, that which disagrees most first; none where they are too few to compare.
 
-    Photos that are set aside are not learnt, and would disagree for that reason alone.
+    Photos that no step was taken on would disagree for that reason alone.
     """
-    seen_in_steps = [index for index in range(len(run.views)) if index not in run.set_aside]
-    views = [run.views[index] for index in seen_in_steps]
+    views = [run.views[index] for index in learnt]
     if len(views) < FEWEST_PHOTOS:
         return ()
     background = evaluation_background(run.plan, run.views)
     targets = [small(view) for view in views]
     if run.poses is not None:
-        moved = [run.poses.viewmat(index) for index in seen_in_steps]
+        moved = [run.poses.viewmat(index) for index in learnt]
         targets = [target._replace(viewmat=viewmat) for target, viewmat in zip(targets, moved, strict=True)]
     glances = [glance(run.engine, run.plan, target, background) for target in targets]
     found = compared(glances)

@@ -102,7 +102,7 @@ class Trained:
     on_training: score of an even choice of the training views at the end.
     steps: training steps.
     seconds: training time, without evaluations and checkpoints.
-    evaluate_seconds: time of all evaluations of this attempt.
+    evaluate_seconds: time of all evaluations of this attempt, and of the comparison of the photos.
     stopped: why the run ended, a clause or, after a failure, a sentence.
     failure: the failure that ended the run with its last good state; None where none did.
     recoveries: roll-backs.
