@@ -63,8 +63,10 @@ def test_a_scene_that_has_grown_covers_what_the_first_gaussians_covered() -> Non
     copies = original.bincount()
     assert int(copies.max() - copies.min()) <= 1
     # As many times smaller an area as there are copies of it.
-    area = (2.0 * first.log_scales[:, 0]).exp().sum()
-    assert float((2.0 * many.log_scales[:, 0]).exp().sum()) == pytest.approx(float(area), rel=1e-2)
+    area = ((2.0 * first.log_scales[:, 0]).exp() * copies).sum() * first.count / GROWN
+    smaller = math.log(GROWN / first.count) / 2.0
+    assert torch.allclose(many.log_scales, first.log_scales[original] - smaller, atol=1e-5)
+    assert float((2.0 * many.log_scales[:, 0]).exp().sum()) == pytest.approx(float(area), rel=1e-3)
     # Copies lie within a few standard deviations of the original, on all its sides.
     away = (many.means - first.means[original]) / first.log_scales.exp()[original]
     assert float(away.mean().abs()) < 0.05

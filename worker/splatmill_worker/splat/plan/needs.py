@@ -17,8 +17,8 @@ MANY_GAPS = 0.1
 """Share of the photos' area, sky excluded, from which gaps are filled; smaller ones are left to densification."""
 
 FEW_VIEWS = 12
-"""Training photos below which they count as few: gaps are not filled, the background is black, and Adam averages over a
-thousand steps (decisions: FEW_VIEWS), (decisions: second-moment)."""
+"""Training photos below which they count as few: gaps are not filled, a far shell wants sky or views to several sides,
+the background is black, and Adam averages over a thousand steps (decisions: FEW_VIEWS), (decisions: second-moment)."""
 
 HALF_TURN = 2 / math.pi
 """Alignment of photos that look level and evenly over half a turn (decisions: FEW_VIEWS)."""

@@ -34,8 +34,10 @@ OTHER_LIGHT = 3.0
 
 WHOLLY_OFF = 1.3
 """A photo has a wrong camera or is blurred where its residuals are this many times those of the others by two measures:
-the median over its pixels, relative to that of the median photo, and the root mean square; 1.3 is 2.3 dB (decisions:
-disagreement)."""
+the median over its pixels, relative to that of the median photo, and the root mean square (decisions: disagreement)."""
+
+WHOLLY_OFF_DB = 20.0 * math.log10(WHOLLY_OFF)
+"""The same in decibels: 2.3."""
 
 THING = 0.01
 """Share of a photo's pixels that no other agrees with, from which it is named (decisions: disagreement)."""
@@ -119,9 +121,7 @@ def _judged(name: str, seen: Glance, comparison: Comparison, usual: float) -> Di
         reason = "other light"
     elif comparison.decibels <= 0.0:
         reason = None
-    elif 0.0 < WHOLLY_OFF * usual <= comparison.median and comparison.decibels >= 20.0 * math.log10(
-        WHOLLY_OFF
-    ):
+    elif comparison.decibels >= WHOLLY_OFF_DB and 0.0 < WHOLLY_OFF * usual <= comparison.median:
         reason = "wrong camera or blur"
     elif share >= THING:
         reason = "moving things"
