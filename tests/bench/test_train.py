@@ -70,6 +70,7 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> Any:
                 "ablation",
                 "budgets",
                 "configurations",
+                "instead",
                 "lpips",
                 "outliers",
                 "perceived",
@@ -185,7 +186,9 @@ def test_a_line_that_was_cut_short_is_dropped(parts: Any, tmp_path: Path) -> Non
     assert rows.lines(path) == [{"n": 1}, {"n": 3}]
 
 
-def test_every_switch_is_an_option_or_changes_the_plan(parts: Any, trained: pipeline.Outcome) -> None:
+def test_every_switch_is_an_option_changes_the_plan_or_replaces_a_function(
+    parts: Any, trained: pipeline.Outcome
+) -> None:
     configurations = parts["_train.configurations"]
     stored = json.loads((trained.out.parent / "plan.json").read_text())
     plan = Plan.from_dict(stored["plan"])
@@ -193,7 +196,7 @@ def test_every_switch_is_an_option_or_changes_the_plan(parts: Any, trained: pipe
         assert TrainOptions.model_validate(switch.options).model_fields_set == set(switch.options)
         revised = configurations.revised(plan, switch.plan)
         assert revised.forced == (*plan.forced, *switch.plan)
-        assert bool(switch.options or switch.plan) == (name != configurations.DEFAULT)
+        assert bool(switch.options or switch.plan or switch.instead) == (name != configurations.DEFAULT)
     revised = configurations.revised(
         plan, {"schedule.resolution": [[0, 2]], "schedule.annealing.rest_fall": 0.7}
     )

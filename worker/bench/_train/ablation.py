@@ -143,5 +143,6 @@ def _comparable(pairs: list[Pair]) -> list[Pair]:
 
 
 def _course(row: Row) -> Row:
-    """The fields of a plan that affect a run: all but the reasons."""
-    return {name: value for name, value in row["plan"].items() if name not in ("left_out", "forced")}
+    """What affects a run: its plan but for the reasons, and what is done otherwise."""
+    plan = {name: value for name, value in row["plan"].items() if name not in ("left_out", "forced")}
+    return plan | {"instead": row.get("instead")}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from _rows import Row
 
-from _train import few
+from _train import configurations, few
 from _train.rows import BenchRun
 from _train.scenes import Scene, named
 
@@ -33,7 +33,9 @@ def measured(run: BenchRun, work: Path, lpips: Sequence[Path] = ()) -> Row:
     return _ask(
         {
             "do": "measure",
-            **located(run.scene, work),
+            **located(
+                run.scene, work, f"sfm-{run.config}" if configurations.named(run.config).recovers else "sfm"
+            ),
             "identity": run.identity(),
             "budget": run.budget.options,
             "lpips": [str(path) for path in lpips],
@@ -47,9 +49,12 @@ def judged(scene: Scene, name: str, model: Path, seconds: float, work: Path) -> 
     return _ask({"do": "judge", **located(scene, work), **job, "seconds": seconds})
 
 
-def located(scene: Scene, work: Path) -> Row:
-    """Where a job finds the capture of a scene and keeps its cameras, and so for the scene that it is a part of."""
-    kept = work / scene.name / "sfm"
+def located(scene: Scene, work: Path, cameras: str = "sfm") -> Row:
+    """Where a job finds the capture of a scene and keeps its cameras, and so for the scene that it is a part of.
+
+    cameras: the folder of the scene's that they are kept in.
+    """
+    kept = work / scene.name / cameras
     place: Row = {"capture": str(scene.folder), "made": scene.made, "sfm": str(kept.resolve())}
     if scene.name in few.SCENES:
         whole = named(few.SCENES[scene.name][0], work)

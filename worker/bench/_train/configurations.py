@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal
 
 from _train.scenes import Scene
+from splatmill_worker import sfm
 from splatmill_worker.splat.plan.plan import Plan
 
 DEFAULT = "default"
@@ -17,21 +18,32 @@ class Configuration:
 
     what: the switch in words. options: fields of TrainOptions. plan: fields of the plan that was made, with dots
     into its parts ("schedule.opacity_decay"). gives: fields of the plan that the options lead to; where a plan has them
-    anyway, the switch changes nothing. photos: the switch means something on such photos only.
-    points: it asks for points of the scene.
+    anyway, the switch changes nothing. instead: functions of the program, by dotted name, and which of `_train.instead`
+    takes the place of each. photos: the switch means something on such photos only. points: it asks for points of the
+    scene.
     """
 
     what: str
     options: dict[str, Any] = field(default_factory=dict)
     gives: dict[str, Any] = field(default_factory=dict)
     plan: dict[str, Any] = field(default_factory=dict)
+    instead: dict[str, str] = field(default_factory=dict)
     photos: Literal["any", "opaque", "transparent"] = "any"
     points: bool = False
 
     def concerns(self, scene: Scene) -> bool:
         """Whether the switch means something there."""
         photos = "transparent" if scene.transparent else "opaque"
-        return self.photos in ("any", photos) and (scene.points or not self.points)
+        return (
+            self.photos in ("any", photos)
+            and (scene.points or not self.points)
+            and not (scene.posed and self.recovers)
+        )
+
+    @property
+    def recovers(self) -> bool:
+        """Whether cameras are recovered otherwise, so that those of other configurations are not its own."""
+        return any(name.startswith(f"{sfm.__name__}.") for name in self.instead)
 
     def changes(self, plan: dict[str, Any]) -> bool:
         """Whether the switch makes another plan of a row's plan, in which what is off or None is absent."""
@@ -95,6 +107,26 @@ CONFIGURATIONS = {
     "no-gaps": _option("no such Gaussians", "gaps", "off", False),
     "pose-refinement": _option("training cameras are corrected", "pose_refinement", "on", True),
     "no-pose-refinement": _option("cameras stay as they are", "pose_refinement", "off", False),
+    "probe-of-the-start": Configuration(
+        "the forecast is made from the Gaussians of the start",
+        instead={"splatmill_worker.splat.plan.probe.grown": "not_grown"},
+    ),
+    "folds-left": Configuration(
+        "sides that look alike may lie on each other",
+        instead={"splatmill_worker.sfm.solve.unfold": "left_folded"},
+    ),
+    "outliers-masked": Configuration(
+        "pixels that no other photo agrees with count no longer",
+        instead={"splatmill_worker.splat.train.disagreement.disagreements": "without_outliers"},
+    ),
+    "named-photos-skipped": Configuration(
+        "no step is taken on photos that the report names",
+        instead={"splatmill_worker.splat.train.disagreement.disagreements": "without_named_photos"},
+    ),
+    "cleaned": Configuration(
+        "Gaussians that the photos do not support are removed at the end",
+        instead={"splatmill_worker.pipeline.train": "trained_and_cleaned"},
+    ),
 }
 """The switches by name. A name never changes its meaning, since measured rows refer to it."""
 

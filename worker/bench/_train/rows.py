@@ -78,13 +78,14 @@ class BenchRun:
             "seed": self.seed,
             "options": self.scene.options | configuration.options,
             "revised": configuration.plan,
+            **({"instead": configuration.instead} if configuration.instead else {}),
         }
 
     def __str__(self) -> str:
         return f"{self.scene.name}, {self.config}, {self.budget.name}, seed {self.seed}"
 
 
-_IDENTITY = ("kind", "scene", "config", "budget", "seed", "options", "revised", "code")
+_IDENTITY = ("kind", "scene", "config", "budget", "seed", "options", "revised", "instead", "code")
 
 
 def key(row: Row) -> str:

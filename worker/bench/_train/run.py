@@ -16,7 +16,7 @@ import torch
 from _rows import Row, origin, worked
 from torch import Tensor
 
-from _train import bare, few
+from _train import bare, few, instead
 from _train.configurations import revised
 from _train.lpips import Lpips
 from _train.outliers import judged
@@ -89,7 +89,8 @@ def measure(job: Row) -> Row:
         return replace(revised(plan, job["identity"]["revised"]), seed=seed)
 
     row = {**job["identity"], "bench": "train", "code": code_version(), **origin()}
-    with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
+    otherwise = instead.applied(job["identity"].get("instead", {}))
+    with otherwise, tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
         workdir = _with_cameras(Path(folder), job)
         wall, cpu, machine = time.perf_counter(), time.process_time(), worked()
         try:

@@ -17,13 +17,15 @@ SIDE = 480
 
 @dataclass(frozen=True)
 class Scene:
-    """A capture and the options that all runs on it share. `made` names the generator of a built-in scene."""
+    """A capture and the options that all runs on it share. `made` names the generator of a built-in scene; `posed` says
+    whether its cameras come with it."""
 
     name: str
     folder: Path
     options: dict[str, Any] = field(default_factory=lambda: {"image_size": SIDE, "holdout": 8})
     transparent: bool = False
     points: bool = True
+    posed: bool = False
     made: str | None = None
 
 
@@ -63,11 +65,11 @@ def named(text: str, work: Path) -> Scene:
             raise FileNotFoundError(
                 f"{text} is left out: fox is not in ../shared/data, and no part of the project."
             )
-        return Scene(text, work / text / "capture", made=text)
+        return Scene(text, work / text / "capture", posed=True, made=text)
     if text in few.SCENES:
         whole = named(few.SCENES[text][0], work)
         options = {**whole.options, "test_views": few.held_out(text)}
-        return Scene(text, work / text / "capture", options, made=text)
+        return Scene(text, work / text / "capture", options, posed=True, made=text)
     if text in (*KNOWN, FOLDED):
         shared = FOLDERS["beer" if text == FOLDED else text]
         folder = SHARED / shared
@@ -78,8 +80,9 @@ def named(text: str, work: Path) -> Scene:
         if text == "beer":
             return Scene(text, _photos_alone(folder, work / text / "capture"))
         if text == "lego":
-            return Scene(text, folder, {"image_size": 400, "holdout": 8}, transparent=True, points=False)
-        return Scene(text, folder)
+            lego = {"image_size": 400, "holdout": 8}
+            return Scene(text, folder, lego, transparent=True, points=False, posed=True)
+        return Scene(text, folder, posed=text in (FOLDED, "fox"))
     folder = Path(text)
     if not folder.is_dir():
         raise ValueError(f"{text!r} is neither a scene ({', '.join(ALL)}) nor a folder with a capture.")
