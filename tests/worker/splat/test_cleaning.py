@@ -1,6 +1,6 @@
 """Proves that what is planted into a trained still life is found and named, and that what photos support stays.
 
-Does not prove the evidence (test_evidence.py), nor how real models gain or lose (worker/bench/clean.md).
+Does not prove the evidence (test_evidence.py), nor how real models gain or lose (worker/bench/train.md).
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from splatmill_worker.splat.cleaning import Cleaning, Reason, clean, photo_psnr
+from splatmill_worker.splat.cleaning import MOST_LOST, Cleaning, Reason, clean, photo_psnr
 from splatmill_worker.splat.engine.open import gaussians_of
 from splatmill_worker.splat.evidence import evidence_of
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians, concatenate
+from splatmill_worker.splat.render import render
 from splatmill_worker.splat.train.loop import train
-from splatmill_worker.splat.views import TrainingView
+from splatmill_worker.splat.views import Target, TrainingView
 from tests.support.training import first_engine, plan, split
 
 BLACK = torch.zeros(3)
@@ -64,7 +65,12 @@ class Trained:
         return sum(photo_psnr(gaussians, view.full, BLACK) for view in self.held_out) / len(self.held_out)
 
     def cleaned(self, gaussians: Gaussians) -> Cleaning:
-        return clean(gaussians, [view.full for view in self.training], BLACK)
+        return clean(gaussians, self.photos, BLACK)
+
+    @property
+    def photos(self) -> list[Target]:
+        """The training photos."""
+        return [view.full for view in self.training]
 
 
 @pytest.fixture(scope="module")
@@ -98,12 +104,25 @@ def test_what_photos_support_stays(life: Trained) -> None:
     gone = ~found.keep
     assert found.psnr >= found.psnr_before
     assert life.psnr(life.gaussians.select(found.keep)) >= life.psnr(life.gaussians) - 0.02
-    photos = [view.full for view in life.training]
-    evidence = evidence_of(life.gaussians, photos, BLACK)
+    evidence = evidence_of(life.gaussians, life.photos, BLACK)
     heavy = evidence.support > 0.1 * evidence.support.max()
     assert int(heavy.sum()) > 10
     assert not bool((gone & heavy).any())
     assert bool((evidence.weight[gone] > 0).all())  # what no photo shows is no matter of support
+
+
+@pytest.mark.slow
+def test_what_one_photo_needs_stays(life: Trained) -> None:
+    """A Gaussian that spoils all photos but one, where it is what passed by."""
+    spoilt = concatenate(life.gaussians, planted("giant", life.training[:1]).padded(1))
+    shown = render(spoilt, life.photos[0].camera, background=BLACK).color.clamp(0.0, 1.0)
+    passed = life.photos[0]._replace(rgb=(255.0 * shown.detach() + 0.5).to(torch.uint8))
+    assert not bool(clean(spoilt, life.photos, BLACK).keep[-1])
+    found = clean(spoilt, [passed, *life.photos[1:]], BLACK)
+    assert bool(found.keep[-1])
+    left = spoilt.select(found.keep)
+    for photo in (passed, *life.photos[1:]):
+        assert photo_psnr(left, photo, BLACK) >= photo_psnr(spoilt, photo, BLACK) - MOST_LOST - 1e-3
 
 
 @pytest.mark.slow

@@ -94,19 +94,18 @@ def test_weights_are_what_the_colour_of_a_gaussian_changes(
     assert float(found.weight[-1]) == 0.0
 
 
-def test_others_leave_out_the_photo_that_supports_the_gaussian_most(
+def test_support_is_a_sum_over_photos_and_each_has_its_own_psnr(
     gaussians: Gaussians, photos: list[Target]
 ) -> None:
-    each = torch.stack([evidence_of(gaussians, [photo], GREY).support for photo in photos[:1]])
-    alone = evidence_of(gaussians, photos[:1], GREY)
-    assert torch.equal(alone.support, each[0])
-    assert not bool(alone.others.any())  # one photo has no others
-    # The same photo twice: the signs differ, the sum without the larger of the two is the smaller one.
+    apart = [evidence_of(gaussians, [photo], GREY) for photo in photos]
+    together = evidence_of(gaussians, photos, GREY)
+    assert together.psnrs.tolist() == pytest.approx([each.psnr for each in apart])
+    assert len(set(together.psnrs.tolist())) == len(photos)
+    assert together.psnr == pytest.approx(sum(each.psnr for each in apart) / len(photos))
+    # The same photo twice: the random signs differ, the weights do not.
     twice = evidence_of(gaussians, [photos[0], photos[0]], GREY)
-    several = twice.photos > 1
-    assert bool(several.any())
-    assert bool((twice.others[several] <= 0.5 * twice.support[several] + 1e-12).all())
-    assert bool((2 * alone.photos == twice.photos).all())
+    torch.testing.assert_close(twice.weight, 2.0 * apart[0].weight)
+    assert torch.equal(twice.photos, 2 * apart[0].photos)
 
 
 @pytest.mark.slow

@@ -35,8 +35,15 @@ counts as an island: it ends before the others begin."""
 FLOATER = 0.5
 """Depth over that of what a photo shows at the same pixels up to which a Gaussian counts as a floater."""
 
+MOST_LOST = 0.02
+"""dB of PSNR that a removal may cost a photo, at most. Where it costs none of M photos more, it costs a photo that took
+no part in it more with a probability of about one in M + 1."""
+
 FIRST_SHARE = 1e-3
 """Share of the Gaussians that are removed first, at least one; each further time, up to twice as many."""
+
+RETRIED_SHARE = 0.125
+"""Share of a removal that is tried in its place where it cost a photo too much, once."""
 
 LEAST_HARM = 3.0 * HALF_LEVEL**2
 """Squared error of all photos up to which a Gaussian does no harm: that of the rounding to 8 bits at one pixel."""
@@ -73,10 +80,10 @@ def clean(
 ) -> Cleaning:
     """Find the Gaussians to remove from a model, by the evidence of `photos`, which have to be at least one.
 
-    A Gaussian is unsupported where the photos have less squared error without it, and would still if the photo that
-    supports it most were left out. That does not add up: of two that make the same place too bright, one may have to
-    stay. So the most harmful are removed first, the evidence is taken anew, and up to twice as many follow, as long
-    as the mean PSNR of the photos rises. A model without unsupported Gaussians stays as it is.
+    A Gaussian is unsupported where all photos together have less squared error without it. That does not add up: of two
+    that make the same place too bright, one may have to stay. So the most harmful are removed first, the evidence is
+    taken anew, and up to twice as many follow, as long as the mean PSNR of the photos rises and none has lost more than
+    MOST_LOST. A model without unsupported Gaussians stays as it is.
 
     background: RGB [3] in 0 to 1 behind the scene and behind transparent photos.
     antialias: whether the model was trained with the compensation of opacities.
@@ -90,27 +97,26 @@ def clean(
     batch = max(1, math.ceil(FIRST_SHARE * gaussians.count))
     evidence = first = seen(rows)
     removed: dict[Reason, int] = {}
+    retried = False
     while True:
-        harm = torch.where(_unsupported(evidence), -evidence.support, torch.zeros_like(evidence.support))
+        harm = -evidence.support
         going = (harm > LEAST_HARM) & (harm >= COMPARABLE * harm.max())
         if not bool(going.any()):
             break
         going[torch.argsort(harm, descending=True, stable=True)[batch:]] = False
         left = rows[~going]
         found = seen(left)
-        if not found.psnr > evidence.psnr:
+        if found.psnr > evidence.psnr and bool((found.psnrs >= first.psnrs - MOST_LOST).all()):
+            for reason, number in _by_reason(gaussians.select(rows), evidence, going).items():
+                removed[reason] = removed.get(reason, 0) + number
+            rows, evidence, batch = left, found, 2 * batch
+        elif retried or int(going.sum()) == 1:
             break
-        for reason, number in _by_reason(gaussians.select(rows), evidence, going).items():
-            removed[reason] = removed.get(reason, 0) + number
-        rows, evidence, batch = left, found, 2 * batch
+        else:
+            retried, batch = True, max(1, int(RETRIED_SHARE * int(going.sum())))
     keep = torch.zeros(gaussians.count, dtype=torch.bool, device=rows.device)
     keep[rows] = True
-    return Cleaning(keep, removed, int(_unsupported(first).sum()), first.psnr, evidence.psnr)
-
-
-def _unsupported(evidence: Evidence) -> Tensor:
-    """bool [N]: Gaussians without which the photos fit better, also if the photo that supports one most is left out."""
-    return (evidence.support < 0.0) & (evidence.others <= 0.0)
+    return Cleaning(keep, removed, int((first.support < 0.0).sum()), first.psnr, evidence.psnr)
 
 
 def _by_reason(gaussians: Gaussians, evidence: Evidence, removed: Tensor) -> dict[Reason, int]:

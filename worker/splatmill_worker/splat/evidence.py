@@ -43,27 +43,31 @@ BELOW_CLAMP = 0.99
 
 @dataclass(frozen=True)
 class Evidence:
-    """What photos say about N Gaussians: `psnr` of them all, each other field [N]. Sums are over pixels and channels.
+    """What M photos say about N Gaussians: `psnrs` of them all [M], each other field [N]. Sums are over pixels and
+    channels.
 
     weight: sum of alpha T over all photos, pixels.
     peak: the same in the photo where it is largest, pixels.
     photos: number of photos in which the weight is HALF_LEVEL or more, int64.
     support: growth of the squared error of all photos without the Gaussian, colours in 0 to 1.
-    others: the same without the photo that supports the Gaussian most, and 0 for what one photo alone shows.
     extent: largest half side of the Gaussian's box in a photo that shows it, in halves of the photo's longer side.
     depth: smallest ratio of the Gaussian's depth to the mean depth of what a photo shows at the same pixels; infinite
         where no photo shows it.
-    psnr: mean over the photos, dB, of the model with opacities up to BELOW_CLAMP.
+    psnrs: of each photo, dB float64, of the model with opacities up to BELOW_CLAMP.
     """
 
     weight: Tensor
     peak: Tensor
     photos: Tensor
     support: Tensor
-    others: Tensor
     extent: Tensor
     depth: Tensor
-    psnr: float
+    psnrs: Tensor
+
+    @property
+    def psnr(self) -> float:
+        """Mean over the photos, dB."""
+        return float(self.psnrs.mean())
 
 
 def evidence_of(
@@ -84,24 +88,23 @@ def evidence_of(
     """
     n, like = gaussians.count, gaussians.means
     zero = like.new_zeros(n, dtype=torch.float64)
-    weight, peak, support, best = zero.clone(), zero.clone(), zero.clone(), zero.clone()
+    weight, peak, support = zero.clone(), zero.clone(), zero.clone()
     seen = torch.zeros(n, dtype=torch.int64, device=like.device)
     extent, depth = like.new_zeros(n), torch.full_like(zero, float("inf"))
     random = torch.Generator().manual_seed(seed)
-    decibels = 0.0
+    decibels: list[float] = []
     for target in photos:
         one = _in_one_photo(gaussians, target, background, antialias, backend, random)
         shown = one.weight >= HALF_LEVEL
-        decibels += one.psnr / len(photos)
+        decibels.append(one.psnr)
         weight += one.weight
         peak = torch.maximum(peak, one.weight)
         seen += shown
         support += one.support
-        best = torch.maximum(best, one.support)
         extent = torch.where(shown, torch.maximum(extent, one.extent), extent)
         depth = torch.where(shown, torch.minimum(depth, one.depth), depth)
-    others = torch.where(seen > 1, support - best, zero)
-    return Evidence(weight, peak, seen, support, others, extent, depth, decibels)
+    psnrs = torch.tensor(decibels, dtype=torch.float64)
+    return Evidence(weight, peak, seen, support, extent, depth, psnrs)
 
 
 @dataclass(frozen=True)
