@@ -68,7 +68,7 @@ def without_named_photos(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disag
                 index = following()
             return index
 
-        run._next_view = next_left  # type: ignore[method-assign]
+        vars(run)["_next_view"] = next_left
     return found
 
 
