@@ -36,8 +36,8 @@ FLOATER = 0.5
 """Depth over that of what a photo shows at the same pixels up to which a Gaussian counts as a floater."""
 
 MOST_LOST = 0.02
-"""dB of PSNR that a removal may cost a photo, at most. Where it costs none of M photos more, it costs a photo that took
-no part in it more with a probability of about one in M + 1 (decisions: cleaning)."""
+"""dB of PSNR that all removals together may cost any one of the photos. A bound on each of them, and not on their mean,
+keeps photos that took no part from losing (decisions: cleaning)."""
 
 FIRST_SHARE = 1e-3
 """Share of the Gaussians that are removed first, at least one; each further time, up to twice as many."""
