@@ -90,7 +90,7 @@ def test_what_is_planted_goes(life: Trained, kind: Reason) -> None:
     found = life.cleaned(spoilt)
     gone = ~found.keep
     assert int(gone[-EACH:].sum()) == EACH
-    assert found.removed.get(kind, 0) >= EACH
+    assert found.removed[kind] >= EACH
     assert sum(found.removed.values()) == int(gone.sum())
     # Held-out photos took no part in it, and are shown as without what was planted, or better.
     assert life.psnr(spoilt.select(found.keep)) >= life.psnr(life.gaussians) - 0.02

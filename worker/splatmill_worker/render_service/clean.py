@@ -58,7 +58,7 @@ class Cleaned:
 
     before: number of Gaussians of the model.
     left: how many of them stay.
-    removed: number by reason, in the order in which they were removed.
+    removed: number by each reason that there can be, in the order in which these were tried.
     photos, held_out: number of training photos and of held-out ones, mean PSNR before and after in dB; None without.
     """
 

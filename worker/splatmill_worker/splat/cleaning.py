@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -58,7 +58,7 @@ class Cleaning:
     """What was removed from a model of N Gaussians.
 
     keep: bool [N], the Gaussians that stay.
-    removed: number of Gaussians by what they look like, the reasons with none left out.
+    removed: number of Gaussians by what they look like, with all reasons.
     unsupported: number of Gaussians without which the photos would fit better, each taken alone.
     psnr_before, psnr: mean over the photos, dB, before and after, with opacities as in `Evidence.psnr`.
     """
@@ -96,7 +96,7 @@ def clean(
     rows = torch.arange(gaussians.count, device=gaussians.means.device)
     batch = max(1, math.ceil(FIRST_SHARE * gaussians.count))
     evidence = first = seen(rows)
-    removed: dict[Reason, int] = {}
+    removed: dict[Reason, int] = dict.fromkeys(get_args(Reason), 0)
     retried = False
     while True:
         harm = -evidence.support
@@ -108,7 +108,7 @@ def clean(
         found = seen(left)
         if found.psnr > evidence.psnr and bool((found.psnrs >= first.psnrs - MOST_LOST).all()):
             for reason, number in _by_reason(gaussians.select(rows), evidence, going).items():
-                removed[reason] = removed.get(reason, 0) + number
+                removed[reason] += number
             rows, evidence, batch = left, found, 2 * batch
         elif retried or int(going.sum()) == 1:
             break
@@ -134,7 +134,7 @@ def _by_reason(gaussians: Gaussians, evidence: Evidence, removed: Tensor) -> dic
     for reason, like in looks.items():
         counts[reason] = int((left & like).sum())
         left &= ~like
-    return {reason: number for reason, number in counts.items() if number}
+    return counts
 
 
 def photo_psnr(
