@@ -14,8 +14,8 @@ ENOUGH_REGISTERED = 0.9
 """Share of the photos, reliably registered, from which no higher effort is tried; and of those that the view graph
 connects, from which no other mapper is."""
 
-GLOBAL_MIN_PHOTOS = 400
-"""Photos from which the global mapper is tried first, where the view graph is dense."""
+GLOBAL_MIN_PHOTOS = 1000
+"""Photos from which the global mapper is tried first, where the view graph is dense (decisions: GLOBAL_MIN_PHOTOS)."""
 
 GLOBAL_MIN_DEGREE = 5
 """Verified pairs per photo from which a view graph counts as dense."""
