@@ -2,7 +2,7 @@
 
     python -m splatmill_worker bench sfm                          # all scenes, with training; about 20 minutes
     python -m splatmill_worker bench sfm --scenes fox kermit --settings auto --again --no-train
-    python -m splatmill_worker bench sfm --growth                 # 25 to 500 generated photos, and the fit; about 10 minutes
+    python -m splatmill_worker bench sfm --growth                 # 25 to 500 generated photos, and the fit
 
 Rows go to results/sfm.jsonl (results/sfm_growth.jsonl) one by one, the figures to figures/, the tables to sfm*.md.
 A row that is there is not measured again, unless by --again; without a training of --train seconds it is not whole.
