@@ -45,8 +45,13 @@ def test_every_replaced_function_is_there_and_comes_back(instead: Any, switches:
     with instead.applied(switches["probe-of-the-start"].instead):
         assert probe.grown is instead.not_grown
     assert (probe.grown, pipeline.train) == before
-    with pytest.raises(AttributeError), instead.applied({"splatmill_worker.pipeline.trained": "not_grown"}):
-        pass
+    unknown = (
+        {"splatmill_worker.pipeline.trained": "not_grown"},
+        {"splatmill_worker.pipeline.train": "not_there"},
+    )
+    for functions in unknown:
+        with pytest.raises(AttributeError), instead.applied(functions):
+            pass
 
 
 def test_cameras_of_a_switch_of_their_recovery_are_kept_apart(switches: dict[str, Switch]) -> None:

@@ -91,7 +91,35 @@ def test_no_other_mapper_is_tried_for_photos_that_nothing_connects(
     registered: int, tried: list[tuple[str, bool]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of ten photos seven are connected, so that no mapper registers more."""
-    calls = []
+    chain = [(first, first + 1) for first in range(6)]
+    assert _tried(10, chain, registered, tmp_path, monkeypatch) == tried
+
+
+@pytest.mark.parametrize(
+    ("count", "pairs_each", "first"),
+    [
+        (trials.GLOBAL_MIN_PHOTOS - 1, trials.GLOBAL_MIN_DEGREE, "incremental"),
+        (trials.GLOBAL_MIN_PHOTOS, trials.GLOBAL_MIN_DEGREE, "global"),
+        (trials.GLOBAL_MIN_PHOTOS, trials.GLOBAL_MIN_DEGREE - 1, "incremental"),
+    ],
+)
+def test_the_global_mapper_is_first_for_many_photos_in_a_dense_graph(
+    count: int, pairs_each: int, first: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ring = [(photo, (photo + step) % count) for photo in range(count) for step in range(1, pairs_each + 1)]
+    verified = [(min(pair), max(pair)) for pair in ring]
+    assert _tried(count, verified, count, tmp_path, monkeypatch) == [(first, False)]
+
+
+def _tried(
+    count: int,
+    verified: list[tuple[int, int]],
+    registered: int,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> list[tuple[str, bool]]:
+    """The mappers that are tried, and whether relaxed, where each registers as many photos."""
+    calls: list[tuple[str, bool]] = []
 
     def run(name: mapper.Mapper, *_: object, relaxed: bool, **__: object) -> mapper.Mapped:
         calls.append((name, relaxed))
@@ -100,8 +128,8 @@ def test_no_other_mapper_is_tried_for_photos_that_nothing_connects(
     monkeypatch.setattr(mapper, "run", run)
     monkeypatch.setattr(trials, "registered_counts", lambda _: (registered, registered))
     asked: Any = SimpleNamespace(
-        options=sfm.SfmOptions(), best_mapper=None, count=10, threads=1, show=None, cancelled=None,
+        options=sfm.SfmOptions(), best_mapper=None, count=count, threads=1, show=None, cancelled=None,
         clock=lambda _: nullcontext(),
     )  # fmt: skip
-    trials.best_mapping(asked, tmp_path / "database.db", [(first, first + 1) for first in range(6)])
-    assert calls == tried
+    trials.best_mapping(asked, folder / "database.db", verified)
+    return calls

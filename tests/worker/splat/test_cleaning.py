@@ -112,17 +112,33 @@ def test_what_photos_support_stays(life: Trained) -> None:
 
 
 @pytest.mark.slow
-def test_what_one_photo_needs_stays(life: Trained) -> None:
-    """A Gaussian that spoils all photos but one, where it is what passed by."""
+@pytest.mark.parametrize("kind", ["needle", "floater", "island"])
+def test_what_one_photo_needs_stays_and_the_others_go(life: Trained, kind: Reason) -> None:
+    """A Gaussian that spoils all photos but one, where it is what passed by, beside some that spoil all of them."""
     spoilt = concatenate(life.gaussians, planted("giant", life.training[:1]).padded(1))
+    assert not bool(life.cleaned(spoilt).keep[-1])
     shown = render(spoilt, life.photos[0].camera, background=BLACK).color.clamp(0.0, 1.0)
     passed = life.photos[0]._replace(rgb=(255.0 * shown.detach() + 0.5).to(torch.uint8))
-    assert not bool(clean(spoilt, life.photos, BLACK).keep[-1])
-    found = clean(spoilt, [passed, *life.photos[1:]], BLACK)
+    photos = [passed, *life.photos[1:]]
+    spoilt = concatenate(planted(kind, life.training).padded(1), spoilt)
+    found = clean(spoilt, photos, BLACK)
     assert bool(found.keep[-1])
+    assert not bool(found.keep[:EACH].any())
     left = spoilt.select(found.keep)
-    for photo in (passed, *life.photos[1:]):
+    for photo in photos:
         assert photo_psnr(left, photo, BLACK) >= photo_psnr(spoilt, photo, BLACK) - MOST_LOST - 1e-3
+
+
+def test_a_model_of_harmful_gaussians_alone_loses_all_of_them() -> None:
+    training, _ = split()
+    black = [view.full._replace(rgb=torch.zeros_like(view.full.rgb)) for view in training]
+    harmful = planted("giant", training).padded(1)
+    found = clean(harmful, black, BLACK)
+    assert not bool(found.keep.any())
+    assert sum(found.removed.values()) == found.unsupported == EACH
+    nothing = clean(harmful.select(torch.zeros(0, dtype=torch.int64)), black, BLACK)
+    assert nothing.keep.shape == (0,)
+    assert not any(nothing.removed.values())
 
 
 @pytest.mark.slow

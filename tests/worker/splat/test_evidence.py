@@ -94,7 +94,7 @@ def test_weights_are_what_the_colour_of_a_gaussian_changes(
     assert float(found.weight[-1]) == 0.0
 
 
-def test_support_is_a_sum_over_photos_and_each_has_its_own_psnr(
+def test_weights_add_up_over_photos_and_each_has_its_own_psnr(
     gaussians: Gaussians, photos: list[Target]
 ) -> None:
     apart = [evidence_of(gaussians, [photo], GREY) for photo in photos]

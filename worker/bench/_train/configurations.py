@@ -120,7 +120,7 @@ CONFIGURATIONS = {
         instead={"splatmill_worker.splat.train.disagreement.disagreements": "without_outliers"},
     ),
     "named-photos-skipped": Configuration(
-        "no step is taken on photos that the report names",
+        "no step is taken on photos that disagree for a reason",
         instead={"splatmill_worker.splat.train.disagreement.disagreements": "without_named_photos"},
     ),
     "cleaned": Configuration(

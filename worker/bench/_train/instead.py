@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -34,7 +35,7 @@ def applied(functions: dict[str, str]) -> Iterator[None]:
     """
     with ExitStack() as stack:
         for name, ours in functions.items():
-            stack.enter_context(patch(name, globals()[ours]))
+            stack.enter_context(patch(name, getattr(sys.modules[__name__], ours)))
         yield
 
 
@@ -48,14 +49,17 @@ def left_folded(run: SfmRun, result: EffortResult) -> None:
 
 
 def without_outliers(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disagreement, ...]:
-    """In place of `disagreements`: no step from here on counts the pixels that no other photo agrees with."""
+    """In place of `disagreements`: no step from here on counts the pixels that no other photo agrees with.
+
+    The training photos that are measured at the end are measured without these pixels too.
+    """
     found = disagreements(run, learnt)
     _mask(run, {each.name: ~each.outliers for each in found})
     return found
 
 
 def without_named_photos(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disagreement, ...]:
-    """In place of `disagreements`: no step from here on is taken on the photos that the report names."""
+    """In place of `disagreements`: no step from here on is taken on photos that disagree for a reason."""
     found = disagreements(run, learnt)
     named = {each.name for each in found if each.reason is not None}
     left = [index for index, view in enumerate(run.views) if view.name not in named]

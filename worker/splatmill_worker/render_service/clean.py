@@ -58,7 +58,7 @@ class Cleaned:
 
     before: number of Gaussians of the model.
     left: how many of them stay.
-    removed: number by each reason that there can be, in the order in which these were tried.
+    removed: number for each condition and reason that was applied, zero included, in the order of the table.
     photos, held_out: number of training photos and of held-out ones, mean PSNR before and after in dB; None without.
     """
 
@@ -134,7 +134,8 @@ def clean_file(model: Path, out: Path, wanted: Wanted) -> Cleaned:
     if not bool(keep.any()):
         raise Refusal(
             "option_out_of_range",
-            f"Nothing would be left of the {whole.count:,} Gaussians. Choose a larger box or a smaller weight.",
+            f"Nothing would be left of the {whole.count:,} Gaussians. Choose a larger box, a smaller weight, or photos "
+            "that show the model.",
         )
     cleaned.left = registry.write(out, whole.select(keep), offset=contents.offset, antialiased=antialias)
     return cleaned

@@ -43,8 +43,8 @@ BELOW_CLAMP = 0.99
 
 @dataclass(frozen=True)
 class Evidence:
-    """What M photos say about N Gaussians: `psnrs` of them all [M], each other field [N]. Sums are over pixels and
-    channels.
+    """What M photos say about N Gaussians: `psnrs` is [M], one for each photo; every other field is [N]. Sums are over
+    pixels and channels.
 
     weight: sum of alpha T over all photos, pixels.
     peak: the same in the photo where it is largest, pixels.

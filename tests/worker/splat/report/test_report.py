@@ -123,7 +123,7 @@ def test_photos_that_disagree_are_ranked_with_the_reason(tmp_path: Path) -> None
         "reason": "moving things",
     }
     assert len(report["disagreement"]) == 3
-    assert report["warnings"][1].endswith("Mask them, or leave the photo out.")
+    assert report["warnings"][1].endswith("and mask what moved.")
     page = (tmp_path / "report.html").read_text()
     assert "<td>02.png</td><td>other light</td><td class=n>4.0</td>" in page
     assert page.count("<figcaption>01.png: moving things</figcaption>") == 1

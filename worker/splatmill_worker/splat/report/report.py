@@ -31,8 +31,8 @@ MISFIT = 6.0
 """A training photo whose PSNR is more than this below the median, dB, is named in a warning."""
 
 ADVICE: dict[Reason | None, str] = {
-    "moving things": "It shows things that no other photo shows there. Mask them, or leave the photo out.",
-    "other light": "Its light differs. Leave it out, or set exposure to on.",
+    "moving things": "It shows things that no other photo shows there. Look at the picture, and mask what moved.",
+    "other light": "Its light differs. Set exposure to on, or leave it out if other photos show the same places.",
     "wrong camera or blur": "Most of it disagrees. Leave it out if it is blurred or has a wrong camera.",
     None: "Leave it out if it is blurred, shows something that moved, or has a wrong camera.",
 }
