@@ -134,8 +134,7 @@ def clean_file(model: Path, out: Path, wanted: Wanted) -> Cleaned:
     if not bool(keep.any()):
         raise Refusal(
             "option_out_of_range",
-            f"Nothing would be left of the {whole.count:,} Gaussians. Choose a larger box, a smaller weight, or photos "
-            "that show the model.",
+            f"Nothing would be left of the {whole.count:,} Gaussians. Choose a larger box or a smaller weight.",
         )
     cleaned.left = registry.write(out, whole.select(keep), offset=contents.offset, antialiased=antialias)
     return cleaned
