@@ -14,6 +14,7 @@ from splatmill.backplane.storage import Entry, Storage
 from splatmill.schema import (
     CONVERSION_HEADER,
     CONVERSION_VERSION,
+    DEFAULT_OWNER,
     DOWNLOADS,
     PROBLEMS,
     Conversion,
@@ -23,10 +24,12 @@ from splatmill.schema import (
     ModelFormat,
     Problem,
 )
+from splatmill_server.access.caller import Caller
 from splatmill_server.leases import lease
 from splatmill_server.models import Models, model_not_found
 from splatmill_server.problems import ProblemError
 from splatmill_server.renderer import post
+from splatmill_server.space.quota import RECORD_BYTES, Arrival, Quota
 
 STORED_AS_IT_IS = "ply"
 """Key of the format of model.ply, which needs no conversion."""
@@ -55,12 +58,14 @@ class Conversions:
         connection: Redis,
         models: Models,
         renderer: httpx.AsyncClient | None,
+        quota: Quota,
         seconds: float,
     ) -> None:
         self._storage = storage
         self._redis = connection
         self._models = models
         self._renderer = renderer
+        self._quota = quota
         self._seconds = seconds
         self._running: dict[tuple[str, str], _Running] = {}
 
@@ -85,14 +90,18 @@ class Conversions:
             )
         return ModelDownloads(formats=formats, psnr=model.psnr)
 
-    async def path(self, model_id: str, form: ModelFormat) -> str:
+    async def path(self, model_id: str, form: ModelFormat, who: Caller | None = None) -> str:
         """Return the path of the model in a format, which is made if it is not there.
+
+        who: the caller; None for somebody with a link.
 
         The conversion is given up when nobody waits for it any more. Raises 404, 409 and 5xx problems.
         """
         if form.key == STORED_AS_IT_IS:
             return (await run_in_threadpool(self._ply, model_id)).path
         if not await self._stored(model_id, form):
+            if who is not None:
+                await run_in_threadpool(self._quota.note, who)
             await self._made(model_id, form)
         return layout.conversion(model_id, form.key)
 
@@ -127,13 +136,22 @@ class Conversions:
             await asyncio.sleep(POLL_SECONDS)
 
     async def _make(self, model_id: str, form: ModelFormat) -> None:
+        owner = await run_in_threadpool(self._models.owner, model_id) or DEFAULT_OWNER
+        async with self._quota.storing(None, owner, model_id, RECORD_BYTES) as room:
+            await self._convert(model_id, form, room)
+
+    async def _convert(self, model_id: str, form: ModelFormat, room: Arrival) -> None:
         content = ConversionRequest(format=form.key).model_dump_json()
         answer = await post(self._renderer, rendering.convert_path(model_id), content, {}, self._seconds)
         try:
             if answer.status_code != 200:
                 raise _refused(await answer.aread())
             record = Conversion.model_validate_json(answer.headers.get(CONVERSION_HEADER, ""))
-            await self._storage.stream_put(layout.conversion(model_id, form.key), answer.aiter_raw())
+            room.take(len(record.model_dump_json()))
+            await run_in_threadpool(room.announce, answer.headers.get("content-length"))
+            await self._storage.stream_put(
+                layout.conversion(model_id, form.key), room.counted(answer.aiter_raw())
+            )
         except (httpx.TransportError, ValidationError) as error:
             raise ProblemError(
                 "conversion_failed",

@@ -1,7 +1,6 @@
 """Models made from models: what the renderer leaves of one becomes another, with its photos and its report."""
 
 import json
-import secrets
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -11,34 +10,48 @@ from splatmill.backplane import layout
 from splatmill.backplane.row import now
 from splatmill.backplane.storage import Storage
 from splatmill.schema import HELD_OUT, Edited, EditModel
+from splatmill_server.space.quota import Arrival
 
 STALE = ("time_lapse", "views", "disagreement", "warnings")
 """Parts of a training's report that an edited model has not."""
 
 
 async def store_edited(
-    storage: Storage, model_id: str, request: EditModel, edited: Edited, ply: AsyncIterator[bytes]
+    storage: Storage,
+    model_id: str,
+    request: EditModel,
+    edited: Edited,
+    ply: AsyncIterator[bytes],
+    room: Arrival,
 ) -> str:
     """Store an edited model and return its id. Its record is written last; if anything fails, nothing is left.
 
     model_id: the model that was edited, which is not changed.
     ply: its new model.ply.
+    room: where each file is reserved before it is stored.
     """
-    new_id = secrets.token_hex(8)
+    new_id = room.record_id
     try:
-        await storage.stream_put(layout.model_file(new_id, "model.ply"), ply)
-        await run_in_threadpool(_store_others, storage, model_id, new_id, request, edited)
+        await storage.stream_put(layout.model_file(new_id, "model.ply"), room.counted(ply))
+        await run_in_threadpool(_store_others, storage, model_id, new_id, request, edited, room)
     except BaseException:
         await run_in_threadpool(storage.delete_prefix, layout.model(new_id))
         raise
     return new_id
 
 
-def _store_others(storage: Storage, model_id: str, new_id: str, request: EditModel, edited: Edited) -> None:
+def _store_others(
+    storage: Storage, model_id: str, new_id: str, request: EditModel, edited: Edited, room: Arrival
+) -> None:
     """Store what an edited model has beside model.ply, its record last."""
+
+    def put(name: str, content: bytes) -> None:
+        room.take(len(content))
+        storage.put(layout.model_file(new_id, name), content)
+
     for entry in storage.entries(layout.model_file(model_id, HELD_OUT)):
         name = entry.path.removeprefix(layout.model(model_id) + "/")
-        storage.put(layout.model_file(new_id, name), storage.get(entry.path))
+        put(name, storage.get(entry.path))
     scores = {view.name: view for view in edited.views}
     cameras = _read(storage, model_id, "cameras.json")
     if cameras:
@@ -47,11 +60,11 @@ def _store_others(storage: Storage, model_id: str, new_id: str, request: EditMod
                 row.pop(stale, None)
             if (score := scores.get(row.get("name"))) is not None:
                 row |= score.model_dump(mode="json", include={"psnr", "ssim"})
-        storage.put(layout.model_file(new_id, "cameras.json"), json.dumps(cameras, indent=1).encode())
+        put("cameras.json", json.dumps(cameras, indent=1).encode())
     if frame := _read(storage, model_id, "frame.json"):
-        storage.put(layout.model_file(new_id, "frame.json"), json.dumps(frame, indent=1).encode())
+        put("frame.json", json.dumps(frame, indent=1).encode())
     report = _edited_report(_read(storage, model_id, "report.json"), model_id, request, edited)
-    storage.put(layout.model_file(new_id, "report.json"), json.dumps(report, indent=1).encode())
+    put("report.json", json.dumps(report, indent=1).encode())
     moment = now().isoformat()
     record = json.loads(storage.get(layout.job_record(model_id)))
     record |= {
@@ -62,7 +75,7 @@ def _store_others(storage: Storage, model_id: str, new_id: str, request: EditMod
         "finished_at": moment,
         "sha256": {},
     }
-    storage.put(layout.job_record(new_id), json.dumps(record, indent=1).encode())
+    put("job.json", json.dumps(record, indent=1).encode())
 
 
 def _edited_report(

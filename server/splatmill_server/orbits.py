@@ -8,7 +8,6 @@ the same video.
 import asyncio
 import hashlib
 import json
-from collections.abc import Callable
 from datetime import UTC, datetime
 
 import httpx
@@ -30,9 +29,11 @@ from splatmill.schema import (
     OrbitState,
     Problem,
 )
+from splatmill_server.access.caller import Caller
 from splatmill_server.models import Models
 from splatmill_server.problems import ProblemError
 from splatmill_server.renderer import no_renderer, post
+from splatmill_server.space.quota import RECORD_BYTES, Quota
 from splatmill_server.unfinished import Unfinished
 
 log = structlog.get_logger()
@@ -88,11 +89,13 @@ class Orbits:
         connection: Redis,
         models: Models,
         renderer: httpx.AsyncClient | None,
+        quota: Quota,
         seconds: float,
     ) -> None:
         self._storage = storage
         self._models = models
         self._renderer = renderer
+        self._quota = quota
         self._seconds = seconds
         self._asking: dict[str, asyncio.Task[None]] = {}
         self.unfinished = Unfinished(
@@ -106,19 +109,19 @@ class Orbits:
             look_seconds=_LOOK_SECONDS,
         )
 
-    async def create(self, model_id: str, request: OrbitRequest, check_room: Callable[[], None]) -> Orbit:
+    async def create(self, model_id: str, request: OrbitRequest, who: Caller) -> Orbit:
         """Return the orbit video of a request, which is rendered in the background if it is not there.
 
-        check_room: raises a problem if the owner has no room in storage; called for a new video.
+        who: the caller, whose room in storage is looked at for a new video. Each of its parts is reserved on its own.
 
-        Raises 404 and 409 problems of the model, a 503 problem without a renderer, and a 409 problem for too many orbit
-        videos.
+        Raises 404 and 409 problems of the model, a 503 problem without a renderer, a 409 problem for too many orbit
+        videos, and a 507 problem where the quota is used up.
         """
-        made = await run_in_threadpool(self._accept, model_id, request, check_room)
+        made = await run_in_threadpool(self._accept, model_id, request, who)
         self.unfinished.wake()
         return made
 
-    def _accept(self, model_id: str, request: OrbitRequest, check_room: Callable[[], None]) -> Orbit:
+    def _accept(self, model_id: str, request: OrbitRequest, who: Caller) -> Orbit:
         ply = self._models.file(model_id, "model.ply")
         if self._renderer is None:
             raise no_renderer()
@@ -129,7 +132,6 @@ class Orbits:
             return found
         if found is None or found.state is OrbitState.failed:
             self._check_number(model_id, new=found is None)
-            check_room()
             found = Orbit(
                 id=orbit_id,
                 model=model_id,
@@ -138,7 +140,9 @@ class Orbits:
                 frames=request.frames,
                 created_at=datetime.now(UTC),
             )
-            self._put(found)
+            with self._quota.room(who, self._owner(model_id), model_id, RECORD_BYTES) as room:
+                self._put(found)
+                room.stored = RECORD_BYTES
         # After the record, without which a mark is removed; also for a record whose mark was never written.
         self._storage.put_new(mark, b"{}")
         return _with_links(found)
@@ -284,16 +288,23 @@ class Orbits:
         try:
             if answer.status_code != 200:
                 raise _refusal(await answer.aread())
-            await self._storage.stream_put(path, answer.aiter_raw())
+            _, model_id, _ = name.split(".")
+            owner = await run_in_threadpool(self._owner, model_id)
+            async with self._quota.storing(None, owner, model_id) as room:
+                await run_in_threadpool(room.announce, answer.headers.get("content-length"))
+                await self._storage.stream_put(path, room.counted(answer.aiter_raw()))
         except httpx.TransportError as error:
             detail = f"The renderer ended before its answer did ({type(error).__name__})."
             raise _Delayed(_orbit_problem("render_failed", detail), counts=True) from error
         finally:
             await answer.aclose()
 
+    def _owner(self, model_id: str) -> str:
+        return self._models.owner(model_id) or DEFAULT_OWNER
+
     def _line(self, model_id: str) -> str:
         """Return what the marks of all videos of a model's owner begin with."""
-        return hashlib.sha256((self._models.owner(model_id) or DEFAULT_OWNER).encode()).hexdigest()[:16]
+        return hashlib.sha256(self._owner(model_id).encode()).hexdigest()[:16]
 
     def _read(self, model_id: str, orbit_id: str) -> Orbit | None:
         path = layout.orbit_record(model_id, orbit_id)

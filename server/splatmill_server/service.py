@@ -131,6 +131,7 @@ class Service:
         lists.makers += [jobs.make_lists, captures.make_lists, models.make_lists]
         usage = Usage(storage, Ledger(connection))
         quota = Quota(usage, captures, settings.quota)
+        jobs.on_end.append(quota.job_ended)
         deletion = Deletion(connection, storage, captures, jobs, usage.ledger)
         outgoing = Outgoing(settings.outgoing_allow)
         webhooks = Webhooks(storage, jobs)
@@ -157,8 +158,8 @@ class Service:
             finished=Finished(storage, lists),
             models=models,
             shares=Shares(storage, models),
-            conversions=Conversions(storage, connection, models, renderer, settings.orbit_timeout),
-            orbits=Orbits(storage, connection, models, renderer, settings.orbit_timeout),
+            conversions=Conversions(storage, connection, models, renderer, quota, settings.orbit_timeout),
+            orbits=Orbits(storage, connection, models, renderer, quota, settings.orbit_timeout),
             keys=stored_keys,
             authentication=Authentication(settings, stored_keys, sessions),
             sessions=sessions,

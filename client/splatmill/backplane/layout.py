@@ -6,6 +6,7 @@ captures/{id}/sha256/{role}/{name}          hex digest of that file; written fir
 captures/{id}/manifest.json                 the digests of all files, in one file; it can be made again
 captures/{id}/incoming/{token}              upload in progress; renamed into files/ when complete
 captures/{id}/uploads/{upload}/record.json  upload that arrives in several requests: what it will be
+captures/{id}/uploads/{upload}/stored.json  in place of record.json, once it is complete: the file that it became
 captures/{id}/uploads/{upload}/part         its bytes so far, in a local folder
 captures/{id}/uploads/{upload}/blocks/...   its bytes so far, in a bucket: objects named by their offset
 captures/{id}/imports/{import}.json         record of a file that the server fetches from an address
@@ -158,6 +159,11 @@ def upload(capture_id: str, upload_id: str) -> str:
 
 def upload_record(capture_id: str, upload_id: str) -> str:
     return f"captures/{capture_id}/uploads/{upload_id}/record.json"
+
+
+def upload_stored(capture_id: str, upload_id: str) -> str:
+    """Return the path of the record of an upload that is complete."""
+    return f"captures/{capture_id}/uploads/{upload_id}/stored.json"
 
 
 def upload_part(capture_id: str, upload_id: str) -> str:

@@ -8,6 +8,7 @@ from starlette.responses import Response
 
 from splatmill.backplane import layout, rendering
 from splatmill.schema import RenderRequest
+from splatmill_server.access.caller import Caller
 from splatmill_server.answers.files import file_response
 from splatmill_server.answers.forward import CLIENT_GONE, forward, while_connected
 from splatmill_server.conversions import format_of_key
@@ -22,10 +23,15 @@ async def model_file(service: Service, model_id: str, name: str, request: Reques
     return await file_response(request, service.storage, entry.path, media_type, download_name=download)
 
 
-async def model_in_format(service: Service, model_id: str, key: str, request: Request) -> Response:
-    """Return a model in the format of this key, such as `sog`, converted first if nobody has asked for it before."""
+async def model_in_format(
+    service: Service, model_id: str, key: str, request: Request, who: Caller | None = None
+) -> Response:
+    """Return a model in the format of this key, such as `sog`, converted first if nobody has asked for it before.
+
+    who: the caller; None for somebody with a link.
+    """
     form = format_of_key(key)
-    path = await while_connected(request, service.conversions.path(model_id, form))
+    path = await while_connected(request, service.conversions.path(model_id, form, who))
     if path is None:
         return Response(status_code=CLIENT_GONE)
     name = f"{model_id}{form.suffix}"

@@ -25,7 +25,7 @@ from splatmill_server.captures.records import Captures
 from splatmill_server.outgoing import AddressRefused, Answer, NoAnswer, Outgoing
 from splatmill_server.problems import ProblemError, problem_of_storage
 from splatmill_server.settings import Settings
-from splatmill_server.space.quota import Quota
+from splatmill_server.space.quota import Quota, bytes_beside
 from splatmill_server.unfinished import Unfinished
 
 log = structlog.get_logger()
@@ -178,7 +178,9 @@ class Imports:
             _check(answer)
             found = found.model_copy(update={"size": answer.size})
             chunks = self._recorded(found, answer.chunks)
-            async with self.quota.upload(None, found.capture, answer.size) as arrival:
+            async with self.quota.upload(
+                None, found.capture, answer.size, beside=bytes_beside(found.name)
+            ) as arrival:
                 file, new = await self.captures.store(
                     found.capture,
                     found.role,

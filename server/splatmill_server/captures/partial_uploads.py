@@ -33,6 +33,7 @@ from splatmill_server.captures.records import (
     sent_name,
     too_large,
 )
+from splatmill_server.captures.unfinished_uploads import UnfinishedUploads
 from splatmill_server.problems import ProblemError, problem_of_storage
 
 
@@ -74,6 +75,7 @@ class PartialUploads:
         # are held off by `Part.append`.
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._writers: dict[str, object] = {}
+        self._unfinished = UnfinishedUploads(storage, self._is_complete)
 
     async def create(
         self, capture_id: str, role: Role, name: str, length: int | None, sha256: str | None
@@ -107,8 +109,9 @@ class PartialUploads:
             record = UploadRecord(
                 id=upload_id, role=role, name=name, length=length, sha256=sha256, created_at=datetime.now(UTC)
             )
-            part.create()
-            self._write(capture_id, record)
+            with self._unfinished.one_more(capture_id, upload_id):
+                part.create()
+                self._write(capture_id, record)
         return Standing(record, part.offset(), STALE_SECONDS)
 
     async def standing(self, capture_id: str, upload_id: str) -> Standing:
@@ -310,14 +313,23 @@ class PartialUploads:
         )
 
     def _record(self, capture_id: str, upload_id: str) -> UploadRecord | None:
-        try:
-            fields = json.loads(self.storage.get(layout.upload_record(capture_id, upload_id)))
-            return UploadRecord.model_validate(fields)
-        except (FileNotFoundError, ValueError):
-            return None
+        for path in (
+            layout.upload_record(capture_id, upload_id),
+            layout.upload_stored(capture_id, upload_id),
+        ):
+            try:
+                return UploadRecord.model_validate(json.loads(self.storage.get(path)))
+            except (FileNotFoundError, ValueError):
+                continue
+        return None
+
+    def _is_complete(self, capture_id: str, upload_id: str) -> bool:
+        record = self._record(capture_id, upload_id)
+        return record is not None and record.stored is not None
 
     def _write(self, capture_id: str, record: UploadRecord) -> None:
-        path = layout.upload_record(capture_id, record.id)
+        place = layout.upload_record if record.stored is None else layout.upload_stored
+        path = place(capture_id, record.id)
         self.storage.put(path, record.model_dump_json(exclude_none=True).encode())
 
     def _delete(self, capture_id: str, upload_id: str) -> None:

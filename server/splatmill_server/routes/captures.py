@@ -17,6 +17,7 @@ from splatmill_server.routes.openapi import CAPTURE_EXAMPLE, answer, example, pr
 from splatmill_server.routes.ownership import CaptureId, ListedOwner
 from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit, NamePart
 from splatmill_server.service import Shared
+from splatmill_server.space.quota import CAPTURE_BYTES, bytes_beside
 
 router = APIRouter(prefix="/v1/captures", tags=["captures"])
 
@@ -50,7 +51,9 @@ async def create_capture(
     )
     if new:
         try:
-            await run_in_threadpool(service.quota.check_new, who)
+            size = len(capture.model_dump_json()) + CAPTURE_BYTES
+            async with service.quota.storing(who, who.owner, capture.id, size) as room:
+                room.stored = size
         except Exception:
             await run_in_threadpool(service.deletion.unused_capture, capture)
             raise
@@ -107,6 +110,7 @@ def delete_capture(service: Shared, capture_id: CaptureId) -> Response:
         "unsupported_media_type",
         "storage_full",
         "quota_exceeded",
+        "too_many_requests",
     ),
     openapi_extra={
         "requestBody": {
@@ -167,6 +171,7 @@ async def put_file(
         capture_id,
         size,
         file=f"{role.value}/{name}",
+        beside=bytes_beside(name),
         is_stored=lambda: service.captures.digests.of(capture_id, role, name) is not None,
     ) as arrival:
         file, new = await service.captures.store(

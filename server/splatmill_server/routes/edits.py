@@ -1,5 +1,6 @@
 """The endpoint of edits: a new model that leaves out a part of another."""
 
+import secrets
 from typing import Annotated
 
 import httpx
@@ -18,7 +19,8 @@ from splatmill_server.routes.models import RENDER_PROBLEMS
 from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.routes.ownership import ModelId
 from splatmill_server.routes.requests import JSON_ONLY
-from splatmill_server.service import Shared
+from splatmill_server.service import Service, Shared
+from splatmill_server.space.quota import Arrival
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
 
@@ -48,8 +50,18 @@ async def edit_model(
     The answer has the PSNR before and after, on the held-out photos. With `preview`, no model is made.
     """
     model = await run_in_threadpool(service.models.get, model_id)
-    if not body.preview:
-        await run_in_threadpool(service.quota.check_new, who, size=model.bytes)
+    if body.preview:
+        return await _edit(service, model_id, request, body, None)
+    owner = await run_in_threadpool(service.models.owner, model_id) or who.owner
+    # An edit only leaves out Gaussians.
+    async with service.quota.storing(who, owner, secrets.token_hex(8), model.bytes) as room:
+        return await _edit(service, model_id, request, body, room)
+
+
+async def _edit(
+    service: Service, model_id: str, request: Request, body: EditModel, room: Arrival | None
+) -> Response:
+    """Have a model edited; without `room` for a new one, only return what the edit would do."""
     asked = post(
         service.renderer,
         rendering.edits_path(model_id),
@@ -65,8 +77,8 @@ async def edit_model(
             problem = await found.aread()
             return Response(problem, found.status_code, media_type=found.headers.get("content-type"))
         edited = Edited.model_validate_json(found.headers[EDIT_HEADER])
-        if not body.preview:
-            new_id = await store_edited(service.storage, model_id, body, edited, found.aiter_raw())
+        if room is not None:
+            new_id = await store_edited(service.storage, model_id, body, edited, found.aiter_raw(), room)
             await run_in_threadpool(service.models.list_new, new_id)
             edited = edited.model_copy(update={"model": new_id})
     except httpx.TransportError as error:
@@ -77,5 +89,5 @@ async def edit_model(
         ) from error
     finally:
         await found.aclose()
-    headers = {} if body.preview else {"Location": f"/v1/models/{edited.model}"}
-    return JSONResponse(edited.model_dump(mode="json"), 200 if body.preview else 201, headers)
+    headers = {} if room is None else {"Location": f"/v1/models/{edited.model}"}
+    return JSONResponse(edited.model_dump(mode="json"), 200 if room is None else 201, headers)

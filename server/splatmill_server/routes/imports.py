@@ -12,6 +12,7 @@ from splatmill_server.routes.openapi import problems
 from splatmill_server.routes.ownership import CaptureId
 from splatmill_server.routes.requests import JSON_ONLY
 from splatmill_server.service import Shared
+from splatmill_server.space.quota import RECORD_BYTES
 
 router = APIRouter(prefix="/v1/captures", tags=["captures"])
 
@@ -40,8 +41,11 @@ async def import_file(
     request: Annotated[CreateImport, Body(examples=[{"url": "https://example.org/kitchen.zip"}])],
 ) -> Import:
     """Fetch a file of the capture from an address. It is fetched in the background; `Location` tells how far it is."""
-    await run_in_threadpool(service.quota.check_new, who, capture_id)
-    made = await service.imports.create(capture_id, request)
+    owner = (await run_in_threadpool(service.captures.recent, capture_id)).owner
+    size = RECORD_BYTES + 6 * len(request.url)  # as JSON, a character has up to six bytes
+    async with service.quota.storing(who, owner, capture_id, size) as room:
+        made = await service.imports.create(capture_id, request)
+        room.stored = size
     response.headers["Location"] = f"/v1/captures/{capture_id}/imports/{made.id}"
     return made
 

@@ -1,5 +1,7 @@
 """`POST /v1/jobs` with a form: uploads photos and starts a job in one request."""
 
+from contextlib import nullcontext
+
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 from pydantic_core import from_json
@@ -13,6 +15,7 @@ from splatmill_server.problems import ProblemError
 from splatmill_server.routes.multipart import Part, read_parts
 from splatmill_server.routes.ownership import check_model
 from splatmill_server.service import Service
+from splatmill_server.space.quota import bytes_beside
 
 _FIELDS = ("name", "options", "priority")
 
@@ -35,16 +38,25 @@ async def create_from_form(
         await run_in_threadpool(service.captures.check_trainable, capture.id)
         await run_in_threadpool(check_start_model, service, who, create)
         described = create.described(with_capture=False) + "\n".join(fingerprints(files))
-        job, new = await run_in_threadpool(
-            lambda: service.jobs.create(
-                create, owner=who.owner, key=key, body=described, most=who.limits.unfinished_jobs
-            )
-        )
+        job, new = await run_in_threadpool(create_job_in_room, service, who, create, key, described)
         kept = job.capture == capture.id
         return job, new
     finally:
         if not kept:
             await run_in_threadpool(service.deletion.unused_capture, capture)
+
+
+def create_job_in_room(
+    service: Service, who: Caller, create: CreateJob, key: str | None, body: str, *, is_new: bool = True
+) -> tuple[Job, bool]:
+    """Create a job with room for what it will store; return it, and whether it is new. One that is not needs none."""
+    with service.quota.job(who, who.owner) if is_new else nullcontext() as keep_room:
+        job, new = service.jobs.create(
+            create, owner=who.owner, key=key, body=body, most=who.limits.unfinished_jobs
+        )
+        if new and keep_room is not None:
+            keep_room(job.id)
+    return job, new
 
 
 def check_start_model(service: Service, who: Caller, create: CreateJob) -> None:
@@ -83,7 +95,7 @@ async def _receive(
 async def _store(service: Service, who: Caller, capture_id: str, part: Part, filename: str) -> CaptureFile:
     if not filename:
         raise ProblemError("name_invalid", f"A file among the {part.name} of the form has no file name.")
-    async with service.quota.upload(who, capture_id, None) as arrival:
+    async with service.quota.upload(who, capture_id, None, beside=bytes_beside(filename)) as arrival:
         file, new = await service.captures.store(
             capture_id, Role(part.name), filename, arrival.counted(part.chunks)
         )

@@ -13,7 +13,7 @@ from splatmill_server.access.caller import Caller, Who
 from splatmill_server.filters import JobFilter
 from splatmill_server.paging import DEFAULT_LIMIT
 from splatmill_server.problems import ProblemError
-from splatmill_server.routes.job_form import check_start_model, create_from_form
+from splatmill_server.routes.job_form import check_start_model, create_from_form, create_job_in_room
 from splatmill_server.routes.openapi import JOB_REQUESTS, answer, problems
 from splatmill_server.routes.ownership import JobId, ListedOwner, check_capture
 from splatmill_server.routes.requests import Cursor, Limit, NamePart
@@ -113,18 +113,12 @@ async def _create_from_json(service: Service, who: Caller, body: bytes, key: str
     def make() -> tuple[Job, bool]:
         # A repeated request returns its job even if the capture was deleted meanwhile.
         known = service.jobs.id_of_key(who.owner, key) if key is not None else None
-        if known is None or service.jobs.owner(known) is None:
+        is_new = known is None or service.jobs.owner(known) is None
+        if is_new:
             check_capture(service, who, create.capture)
             service.captures.check_trainable(create.capture)
             check_start_model(service, who, create)
-            service.quota.check_new(who)
-        return service.jobs.create(
-            create,
-            owner=who.owner,
-            key=key,
-            body=create.described(),
-            most=who.limits.unfinished_jobs,
-        )
+        return create_job_in_room(service, who, create, key, create.described(), is_new=is_new)
 
     return await run_in_threadpool(make)
 
@@ -184,8 +178,13 @@ async def cancel_job(service: Shared, job_id: JobId) -> Job:
 @router.post(
     "/{job_id}/restart",
     status_code=202,
-    responses=problems("job_not_found", "job_running", "capture_not_found", "too_many_jobs"),
+    responses=problems(
+        "job_not_found", "job_running", "capture_not_found", "too_many_jobs", "quota_exceeded", "storage_full"
+    ),
 )
 def restart_job(service: Shared, who: Who, job_id: JobId) -> Job:
     """Run a job that has ended again, with the same options, from its last checkpoint if there is one."""
-    return service.jobs.restart(job_id, most=who.limits.unfinished_jobs)
+    with service.quota.job(who, service.jobs.owner(job_id) or who.owner) as keep_room:
+        restarted = service.jobs.restart(job_id, most=who.limits.unfinished_jobs)
+        keep_room(job_id)
+    return restarted

@@ -17,6 +17,7 @@ from splatmill.schema import (
     RenderRequest,
     Scope,
 )
+from splatmill_server.access.caller import Who
 from splatmill_server.access.permission import needs
 from splatmill_server.answers.forward import CLIENT_GONE, forward, while_connected
 from splatmill_server.answers.model_outputs import model_file, model_in_format, rendered_by_query
@@ -119,13 +120,15 @@ def get_formats(service: Shared, model_id: ModelId) -> ModelDownloads:
         "model_not_ready",
         "model_corrupt",
         "conversion_failed",
+        "quota_exceeded",
+        "storage_full",
         "renderer_unavailable",
         "render_timeout",
     ),
 )
-async def download_html(service: Shared, model_id: ModelId, request: Request) -> Response:
+async def download_html(service: Shared, who: Who, model_id: ModelId, request: Request) -> Response:
     """Download a model with its viewer in one HTML file, which needs no server and sends no request."""
-    path = await while_connected(request, service.conversions.path(model_id, DOWNLOADS["sog"]))
+    path = await while_connected(request, service.conversions.path(model_id, DOWNLOADS["sog"], who))
     if path is None:
         return Response(status_code=CLIENT_GONE)
 
@@ -157,18 +160,21 @@ async def download_html(service: Shared, model_id: ModelId, request: Request) ->
         "range_not_satisfiable",
         "model_corrupt",
         "conversion_failed",
+        "quota_exceeded",
+        "storage_full",
         "renderer_unavailable",
         "render_timeout",
     ),
 )
 async def download(
     service: Shared,
+    who: Who,
     model_id: ModelId,
     format: Annotated[str, Path(description=f"One of {', '.join(DOWNLOADS)}.")],
     request: Request,
 ) -> Response:
     """Download a model in a file format, such as `sog`. The first request converts it, which takes seconds."""
-    return await model_in_format(service, model_id, format, request)
+    return await model_in_format(service, model_id, format, request, who)
 
 
 @router.get(

@@ -51,7 +51,7 @@ async def create_orbit(
     `Location` tells how many frames are rendered. The same request returns the same video, and begins one that has
     failed again.
     """
-    made = await service.orbits.create(model_id, body or OrbitRequest(), lambda: service.quota.check_new(who))
+    made = await service.orbits.create(model_id, body or OrbitRequest(), who)
     response.headers["Location"] = made.links["self"]
     if made.state.final:
         response.status_code = 200

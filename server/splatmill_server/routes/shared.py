@@ -93,6 +93,8 @@ def get_shared_formats(
         "range_not_satisfiable",
         "model_corrupt",
         "conversion_failed",
+        "quota_exceeded",
+        "storage_full",
         "renderer_unavailable",
         "render_timeout",
     ),
@@ -104,7 +106,16 @@ async def download_shared(
     request: Request,
 ) -> Response:
     """Download the model that a link shows in a file format. The first request of anybody converts it."""
-    return await model_in_format(service, share.model, format, request)
+    try:
+        return await model_in_format(service, share.model, format, request)
+    except ProblemError as error:
+        if error.problem.code != "quota_exceeded":
+            raise
+        raise ProblemError(  # visitors learn nothing of the owner, nor of what else is stored
+            "quota_exceeded",
+            f"There is no room to store the model as {format!r}.",
+            advice="Ask whoever sent the link to download it in this format.",
+        ) from None
 
 
 @router.get(

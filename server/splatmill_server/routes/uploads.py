@@ -29,6 +29,7 @@ from splatmill_server.problems import ProblemError
 from splatmill_server.routes.openapi import Responses, answer, problems
 from splatmill_server.routes.ownership import CaptureId
 from splatmill_server.service import Service, Shared
+from splatmill_server.space.quota import RECORD_BYTES, bytes_beside
 
 router = APIRouter(prefix="/v1/captures", tags=["captures"])
 
@@ -66,7 +67,10 @@ async def begin(
 ) -> Response:
     """Begin an upload, with the first bytes if the request has a body; answer with its address."""
     with _limits_on_413(service):
-        found = await service.partial_uploads.create(capture_id, role, name, read_integer(length), digest)
+        owner = (await run_in_threadpool(service.captures.recent, capture_id)).owner
+        async with service.quota.storing(who, owner, capture_id, RECORD_BYTES) as room:
+            found = await service.partial_uploads.create(capture_id, role, name, read_integer(length), digest)
+            room.stored = len(found.record.model_dump_json()) if isinstance(found, Standing) else 0
         if isinstance(found, CaptureFile):
             return _stored(found, 200)
         try:
@@ -185,7 +189,8 @@ async def append_to_upload(
         )
     size = read_integer(request.headers.get("content-length"))
     with _limits_on_413(service):
-        async with service.quota.upload(who, capture_id, size, keeps_parts=True) as arrival:
+        beside = bytes_beside("") if last else 0
+        async with service.quota.upload(who, capture_id, size, beside=beside, keeps_parts=True) as arrival:
             standing, file, new = await service.partial_uploads.append(
                 capture_id,
                 upload_id,
@@ -195,6 +200,7 @@ async def append_to_upload(
                 length=read_integer(length),
                 body_size=size,
             )
+            arrival.beside = bytes_beside(file.name) if file is not None else 0
     if file is None:
         return Response(status_code=204, headers=_state(service, standing))
     return _stored(file, 201 if new else 200)

@@ -1,40 +1,36 @@
 """What each owner has in storage, as of the last scan, with what was uploaded and deleted since. Kept in Redis.
 
-Each scan replaces the figures of the last one. In between, uploads are entries of their own, and deletions leave a mark
-where a running scan would put the record back. A file that is stored just while its capture is listed may count twice
-until the next scan. If a process dies between a change of storage and its entry here, the
-figures are wrong until the next scan, which corrects them.
+Each scan replaces the figures of the last one. In between, what is stored is entered as reservations
+(`splatmill.backplane.reservations`), and deletions leave a mark where a running scan would put the record back. A file
+that is stored just while its folder is listed may count twice until the next scan. If a process dies between a change
+of storage and its entry here, the figures are too large until the next scan, which corrects them.
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass
 from typing import Any, cast
 
 import redis
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from splatmill.backplane import keys
+from splatmill.backplane import keys, reservations
+from splatmill.backplane.reservations import ARRIVING, JOB, STORED, UPLOAD_SECONDS, WORK
 from splatmill.schema import StoredKind
 from splatmill_server.space.holdings import Holding
 
 NOBODY = ""
 """In keys of Redis, the owner of what belongs to nobody. No owner has an empty name."""
 
-UPLOAD_SECONDS = 3600.0
-"""Seconds after its last sign of life at which an upload counts as broken off."""
-
-_ARRIVING, _STORED = "arriving", "stored"
-
 Clock = Callable[[], float]
 """Returns the time in seconds since 1970."""
 
 
 class Upload(BaseModel):
-    """An upload that arrives.
+    """A reservation: of an upload that arrives, or of other bytes that are to be stored.
 
     bytes: its size as announced, or what has arrived if that is more.
-    capture: where it goes.
+    capture: id of the record that it goes to.
     touched: time of its last sign of life.
     """
 
@@ -50,7 +46,7 @@ class Account:
     """What one owner has in storage.
 
     holdings: the folders as of the last scan, without those deleted since.
-    uploads: bytes of uploads that arrive, and of those that no scan has counted.
+    uploads: bytes of reservations, and of what was stored and no scan has counted.
     """
 
     holdings: list[Holding]
@@ -58,7 +54,7 @@ class Account:
 
     @property
     def bytes(self) -> int:
-        """Bytes in storage, with those of uploads that still arrive."""
+        """Bytes in storage, with those that are reserved."""
         return sum(held.size for held in self.holdings) + self.uploads
 
 
@@ -93,28 +89,25 @@ class Ledger:
             pipe.hvals(keys.stored(owner))
             pipe.hgetall(keys.uploads(owner))
             stored, uploads = pipe.execute()
-        held = (_holding(value) for value in stored)
-        return Account([found for found in held if found is not None], _bytes_of(uploads))
+        held = [found for value in stored if (found := _holding(value)) is not None]
+        return Account(held, _bytes_of(uploads, held))
 
     def bytes_of(self, owner: str) -> int:
-        """Return the bytes that an owner has in storage, with those of uploads that arrive."""
-        with self.connection.pipeline() as pipe:
-            pipe.hget(keys.STORED_TOTALS, owner)
-            pipe.hgetall(keys.uploads(owner))
-            total, uploads = pipe.execute()
-        return int(total or 0) + _bytes_of(uploads)
+        """Return the bytes that an owner has in storage, with those that are reserved."""
+        return reservations.used(self.connection, owner)
 
     def last_scan(self) -> ScanTimes | None:
         """Return when the last scan was, or None if Redis knows of none."""
         began, ended = cast(list[bytes | None], self.connection.hmget(keys.SCAN, ["began", "ended"]))
         return ScanTimes(float(began), float(ended)) if began and ended else None
 
-    def note_limit(self, owner: str, limit: int | None) -> None:
-        """Note the limit of the key that adds to an owner's records, for what is added without a caller."""
-        if limit is None:
-            self.connection.hdel(keys.STORED_LIMITS, owner)
-        else:
-            self.connection.hset(keys.STORED_LIMITS, owner, limit)
+    def note_limits(self, owner: str, limit: int | None, everybody: int | None) -> None:
+        """Note the limit of the key that adds to an owner's records, and that of owners whose key has none.
+
+        They hold for what is stored without a caller, also by workers.
+        """
+        reservations.note_limit(self.connection, owner, limit)
+        reservations.note_limit(self.connection, reservations.EVERYBODY, everybody)
 
     def noted_limit(self, owner: str) -> int | None:
         """Return the limit that was noted last for an owner, or None."""
@@ -128,29 +121,34 @@ class Ledger:
         """
         return self.connection.hincrby(keys.SCAN, "listing", 1)
 
-    def captures_since(self, listing: int) -> set[str]:
-        """Return the captures that files were stored in since a listing began."""
+    def stored_since(self, listing: int) -> set[str]:
+        """Return the captures, jobs and models that files were stored in since a listing began."""
         found = set()
         for owner in self.owners():
             for field in cast(list[bytes], self.connection.hkeys(keys.uploads(owner))):
-                kind, capture, number = [*field.decode().split("/"), ""][:3]
-                if kind == _STORED and number.isdigit() and int(number) >= listing:
-                    found.add(capture)
+                kind, record, number = [*field.decode().split("/"), ""][:3]
+                if kind == STORED and number.isdigit() and int(number) >= listing:
+                    found.add(record)
         return found
 
-    def publish(self, began: float, listing: int, holdings: Iterable[Holding]) -> None:
+    def publish(
+        self, began: float, listing: int, holdings: Iterable[Holding], unfinished: Set[str] = frozenset()
+    ) -> None:
         """Replace the figures by those of a scan that began at `began`.
 
-        listing: uploads that ended before this listing began are among `holdings`, and are forgotten.
+        listing: what was stored before this listing began is among `holdings`, and its entries are forgotten.
+        unfinished: ids of the jobs that had not ended when the scan began. Reservations of others are forgotten.
         """
         by_owner: dict[str, dict[str, Holding]] = {owner: {} for owner in self.owners()}
         for held in holdings:
             by_owner.setdefault(NOBODY if held.owner is None else held.owner, {})[held.key] = held
         for owner, found in by_owner.items():
-            self._replace(owner, found, began, listing)
+            self._replace(owner, found, began, listing, unfinished)
         self.connection.hset(keys.SCAN, mapping={"began": str(began), "ended": str(self.clock())})
 
-    def _replace(self, owner: str, found: Mapping[str, Holding], began: float, listing: int) -> None:
+    def _replace(
+        self, owner: str, found: Mapping[str, Holding], began: float, listing: int, unfinished: Set[str]
+    ) -> None:
         name, uploads_name = keys.stored(owner), keys.uploads(owner)
 
         def apply(pipe: Any) -> None:
@@ -161,7 +159,9 @@ class Ledger:
             }
             uploads = pipe.hgetall(uploads_name)
             over = [
-                field for field, value in uploads.items() if _is_over(field.decode(), value, began, listing)
+                field
+                for field, value in uploads.items()
+                if _is_over(field.decode(), value, began, listing, unfinished)
             ]
             kept = {key: held for key, held in found.items() if key not in marks}
             fields = {key: held.model_dump_json(exclude_defaults=True) for key, held in kept.items()} | marks
@@ -178,29 +178,33 @@ class Ledger:
 
         self.connection.transaction(apply, name, uploads_name)
 
-    def put_upload(self, owner: str, token: str, upload: Upload) -> int:
-        """Enter an upload, or its new size. Return the bytes that the owner then has in storage."""
-        with self.connection.pipeline(transaction=True) as pipe:
-            pipe.hset(keys.uploads(owner), f"{_ARRIVING}/{token}", upload.model_dump_json())
-            pipe.hincrby(keys.STORED_TOTALS, owner, 0)
-            pipe.hgetall(keys.uploads(owner))
-            _, total, uploads = pipe.execute()
-        return int(total) + _bytes_of(uploads)
+    def reserve(
+        self, owner: str, field: str, size: int, record_id: str, limit: int | None, *, beyond: bool = False
+    ) -> None:
+        """Do as `reservations.reserve`, by this ledger's clock. Raises its NoRoom."""
+        reservations.reserve(
+            self.connection,
+            owner,
+            field,
+            size,
+            folder=record_id,
+            limit=limit,
+            beyond=beyond,
+            now=self.clock(),
+        )
 
-    def end_upload(self, owner: str, token: str, capture: str, stored: int) -> None:
-        """Enter that an upload has ended, and left `stored` bytes in storage."""
-        listing = int(cast(bytes | None, self.connection.hget(keys.SCAN, "listing")) or 0)
-        with self.connection.pipeline(transaction=True) as pipe:
-            pipe.hdel(keys.uploads(owner), f"{_ARRIVING}/{token}")
-            if stored:
-                pipe.hincrby(keys.uploads(owner), f"{_STORED}/{capture}/{listing}", stored)
-                pipe.hincrby(keys.STORED_TOTALS, owner, 0)
-            pipe.execute()
+    def settle(self, owner: str, field: str, record_id: str, stored: int) -> None:
+        """Enter that a reservation has ended, and that `stored` of its bytes are in storage."""
+        reservations.settle(self.connection, owner, field, folder=record_id, stored=stored)
+
+    def is_reserved(self, owner: str, field: str) -> bool:
+        """Return whether there is a reservation."""
+        return bool(self.connection.hexists(keys.uploads(owner), field))
 
     def arriving(self, owner: str, capture: str, now: float) -> bool:
         """Return whether an upload to a capture arrives, as far as is known."""
         for field, value in cast(dict[bytes, bytes], self.connection.hgetall(keys.uploads(owner))).items():
-            upload = _upload(value) if field.decode().startswith(_ARRIVING) else None
+            upload = _upload(value) if field.decode().startswith(ARRIVING) else None
             if upload is not None and upload.capture == capture and upload.touched > now - UPLOAD_SECONDS:
                 return True
         return False
@@ -218,11 +222,11 @@ class Ledger:
         def apply(pipe: Any) -> None:
             before = _holding(pipe.hget(stored, key) or b"")
             gone = []
-            if kind is StoredKind.capture:
+            if kind is not StoredKind.job:  # what is stored of a job and of its model is entered under one id
                 gone = [
                     field
                     for field in pipe.hkeys(uploads)
-                    if field.decode().startswith(f"{_STORED}/{record_id}/")
+                    if field.decode().startswith(f"{STORED}/{record_id}/")
                 ]
             pipe.multi()
             pipe.hset(stored, key, mark)
@@ -257,22 +261,27 @@ def _upload(value: bytes) -> Upload | None:
         return None
 
 
-def _bytes_of(uploads: Mapping[bytes, bytes]) -> int:
+def _bytes_of(uploads: Mapping[bytes, bytes], held: Iterable[Holding]) -> int:
+    """The bytes of entries, as the scripts of `reservations` sum them."""
+    sizes = {found.key: found.size for found in held}
     total = 0
     for field, value in uploads.items():
-        if field.decode().startswith(f"{_ARRIVING}/"):
-            upload = _upload(value)
-            total += upload.bytes if upload is not None else 0
-        elif value.isdigit():
-            total += int(value)
+        kind, _, rest = field.decode().partition("/")
+        if kind == STORED:
+            total += int(value) if value.isdigit() else 0
+        elif (upload := _upload(value)) is not None:
+            counted = sum(sizes.get(f"{of}/{rest}", 0) for of in ("job", "model")) if kind == JOB else 0
+            total += max(0, upload.bytes - counted)
     return total
 
 
-def _is_over(field: str, value: bytes, began: float, listing: int) -> bool:
-    """Whether a scan has counted an upload, or the upload was broken off long before."""
+def _is_over(field: str, value: bytes, began: float, listing: int, unfinished: Set[str]) -> bool:
+    """Whether a scan has counted an entry, or whoever made it has gone without an end of it."""
     kind, _, rest = field.partition("/")
-    if kind == _ARRIVING:
-        upload = _upload(value)
+    upload = _upload(value)
+    if kind == ARRIVING:
         return upload is None or upload.touched < began - UPLOAD_SECONDS
+    if kind in (JOB, WORK):
+        return upload is None or (rest not in unfinished and upload.touched < began)
     number = rest.rpartition("/")[2]
     return not number.isdigit() or int(number) < listing

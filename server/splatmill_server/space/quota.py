@@ -1,23 +1,26 @@
 """Quotas: how many bytes an owner may have in storage.
 
-An upload is refused before it begins if its announced size does not fit, and while it arrives otherwise. What jobs
-leave counts, but ends no job: a new job is refused once the quota is used up.
+Nothing is stored for an owner with a limit before its bytes are reserved in the ledger, and of several requests at once
+only those are admitted that fit together. An upload is refused before it begins if its announced size does not fit, and
+while it arrives otherwise. A job reserves JOB_ROOM, and its worker what it stores beyond that.
 """
 
 import secrets
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 
 import redis
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.schema import format_bytes
+from splatmill.backplane import reservations
+from splatmill.backplane.reservations import NoRoom
+from splatmill.schema import DEFAULT_OWNER, Job, StoredKind, format_bytes
 from splatmill_server.access.caller import Caller
 from splatmill_server.captures.records import Captures
 from splatmill_server.problems import ProblemError
-from splatmill_server.space.ledger import Upload
+from splatmill_server.space.holdings import folder
 from splatmill_server.space.usage import Usage
 
 log = structlog.get_logger()
@@ -29,6 +32,20 @@ _OLDEST = 60.0
 """Seconds: with older figures, storage is scanned before an upload or a job with a limit."""
 
 _TOUCH_SECONDS = 60.0
+
+JOB_ROOM = 16 << 20
+"""Bytes that are reserved for a new job, or what is left if that is less: log, curve, and a small model."""
+
+CAPTURE_BYTES = 160
+"""Bytes that an empty capture takes beside its record, at most: the beginning of its manifest."""
+
+RECORD_BYTES = 4096
+"""Bytes reserved for a record while it is written: of a capture, an import, an upload in parts or an orbit video."""
+
+
+def bytes_beside(name: str) -> int:
+    """Return the most bytes that a file of a capture takes beside its own: its digest, and its row in the manifest."""
+    return 160 + 6 * len(name)
 
 
 class Quota:
@@ -65,7 +82,8 @@ class Quota:
         if limit is None:
             return
         self._refresh()
-        self._note(who, owner)
+        if who.owner == owner:
+            self.note(who)
         used = self.usage.ledger.bytes_of(owner)
         if used + max(size, 1) > limit:
             raise _exceeded(owner, used, limit, size or None)
@@ -80,9 +98,82 @@ class Quota:
                 advice="Try again in a minute.",
             )
 
-    def _note(self, who: Caller, owner: str) -> None:
-        if who.owner == owner:
-            self.usage.ledger.note_limit(owner, who.limits.bytes_stored)
+    def note(self, who: Caller) -> None:
+        """Note the limit of a caller, for what is stored for its records without it."""
+        self.usage.ledger.note_limits(who.owner, who.limits.bytes_stored, self.default)
+
+    @contextmanager
+    def room(self, who: Caller | None, owner: str, record_id: str, size: int = 1) -> Iterator["Arrival"]:
+        """Reserve bytes for a record while the context is open; what it has left is then entered by `stored`.
+
+        who: the caller; None where there is none, and the limit last noted for the owner counts.
+
+        After an error, nothing counts as stored. Raises a 507 problem where the quota does not suffice.
+        """
+        arrival = Arrival(self.usage, owner, record_id, self._begin(who, owner))
+        try:
+            arrival.claim(size)
+            yield arrival
+        except BaseException:
+            arrival.stored = arrival.stored or 0
+            raise
+        finally:
+            arrival.end()
+
+    @asynccontextmanager
+    async def storing(
+        self, who: Caller | None, owner: str, record_id: str, size: int = 1
+    ) -> AsyncIterator["Arrival"]:
+        """Do as `room`, from a coroutine."""
+        room = self.room(who, owner, record_id, size)
+        arrival = await run_in_threadpool(room.__enter__)
+        try:
+            yield arrival
+        except BaseException as error:
+            await run_in_threadpool(room.__exit__, type(error), error, error.__traceback__)
+            raise
+        await run_in_threadpool(room.__exit__, None, None, None)
+
+    @contextmanager
+    def job(self, who: Caller, owner: str) -> Iterator[Callable[[str], None]]:
+        """Reserve room for a job that is created or restarted in the context; what is yielded is called with its id.
+
+        Raises a 507 problem if the quota is used up.
+        """
+        limit = self._begin(who, owner)
+        if limit is None:
+            yield lambda job_id: None
+            return
+        ledger, field, size = self.usage.ledger, _token(), JOB_ROOM
+        while True:
+            try:
+                ledger.reserve(owner, field, size, "", limit)
+                break
+            except NoRoom as refused:
+                left = refused.limit - refused.used
+                if left < 1:
+                    raise _exceeded(owner, refused.used, limit, None) from None
+                size = min(left, size - 1)
+
+        def keep(job_id: str) -> None:
+            # What the first reservation holds is taken over, so that this one always fits.
+            ledger.reserve(owner, reservations.job(job_id), size, job_id, None, beyond=True)
+
+        try:
+            yield keep
+        finally:
+            ledger.settle(owner, field, "", 0)
+
+    def job_ended(self, job: Job, generation: int) -> None:
+        """Enter what a job that has ended has left in storage, in place of what was reserved for it."""
+        owner, ledger = job.owner or DEFAULT_OWNER, self.usage.ledger
+        if ledger.is_reserved(owner, reservations.job(job.id)):
+            entries = (
+                entry
+                for kind in (StoredKind.job, StoredKind.model)
+                for entry in self.usage.storage.walk(folder(kind, job.id))
+            )
+            ledger.settle(owner, reservations.job(job.id), job.id, sum(entry.size for entry in entries))
 
     @asynccontextmanager
     async def upload(
@@ -92,6 +183,7 @@ class Quota:
         size: int | None,
         *,
         file: str | None = None,
+        beside: int = 0,
         keeps_parts: bool = False,
         is_stored: Callable[[], bool] | None = None,
     ) -> AsyncIterator["Arrival"]:
@@ -100,6 +192,7 @@ class Quota:
         who: who sends it; None for an upload that nobody waits for, which has the limit last noted for the owner.
         size: announced bytes, or None.
         file: how errors name the file.
+        beside: bytes that are stored beside a new file.
         keeps_parts: whether what has arrived stays in storage if the upload breaks off.
         is_stored: returns whether the file is stored already, so that sending it again takes no room.
 
@@ -112,6 +205,7 @@ class Quota:
         limit = await run_in_threadpool(self._begin, who, owner)
         arrival = Arrival(self.usage, owner, capture_id, limit, is_stored)
         arrival.file = file
+        arrival.beside = beside
         try:
             await run_in_threadpool(arrival.claim, size or 0)
             yield arrival
@@ -122,10 +216,11 @@ class Quota:
             await run_in_threadpool(arrival.end)
 
     def _begin(self, who: Caller | None, owner: str) -> int | None:
+        """Return the limit of an owner, with figures to compare it to."""
         try:
             limit = self.limit(who, owner) if who is not None else self.known_limit(owner)
-            if who is not None:
-                self._note(who, owner)
+            if who is not None and who.owner == owner:
+                self.note(who)
             if limit is not None:
                 self._refresh()
         except redis.RedisError:
@@ -136,10 +231,12 @@ class Quota:
 
 
 class Arrival:
-    """An upload that arrives.
+    """An upload that arrives, or something else that is about to be stored.
 
+    record_id: of the capture, job or model that it goes to.
     received: bytes so far.
-    stored: bytes that it leaves in storage; 0 where the file was there already.
+    stored: bytes that it leaves in storage; 0 where the file was there already. None counts what was received.
+    beside: bytes that are stored with it, unless it leaves nothing.
     file: how errors name the file.
     """
 
@@ -147,19 +244,20 @@ class Arrival:
         self,
         usage: Usage,
         owner: str,
-        capture_id: str,
+        record_id: str,
         limit: int | None,
-        is_stored: Callable[[], bool] | None,
+        is_stored: Callable[[], bool] | None = None,
     ) -> None:
         self.received = 0
         self.stored: int | None = None
+        self.beside = 0
         self.file: str | None = None
         self._usage = usage
         self._owner = owner
-        self._capture = capture_id
+        self.record_id = record_id
         self._limit = limit
         self._is_stored = is_stored
-        self._token = secrets.token_hex(8)
+        self._field = _token()
         self._claimed = 0
         self._touched = time.monotonic()
         self._counted = True
@@ -171,6 +269,17 @@ class Arrival:
             if self.received > self._claimed or time.monotonic() - self._touched > _TOUCH_SECONDS:
                 await run_in_threadpool(self._grow)
             yield chunk
+
+    def announce(self, length: str | None) -> None:
+        """Reserve what is to arrive beyond what has, as a header says. Raises a 507 problem if it does not fit."""
+        if length is not None and length.isdigit():
+            self.claim(max(self._claimed, self.received + int(length)))
+
+    def take(self, size: int) -> None:
+        """Count bytes that are about to be stored at once. Raises a 507 problem where they exceed the quota."""
+        self.received += size
+        if self.received > self._claimed:
+            self.claim(self.received)
 
     def _grow(self) -> None:
         wanted = max(self._claimed, self.received)
@@ -184,44 +293,45 @@ class Arrival:
             self.claim(max(self.received, self._claimed))
 
     def claim(self, size: int) -> None:
-        """Enter the upload with `size` bytes. Raises a 507 problem if they do not fit."""
+        """Reserve `size` bytes. Raises a 507 problem if they do not fit."""
         if not self._counted:
             return
         ledger = self._usage.ledger
         self._touched = time.monotonic()
         try:
-            entry = Upload(bytes=size, capture=self._capture, touched=ledger.clock())
-            total = ledger.put_upload(self._owner, self._token, entry)
+            ledger.reserve(self._owner, self._field, size + self.beside, self.record_id, self._limit)
         except redis.RedisError as error:
             if self._limit is not None:
                 raise
             log.warning("an upload is not counted before the next scan of storage", error=str(error))
             self._counted = False
             return
-        if self._limit is not None and total > self._limit:
+        except NoRoom as refused:
             if self._is_stored is not None and self._is_stored():
                 self._counted = False
-                self._drop()
+                ledger.settle(self._owner, self._field, self.record_id, 0)
                 return
-            refusal = _exceeded(self._owner, total - size, self._limit, size)
-            raise refusal.about_file(self.file) if self.file is not None else refusal
+            problem = _exceeded(self._owner, refused.used, refused.limit, size)
+            raise (problem.about_file(self.file) if self.file is not None else problem) from None
         self._claimed = size
 
     def end(self) -> None:
-        """Enter what the upload leaves in storage."""
+        """Enter what is left in storage."""
         if self._counted:
             stored = self.received if self.stored is None else self.stored
+            stored += self.beside if stored else 0
             try:
-                self._usage.ledger.end_upload(self._owner, self._token, self._capture, stored)
+                self._usage.ledger.settle(self._owner, self._field, self.record_id, stored)
             except redis.RedisError as error:
                 log.warning("an upload is not counted before the next scan of storage", error=str(error))
 
-    def _drop(self) -> None:
-        self._usage.ledger.end_upload(self._owner, self._token, self._capture, 0)
+
+def _token() -> str:
+    return f"{reservations.ARRIVING}/{secrets.token_hex(8)}"
 
 
 def _exceeded(owner: str, used: int, limit: int, size: int | None) -> ProblemError:
-    needs = "" if size is None else f", and this upload needs {format_bytes(size)}"
+    needs = "" if size is None else f", and this needs {format_bytes(size)}"
     return ProblemError(
         "quota_exceeded",
         f"The owner {owner} has {format_bytes(used)} of {format_bytes(limit)} in storage{needs}.",

@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
+from itertools import chain
 
 import redis
 import structlog
@@ -13,7 +14,7 @@ from redis.lock import Lock
 from splatmill.backplane import expiry, keys
 from splatmill.backplane.storage import Entry, Storage
 from splatmill.schema import OwnerUse, StoredBytes, StoredKind, StoredRecord
-from splatmill_server.space.holdings import Holding, scan, sums
+from splatmill_server.space.holdings import Holding, folder, scan
 from splatmill_server.space.job_uses import JobUse, all_jobs
 from splatmill_server.space.ledger import NOBODY, Account, Ledger
 from splatmill_server.space.snapshot import Snapshot
@@ -78,20 +79,15 @@ class Usage:
         listed = _renewing(lock, self.storage.walk(""))
         found = scan(self.storage, listed, known, {job.id: job.owner for job in jobs.values()})
         second = self.ledger.begin_listing()
-        busy = self.ledger.captures_since(first)
-        self.ledger.publish(
-            began, second, [self._listed_again(held) if held.id in busy else held for held in found]
-        )
+        # What was written to meanwhile is listed once more: the listing may have missed a part of it, or all.
+        busy = self.ledger.stored_since(first)
+        folders = [folder(kind, record_id) for record_id in sorted(busy) for kind in StoredKind]
+        again = _renewing(lock, chain.from_iterable(map(self.storage.walk, folders)))
+        found = [held for held in found if held.id not in busy]
+        found += scan(self.storage, again, known, {job.id: job.owner for job in jobs.values()})
+        unfinished = {job.id for job in jobs.values() if job.unfinished}
+        self.ledger.publish(began, second, found, unfinished)
         log.debug("storage scanned", folders=len(found), bytes=sum(held.size for held in found))
-
-    def _listed_again(self, held: Holding) -> Holding:
-        """Return a folder that was written to while it was listed with the bytes of another listing."""
-        now = sums(self.storage.walk(held.folder)).get((held.kind, held.id))
-        return (
-            held
-            if now is None
-            else now.model_copy(update=held.model_dump(include={"owner", "name", "capture"}))
-        )
 
     def account(self, owner: str) -> Account:
         """Return what an owner has in storage."""

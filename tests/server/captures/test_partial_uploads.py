@@ -19,6 +19,7 @@ import pytest
 from splatmill.backplane import layout
 from splatmill.backplane.parts import EndMoved, open_part
 from splatmill.schema import SHA256_HEADER, Role
+from splatmill_server.captures import unfinished_uploads
 from tests.support.bucket import bucket
 from tests.support.served_app import Serve, ServedApp, problem
 from tests.support.waiting import wait_for
@@ -88,7 +89,9 @@ def leftovers(app: ServedApp, capture_id: str) -> list[str]:
     entries = app.service.storage.entries(layout.capture(capture_id))
     kept = ("capture.json", "manifest.json", "files", "sha256")
     paths = [entry.path.removeprefix(layout.capture(capture_id) + "/") for entry in entries]
-    return [p for p in paths if p.split("/")[0] not in kept and not p.endswith("/record.json")]
+    return [
+        p for p in paths if p.split("/")[0] not in kept and not p.endswith(("/record.json", "/stored.json"))
+    ]
 
 
 def test_a_file_arrives_in_pieces_and_is_checked_as_a_whole(app: ServedApp) -> None:
@@ -370,3 +373,26 @@ def test_uploads_that_nobody_goes_on_with_are_swept_as_a_whole(serve: Serve) -> 
     assert app.service.captures.delete_abandoned_uploads() == 2
     assert app.http.head(old).status_code == 404
     assert offset(app, slow) == 2000
+
+
+def test_a_capture_has_a_limited_number_of_unfinished_uploads(
+    app: ServedApp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(unfinished_uploads, "MAX_UNFINISHED", 6)
+    one, other = capture(app), capture(app)
+    unsized = {"Upload-Complete": "?0"}  # without length and digest, each request begins another upload
+    with ThreadPoolExecutor(16) as pool:
+        answers = list(pool.map(lambda _: begin(app, one, **unsized), range(31)))
+    begun = [answer.headers["location"] for answer in answers if answer.status_code == 201]
+    assert len(begun) == 6
+    for answer in answers:
+        if answer.status_code != 201:
+            assert problem(answer, 429, "too_many_requests")["facts"]["limit"] == 6
+    assert len(app.service.storage.children(layout.capture_uploads(one))) == 6
+    assert begin(app, other, **unsized).status_code == 201
+    # One that is complete, and one that is cancelled, make room for two.
+    assert append(app, begun[0], 0, b"whole", complete=True).status_code == 201
+    assert append(app, begun[0], 0, b"whole", complete=True).json()["code"] == "upload_completed"
+    assert app.http.delete(begun[1]).status_code == 204
+    more = [begin(app, one, f"images/{n}.mp4", **unsized).status_code for n in range(3)]
+    assert more == [201, 201, 429]

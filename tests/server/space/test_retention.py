@@ -87,12 +87,10 @@ def test_an_upload_that_arrives_keeps_its_capture(people: ServedApp) -> None:
     snapshot_age = Ages(captures=30 * DAY)
 
     service.sweeper.ages = snapshot_age
-    service.usage.ledger.clock = clock = Clock(time.time() + 40 * DAY)
-    from splatmill_server.space.ledger import Upload
-
-    service.usage.ledger.put_upload("default", "x", Upload(bytes=1, capture=capture, touched=clock.now))
+    service.usage.ledger.clock = Clock(time.time() + 40 * DAY)
+    service.usage.ledger.reserve("default", "arriving/x", 1, capture, None)
     assert service.sweeper.sweep() == []
-    service.usage.ledger.end_upload("default", "x", capture, 0)
+    service.usage.ledger.settle("default", "arriving/x", capture, 0)
     assert [found.held.id for found in service.sweeper.sweep()] == [capture]
 
 

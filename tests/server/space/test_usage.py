@@ -9,12 +9,13 @@ import threading
 import pytest
 
 from splatmill.backplane import keys, layout
+from splatmill.backplane.reservations import UPLOAD_SECONDS
 from splatmill.backplane.storage import Entry
 from splatmill.schema import StoredKind
 from splatmill_server.routes import storage as route
 from splatmill_server.space import usage as usage_module
 from splatmill_server.space.holdings import Holding, sums
-from splatmill_server.space.ledger import UPLOAD_SECONDS, Ledger, Upload
+from splatmill_server.space.ledger import Ledger
 from tests.server.space.conftest import Clock, Person, ServePeople
 from tests.support.served_app import ServedApp, problem
 
@@ -141,20 +142,20 @@ def test_what_is_deleted_during_a_scan_stays_deleted(serve_people: ServePeople) 
 def test_an_upload_is_counted_until_a_listing_that_began_after_it(serve_people: ServePeople) -> None:
     app = serve_people()
     ledger = Ledger(app.redis, Clock(1000.0))
-    arriving = Upload(bytes=70, capture="c", touched=1000.0)
-    assert ledger.put_upload("ann", "token", arriving) == 70
+    ledger.reserve("ann", "arriving/token", 70, "c", None)
+    assert ledger.bytes_of("ann") == 70
     first = ledger.begin_listing()
     ledger.publish(1001.0, first, [])
     assert ledger.bytes_of("ann") == ledger.account("ann").bytes == 70
-    ledger.end_upload("ann", "token", "c", 60)
-    assert ledger.captures_since(first) == {"c"}
+    ledger.settle("ann", "arriving/token", "c", 60)
+    assert ledger.stored_since(first) == {"c"}
     held = [Holding(kind=StoredKind.capture, id="c", bytes=60, owner="ann")]
     ledger.publish(1002.0, first, [])
     assert ledger.bytes_of("ann") == ledger.account("ann").bytes == 60
     ledger.publish(1003.0, ledger.begin_listing(), held)
     assert ledger.bytes_of("ann") == ledger.account("ann").bytes == 60
     assert ledger.account("ann").uploads == 0
-    ledger.put_upload("ann", "killed", arriving)
+    ledger.reserve("ann", "arriving/killed", 70, "c", None)
     assert ledger.arriving("ann", "c", 1010.0)
     ledger.publish(1000.0 + UPLOAD_SECONDS + 1, ledger.begin_listing(), held)
     assert ledger.bytes_of("ann") == 60
