@@ -24,7 +24,8 @@ group allows); 0 is no limit.
 `SPLATMILL_RENDER_CACHE` limits the memory of the models that the renderer keeps, such as `500MB`; without it, an eighth
 of the machine's memory and at most 1 GiB. `SPLATMILL_REDIS_PATIENCE` is the number of seconds for which an attempt at a
 job waits at its start and its end for a Redis that does not work; by default 600. `SPLATMILL_DISK_RESERVE` is the space
-that a worker leaves free on the disk of `SPLATMILL_DATA`, such as `1GB`; by default 256 MiB. Workers read
+that a worker leaves free on the disk of `SPLATMILL_DATA`, such as `1GB`; by default 256 MiB. `SPLATMILL_MAX_UNPACKED`
+limits the bytes that the zips of a capture and the frames of its videos take together, by default 16 GiB. Workers read
 `SPLATMILL_KEEP_WORK`, too, and remove the folders of ended jobs from their machine at that age.
 """
 

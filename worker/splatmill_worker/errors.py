@@ -12,6 +12,7 @@
     ├── TrainingFailed       training ended with a numerical failure
     ├── ModelNotFound        there is no finished model with the requested id
     ├── ModelUnreadable      a model file cannot be read as 3D Gaussians, or is of an unknown format
+    ├── QuotaReached         the owner has no room left for what the job stores or unpacks
     ├── FolderInUse          another process works in the job's folder
     └── DiskReserveReached   the worker's disk is full but for the reserve
 
@@ -225,6 +226,22 @@ class FolderInUse(WorkerError):
             "worker_lost",
             f"Another process works in the job's folder {folder}.",
             advice="End the process that was left over on the worker's machine, then restart the job.",
+        )
+
+
+class QuotaReached(WorkerError):
+    """The owner has no room left for what the job stores or unpacks. What the attempt has stored is kept.
+
+    used, limit, size: bytes that are used, that the owner may have, and that the job needs.
+    """
+
+    def __init__(self, owner: str, used: int, limit: int, size: int) -> None:
+        super().__init__(
+            "quota_exceeded",
+            f"The owner {owner} has {format_bytes(used)} of {format_bytes(limit)} in storage, and the job needs "
+            f"{format_bytes(size)}.",
+            facts={"used": used, "limit": limit, "size": size},
+            advice="Delete captures or jobs that are no longer needed, then restart the job.",
         )
 
 

@@ -12,6 +12,9 @@ from splatmill.schema.quantities import parse_bytes, parse_duration
 DISK_RESERVE = 256 * 2**20
 """Bytes that stay free on the disk of the data folder. On a shared disk, Redis needs them for its log."""
 
+MAX_UNPACKED = 16 * 2**30
+"""Bytes that all zips and videos of a capture unpack to, at most."""
+
 
 def redis_url() -> str:
     """Return REDIS_URL, or the default address on this machine."""
@@ -67,6 +70,14 @@ def max_memory() -> int | None:
     """Return SPLATMILL_MAX_MEMORY in bytes (0: no limit), or None if it is not set. Raises ValueError."""
     found: int | None = _read("SPLATMILL_MAX_MEMORY", parse_bytes, None)
     return found
+
+
+def max_unpacked() -> int:
+    """Return SPLATMILL_MAX_UNPACKED, the bytes that the zips and videos of a capture unpack to, by default 16 GiB.
+
+    Raises ValueError.
+    """
+    return int(_read("SPLATMILL_MAX_UNPACKED", parse_bytes, MAX_UNPACKED))
 
 
 def _read(name: str, parse: Callable[[str], Any], default: Any) -> Any:

@@ -151,12 +151,12 @@ def idempotency(key_digest: str) -> str:
 
 
 STORED_TOTALS = PREFIX + "stored"
-"""Hash with the bytes in `stored` by owner, for all owners that have keys of `stored` or `uploads`. Only the server
-writes it."""
+"""Hash with the bytes in `stored` by owner, for all owners that have keys of `stored` or `uploads`. The server writes
+the figures; reservations of workers add owners."""
 
 STORED_LIMITS = PREFIX + "stored:limits"
-"""Hash with the limit in bytes of the API key that last added to an owner's records, by owner. Only the server writes
-it."""
+"""Hash with the limit in bytes of the API key that last added to an owner's records, by owner, and under an empty name
+that of owners whose key has none. Only the server writes it."""
 
 SCAN = PREFIX + "stored:scan"
 """Hash with the beginning and the end of the last scan of storage, and the number of the last listing."""
@@ -179,6 +179,10 @@ def job_of(name: str) -> str | None:
     return name.removeprefix(head).partition(":")[0] if name.startswith(head) else None
 
 
+DELETED = b"deleted"
+"""Value of `deleting` once the files are gone."""
+
+
 def deleting(record: str) -> str:
     """Return the key of a string that says that a record (kind and id) is being deleted, or was. It expires.
 
@@ -193,7 +197,10 @@ def stored(owner: str) -> str:
 
 
 def uploads(owner: str) -> str:
-    """Return the key of a hash with an owner's uploads that no scan has counted. Only the server writes it."""
+    """Return the key of a hash with an owner's reservations, and what was stored and no scan has counted.
+
+    Server and workers write it, by the scripts of `reservations`.
+    """
     return f"{PREFIX}stored:uploads:{owner}"
 
 

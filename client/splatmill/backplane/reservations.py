@@ -6,7 +6,7 @@ stored, which the next scan of storage counts and removes. The entry's name says
 
     arriving/{token}            until nobody has renewed it for UPLOAD_SECONDS
     job/{job}                   as long as the job is unfinished: what its attempts store
-    work/{job}                  as long as the job is unfinished: what they unpack on the worker's disk
+    work/{job}                  until the job is deleted: what they unpack and leave on the worker's disk
     stored/{record}/{listing}   bytes that were stored, until a later listing of storage counts them
 
 Files of a job that a scan has counted already are not counted again in the job's reservation.

@@ -28,7 +28,9 @@ class StoredBytes(Response):
     sfm: int = Field(default=0, ge=0, description="Cameras recovered from captures; shared by their jobs.")
     jobs: int = Field(default=0, ge=0, description="Files from which jobs resume.")
     models: int = Field(default=0, ge=0, description="Models and reports.")
-    uploads: int = Field(default=0, ge=0, description="What was stored since the last scan of storage, and what is reserved.")
+    uploads: int = Field(
+        default=0, ge=0, description="What was stored since the last scan of storage, and what is reserved."
+    )
 
     @property
     def total(self) -> int:

@@ -7,7 +7,7 @@ of storage and its entry here, the figures are too large until the next scan, wh
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -132,22 +132,23 @@ class Ledger:
         return found
 
     def publish(
-        self, began: float, listing: int, holdings: Iterable[Holding], unfinished: Set[str] = frozenset()
+        self, began: float, listing: int, holdings: Iterable[Holding], jobs: Mapping[str, bool] | None = None
     ) -> None:
         """Replace the figures by those of a scan that began at `began`.
 
         listing: what was stored before this listing began is among `holdings`, and its entries are forgotten.
-        unfinished: ids of the jobs that had not ended when the scan began. Reservations of others are forgotten.
+        jobs: for each job that was known when the scan began, whether it was unfinished. Reservations of others are
+        forgotten, and of jobs that had ended those for what they store.
         """
         by_owner: dict[str, dict[str, Holding]] = {owner: {} for owner in self.owners()}
         for held in holdings:
             by_owner.setdefault(NOBODY if held.owner is None else held.owner, {})[held.key] = held
         for owner, found in by_owner.items():
-            self._replace(owner, found, began, listing, unfinished)
+            self._replace(owner, found, began, listing, jobs or {})
         self.connection.hset(keys.SCAN, mapping={"began": str(began), "ended": str(self.clock())})
 
     def _replace(
-        self, owner: str, found: Mapping[str, Holding], began: float, listing: int, unfinished: Set[str]
+        self, owner: str, found: Mapping[str, Holding], began: float, listing: int, jobs: Mapping[str, bool]
     ) -> None:
         name, uploads_name = keys.stored(owner), keys.uploads(owner)
 
@@ -161,7 +162,7 @@ class Ledger:
             over = [
                 field
                 for field, value in uploads.items()
-                if _is_over(field.decode(), value, began, listing, unfinished)
+                if _is_over(field.decode(), value, began, listing, jobs)
             ]
             kept = {key: held for key, held in found.items() if key not in marks}
             fields = {key: held.model_dump_json(exclude_defaults=True) for key, held in kept.items()} | marks
@@ -222,6 +223,8 @@ class Ledger:
         def apply(pipe: Any) -> None:
             before = _holding(pipe.hget(stored, key) or b"")
             gone = []
+            if kind is StoredKind.job:
+                gone = [reservations.job(record_id), reservations.work(record_id)]
             if kind is not StoredKind.job:  # what is stored of a job and of its model is entered under one id
                 gone = [
                     field
@@ -275,13 +278,14 @@ def _bytes_of(uploads: Mapping[bytes, bytes], held: Iterable[Holding]) -> int:
     return total
 
 
-def _is_over(field: str, value: bytes, began: float, listing: int, unfinished: Set[str]) -> bool:
+def _is_over(field: str, value: bytes, began: float, listing: int, jobs: Mapping[str, bool]) -> bool:
     """Whether a scan has counted an entry, or whoever made it has gone without an end of it."""
     kind, _, rest = field.partition("/")
     upload = _upload(value)
     if kind == ARRIVING:
         return upload is None or upload.touched < began - UPLOAD_SECONDS
     if kind in (JOB, WORK):
-        return upload is None or (rest not in unfinished and upload.touched < began)
+        needed = rest in jobs if kind == WORK else jobs.get(rest, False)
+        return upload is None or (not needed and upload.touched < began)
     number = rest.rpartition("/")[2]
     return not number.isdigit() or int(number) < listing

@@ -11,7 +11,7 @@ from splatmill.schema import StoredKind, TrainOptions
 from splatmill_server.problems import ProblemError
 from splatmill_server.space.holdings import Holding
 
-DELETING, DELETED = b"deleting", b"deleted"
+DELETING, DELETED = b"deleting", keys.DELETED
 """Values of a mark: files are being deleted, or they are gone, unless the record was made anew under the same id."""
 
 

@@ -85,8 +85,7 @@ class Usage:
         again = _renewing(lock, chain.from_iterable(map(self.storage.walk, folders)))
         found = [held for held in found if held.id not in busy]
         found += scan(self.storage, again, known, {job.id: job.owner for job in jobs.values()})
-        unfinished = {job.id for job in jobs.values() if job.unfinished}
-        self.ledger.publish(began, second, found, unfinished)
+        self.ledger.publish(began, second, found, {job.id: job.unfinished for job in jobs.values()})
         log.debug("storage scanned", folders=len(found), bytes=sum(held.size for held in found))
 
     def account(self, owner: str) -> Account:

@@ -100,3 +100,15 @@ def gzip_of_zeros(head: bytes, zeros: int) -> bytes:
     size = len(head) + zeros * 10**6
     start = b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x02\xff"
     return start + first + zeros * block + packer.flush() + struct.pack("<II", checksum, size)
+
+
+@cache
+def many_small() -> bytes:
+    """A zip of 193 files of a MiB of zeros, each too small for a ratio of its own."""
+    return packed({f"{number:03d}.jpg": bytes(2**20) for number in range(193)}, zipfile.ZIP_DEFLATED)
+
+
+@cache
+def many_folders() -> bytes:
+    """A zip whose 200 empty files lie in 110 folders each."""
+    return packed({f"{number:03d}/" + "a/" * 109 + "b.jpg": b"" for number in range(200)})

@@ -7,5 +7,6 @@ from tests.support.hostile.table_files import FILES
 from tests.support.hostile.table_poses import POSES
 from tests.support.hostile.table_requests import REQUESTS
 from tests.support.hostile.table_services import SERVICES
+from tests.support.hostile.table_unpacked import UNPACKED
 
-HOSTILE: tuple[Hostile, ...] = (*REQUESTS, *SERVICES, *FILES, *POSES)
+HOSTILE: tuple[Hostile, ...] = (*REQUESTS, *SERVICES, *FILES, *UNPACKED, *POSES)

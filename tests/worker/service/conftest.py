@@ -6,10 +6,12 @@ Remote storage is played by a local folder that does not say where its files lie
 from pathlib import Path
 
 import pytest
+import redis
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Role
+from splatmill_worker.service.room import Room
 from tests.support.jobs import CAPTURE
 from tests.support.other_file_system import other_file_system as other_file_system
 from tests.support.redis_server import connection as connection
@@ -43,3 +45,9 @@ def remote(local: Storage) -> Storage:
     """The same storage, as if it were an S3 bucket."""
     local.root = None
     return local
+
+
+@pytest.fixture
+def room(connection: redis.Redis) -> Room:
+    """The room of the job "job00001", whose owner has no limit."""
+    return Room(connection, "default", "job00001")

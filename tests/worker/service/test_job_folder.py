@@ -23,6 +23,7 @@ from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.job_folder import JobFolder, hold
 from splatmill_worker.service.mirror import Mirror
 from splatmill_worker.service.problems import is_transient, problem_of
+from splatmill_worker.service.room import Room
 from splatmill_worker.service.staging import DOWNLOADS
 from tests.support.faulty_s3 import FaultyS3, faulty_s3
 from tests.support.jobs import CAPTURE
@@ -155,14 +156,14 @@ def test_a_file_that_the_bucket_does_not_give_ends_the_staging_by_name(
 
 
 def test_the_checkpoint_is_copied_less_often_than_small_files_and_at_a_stop(
-    remote: Storage, monkeypatch: pytest.MonkeyPatch
+    room: Room, remote: Storage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mirror, "INTERVAL", 0.01)
     folder = JobFolder(remote, JOB, CAPTURE)
     work = layout.job_work(JOB)
     (folder.run / "checkpoints").mkdir(parents=True)
     (folder.run / "checkpoints/checkpoint.pt").write_text("1")
-    copying = Mirror(folder, lambda _: None)
+    copying = Mirror(folder, room, lambda _: None)
     wait_for(lambda: remote.exists(f"{work}/checkpoints/checkpoint.pt"))
     (folder.run / "checkpoints/checkpoint.pt").write_text("of later")
     # One after the other, so that a whole look lies between.
@@ -184,7 +185,7 @@ def test_what_left_the_capture_leaves_the_folder(local: Storage) -> None:
 
 
 def test_checkpoints_reach_an_attempt_on_another_machine(
-    remote: Storage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    room: Room, remote: Storage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = JobFolder(remote, JOB, CAPTURE)
     for name in (
@@ -193,7 +194,7 @@ def test_checkpoints_reach_an_attempt_on_another_machine(
         (folder.run / name).parent.mkdir(parents=True, exist_ok=True)
         (folder.run / name).write_text(name)
     warnings: list[str] = []
-    Mirror(folder, warnings.append).close(copy=True)
+    Mirror(folder, room, warnings.append).close(copy=True)
     assert warnings == []
 
     monkeypatch.setenv("SPLATMILL_DATA", str(tmp_path / "another machine"))
@@ -207,13 +208,13 @@ def test_checkpoints_reach_an_attempt_on_another_machine(
 
 
 def test_a_checkpoint_that_storage_refuses_is_reported_and_copied_later(
-    remote: Storage, monkeypatch: pytest.MonkeyPatch
+    room: Room, remote: Storage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = JobFolder(remote, JOB, CAPTURE)
     folder.run.mkdir()
     (folder.run / "plan.json").write_text("{}")
     warnings: list[str] = []
-    copying = Mirror(folder, warnings.append)
+    copying = Mirror(folder, room, warnings.append)
     stored = f"{layout.job_work(JOB)}/plan.json"
 
     def refuse(path: str, data: object) -> None:
@@ -232,13 +233,13 @@ def test_a_checkpoint_that_storage_refuses_is_reported_and_copied_later(
 
 @pytest.mark.parametrize("elsewhere", [True, False])
 def test_a_run_begun_anew_gets_no_film_of_the_one_before(
-    remote: Storage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, elsewhere: bool
+    room: Room, remote: Storage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, elsewhere: bool
 ) -> None:
     folder = JobFolder(remote, JOB, CAPTURE)
     for name in ("film/000.jpg", "plan.json"):
         (folder.run / name).parent.mkdir(parents=True, exist_ok=True)
         (folder.run / name).write_text(name)
-    Mirror(folder, lambda _: None).close(copy=True)
+    Mirror(folder, room, lambda _: None).close(copy=True)
     if elsewhere:
         monkeypatch.setenv("SPLATMILL_DATA", str(tmp_path / "another machine"))
         folder = JobFolder(remote, JOB, CAPTURE)

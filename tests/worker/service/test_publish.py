@@ -16,6 +16,7 @@ from splatmill.schema import JobState, StateEvent
 from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.lock import JobLock
 from splatmill_worker.service.publish import is_published, publish
+from splatmill_worker.service.room import Room
 from tests.support.jobs import write_row
 
 JOB = "job00001"
@@ -26,7 +27,7 @@ def attempt(connection: redis.Redis, generation: int) -> Attempt:
 
 
 def test_a_model_is_published_for_its_generation(
-    local: Storage, connection: redis.Redis, tmp_path: Path
+    room: Room, local: Storage, connection: redis.Redis, tmp_path: Path
 ) -> None:
     for name in ("model.ply", "report.json", "notes.txt"):
         (tmp_path / name).write_text(name)
@@ -34,7 +35,7 @@ def test_a_model_is_published_for_its_generation(
     row = write_row(connection, JOB)
     first.report(StateEvent(state=JobState.exporting))
     assert not is_published(local, first)
-    publish(local, first, row, tmp_path)
+    publish(local, first, row, tmp_path, room)
     assert is_published(local, first)
     assert not is_published(local, second), "a restarted job is trained again"
     record = json.loads(local.get(layout.job_record(JOB)))
@@ -46,7 +47,7 @@ def test_a_model_is_published_for_its_generation(
 
 
 def test_files_in_folders_are_those_of_the_last_generation(
-    local: Storage, connection: redis.Redis, tmp_path: Path
+    room: Room, local: Storage, connection: redis.Redis, tmp_path: Path
 ) -> None:
     (tmp_path / "model.ply").write_text("splats")
     for name in ("held_out/000.webp", "held_out/001.webp", "time_lapse/000.ply", "film/000.jpg"):
@@ -58,21 +59,21 @@ def test_files_in_folders_are_those_of_the_last_generation(
         folder = layout.model(JOB) + "/"
         return {entry.path.removeprefix(folder) for entry in local.entries(layout.model(JOB))}
 
-    publish(local, attempt(connection, 1), row, tmp_path)
+    publish(local, attempt(connection, 1), row, tmp_path, room)
     common = {"model.ply", "job.json", "held_out/000.webp"}
     assert stored() == common | {"held_out/001.webp", "time_lapse/000.ply"}
     digests = json.loads(local.get(layout.job_record(JOB)))["sha256"]
     assert digests["held_out/000.webp"] == hashlib.sha256(b"held_out/000.webp").hexdigest()
     for name in ("held_out/001.webp", "time_lapse/000.ply"):
         (tmp_path / name).unlink()
-    publish(local, attempt(connection, 2), row, tmp_path)
+    publish(local, attempt(connection, 2), row, tmp_path, room)
     assert stored() == common
 
 
 def test_without_a_model_nothing_is_published(
-    local: Storage, connection: redis.Redis, tmp_path: Path
+    room: Room, local: Storage, connection: redis.Redis, tmp_path: Path
 ) -> None:
     (tmp_path / "report.json").write_text("{}")
     with pytest.raises(FileNotFoundError, match=r"model\.ply"):
-        publish(local, attempt(connection, 1), write_row(connection, JOB), tmp_path)
+        publish(local, attempt(connection, 1), write_row(connection, JOB), tmp_path, room)
     assert list(local.entries(layout.model(JOB))) == []

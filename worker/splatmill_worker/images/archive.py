@@ -10,11 +10,13 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import IO, cast
 
 from splatmill_worker.errors import Cancelled, Refusal
+from splatmill_worker.images import unpacked_room
+from splatmill_worker.settings import max_unpacked
 
 MAX_ENTRIES = 20_000
 """Files in all archives of a capture, at most."""
@@ -22,17 +24,18 @@ MAX_ENTRIES = 20_000
 MAX_FILE_BYTES = 2 * 2**30
 """Bytes of an unpacked file, at most."""
 
-MAX_TOTAL_BYTES = 16 * 2**30
-"""Bytes of all unpacked files of a capture, at most."""
+MAX_FOLDERS = MAX_ENTRIES
+"""Folders that the names of an archive's files make, at most: each takes a block of the disk."""
 
 MAX_DIRECTORY_BYTES = 256 * MAX_ENTRIES
 """Bytes of an archive's list of files. It is read at once, and takes ten times the memory."""
 
 MAX_RATIO = 100
-"""Largest ratio of a file's unpacked to packed size: photos and videos hardly compress, a zip bomb 1000 to 1."""
+"""Largest ratio of unpacked to packed size, of a file and of the whole archive: photos and videos hardly compress, a
+zip bomb 1000 to 1."""
 
 RATIO_FLOOR = 2**20
-"""Bytes of an unpacked file up to which its ratio is not limited."""
+"""Bytes of an unpacked file, and of all files of an archive, up to which their ratio is not limited."""
 
 _LOCAL_HEADER_BYTES = 30
 """Bytes before a packed file, without its name."""
@@ -57,22 +60,22 @@ class UnsafeArchive(ValueError):
 
 @dataclass
 class Allowance:
-    """What the archives of a capture may still unpack to, together.
+    """What the archives and videos of a capture may still unpack to, together.
 
-    files: number of files.
-    bytes: of all files.
+    files: number of files, those of archives.
+    bytes: of all files; at first those of the setting `max_unpacked`.
     """
 
     files: int = MAX_ENTRIES
-    bytes: int = MAX_TOTAL_BYTES
+    bytes: int = field(default_factory=max_unpacked)
 
     def take(self, archive: str, files: int, size: int) -> None:
         """Subtract `files` with `size` bytes. Raises Refusal, naming the archive, when that is more than is left."""
         if files > self.files or size > self.bytes:
             raise Refusal(
                 "archive_bomb",
-                f"With {archive}, the archives of the capture unpack to more than {MAX_ENTRIES} files or "
-                f"{MAX_TOTAL_BYTES} bytes: it has {files} files and {size} bytes, where {self.files} and {self.bytes} "
+                f"With {archive}, the archives and videos of the capture unpack to more than {MAX_ENTRIES} files or "
+                f"{max_unpacked()} bytes: it has {files} files and {size} bytes, where {self.files} and {self.bytes} "
                 "are left.",
                 facts={"file": archive, "files": files, "bytes": size},
                 advice="Give fewer or smaller photos.",
@@ -89,22 +92,25 @@ def unpack(
 ) -> list[Path]:
     """Write the archive's files under `target` and return their paths, in the archive's order.
 
-    The declared sizes are checked before anything is written, and the real ones while writing. Hidden files and the
-    resource forks of macOS are left out. What is written is taken from `allowance`, before it is written.
+    The declared sizes are checked before anything is written, and the real ones while writing: none exceeds what was
+    declared. Hidden files and the resource forks of macOS are left out. What is written is taken from `allowance` and
+    from the owner's room, before it is written.
 
     Raises UnsafeArchive for absolute names, names with `..`, names that no file can have, links, encrypted files, files
-    that overlap, zip bombs, too many files, and files that are no complete zip; Refusal when the allowance is exceeded;
-    Cancelled when `cancelled()` turns true.
+    that overlap, zip bombs, too many files or folders, and files that are no complete zip; Refusal when
+    the allowance is exceeded; Cancelled when `cancelled()` turns true.
     """
     try:
         with _BoundedReads(io.FileIO(path)) as file, zipfile.ZipFile(cast(IO[bytes], file)) as archive:
             _check_places(archive)
             entries = [entry for entry in archive.infolist() if not entry.filename.endswith("/")]
             _check_declared(entries)
-            if allowance is not None:
-                allowance.take(path.name, len(entries), sum(entry.file_size for entry in entries))
+            _check_folders(entries)
+            declared = sum(entry.file_size for entry in entries)
+            _check_ratio(declared, path.stat().st_size)
+            (allowance or Allowance()).take(path.name, len(entries), declared)
+            unpacked_room.take(target.name.removesuffix(".partial"), declared)
             written: list[Path] = []
-            total = 0
             for entry in entries:
                 name = PurePosixPath(entry.filename)
                 if any(part.startswith((".", "__MACOSX")) for part in name.parts):
@@ -112,7 +118,7 @@ def unpack(
                 place = target / name
                 try:
                     place.parent.mkdir(parents=True, exist_ok=True)
-                    total = _write(archive, entry, place, total, cancelled)
+                    _write(archive, entry, place, cancelled)
                 except OSError as error:
                     if error.errno not in _NAME_ERRNOS:
                         raise
@@ -184,27 +190,41 @@ def _check_declared(entries: list[zipfile.ZipInfo]) -> None:
             raise UnsafeArchive(
                 f"{name!r} is compressed {ratio} to 1, where at most {MAX_RATIO} to 1 is allowed; it may be a zip bomb"
             )
-    total = sum(entry.file_size for entry in entries)
-    if total > MAX_TOTAL_BYTES:
+
+
+def _check_folders(entries: list[zipfile.ZipInfo]) -> None:
+    """Raise UnsafeArchive when the names lead through too many folders."""
+    folders: set[PurePosixPath] = set()
+    for entry in entries:
+        for folder in PurePosixPath(entry.filename).parents:
+            if folder in folders:
+                break  # and so are those above it
+            folders.add(folder)
+            if len(folders) > MAX_FOLDERS:
+                raise UnsafeArchive(f"its files lie in more than {MAX_FOLDERS} folders")
+
+
+def _check_ratio(unpacked: int, packed: int) -> None:
+    """Raise UnsafeArchive when an archive of `packed` bytes as a whole unpacks to too many."""
+    if unpacked > RATIO_FLOOR and unpacked > MAX_RATIO * packed:
         raise UnsafeArchive(
-            f"its files have {total} bytes when unpacked; at most {MAX_TOTAL_BYTES} are allowed"
+            f"it is compressed {unpacked // max(packed, 1)} to 1 as a whole, where at most {MAX_RATIO} to 1 is "
+            "allowed; it may be a zip bomb"
         )
 
 
 def _write(
-    archive: zipfile.ZipFile, entry: zipfile.ZipInfo, place: Path, total: int, cancelled: Callable[[], bool]
-) -> int:
-    """Write one entry to `place`; returns `total` plus the number of bytes that were really written."""
+    archive: zipfile.ZipFile, entry: zipfile.ZipInfo, place: Path, cancelled: Callable[[], bool]
+) -> None:
+    """Write one entry to `place`. Raises UnsafeArchive when it has more bytes than its header says."""
     size = 0
     with archive.open(entry) as source, place.open("wb") as sink:
         while chunk := source.read(CHUNK):
             if cancelled():
                 raise Cancelled(f"Unpacking {entry.filename} was cancelled.")
             size += len(chunk)
-            total += len(chunk)
-            if size > entry.file_size or size > MAX_FILE_BYTES or total > MAX_TOTAL_BYTES:
+            if size > entry.file_size:
                 raise UnsafeArchive(
                     f"{entry.filename!r} is larger than its header says; it may be a zip bomb"
                 )
             sink.write(chunk)
-    return total

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES
 from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusableVideo
-from splatmill_worker.images import archive, decoders, exif
+from splatmill_worker.images import archive, decoders, exif, unpacked_room
 from splatmill_worker.images.masks import mask_of, masks_under
 
 IGNORED_PREFIXES = (".", "__MACOSX")
@@ -113,8 +113,8 @@ def prepare(
     masks: folder of the masks, if there is one; a mask may also lie beside its photo as name.jpg.png.
     on_progress: called as ("images", files examined, files in all, name of the file).
 
-    Raises Refusal for a mask that is too large to be decoded and for archives that together exceed `archive.Allowance`,
-    CaptureIncomplete when a file is neither used nor skipped, and Cancelled.
+    Raises Refusal for a mask that is too large to be decoded and for archives and videos that together exceed
+    `archive.Allowance`, CaptureIncomplete when a file is neither used nor skipped, and Cancelled.
     """
     found = _Found()
     given = given_files(images)
@@ -198,6 +198,9 @@ def _expand(
                 lambda place: decoders.keyframes(path, place, frames, cancelled=cancelled),
             )
             pictures = given_files(folder)
+            size = _bytes_of(pictures)
+            unpacked_room.take(folder.name, size, may_refuse=False)
+            found.allowance.take(name, 0, size)
             prefix = Path(name).with_suffix("").as_posix()
             found.files += [(f"{prefix}_{p.stem.rpartition('_')[2]}.jpg", p, name) for p in pictures]
             found.opened.add(name)
@@ -226,8 +229,13 @@ def unpacked(
     folder = workdir / "unpacked" / _sha256(path)[:24]
     if folder.is_dir():
         files = given_files(folder)
-        allowance.take(name, len(files), sum(inner.stat().st_size for inner in files))
+        allowance.take(name, len(files), _bytes_of(files))
+        unpacked_room.take(folder.name, _bytes_of(files))
     return _filled_once(folder, lambda place: archive.unpack(path, place, cancelled, allowance))
+
+
+def _bytes_of(files: list[Path]) -> int:
+    return sum(path.stat().st_size for path in files)
 
 
 def _filled_once(folder: Path, make: Callable[[Path], object]) -> Path:

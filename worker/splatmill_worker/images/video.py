@@ -40,6 +40,9 @@ without a candidate gives no frame."""
 QUALITY = 95
 """JPEG quality of the frames."""
 
+MAX_WRITTEN_BYTES = 16 * 2**30
+"""Bytes of all frames of a video as JPEGs: some formats draw noise that takes no bytes in the video."""
+
 DEFAULT_RATE = 30.0
 """Frames per second assumed for videos without time stamps."""
 
@@ -72,10 +75,17 @@ def keyframes(
     target.mkdir(parents=True, exist_ok=True)
     numbers = chosen(_candidates(path, CANDIDATES * count, cancelled), count)
     written: list[Path] = []
+    size = 0
     with _decoded(path, cancelled) as (_, frames):
         for number, frame in frames:
             if number == numbers[len(written)]:
                 written.append(_save(frame, target / f"{path.stem}_{number:06d}.jpg"))
+                size += written[-1].stat().st_size
+                if size > MAX_WRITTEN_BYTES:
+                    raise UnusableVideo(
+                        path.name,
+                        f"its frames have more than {MAX_WRITTEN_BYTES} bytes as JPEGs; take fewer or smaller frames",
+                    )
                 if len(written) == len(numbers):
                     break
     return written

@@ -30,6 +30,7 @@ def serve(stop_grace: float | None, queues: str | None = None) -> int:
         connection = connect(url)
         served = served_lines(queues or settings.queues())
         limits = Limits.from_settings()
+        settings.max_unpacked()
         settings.keep_work()  # a wrong value is better found here than in the first maintenance
     except ValueError as error:
         print(error, file=sys.stderr)

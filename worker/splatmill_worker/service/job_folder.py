@@ -37,6 +37,9 @@ _CAMERAS = "sfm"
 _RESTORING = "restoring"
 """Name beside the run folder of what comes from storage to become it."""
 
+_REMADE = ("capture", _RESTORING, "run/unpacked", "run/frames", f"run/{START}")
+"""What an attempt makes anew from storage: the capture, what its zips and videos hold, and the model to start from."""
+
 
 class JobFolder:
     """The folder of one job, locked for this process until it is closed or the process ends.
@@ -154,21 +157,41 @@ class JobFolder:
             self.storage.delete_prefix(layout.job_work(self.job_id))
 
 
+def remove_remade(folder: Path) -> bool:
+    """Delete what an attempt would make anew; return whether there was any. The caller holds the folder's lock."""
+    found = [path for name in _REMADE if (path := folder / name).exists()]
+    for path in found:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+    return bool(found)
+
+
+def bytes_in(folder: Path) -> int:
+    """Return the bytes of all files in a folder that have no other name, as links to a stored capture have."""
+    size = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            with suppress(FileNotFoundError):
+                state = os.lstat(os.path.join(place, name))
+                size += state.st_size if state.st_nlink == 1 else 0
+    return size
+
+
 @contextmanager
-def hold(folder: Path) -> Iterator[bool]:
-    """Hold the lock of a job's folder while the context is open; yield False if it is held, or if there is none."""
+def hold(folder: Path, seconds: float = 0.0) -> Iterator[bool]:
+    """Hold the lock of a job's folder while the context is open; yield False if there is none, or if it is held.
+
+    seconds: how long to wait for a lock that is held.
+    """
     try:
         descriptor = os.open(folder / "lock", os.O_WRONLY)
     except FileNotFoundError:
         yield False
         return
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            yield False
-        else:
-            yield True
+        yield _acquired(descriptor, seconds)
     finally:
         os.close(descriptor)
 
@@ -191,13 +214,20 @@ def _locked(path: Path) -> int:
     """Lock a file exclusively and return its descriptor. The lock ends when that is closed, also by a kill."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
     path.touch()  # its modification time is the start of the last attempt
-    deadline = time.monotonic() + LOCK_SECONDS
+    if not _acquired(descriptor, LOCK_SECONDS):
+        os.close(descriptor)
+        raise FolderInUse(path.parent)
+    return descriptor
+
+
+def _acquired(descriptor: int, seconds: float) -> bool:
+    """Lock a file, and return whether that succeeded within this time."""
+    deadline = time.monotonic() + seconds
     while True:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return descriptor
+            return True
         except BlockingIOError:
-            if time.monotonic() > deadline:
-                os.close(descriptor)
-                raise FolderInUse(path.parent) from None
+            if time.monotonic() >= deadline:
+                return False
             time.sleep(0.05)

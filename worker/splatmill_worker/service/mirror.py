@@ -7,7 +7,9 @@ from pathlib import Path
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import StorageError
+from splatmill_worker.errors import QuotaReached
 from splatmill_worker.service.job_folder import CHECKPOINTS, FILM, SNAPSHOTS, START, JobFolder
+from splatmill_worker.service.room import Room
 
 INTERVAL = 15.0
 """Seconds between two looks for new files. Those are small, or never change, but the checkpoint."""
@@ -27,11 +29,13 @@ MIRRORED = (START, CHECKPOINTS, "plan.json", "stages.json", FILM, SNAPSHOTS)
 class Mirror:
     """The thread that copies new files of `folder.run` to storage while the pipeline runs.
 
-    Where storage is a folder of this machine, nothing is copied. A failed copy is reported to `warn` and tried again.
+    Where storage is a folder of this machine, nothing is copied. A failed copy is reported to `warn` and tried again,
+    and so is one that has no room.
     """
 
-    def __init__(self, folder: JobFolder, warn: Callable[[str], None]) -> None:
+    def __init__(self, folder: JobFolder, room: Room, warn: Callable[[str], None]) -> None:
         self._folder = folder
+        self._room = room
         self._warn = warn
         self._copied: dict[Path, tuple[int, int]] = {}
         self._checkpoint_at = float("-inf")
@@ -76,8 +80,9 @@ class Mirror:
                 continue  # a leading dot marks a file that is still being written
             name = path.relative_to(run).as_posix()
             try:
+                self._room.store(name, state.st_size)
                 storage.put(f"{layout.job_work(self._folder.job_id)}/{name}", path)
-            except (StorageError, FileNotFoundError) as error:
+            except (StorageError, FileNotFoundError, QuotaReached) as error:
                 self._warn(f"{name} could not be copied to storage and will be tried again: {error}")
             else:
                 self._copied[path] = version

@@ -7,7 +7,7 @@ from redis.exceptions import RedisError
 
 from splatmill.backplane.storage import StorageError, StorageFullError
 from splatmill.schema import Problem
-from splatmill_worker.errors import DiskReserveReached, FolderInUse, WorkerError
+from splatmill_worker.errors import DiskReserveReached, FolderInUse, QuotaReached, WorkerError
 
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NOT_PERMITTED = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -32,7 +32,9 @@ def keeps_progress(error: BaseException) -> bool:
     """Return whether a restart of the job may go on from its checkpoint: the cause lies outside of the training."""
     if isinstance(error, OSError):
         return error.errno in _DISK_FULL | _NOT_PERMITTED
-    return is_transient(error) or isinstance(error, DiskReserveReached | StorageError | MemoryError)
+    return is_transient(error) or isinstance(
+        error, DiskReserveReached | QuotaReached | StorageError | MemoryError
+    )
 
 
 def problem_of(error: BaseException) -> Problem:

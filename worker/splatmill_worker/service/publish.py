@@ -12,6 +12,7 @@ from splatmill.backplane.storage import Storage
 from splatmill.schema import JobState
 from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.redis_patience import patiently
+from splatmill_worker.service.room import Room
 
 _RECORD, _PREVIEW = "job.json", "preview.jpg"
 
@@ -31,19 +32,25 @@ def _in_folders(out: Path) -> list[str]:
     return [name for name in found if layout.model_media_type(name) is not None]
 
 
-def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path) -> None:
-    """Store the files of the pipeline's `out` folder as the job's model.
+RECORD_BYTES = 64 << 10
+"""Bytes reserved for `job.json`: the options of the job, and a digest of each file."""
+
+
+def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path, room: Room) -> None:
+    """Store the files of the pipeline's `out` folder as the job's model, once there is room for all of them.
 
     The record of an earlier generation is deleted first, so that no client sees a model and a report of two runs.
-    Raises StorageError, redis.RedisError when Redis fails for longer than PATIENCE, and FileNotFoundError when there is
-    no model.ply.
+    Raises QuotaReached, StorageError, redis.RedisError when Redis fails for longer than PATIENCE, and FileNotFoundError
+    when there is no model.ply.
     """
     if not (out / "model.ply").is_file():
         raise FileNotFoundError(f"The pipeline ended without writing {out / 'model.ply'}.")
+    names = [*layout.MODEL_FILES, *_in_folders(out)]
+    sizes = {name: path.stat().st_size for name in names if (path := out / name).is_file()}
+    room.store_all(sizes | {_RECORD: RECORD_BYTES + 100 * len(sizes)})
     storage.delete(layout.job_record(attempt.job_id))
     patiently(lambda: lists.remove_model(attempt.connection, attempt.job_id, row.owner))
     digests: dict[str, str] = {}
-    names = [*layout.MODEL_FILES, *_in_folders(out)]
     for entry in storage.entries(layout.model(attempt.job_id)):
         name = entry.path.removeprefix(layout.model(attempt.job_id) + "/")
         if "/" in name and name not in names:

@@ -33,7 +33,7 @@ from splatmill.backplane.lines import Line
 from splatmill.backplane.process import die_with_parent
 from splatmill.backplane.row import request_of
 from splatmill_worker.service import hand_back, recovery
-from splatmill_worker.service.abandoned_folders import remove_abandoned
+from splatmill_worker.service.abandoned_folders import remove_abandoned, tidy
 from splatmill_worker.service.attempt import Attempt, start_attempt
 from splatmill_worker.service.attempt_limits import Exceeded, Limits, LimitWatch, RunTimeExceeded, die_first
 from splatmill_worker.service.disk_reserve import shortage_text, spare_bytes
@@ -61,7 +61,7 @@ AttemptEnd = Literal["reported", "stopped", "handed_back", "limited", "crashed",
 _RETRY_SECONDS = 0.5
 _SPACE_SECONDS = 1.0  # between two looks at a disk that is full
 _LOG_SECONDS = 30.0  # between two log lines about a Redis that does not work
-_REMOVAL_INTERVAL = 3600.0
+_REMOVAL_INTERVAL = 300.0  # half as long as Redis knows that a job was deleted
 _IDLE_SECONDS = 5.0
 _SIGNALS = {signal.SIGTERM, signal.SIGINT, hand_back.SIGNAL}
 
@@ -391,6 +391,7 @@ class AttemptWorker(Worker):
             os.killpg(horse, signal.SIGKILL)
         self._horse_pid = 0
         end = self._until_redis_works(lambda: self._settle(job, queue, process_exit))
+        self._until_redis_works(lambda: tidy(self.connection, entries.split_rq_id(job.id)[0]))
         self._count(end, usage.ru_utime + usage.ru_stime)
 
     def _count(self, end: AttemptEnd, cpu_seconds: float) -> None:

@@ -32,12 +32,12 @@ from splatmill.schema import (
     StateEvent,
     TrainOptions,
 )
-from splatmill_worker.errors import EmptyCapture
+from splatmill_worker.errors import EmptyCapture, QuotaReached
 from splatmill_worker.service import hand_back, publish, sfm_cache
 from splatmill_worker.service.attempt import LONGEST_MESSAGE, Attempt
 from splatmill_worker.service.disk_reserve import DiskWatch
 from splatmill_worker.service.hand_back import HandedBack
-from splatmill_worker.service.job_folder import JobFolder
+from splatmill_worker.service.job_folder import JobFolder, remove_remade
 from splatmill_worker.service.live_view import LiveView
 from splatmill_worker.service.lock import LockState
 from splatmill_worker.service.mirror import Mirror
@@ -45,6 +45,7 @@ from splatmill_worker.service.outbox import Outbox
 from splatmill_worker.service.problems import is_transient, keeps_progress, problem_of
 from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, UNREPORTED_STATUS, WITHDRAWN_STATUS
 from splatmill_worker.service.redis_patience import PATIENCE, patiently
+from splatmill_worker.service.room import Room
 from splatmill_worker.settings import storage_url
 
 PIPELINE = os.environ.get("SPLATMILL_PIPELINE", "splatmill_worker.pipeline")
@@ -181,9 +182,10 @@ def _run(attempt: Attempt, row: JobRow, outbox: Outbox, can_retry: bool) -> None
 
 def _train_and_publish(attempt: Attempt, row: JobRow, storage: Storage, outbox: Outbox) -> None:
     folder = JobFolder(storage, attempt.job_id, row.capture)
+    room = Room(attempt.connection, row.owner, attempt.job_id)
     disk = DiskWatch()
     try:
-        _train(attempt, row, folder, disk, outbox)
+        _train(attempt, row, folder, room, disk, outbox)
     except Exception as error:
         # Native code reports a full disk in many ways; the watch knows better.
         if disk.error is not None and not hand_back.requested():
@@ -193,11 +195,16 @@ def _train_and_publish(attempt: Attempt, row: JobRow, storage: Storage, outbox: 
         disk.close()
     if patiently(attempt.lock.refresh) is LockState.lost:
         _exit_superseded()
-    publish.publish(storage, attempt, row, folder.run / "out")
+    # The room of what was unpacked is needed for the model.
+    remove_remade(folder.path)
+    room.release_unpacked()
+    publish.publish(storage, attempt, row, folder.run / "out", room)
     folder.remove()
 
 
-def _train(attempt: Attempt, row: JobRow, folder: JobFolder, disk: DiskWatch, outbox: Outbox) -> None:
+def _train(
+    attempt: Attempt, row: JobRow, folder: JobFolder, room: Room, disk: DiskWatch, outbox: Outbox
+) -> None:
     """Stage the capture and run the pipeline to its end. Raises HandedBack, DiskReserveReached and its errors."""
     if disk.error is not None:
         raise disk.error
@@ -211,19 +218,22 @@ def _train(attempt: Attempt, row: JobRow, folder: JobFolder, disk: DiskWatch, ou
         log.info("Using the cameras that an earlier job recovered from this capture.")
     if row.options.start_model is not None:
         folder.stage_start(row.options.start_model)
-    mirror = Mirror(folder, log.warning)
+    mirror = Mirror(folder, room, log.warning)
     live = LiveView(attempt, outbox.put)
     try:
         # Not imported by the worker that forks this process: numpy and the decoders start threads.
-        from splatmill_worker.images import decoders
+        from splatmill_worker.images import decoders, unpacked_room
 
         folder.run.mkdir(parents=True, exist_ok=True)
-        with decoders.confined(read=[folder.path], write=[folder.run]):
+        with (
+            decoders.confined(read=[folder.path], write=[folder.run]),
+            unpacked_room.claimed_by(room.unpack),
+        ):
             result = _pipeline()(
                 folder.capture,
                 folder.run,
                 row.options,
-                lambda event: _forward(event, folder, outbox),
+                lambda event: _forward(event, folder, room, outbox),
                 lambda: hand_back.requested() or disk.error is not None,
                 onlookers=live,
             )
@@ -247,7 +257,7 @@ def _pipeline() -> Pipeline:
         return cast(Pipeline, importlib.import_module(PIPELINE).run)
 
 
-def _forward(event: Event, folder: JobFolder, outbox: Outbox) -> None:
+def _forward(event: Event, folder: JobFolder, room: Room, outbox: Outbox) -> None:
     """Send an event of the pipeline, and store the files that belong to it.
 
     A preview and a placement of cameras are stored before they are announced. When training begins, the recovered
@@ -259,27 +269,33 @@ def _forward(event: Event, folder: JobFolder, outbox: Outbox) -> None:
     if isinstance(event, PreviewEvent):
         target = layout.model_file(folder.job_id, "preview.jpg")
         try:
-            folder.storage.put(target, (folder.run / event.path).read_bytes())
-        except (StorageError, OSError) as error:
+            _store(folder, room, "preview.jpg", target, event.path)
+        except (StorageError, OSError, QuotaReached) as error:
             outbox.put(LogEvent(level="warning", message=f"A preview could not be stored: {error}"))
             return
         event = PreviewEvent(path=target, step=event.step)
     if isinstance(event, CamerasEvent):
         target = layout.job_cameras(folder.job_id)
         try:
-            folder.storage.put(target, (folder.run / event.path).read_bytes())
-        except (StorageError, OSError) as error:
+            _store(folder, room, "placed cameras", target, event.path)
+        except (StorageError, OSError, QuotaReached) as error:
             outbox.put(LogEvent(level="warning", message=f"The cameras to show could not be stored: {error}"))
             return
         event = event.model_copy(update={"path": target})
     outbox.put(event)
     if isinstance(event, StateEvent) and event.state is JobState.training:
         try:
-            sfm_cache.store(folder.storage, folder.capture_id, folder.run)
-        except StorageError as error:
+            sfm_cache.store(folder.storage, folder.capture_id, folder.run, room)
+        except (StorageError, QuotaReached, redis.RedisError) as error:
             # The job itself has the cameras in its folder.
             message = f"The recovered cameras could not be stored for other jobs on this capture: {error}"
             outbox.put(LogEvent(level="warning", message=message))
+
+
+def _store(folder: JobFolder, room: Room, name: str, target: str, path: str) -> None:
+    content = (folder.run / path).read_bytes()
+    room.store(name, len(content))
+    folder.storage.put(target, content)
 
 
 def _report_failure(error: Exception, outbox: Outbox, can_retry: bool) -> None:

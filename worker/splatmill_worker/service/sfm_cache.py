@@ -11,6 +11,7 @@ from pathlib import Path
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Entry, Storage
 from splatmill_worker.service import staging
+from splatmill_worker.service.room import Room
 
 log = logging.getLogger("splatmill_worker")
 
@@ -50,15 +51,20 @@ def _readable(document: bytes) -> bool:
         return False
 
 
-def store(storage: Storage, capture_id: str, run: Path) -> int:
-    """Copy the models of the `run` folder that the cache lacks into it. Return their number."""
+def store(storage: Storage, capture_id: str, run: Path, room: Room) -> int:
+    """Copy the models of the `run` folder that the cache lacks into it. Return their number.
+
+    Raises StorageError, QuotaReached where there is no room for one, and redis.RedisError.
+    """
     prefix = layout.capture_sfm(capture_id)
     stored = 0
     for last in sorted((run / _FOLDER).glob(f"*/model-*/{_LAST_FILE}")):
         target = f"{prefix}/{last.parent.relative_to(run / _FOLDER).as_posix()}"
         if storage.exists(f"{target}/{_LAST_FILE}"):
             continue
-        for path in [*(p for p in sorted(last.parent.iterdir()) if p.is_file() and p != last), last]:
-            storage.put(f"{target}/{path.name}", path)
+        paths = [*(p for p in sorted(last.parent.iterdir()) if p.is_file() and p != last), last]
+        with room.of_capture(capture_id, sum(path.stat().st_size for path in paths)):
+            for path in paths:
+                storage.put(f"{target}/{path.name}", path)
         stored += 1
     return stored

@@ -1,0 +1,83 @@
+"""Proves that an archive is bounded as a whole: its ratio, the folders of its files, and its bytes; and so are
+the frames of a video.
+
+Does not prove the bounds of single files, names and links (test_images.py, tests/hostile), nor that what is unpacked
+counts for an owner (tests/worker/service/test_room.py).
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from splatmill_worker.errors import Refusal, UnusableVideo
+from splatmill_worker.images import archive, prepare, video
+from splatmill_worker.images.archive import Allowance, UnsafeArchive, unpack
+from tests.support.hostile import archives, videos
+
+
+def written(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def zipped(folder: Path, files: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
+    place = folder / "set.zip"
+    place.write_bytes(archives.packed(files, method))
+    return place
+
+
+def test_many_small_files_are_a_bomb_together(tmp_path: Path) -> None:
+    place = tmp_path / "set.zip"
+    place.write_bytes(archives.many_small())
+    assert place.stat().st_size < 250_000
+    with pytest.raises(UnsafeArchive, match=r"compressed \d{3} to 1 as a whole"):
+        unpack(place, tmp_path / "target")
+    assert written(tmp_path / "target") == 0
+
+
+def test_texts_that_compress_well_are_unpacked(tmp_path: Path) -> None:
+    lines = b"".join(b"%d %d 0.5 0.5 -1\n" % (n, n * 7919 % 4000) for n in range(20_000))
+    place = zipped(tmp_path, {"sparse/0/images.txt": lines, "mask.bmp": bytes(2**20)})
+    assert [path.stat().st_size for path in unpack(place, tmp_path / "target")] == [len(lines), 2**20]
+
+
+def test_names_lead_through_a_bounded_number_of_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(archive, "MAX_FOLDERS", 1000)
+    files = {f"{n}/" + "a/" * 20 + "x.jpg": b"x" for n in range(50)}
+    with pytest.raises(UnsafeArchive, match="more than 1000 folders"):
+        unpack(zipped(tmp_path, files), tmp_path / "target")
+    assert not (tmp_path / "target").exists()
+
+
+def test_the_setting_bounds_what_a_capture_unpacks_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = zipped(tmp_path, {"a.jpg": os.urandom(50_000)}, zipfile.ZIP_STORED)
+    monkeypatch.setenv("SPLATMILL_MAX_UNPACKED", "40kB")
+    with pytest.raises(Refusal, match="40000 bytes"):
+        unpack(place, tmp_path / "target")
+    monkeypatch.setenv("SPLATMILL_MAX_UNPACKED", "60kB")
+    allowance = Allowance()
+    unpack(place, tmp_path / "target", allowance=allowance)
+    assert allowance.bytes == 10_000
+
+
+def test_frames_of_a_video_are_bounded_while_they_are_written_and_with_the_archives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    (images / "a.mp4").write_bytes(videos.video())
+    monkeypatch.setenv("SPLATMILL_MAX_UNPACKED", "1kB")
+    with pytest.raises(Refusal, match=r"With a\.mp4") as refused:
+        prepare.prepare(images, None, tmp_path / "work", frames=4)
+    assert refused.value.code == "archive_bomb"
+    monkeypatch.setattr(video, "MAX_WRITTEN_BYTES", 1000)
+    with pytest.raises(UnusableVideo, match="more than 1000 bytes as JPEGs"):
+        video.keyframes(images / "a.mp4", tmp_path / "frames", 4)
+    assert len(list((tmp_path / "frames").iterdir())) <= 2
