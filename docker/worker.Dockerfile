@@ -23,7 +23,7 @@ RUN apt-get update \
     && apt-get install -y --no-install-recommends python3 ca-certificates libgomp1 $GPU_PACKAGES \
     && rm -rf /var/lib/apt/lists/* \
     && useradd --system --uid 10001 --create-home splatmill \
-    && install -d -o splatmill -g splatmill /data
+    && install -d -m 0700 -o splatmill -g splatmill /data
 COPY --from=build /opt/splatmill /opt/splatmill
 ENV PATH=/opt/splatmill/bin:$PATH PYTHONUNBUFFERED=1 SPLATMILL_DATA=/data SPLATMILL_STORAGE=file:///data/storage
 USER splatmill

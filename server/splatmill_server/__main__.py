@@ -2,13 +2,13 @@
 
 import argparse
 import logging
+import os
 import resource
 import signal
 import socket
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
 from types import FrameType
 
 import structlog
@@ -16,10 +16,11 @@ import uvicorn
 from fastapi import FastAPI
 from pydantic import ValidationError
 
+from splatmill.backplane import layout, private_files
 from splatmill.backplane.connection import InvalidRedisUrl
 from splatmill.backplane.log_lines import LogFormat
 from splatmill.backplane.redact import redacted
-from splatmill.backplane.storage import StorageError
+from splatmill.backplane.storage import Storage, StorageError
 from splatmill_server.access.exposure import NeedsKey
 from splatmill_server.app import create_app
 from splatmill_server.settings import Settings
@@ -55,6 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         settings = Settings(**{name: value for name, value in given.items() if value is not None})
         configure_logging(settings.log_format)
+        os.umask(settings.file_mask)
         app = create_app(settings)
         listener = listen(settings)
     except ValidationError as error:
@@ -66,6 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=GRACE_SECONDS)
     log.info("serving", address=_address(listener), storage=redacted(settings.storage))
+    _check_modes(app.state.service.storage, settings)
     server = Server(config, app)
     server.run(sockets=[listener])
     if settings.uds is not None:
@@ -85,10 +88,19 @@ def _options() -> argparse.ArgumentParser:
     return parser
 
 
+def _check_modes(storage: Storage, settings: Settings) -> None:
+    """Log which folders other users of the machine may read, and close that with secrets."""
+    for folder in (settings.data.expanduser().absolute(), storage.root):
+        exposed = private_files.exposure(folder, settings.file_mask) if folder is not None else None
+        if exposed is not None:
+            log.warning(exposed)
+    private_files.close(storage.local_path(layout.webhooks()), settings.file_mask)
+
+
 def listen(settings: Settings) -> socket.socket:
     """Return the listening socket. Raises OSError, with a sentence, if the address is not available."""
     if settings.uds is not None:
-        return _listen_unix(settings.uds)
+        return private_files.listen(settings.uds, "set SPLATMILL_UDS to another path.")
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -100,31 +112,6 @@ def listen(settings: Settings) -> socket.socket:
             f"Cannot listen on {settings.host}:{settings.port}: {error.strerror}. "
             "Stop the program that uses the port, or set SPLATMILL_PORT to another one (0 takes "
             "any free port)."
-        ) from error
-    return listener
-
-
-def _listen_unix(path: Path) -> socket.socket:
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    probe = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        probe.connect(str(path))
-    except OSError:
-        path.unlink(missing_ok=True)  # left by a server that was killed
-    else:
-        listener.close()
-        raise OSError(f"Another server listens on {path}; stop it, or set SPLATMILL_UDS to another path.")
-    finally:
-        probe.close()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        listener.bind(str(path))
-        path.chmod(0o600)
-    except OSError as error:
-        listener.close()
-        raise OSError(
-            f"The socket {path} cannot be created: {error.strerror or error}. Set SPLATMILL_UDS "
-            f"to another path."
         ) from error
     return listener
 

@@ -10,6 +10,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from splatmill.backplane import rendering
 from splatmill.backplane.address import DEFAULT_URL
 from splatmill.backplane.log_lines import LogFormat
+from splatmill.backplane.private_files import parse_mask
 from splatmill.schema import DEFAULT_PORT, ByteSize, Duration
 from splatmill_server import outgoing
 
@@ -32,6 +33,11 @@ class Settings(BaseSettings):
         description="Address of Redis: redis://host:port/0 or unix:///path.",
     )
     data: Path = Field(default=Path("splatmill-data"), description="Folder for data on this machine.")
+    umask: str = Field(
+        default="077",
+        description="Mask of the modes of new files and folders, in octal digits, which workers and the renderer read "
+        "too. 077 keeps all other users of the machine out, 027 lets the group read.",
+    )
     storage: str = Field(
         default="",
         description="file:///folder or s3://bucket/prefix. Left out, the folder storage in `data`.",
@@ -156,12 +162,18 @@ class Settings(BaseSettings):
     def _complete(self) -> Self:
         if not self.storage:
             self.storage = (self.data.expanduser().absolute() / "storage").as_uri()
+        parse_mask(self.umask)
         outgoing.allowed_hosts(self.outgoing_allow)
         if self.renderer_url is not None:
             rendering.address(self.renderer_url)
         if self.api_key is not None and not self.api_key.get_secret_value():
             self.api_key = None
         return self
+
+    @property
+    def file_mask(self) -> int:
+        """The mask of the modes of new files."""
+        return parse_mask(self.umask)
 
     @property
     def own_names(self) -> list[str]:

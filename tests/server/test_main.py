@@ -190,3 +190,49 @@ def peak(pid: int) -> int:
     """Bytes of the largest resident size a process ever had."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return int(next(line.split()[1] for line in lines if line.startswith("VmHWM"))) * 1024
+
+
+def modes(folder: Path) -> dict[str, str]:
+    """The modes of all folders and files in and below a folder, by kind."""
+    found = [folder, *folder.rglob("*")]
+    return {
+        kind: ",".join(sorted({f"{path.stat().st_mode & 0o777:o}" for path in found if is_kind(path)}))
+        for kind, is_kind in (("folders", Path.is_dir), ("files", Path.is_file))
+    }
+
+
+@pytest.mark.parametrize(("umask", "expected"), [("", ("700", "600")), ("027", ("750", "640"))])
+def test_other_users_of_the_machine_may_read_no_file(
+    tmp_path: Path, redis_url: str, umask: str, expected: tuple[str, str]
+) -> None:
+    data = tmp_path / "data"
+    env = {"REDIS_URL": redis_url, "SPLATMILL_DATA": str(data), "SPLATMILL_UMASK": umask}
+    with served(tmp_path / "s", env=env) as (_, http):
+        capture_id = http.post("/v1/captures", json={}).json()["id"]
+        http.put(f"/v1/captures/{capture_id}/images/a.jpg", content=b"photo").raise_for_status()
+        http.post("/v1/webhooks", json={"url": "http://8.8.8.8/"}).raise_for_status()
+        assert list((data / "storage" / "webhooks").iterdir())
+        assert modes(data) == dict(zip(("folders", "files"), expected, strict=True))
+
+
+def test_a_folder_that_is_open_to_others_is_named_at_the_start_and_its_secrets_are_closed(
+    tmp_path: Path, redis_url: str
+) -> None:
+    storage = tmp_path / "data" / "storage"
+    (storage / "webhooks").mkdir(parents=True)
+    for above in (tmp_path, *tmp_path.parents):
+        if above.stat().st_uid == os.geteuid() and "pytest" in str(above):
+            above.chmod(0o755)  # pytest makes the folders that hold it for its user alone
+    env = {"REDIS_URL": redis_url, "SPLATMILL_DATA": str(tmp_path / "data")}
+    with served(tmp_path / "s", env=env) as (_, http):
+        assert http.get("/healthz").status_code == 200
+        log = (tmp_path / "s.log").read_text()
+    for folder in (tmp_path / "data", storage):
+        assert f"The folder {folder} has the mode 0755" in log
+        assert f"chmod 0700 {folder}" in log
+    assert storage.stat().st_mode & 0o777 == 0o755, (
+        "a folder that the operator may have made is left as it is"
+    )
+    assert (storage / "webhooks").stat().st_mode & 0o777 == 0o700
+    wrong = refusals(([], env | {"SPLATMILL_UMASK": "777"}), ([], env | {"SPLATMILL_UMASK": "rubbish"}))
+    assert all("is no mask; write 077" in said for said in wrong)

@@ -156,3 +156,11 @@ def test_the_idle_service_is_small(service: Up) -> None:
     }
     print({name: round(size / 1e6) for name, size in parts.items()})
     assert sum(parts.values()) < 600e6
+
+
+def test_other_users_of_the_machine_may_read_nothing_of_it(own_service: Up) -> None:
+    own_service.start()
+    own_service.submit(steps=1)
+    found = [own_service.data, *own_service.data.rglob("*")]
+    assert {path.stat().st_mode & 0o077 for path in found} == {0}
+    assert sorted(path.name for path in found if path.is_socket()) == ["redis.sock", "renderer.sock"]

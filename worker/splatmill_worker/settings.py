@@ -7,6 +7,7 @@ from typing import Any
 
 from splatmill.backplane.address import DEFAULT_URL
 from splatmill.backplane.log_lines import LogFormat, parse_format
+from splatmill.backplane.private_files import PRIVATE, parse_mask
 from splatmill.schema.quantities import parse_bytes, parse_duration
 
 DISK_RESERVE = 256 * 2**20
@@ -54,6 +55,11 @@ def log_format() -> LogFormat:
     """Return SPLATMILL_LOG_FORMAT, or `text`. Raises ValueError for another word than text and json."""
     found: LogFormat = _read("SPLATMILL_LOG_FORMAT", parse_format, "text")
     return found
+
+
+def umask() -> int:
+    """Return SPLATMILL_UMASK, the mask of the modes of new files, or 077. Raises ValueError."""
+    return int(_read("SPLATMILL_UMASK", parse_mask, PRIVATE))
 
 
 def work_folder(job_id: str) -> Path:

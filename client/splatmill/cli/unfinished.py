@@ -81,7 +81,7 @@ class Unfinished:
         )
         if fresh or not record.is_file():
             shutil.rmtree(data, ignore_errors=True)
-            data.mkdir(parents=True, exist_ok=True)
+            data.mkdir(mode=0o700, parents=True, exist_ok=True)
             return wanted
         try:
             stored = json.loads(record.read_text())

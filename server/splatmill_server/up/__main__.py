@@ -9,6 +9,7 @@ import socket
 import sys
 from pathlib import Path
 
+from splatmill.backplane.private_files import PRIVATE, exposure, parse_mask
 from splatmill.schema.port import DEFAULT_PORT
 from splatmill_server.up.folder import DataFolder, UpError
 from splatmill_server.up.supervisor import Supervisor
@@ -19,8 +20,11 @@ def main(argv: list[str] | None = None) -> int:
     chosen = _parser().parse_args(argv)
     key = os.environ.get("SPLATMILL_API_KEY") or None
     try:
+        mask = _mask()
         with _listen(chosen.host, chosen.port, chosen.data) as listener:
             folder = DataFolder(chosen.data)
+            if (exposed := exposure(folder.path, mask)) is not None:
+                _print(exposed)
             try:
                 url = _url(chosen.host, listener.getsockname()[1])
                 supervisor = Supervisor(folder, listener, _print)
@@ -41,6 +45,16 @@ def main(argv: list[str] | None = None) -> int:
         _print(str(error))
         return 1
     return 0
+
+
+def _mask() -> int:
+    """Set the mask of the modes of files that the service makes, and return it. Raises UpError."""
+    try:
+        mask = parse_mask(os.environ.get("SPLATMILL_UMASK") or f"{PRIVATE:03o}")
+    except ValueError as error:
+        raise UpError(f"SPLATMILL_UMASK: {error}.") from error
+    os.umask(mask)
+    return mask
 
 
 def _parser() -> argparse.ArgumentParser:

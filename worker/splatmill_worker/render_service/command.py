@@ -7,10 +7,11 @@ from pathlib import Path
 import uvicorn
 
 from splatmill.backplane import log_lines
+from splatmill.backplane.private_files import listen
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import parse_bytes
 from splatmill_worker.render_service.app import RenderApp
-from splatmill_worker.settings import log_format, storage_url
+from splatmill_worker.settings import log_format, storage_url, umask
 
 MAX_CACHE_BYTES = 1 << 30
 """Largest default for the memory of cached models; machines with little memory use an eighth of it."""
@@ -26,24 +27,25 @@ def serve(host: str, port: int, uds: Path | None, backend: str | None = None) ->
     """
     try:
         log_lines.configure(log_format())
+        os.umask(umask())
         app = RenderApp(Storage(storage_url(), read_only=True), _cache_bytes(), backend)
-    except (StorageError, ValueError) as error:
+        listener = listen(uds, "choose another path with --uds.") if uds is not None else None
+    except (StorageError, ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 1
     config = uvicorn.Config(
         app.asgi(),
         host=host,
         port=port,
-        uds=str(uds) if uds else None,
         log_level="warning",
         access_log=False,
         timeout_graceful_shutdown=2,
         lifespan="off",
     )
+    server = uvicorn.Server(config)
+    server.run(sockets=None if listener is None else [listener])
     if uds is not None:
         uds.unlink(missing_ok=True)
-    server = uvicorn.Server(config)
-    server.run()
     return 0 if server.started else 1
 
 

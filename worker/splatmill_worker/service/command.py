@@ -1,5 +1,7 @@
 """Starts the queue worker: `python -m splatmill_worker train`."""
 
+import logging
+import os
 import sys
 import time
 
@@ -7,6 +9,7 @@ import redis
 
 from splatmill.backplane import keys, log_lines
 from splatmill.backplane.connection import connect
+from splatmill.backplane.private_files import exposure
 from splatmill.backplane.redact import redacted
 from splatmill_worker import settings
 from splatmill_worker.service.attempt_limits import Limits
@@ -26,6 +29,7 @@ def serve(stop_grace: float | None, queues: str | None = None) -> int:
     url = settings.redis_url()
     try:
         log_lines.configure(settings.log_format())
+        os.umask(settings.umask())
         settings.disk_reserve()
         connection = connect(url)
         served = served_lines(queues or settings.queues())
@@ -35,6 +39,8 @@ def serve(stop_grace: float | None, queues: str | None = None) -> int:
     except ValueError as error:
         print(error, file=sys.stderr)
         return 1
+    if (exposed := exposure(settings.data_folder(), settings.umask())) is not None:
+        logging.getLogger("splatmill.worker").warning("%s", exposed)
     deadline = time.monotonic() + REDIS_WAIT
     while True:
         try:
