@@ -21,13 +21,13 @@ from splatmill.errors import (
     Unavailable,
 )
 from splatmill.schema.captures import CaptureFile
+from splatmill.schema.headers import read_integer, read_token
 from splatmill.schema.uploads import (
     PARTIAL_UPLOAD,
     UPLOAD_COMPLETE,
     UPLOAD_LENGTH,
     UPLOAD_OFFSET,
     read_boolean,
-    read_integer,
     write_boolean,
 )
 
@@ -72,7 +72,7 @@ async def send_in_pieces(
                 if read_boolean(response.headers.get(UPLOAD_COMPLETE)):
                     on_position(size)
                     return read_answer(CaptureFile, response)
-                upload = response.headers.get("Location")
+                upload = _path_of(response.headers.get("Location"))
             else:
                 response = await connection.request("HEAD", upload)
                 if read_boolean(response.headers.get(UPLOAD_COMPLETE)):
@@ -102,6 +102,12 @@ async def send_in_pieces(
             ):
                 upload = None
             await asyncio.sleep(backoff(breaks))
+
+
+def _path_of(location: str | None) -> str | None:
+    """Return the address of an upload, or None for one that is not a path on the same server, which has the key."""
+    path = read_token(location)
+    return path if path is not None and path.startswith("/") and not path.startswith("//") else None
 
 
 async def _append(

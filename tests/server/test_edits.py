@@ -23,6 +23,7 @@ from tests.support.ball import write_ply
 from tests.support.command_line import invoke
 from tests.support.rendering import hold_out, renderer_in
 from tests.support.served_app import Serve, ServedApp, store_model
+from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow
 
@@ -111,3 +112,20 @@ def test_the_command_says_what_is_left_out(app: ServedApp) -> None:
     refused = invoke("edit", MODEL, "--max-size", "0.000001", *at)
     assert refused.exit_code == Exit.refused
     assert "leaves no Gaussian" in refused.stderr
+
+
+def test_photos_may_have_names_in_any_script(app: ServedApp, folder: Path) -> None:
+    hold_out(app, MODEL, VIEWS)
+    cameras = json.loads(app.service.storage.get(layout.model_file(MODEL, "cameras.json")))
+    names = ["写真\u3000一.jpg", "🦊/ø.jpg"]
+    for row, name in zip(cameras["cameras"], names, strict=True):
+        row["name"] = name
+    app.service.storage.put(layout.model_file(MODEL, "cameras.json"), json.dumps(cameras).encode())
+    with Client(str(app.http.base_url)) as client:
+        model = client.model(MODEL)
+        assert [view.name for view in model.edit(box=RIGHT, preview=True).views] == names
+        made = client.model(str(model.edit(box=RIGHT).model))
+        assert [camera.name for camera in made.cameras()] == names
+        for key in ("spz", "sog"):
+            assert model.download_as(key, folder / f"model.{key}").stat().st_size > 100
+    wait_for(lambda: not list((folder / "tmp").iterdir()), 20)

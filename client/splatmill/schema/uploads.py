@@ -1,10 +1,8 @@
 """Uploads in several requests: the header fields of the IETF draft "Resumable Uploads for HTTP".
 
-Integers and Booleans are those of structured fields (RFC 9651): `1024`, `?0`, `?1`. A value of another form counts as
-absent, as the draft asks for.
+Integers and Booleans are those of structured fields (RFC 9651): `1024` (`headers.read_integer`), `?0`, `?1`. A value of
+another form counts as absent, as the draft asks for.
 """
-
-import re
 
 UPLOAD_COMPLETE = "Upload-Complete"
 """Whether the body of a request ends the file: `?1` or `?0`. In a response, whether the upload is complete."""
@@ -20,14 +18,6 @@ UPLOAD_LIMIT = "Upload-Limit"
 
 PARTIAL_UPLOAD = "application/partial-upload"
 """Media type of the body of a PATCH."""
-
-_INTEGER = re.compile(r"[0-9]{1,15}", re.ASCII)
-
-
-def read_integer(value: str | None) -> int | None:
-    """Return the value of a header field with an integer, or None if it is absent or not one."""
-    text = (value or "").strip(" ")
-    return int(text) if _INTEGER.fullmatch(text) else None
 
 
 def read_boolean(value: str | None) -> bool | None:

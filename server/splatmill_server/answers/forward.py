@@ -11,6 +11,7 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
 from splatmill.backplane import rendering
+from splatmill.schema.headers import read_token
 from splatmill_server.access.caller import Caller
 from splatmill_server.renderer import post
 
@@ -41,7 +42,7 @@ async def forward(
     Raises a 503 problem if there is no renderer, and a 504 problem if it does not answer within `seconds`.
     """
     headers = {"Content-Type": "application/json", rendering.CLIENT_HEADER: _client(request)}
-    if (known := request.headers.get("if-none-match")) is not None:
+    if (known := read_token(request.headers.get("if-none-match"))) is not None:
         headers["If-None-Match"] = known
     content = body.model_dump_json(exclude_none=True)
     answer = await while_connected(request, post(renderer, path, content, headers, seconds))

@@ -12,6 +12,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import SHA256_HEADER, CaptureFile, Role
+from splatmill.schema.headers import read_integer
 from splatmill.schema.uploads import (
     PARTIAL_UPLOAD,
     UPLOAD_COMPLETE,
@@ -19,7 +20,6 @@ from splatmill.schema.uploads import (
     UPLOAD_LIMIT,
     UPLOAD_OFFSET,
     read_boolean,
-    read_integer,
     write_boolean,
 )
 from splatmill_server.access.caller import Caller, Who

@@ -60,8 +60,8 @@ def test_box_opacity_and_size_choose_what_stays(storage: Storage, tmp_path: Path
 
 def test_an_edit_tells_its_error_and_leaves_a_model(storage: Storage, tmp_path: Path) -> None:
     before = {entry.path: entry.etag for entry in storage.entries("models")}
-    edited, path = edit(storage, BALL, HALF, None)
-    assert path is not None
+    path = tmp_path / "edited.ply"
+    edited = edit(storage, BALL, HALF, None, path)
     left = ply.read(path).gaussians
     path.unlink()
     assert left.count == edited.gaussians < edited.gaussians_before == 400
@@ -73,9 +73,10 @@ def test_an_edit_tells_its_error_and_leaves_a_model(storage: Storage, tmp_path: 
     assert 15 < edited.psnr < edited.psnr_before
     assert [view.name for view in edited.views] == ["a.jpg"]
     assert {entry.path: entry.etag for entry in storage.entries("models")} == before
-    assert edit(storage, BALL, HALF.model_copy(update={"preview": True}), None) == (edited, None)
+    assert edit(storage, BALL, HALF.model_copy(update={"preview": True}), None, path) == edited
+    assert not path.exists(), "a preview writes no model"
 
 
-def test_an_edit_that_leaves_nothing_is_refused(storage: Storage) -> None:
+def test_an_edit_that_leaves_nothing_is_refused(storage: Storage, tmp_path: Path) -> None:
     with pytest.raises(NothingLeft):
-        edit(storage, BALL, EditModel(max_size=1e-6), None)
+        edit(storage, BALL, EditModel(max_size=1e-6), None, tmp_path / "none.ply")

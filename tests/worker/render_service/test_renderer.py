@@ -181,10 +181,32 @@ def test_an_orbit_that_nobody_waits_for_is_not_rendered_on(http: httpx.Client, s
     with pytest.raises(httpx.ReadTimeout):
         http.post(rendering.orbit_path(BALL), content=body, timeout=1.0)
     # 3600 frames take minutes
-    wait_for(lambda: not list(temporary(storage).glob("splatmill-orbit-*")), 20)
+    wait_for(lambda: not list(temporary(storage).glob("splatmill-render-*")), 20)
     assert picture(http, RenderRequest(camera=FRONT)).status_code == 200
 
 
 def _flipped(camera: CameraSpec) -> list[list[float]]:
     """The matrix of the same view with OpenGL axes."""
     return [[row[0], -row[1], -row[2], row[3]] for row in camera.camera_to_world[:3]] + [[0.0, 0.0, 0.0, 1.0]]
+
+
+def test_only_its_user_can_connect_to_the_renderer(http: httpx.Client, storage: Storage) -> None:
+    assert storage.root is not None
+    assert oct((storage.root.parent / "r.sock").stat().st_mode)[-3:] == "600"
+
+
+def test_nothing_temporary_is_left_of_any_request(http: httpx.Client, storage: Storage) -> None:
+    edits, convert = f"/v1/models/{BALL}/edits", f"/v1/models/{BALL}/convert"
+    box = {"box": {"min": [0, -2, -2], "max": [2, 2, 2]}}
+    for path, body, status in (
+        (edits, box, 200),
+        (edits, box | {"preview": True}, 200),
+        (edits, {"max_size": 1e-6}, 422),
+        (convert, {"format": "spz"}, 200),
+        (convert, {"format": "made up"}, 404),
+        (f"/v1/models/{BALL}/orbit", {"seconds": 0.5, "fps": 1}, 200),
+    ):
+        assert http.post(path, json=body).status_code == status, (path, body)
+    with http.stream("POST", edits, json=box) as cut_off:
+        assert cut_off.status_code == 200
+    wait_for(lambda: not list(temporary(storage).iterdir()), 20)

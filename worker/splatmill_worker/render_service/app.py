@@ -5,23 +5,19 @@ Torch and the kernels are loaded with the first image, so that an idle renderer 
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import logging
-import os
-import shutil
-import tempfile
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 from starlette.applications import Starlette
-from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
@@ -42,9 +38,11 @@ from splatmill.schema import (
     Problem,
     RenderRequest,
 )
+from splatmill.schema.headers import write_json
 from splatmill_worker.errors import ModelNotFound, ModelUnreadable
 from splatmill_worker.render_service.model_cache import LoadedModel, ModelCache
 from splatmill_worker.render_service.render_queue import ClientGone, QueueFull, RenderQueue
+from splatmill_worker.render_service.scratch import ScratchMiddleware, scratch
 from splatmill_worker.scene import Camera
 
 MAX_WAITING = 32
@@ -99,7 +97,8 @@ class RenderApp:
                 Route(rendering.orbit_join_path("{model_id}"), self.orbit_join, methods=["POST"]),
                 Route(rendering.convert_path("{model_id}"), self.convert, methods=["POST"]),
                 Route(rendering.edits_path("{model_id}"), self.edit, methods=["POST"]),
-            ]
+            ],
+            middleware=[Middleware(ScratchMiddleware)],
         )
 
     async def health(self, request: Request) -> Response:
@@ -220,41 +219,40 @@ class RenderApp:
             _client(request),
         )
         waiting = deque(cameras[body.first : body.first + body.count])
-        with _video_file() as path:
-            film = Film(path, orbit.width, orbit.height, orbit.fps)
+        path = scratch(request) / "orbit.mp4"
+        film = Film(path, orbit.width, orbit.height, orbit.fps)
 
-            def add_some() -> None:
-                began = time.monotonic()
-                model = self._cache.get(model_id)
-                read = time.monotonic()
+        def add_some() -> None:
+            began = time.monotonic()
+            model = self._cache.get(model_id)
+            read = time.monotonic()
+            film.add(render_frame(model, waiting.popleft(), orbit.background))
+            while waiting and time.monotonic() - read < read - began:
                 film.add(render_frame(model, waiting.popleft(), orbit.background))
-                while waiting and time.monotonic() - read < read - began:
-                    film.add(render_frame(model, waiting.popleft(), orbit.background))
 
-            try:
-                while waiting:
-                    await self._queue.run(add_some, request.is_disconnected, _client(request))
-            finally:
-                await run_in_threadpool(film.close)
-        return _video_response(path, headers)
+        try:
+            while waiting:
+                await self._queue.run(add_some, request.is_disconnected, _client(request))
+        finally:
+            await run_in_threadpool(film.close)
+        return FileResponse(path, media_type="video/mp4", headers=headers)
 
     async def _joined(
         self, request: Request, model_id: str, body: JoinOrbit, headers: dict[str, str]
     ) -> Response:
         """Join in a thread beside what is rendered: nothing is decoded."""
-        with _video_file() as path:
-            await run_in_threadpool(self._join, model_id, body, path)
-        return _video_response(path, headers)
+        folder = scratch(request)
+        await run_in_threadpool(self._join, model_id, body, folder)
+        return FileResponse(folder / "orbit.mp4", media_type="video/mp4", headers=headers)
 
-    def _join(self, model_id: str, body: JoinOrbit, path: Path) -> None:
+    def _join(self, model_id: str, body: JoinOrbit, folder: Path) -> None:
         from splatmill_worker.render_service.joining import join
 
-        with tempfile.TemporaryDirectory(prefix="splatmill-orbit-") as folder:
-            parts = []
-            for entry in self._storage.entries(layout.orbit_frames(model_id, body.orbit)):
-                parts.append(Path(folder) / entry.path.rsplit("/", 1)[-1])
-                self._storage.download(entry.path, parts[-1])
-            frames = join(parts, path)
+        parts = []
+        for entry in self._storage.entries(layout.orbit_frames(model_id, body.orbit)):
+            parts.append(folder / f"part-{entry.path.rsplit('/', 1)[-1]}")
+            self._storage.download(entry.path, parts[-1])
+        frames = join(parts, folder / "orbit.mp4")
         if frames != body.frames:
             raise ValueError(
                 f"{frames} frames of the orbit {body.orbit} are stored, and {body.frames} belong to it"
@@ -272,41 +270,33 @@ class RenderApp:
         model = await self._queue.run(
             lambda: self._cache.get(model_id), request.is_disconnected, _client(request)
         )
-        folder = Path(await run_in_threadpool(tempfile.mkdtemp, prefix="splatmill-convert-"))
-        try:
-            path, back, record = await self._queue.run(
-                partial(conversion.convert, model, form, folder), request.is_disconnected, _client(request)
-            )
-            views, what = await run_in_threadpool(conversion.pictures_of, self._storage, model_id)
-            behind = await run_in_threadpool(conversion.background_of, self._storage, model_id)
-            scores = [
-                await self._queue.run(
-                    partial(conversion.score, self._storage, model, back, view, behind),
-                    request.is_disconnected,
-                    _client(request),
-                )
-                for view in (views if form.readable else [])
-            ]
-            record = conversion.with_scores(record, scores, what)
-        except BaseException:
-            await run_in_threadpool(shutil.rmtree, folder, ignore_errors=True)
-            raise
-        remove = BackgroundTask(shutil.rmtree, folder, ignore_errors=True)
-        return FileResponse(
-            path,
-            media_type=form.media_type,
-            headers={CONVERSION_HEADER: record.model_dump_json()},
-            background=remove,
+        folder = scratch(request)
+        path, back, record = await self._queue.run(
+            partial(conversion.convert, model, form, folder), request.is_disconnected, _client(request)
         )
+        views, what = await run_in_threadpool(conversion.pictures_of, self._storage, model_id)
+        behind = await run_in_threadpool(conversion.background_of, self._storage, model_id)
+        scores = [
+            await self._queue.run(
+                partial(conversion.score, self._storage, model, back, view, behind),
+                request.is_disconnected,
+                _client(request),
+            )
+            for view in (views if form.readable else [])
+        ]
+        record = conversion.with_scores(record, scores, what)
+        headers = {CONVERSION_HEADER: write_json(record)}
+        return FileResponse(path, media_type=form.media_type, headers=headers)
 
     async def _edited(
         self, request: Request, model_id: str, body: EditModel, headers: dict[str, str]
     ) -> Response:
         from splatmill_worker.render_service.edit import NothingLeft, edit
 
+        path = scratch(request) / "model.ply"
         try:
-            edited, path = await self._queue.run(
-                lambda: edit(self._storage, model_id, body, self._backend),
+            edited = await self._queue.run(
+                lambda: edit(self._storage, model_id, body, self._backend, path),
                 request.is_disconnected,
                 _client(request),
             )
@@ -317,11 +307,10 @@ class RenderApp:
                 advice="Choose a larger box, a lower opacity or a larger size.",
             )
             return _problem_response(problem)
-        headers = {EDIT_HEADER: edited.model_dump_json()}
-        if path is None:
+        headers = {EDIT_HEADER: write_json(edited)}
+        if body.preview:
             return Response(headers=headers)
-        remove = BackgroundTask(path.unlink, missing_ok=True)
-        return FileResponse(path, media_type="application/octet-stream", headers=headers, background=remove)
+        return FileResponse(path, media_type="application/octet-stream", headers=headers)
 
     def _orbit_cameras(self, model: LoadedModel, body: OrbitRequest) -> list[Camera]:
         from splatmill_worker.render_service.orbit import orbit_cameras
@@ -332,24 +321,6 @@ class RenderApp:
         except (FileNotFoundError, ValidationError):
             stored = None
         return list(orbit_cameras(stored, model.gaussians.means.double().cpu().numpy(), body))
-
-
-@contextlib.contextmanager
-def _video_file() -> Iterator[Path]:
-    """Yield the path of a new file, which is removed if the block raises."""
-    descriptor, name = tempfile.mkstemp(prefix="splatmill-orbit-", suffix=".mp4")
-    os.close(descriptor)
-    try:
-        yield Path(name)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-
-
-def _video_response(path: Path, headers: dict[str, str]) -> Response:
-    """Respond with a video, whose file is then removed."""
-    remove = BackgroundTask(path.unlink, missing_ok=True)
-    return FileResponse(path, media_type="video/mp4", headers=headers, background=remove)
 
 
 def _client(request: Request) -> str:

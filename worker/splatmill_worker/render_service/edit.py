@@ -47,10 +47,8 @@ class HeldOut(NamedTuple):
     mask: Tensor | None
 
 
-def edit(
-    storage: Storage, model_id: str, request: EditModel, backend: str | None
-) -> tuple[Edited, Path | None]:
-    """Return what an edit does, and a temporary file with the model that it leaves; None for a preview.
+def edit(storage: Storage, model_id: str, request: EditModel, backend: str | None, path: Path) -> Edited:
+    """Return what an edit does, and write the model that it leaves to `path`, unless it is a preview.
 
     Raises NothingLeft, ModelUnreadable, FileNotFoundError and StorageError.
     """
@@ -80,16 +78,9 @@ def edit(
         psnr=None if after is None else after.psnr,
         views=[EditedView(name=v.name, psnr=v.psnr, ssim=v.ssim) for v in (after.views if after else ())],
     )
-    if request.preview:
-        return edited, None
-    with tempfile.NamedTemporaryFile(prefix="splatmill-edit-", suffix=".ply", delete=False) as file:
-        path = Path(file.name)
-    try:
+    if not request.preview:
         ply.write(path, left, offset=contents.offset, comments=("Made by Splatmill",))
-    except BaseException:
-        path.unlink(missing_ok=True)
-        raise
-    return edited, path
+    return edited
 
 
 def kept(gaussians: Gaussians, request: EditModel) -> Tensor:
