@@ -19,6 +19,9 @@ OF_PROCESS = "Of one API process: add them up."
 SAME = "The same from every API process: take the largest."
 SMALLEST = "As this API process sees it: take the smallest."
 
+_METHODS = frozenset({"DELETE", "GET", "HEAD", "OPTIONS", "PATCH", "POST", "PUT"})
+_OTHER = "other"
+
 _FAST = (0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60)
 _LONG = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 300, 900)
 
@@ -87,6 +90,12 @@ class Metrics:
             _LONG,
             "kind",
         )
+
+    def request(self, method: str, route: str | None, status: int, seconds: float) -> None:
+        """Count an answered request. A method that no endpoint has, and a path of no route, count as `other`."""
+        named = route if route is not None else _OTHER
+        self.requests.labels(method if method in _METHODS else _OTHER, named, str(status)).inc()
+        self.seconds.labels(named).observe(seconds)
 
     def storage_operation(self, verb: str, seconds: float, error: StorageError | None) -> None:
         """Count an operation on storage (`Storage.watch`)."""

@@ -16,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import Problem, format_bytes
+from splatmill.schema.headers import read_integer
 from splatmill_server.access.caller import NOBODY, Caller
 from splatmill_server.access.permission import is_open
 from splatmill_server.problems import (
@@ -77,9 +78,8 @@ class RequestMiddleware:
         finally:
             seconds = time.perf_counter() - begun
             # The route template in place of the path: otherwise each id would be a time series of its own.
-            route = getattr(scope.get("route"), "path", None) or "other"
-            self.metrics.requests.labels(scope["method"], route, str(status)).inc()
-            self.metrics.seconds.labels(route).observe(seconds)
+            route = getattr(scope.get("route"), "path", None)
+            self.metrics.request(scope["method"], route, status, seconds)
             caller: Caller = scope["state"]["caller"]
             level = logging.DEBUG if scope["path"] in PROBES else self.level
             log.log(
@@ -88,7 +88,7 @@ class RequestMiddleware:
                 request=request_id,
                 owner=caller.owner,
                 key=caller.key_name,
-                method=scope["method"],
+                method=scope["method"][:16],
                 path=shown_path(scope["path"]),
                 status=status,
                 seconds=round(seconds, 4),
@@ -139,9 +139,9 @@ class RequestMiddleware:
                     found.code, found.detail, advice=found.advice, headers={"Retry-After": "5"}
                 ) from error
             await self.rate.admit(scope["state"]["caller"])
-        length = headers.get("content-length", "0")
-        if not _streams(scope, headers) and length.isdigit() and int(length) > self.max_body:
-            raise self._too_large(int(length))
+        length = read_integer(headers.get("content-length")) or 0
+        if not _streams(scope, headers) and length > self.max_body:
+            raise self._too_large(length)
 
     def _bounded(self, scope: Scope, headers: Headers, receive: Receive) -> Callable[[], Awaitable[Message]]:
         """Return a `receive` that raises a 413 problem once a body without Content-Length grows too large."""

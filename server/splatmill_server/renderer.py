@@ -75,7 +75,8 @@ class CountingTransport(httpx.AsyncBaseTransport):
         self._metrics = metrics
 
     async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
-        kind = request.url.path.rpartition("/")[2]
+        last = request.url.path.rpartition("/")[2]
+        kind = last if last in _KINDS else "other"
         if request.url.path == rendering.HEALTH:
             return await self._transport.handle_async_request(request)
         result, began = "failed", time.monotonic()
@@ -101,4 +102,5 @@ class CountingTransport(httpx.AsyncBaseTransport):
         await self._transport.aclose()
 
 
+_KINDS = frozenset({"render", "orbit", "frames", "join", "convert", "edits"})
 _RESULTS = {200: "made", 204: "made", 304: "not_modified", 499: "abandoned", 503: "refused"}

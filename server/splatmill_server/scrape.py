@@ -3,6 +3,7 @@
 Nothing is remembered: without Redis there is no value, rather than an old one.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from splatmill.backplane.totals import Counted, Distribution, Total
 from splatmill.backplane.workers import WorkerRecord
 from splatmill_server.metrics import SAME, SMALLEST
 
+_STATES = ("idle", "busy", "suspended")
 _KINDS: tuple[lists.Kind, ...] = ("captures", "jobs", "models")
 
 SERVICE_FAULTS = (
@@ -165,7 +167,9 @@ def _of_queue(seen: Seen | None) -> Iterator[Metric]:
 
 
 def _of_workers(seen: Seen | None) -> Iterator[Metric]:
-    states = _gauge("splatmill_workers", "Registered workers: idle, busy, suspended (disk full).", "state")
+    states = _gauge(
+        "splatmill_workers", "Registered workers: idle, busy, suspended (disk full), other.", "state"
+    )
     age = _gauge(
         "splatmill_worker_heartbeat_age_seconds",
         "Seconds since the last heartbeat of the worker that was silent longest, by the clocks of both machines.",
@@ -175,9 +179,8 @@ def _of_workers(seen: Seen | None) -> Iterator[Metric]:
         "Bytes that are free beyond the reserve on the disk of the worker that has least; at 0 it takes no jobs.",
     )
     if seen is not None:
-        counts = dict.fromkeys(("idle", "busy", "suspended"), 0)
-        for worker in seen.listening:
-            counts[worker.state] = counts.get(worker.state, 0) + 1
+        counts = Counter(dict.fromkeys(_STATES, 0))
+        counts.update(worker.state if worker.state in _STATES else "other" for worker in seen.listening)
         for state, count in counts.items():
             states.add_metric([state], count)
         beats = [worker.last_heartbeat for worker in seen.listening if worker.last_heartbeat is not None]

@@ -4,6 +4,7 @@ Redis is real, the jobs end as workers and the reaper end them, and the text is 
 proved here: that a Prometheus server reads it, and what is asked of it (tests/server/test_monitoring.py).
 """
 
+import re
 from datetime import UTC, datetime, timedelta
 from typing import Any, cast
 
@@ -248,3 +249,29 @@ def test_a_hash_of_another_version_is_read_as_far_as_it_is_known() -> None:
     assert found["splatmill_jobs_ended"].values == {("failed", "diverged"): 2}
     distribution = found["splatmill_stage_seconds"].distributions["sfm",]
     assert (distribution.counts[3], sum(distribution.counts), distribution.sum) == (4, 4, 31.5)
+
+
+def test_the_labels_of_requests_come_from_closed_sets(app: ServedApp) -> None:
+    before = len(app.http.get("/metrics").content)
+    for number in range(300):
+        app.http.request(f"{'HACK' * 500}{number}", f"/made-up/{number}")
+        app.http.request(f"GET{number}", "/v1/jobs")
+    text = app.http.get("/metrics").text
+    assert len(text) - before < 10_000
+    assert "HACK" not in text
+    assert "made-up" not in text
+    assert 'splatmill_http_requests_total{method="other",route="other",status="404"} 300.0' in text
+
+
+def test_a_code_and_a_state_that_nobody_knows_count_as_other(app: ServedApp) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    made_up = Problem.of("diverged", "It went wrong.").model_copy(update={"code": "made_up" * 20})
+    app.say(job_id, StateEvent(state=JobState.failed, problem=made_up))
+    app.service.reaper.tick()
+    app.redis.sadd("rq:workers", "rq:worker:a")
+    app.redis.hset("rq:worker:a", mapping={"state": "made up", "last_heartbeat": "x"})
+    found = scraped(app)
+    assert found["splatmill_jobs_ended_total", ("other", "failed")] == 1
+    assert found["splatmill_workers", ("other",)] == 1
+    assert not re.search("made[ _]up", app.http.get("/metrics").text)

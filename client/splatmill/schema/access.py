@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
-from splatmill.schema.base import Duration, Request, Response, Time
+from splatmill.schema.base import Duration, Label, Request, Response, Time
 
 DEFAULT_OWNER = "default"
 """The owner of what is made without a key or with SPLATMILL_API_KEY, and of records that name no owner."""
@@ -19,16 +19,26 @@ Owner = Annotated[str, Field(description="Whose record it is.")]
 
 
 class Scope(StrEnum):
-    """What a caller may do. Each scope includes those before it.
+    """What a caller may do.
 
     read: read its owner's records, and render its owner's models.
-    train: upload photos, start, cancel and restart jobs, and delete its owner's records.
+    train: what `read` permits; upload photos, start, cancel and restart jobs, and delete its owner's records.
     admin: everything, with the records of all owners.
+    metrics: read the metrics of the service, and nothing else.
     """
 
     read = "read"
     train = "train"
     admin = "admin"
+    metrics = "metrics"
+
+    @property
+    def permits(self) -> "frozenset[Scope]":
+        """The scopes whose requests this one permits."""
+        chain = (Scope.read, Scope.train, Scope.admin)
+        if self is Scope.admin:
+            return frozenset(Scope)
+        return frozenset(chain[: chain.index(self) + 1] if self in chain else (self,))
 
 
 class KeyLimits(Response):
@@ -54,9 +64,7 @@ class NewKeyLimits(KeyLimits):
 class CreateKey(Request):
     """A request for a new key."""
 
-    name: str = Field(
-        min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f]+$", description="What people call the key."
-    )
+    name: Label = Field(min_length=1, max_length=100, description="What people call the key.")
     owner: str = Field(
         default=DEFAULT_OWNER,
         pattern=OWNER_PATTERN,

@@ -37,13 +37,14 @@ ByteSize = Annotated[int, BeforeValidator(parse_bytes)]
 """Bytes; `parse_bytes` accepts a text such as `1.5GB`."""
 
 
-def _without_controls(label: str) -> str:
-    if any(unicodedata.category(char) == "Cc" for char in label):
+def without_controls(text: str) -> str:
+    """Return a text that people will read. Raises ValueError if it holds a control character or a line separator."""
+    if any(unicodedata.category(char) in ("Cc", "Zl", "Zp") for char in text):
         raise ValueError("it contains a control character, which would act on the terminals that show it")
-    return label
+    return text
 
 
-Label = Annotated[str, Field(max_length=200), AfterValidator(_without_controls)]
+Label = Annotated[str, Field(max_length=200), AfterValidator(without_controls)]
 """A name that a client gives to something, to recognise it by. Records of earlier versions may hold other text."""
 
 Time = AwareDatetime

@@ -4,7 +4,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from splatmill.schema.base import Measured, Request, Response
+from splatmill.schema.base import Label, Measured, Request, Response
 
 EDIT_HEADER = "Splatmill-Edit"
 """Response header of the renderer with an edited model: the `Edited` of it, as JSON."""
@@ -39,8 +39,8 @@ class EditModel(Request):
         le=1e9,
         description="Gaussians with a larger standard deviation along any axis are left out. In units of the model.",
     )
-    name: str | None = Field(
-        default=None, max_length=200, description="Name of the new model. Left out, that of the model."
+    name: Label | None = Field(
+        default=None, description="Name of the new model. Left out, that of the model."
     )
     preview: bool = Field(default=False, description="Only measure what the edit does; no model is made.")
 

@@ -10,7 +10,7 @@ from splatmill.schema.base import Response, Time
 class WorkerInfo(Response):
     """A worker that is registered with the job queue."""
 
-    name: str
+    name: str = Field(description="Its machine and process, for an admin; for others, a number.")
     queues: list[str] = Field(default_factory=list, description="The queues that it serves: any, cpu, gpu.")
     state: str = Field(description="idle, busy, suspended, ...")
     job: str | None = Field(default=None, description="Id of the job it works on.")

@@ -11,7 +11,7 @@ from annotated_types import Ge, Le, MaxLen, MinLen
 from pydantic import Field, field_validator
 from pydantic.fields import FieldInfo
 
-from splatmill.schema.base import ByteSize, Duration, Request, Response
+from splatmill.schema.base import ByteSize, Duration, Request, Response, without_controls
 from splatmill.schema.captures import safe_name
 from splatmill.schema.formats import is_model_file, readable_suffixes
 from splatmill.schema.frames import known_distance
@@ -345,7 +345,7 @@ class TrainOptions(Request):
     @classmethod
     def _distance(cls, scale: str | None) -> str | None:
         if scale is not None:
-            known_distance(scale)
+            known_distance(without_controls(scale))
         return scale
 
     def later_defaults(self) -> set[str]:
@@ -368,6 +368,8 @@ class TrainOptions(Request):
     def _names_once(cls, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
         if names is not None and len(set(names)) != len(names):
             raise ValueError("a photo is named twice in test_views; name each once")
+        for name in names or ():
+            without_controls(name)
         return names
 
 

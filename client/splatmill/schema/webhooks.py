@@ -5,7 +5,7 @@ from enum import StrEnum
 from pydantic import Field
 
 from splatmill.schema.access import DEFAULT_OWNER, Owner
-from splatmill.schema.base import Request, Response, Time
+from splatmill.schema.base import Label, Request, Response, Time
 from splatmill.schema.jobs import Job
 
 
@@ -24,7 +24,7 @@ class CreateWebhook(Request):
     events: list[WebhookEvent] = Field(
         default_factory=lambda: list(WebhookEvent), min_length=1, description="What to tell; by default, all."
     )
-    name: str | None = Field(default=None, max_length=200, description="A name to recognise the webhook by.")
+    name: Label | None = Field(default=None, description="A name to recognise the webhook by.")
 
 
 class Webhook(Response):

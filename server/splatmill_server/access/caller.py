@@ -8,7 +8,7 @@ from fastapi import Depends, Request
 from splatmill.schema import DEFAULT_OWNER, KeyLimits, Scope
 from splatmill_server.access.keys import StoredKey
 
-ALL_SCOPES = frozenset(Scope)
+EVERYTHING = frozenset({Scope.admin})
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Caller:
     owner: str
     key_id: str | None = None
     key_name: str = ""
-    scopes: frozenset[Scope] = ALL_SCOPES
+    scopes: frozenset[Scope] = EVERYTHING
     limits: KeyLimits = field(default_factory=KeyLimits)
     by_session: bool = False
 
@@ -42,8 +42,7 @@ class Caller:
 
     def has(self, scope: Scope) -> bool:
         """Return whether the caller may do what `scope` permits."""
-        order = list(Scope)
-        return any(order.index(held) >= order.index(scope) for held in self.scopes)
+        return any(scope in held.permits for held in self.scopes)
 
     @property
     def admin(self) -> bool:

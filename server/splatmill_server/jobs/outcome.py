@@ -12,7 +12,7 @@ from splatmill.backplane import keys, totals
 from splatmill.backplane.events import StoredEvent
 from splatmill.backplane.fold import Fold, fold
 from splatmill.backplane.row import JobRow
-from splatmill.schema import JobState, StateEvent
+from splatmill.schema import PROBLEMS, JobState, StateEvent
 
 # KEYS: unfinished jobs, totals. ARGV: job, then fields of the totals and their increments.
 _RETIRE = """
@@ -39,6 +39,7 @@ def increments(row: JobRow, states: Sequence[StoredEvent]) -> dict[str, float]:
     if not job.state.final or job.finished_at is None:
         return {}
     code = job.problem.code if job.state is JobState.failed and job.problem is not None else ""
+    code = code if code in PROBLEMS or not code else "other"  # labels of metrics come from closed sets
     found = totals.counted(totals.JOBS_ENDED, job.state.value, code)
     whole = (job.finished_at - row.queued_at).total_seconds()
     found |= totals.observed(totals.JOB_SECONDS, whole, job.state.value)

@@ -73,12 +73,15 @@ def rotate_key(
 
 @router.get("/me", responses=problems())
 def get_me(service: Shared, who: Who) -> Me:
-    """Get the owner, scopes, limits and use of the caller."""
+    """Get the owner, scopes, limits and use of the caller.
+
+    The scope `metrics`, which earlier versions of the SDK cannot read, is listed only where the key names it.
+    """
     return Me(
         owner=who.owner,
         key=who.key_id,
         key_name=who.key_name,
-        scopes=[scope for scope in Scope if who.has(scope)],
+        scopes=[s for s in Scope if s in who.scopes or (s is not Scope.metrics and who.has(s))],
         limits=who.limits,
         use=Use(unfinished_jobs=service.jobs.unfinished_of(who.owner)),
     )

@@ -31,11 +31,13 @@ from splatmill.schema import (
     OptionList,
     QueueInfo,
     Ready,
+    Scope,
     WorkerInfo,
     describe_options,
 )
 from splatmill_server import metrics, scrape
 from splatmill_server.access.caller import Caller, Who
+from splatmill_server.access.permission import needs
 from splatmill_server.answers.docs_page import CONTENT_SECURITY_POLICY, docs_page
 from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.service import Service, Shared
@@ -60,7 +62,7 @@ def get_info(service: Shared, who: Who) -> Info:
     return Info(
         version=splatmill.__version__,
         storage="file" if service.storage.root is not None else "s3",
-        workers=[_seen_by(service, who, _shown(worker)) for worker in listening],
+        workers=[_seen_by(service, who, _shown(worker), n) for n, worker in enumerate(listening, 1)],
         queued=sum(queue.waiting for queue in queues.values()),
         queues=queues,
         limits=Limits(
@@ -121,8 +123,9 @@ async def readyz(service: Shared) -> Response:
     response_class=Response,
     responses=answer(200, "The metrics", content={"text/plain": {}}) | problems(),
 )
+@needs(Scope.metrics)
 async def get_metrics(service: Shared) -> Response:
-    """Get the metrics in the text format of Prometheus."""
+    """Get the metrics in the text format of Prometheus. A key needs the scope `metrics` or `admin`."""
     seen, state = await asyncio.gather(run_in_threadpool(_seen, service), _renderer_state(service))
     found = [*scrape.families(seen), *scrape.of_disk(_spare(service)), *scrape.of_renderer(state)]
     return Response(service.metrics.text(found), media_type=metrics.MEDIA_TYPE)
@@ -174,11 +177,12 @@ def _shown(worker: WorkerRecord) -> WorkerInfo:
     )
 
 
-def _seen_by(service: Service, who: Caller, worker: WorkerInfo) -> WorkerInfo:
-    """Return what the caller may know of a worker: not the id of a job of another owner."""
-    if worker.job is None or who.admin or who.may_see(service.jobs.owner(worker.job)):
+def _seen_by(service: Service, who: Caller, worker: WorkerInfo, number: int) -> WorkerInfo:
+    """Return what the caller may know of a worker: not its machine, which its name begins with, nor others' jobs."""
+    if who.admin:
         return worker
-    return worker.model_copy(update={"job": None})
+    job = worker.job if worker.job is not None and who.may_see(service.jobs.owner(worker.job)) else None
+    return worker.model_copy(update={"name": f"worker-{number}", "job": job})
 
 
 def _job_of(rq_id: str | None) -> str | None:

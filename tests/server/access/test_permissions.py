@@ -127,7 +127,8 @@ def test_another_owner_learns_nothing(
             assert found["code"] in {f"{name.removesuffix('_id')}_not_found" for name in names & OWN}, path
             tried += 1
         elif answer.status_code == 403:
-            assert problem(answer, 403, "forbidden")["facts"]["needed"] == "admin", path
+            needed = problem(answer, 403, "forbidden")["facts"]["needed"]
+            assert needed == ("metrics" if path == "/metrics" else "admin"), path
         else:
             # A list, or something about the service: without ann and without any id of hers.
             assert not [known for known in world.ids.values() if known in answer.text], path
@@ -143,9 +144,8 @@ def test_a_read_only_key_changes_nothing(
     for method, path, _ in operations:
         answer = world.ask("reader", method, path)
         if method in SAFE or path in READS:
-            admins = (
-                answer.status_code == 403 and method != "head" and answer.json()["facts"]["needed"] == "admin"
-            )
+            admins = answer.status_code == 403 and method != "head"
+            admins = admins and answer.json()["facts"]["needed"] in ("admin", "metrics")
             assert admins or answer.status_code not in (401, 403), (method, path)
         else:
             found = problem(answer, 403, "forbidden")
@@ -158,8 +158,39 @@ def test_a_read_only_key_changes_nothing(
 
 
 def test_scopes_include_those_before_them(world: World) -> None:
-    assert list(Scope) == ["read", "train", "admin"]
+    assert {scope.value: sorted(scope.permits) for scope in Scope} == {
+        "read": ["read"],
+        "train": ["read", "train"],
+        "admin": ["admin", "metrics", "read", "train"],
+        "metrics": ["metrics"],
+    }
     assert world.ask("bob", "get", "/v1/me").json()["scopes"] == ["read", "train"]
     problem(world.ask("ann", "get", "/v1/keys"), 403, "forbidden")
     problem(world.ask("ann", "delete", "/v1/keys/{key_id}"), 403, "forbidden")
     assert world.ask("root", "get", "/v1/jobs/{job_id}").json()["owner"] == "ann"
+
+
+def test_metrics_need_a_scope_of_their_own_which_permits_nothing_else(world: World) -> None:
+    made = world.app.http.post(
+        "/v1/keys",
+        json={"name": "prometheus", "scopes": ["metrics"]},
+        headers={"Authorization": "Bearer s3cret"},
+    ).json()
+    world.secrets["prometheus"] = made["secret"]
+    for who in ("ann", "reader"):
+        assert problem(world.ask(who, "get", "/metrics"), 403, "forbidden")["facts"]["needed"] == "metrics"
+    for who in ("prometheus", "root"):
+        assert "splatmill_redis_up 1.0" in world.ask(who, "get", "/metrics").text
+    for path in ("/v1/me", "/v1/info", "/v1/jobs", "/v1/storage"):
+        problem(world.ask("prometheus", "get", path), 403, "forbidden")
+
+
+def test_only_an_admin_learns_the_machines_of_workers(world: World) -> None:
+    worker = "rq:worker:render-7.lan-4711-abc123"
+    world.app.redis.sadd("rq:workers", worker)
+    world.app.redis.hset(worker, mapping={"state": "idle", "splatmill_lines": "any", "last_heartbeat": "x"})
+    assert world.ask("root", "get", "/v1/info").json()["workers"][0]["name"] == "render-7.lan-4711-abc123"
+    for who in ("ann", "reader", "bob"):
+        shown = world.ask(who, "get", "/v1/info")
+        assert [found["name"] for found in shown.json()["workers"]] == ["worker-1"]
+        assert "render-7" not in shown.text
