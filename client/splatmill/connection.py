@@ -5,14 +5,13 @@ import random
 import ssl
 from collections.abc import AsyncIterable, AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from datetime import UTC, datetime
-from email.utils import parsedate_to_datetime
 from typing import Any, TypeVar
 
 import httpx
 from pydantic import BaseModel, ValidationError
 
 from splatmill.errors import ConnectionFailed, error_for
+from splatmill.schema.headers import read_retry_after
 from splatmill.schema.problems import PROBLEM_MEDIA_TYPE, Problem, code_for_status
 from splatmill.server_choice import (
     API_KEY_VARIABLE,
@@ -200,15 +199,7 @@ def backoff(tries: int) -> float:
 
 def retry_after(response: httpx.Response) -> float | None:
     """Return the seconds to wait that the header Retry-After names, as a number or as a date; None without it."""
-    text = response.headers.get("Retry-After", "")
-    if text.isascii() and text.isdigit():
-        return float(text)
-    try:
-        moment = parsedate_to_datetime(text)
-    except ValueError:
-        return None
-    aware = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
-    return max((aware - datetime.now(UTC)).total_seconds(), 0.0)
+    return read_retry_after(response.headers.get("Retry-After"))
 
 
 def read_problem(response: httpx.Response) -> Problem:

@@ -12,6 +12,7 @@ from splatmill.connection import LONGEST_WISH, Connection, backoff
 from splatmill.errors import DownloadFailed, InvalidRequest, Unavailable
 from splatmill.files import move_into_place
 from splatmill.schema.captures import SHA256_HEADER
+from splatmill.schema.headers import read_integer, read_token
 
 AnyPath = str | os.PathLike[str]
 OnBytes = Callable[[int, int | None], None]
@@ -96,7 +97,7 @@ class _Part:
     def begin(self, etag: str | None) -> None:
         self.discard()
         # Files with equal weak ETags may differ in their bytes.
-        if etag and not etag.startswith("W/"):
+        if read_token(etag) and etag and not etag.startswith("W/"):
             self.etag_path.write_text(etag)
         self.path.touch()
 
@@ -127,8 +128,8 @@ async def _fetch(connection: Connection, address: str, part: _Part, on_bytes: On
         ):
             part.discard()
             raise httpx.RemoteProtocolError("the server sent another range than the requested one")
-        length = response.headers.get("Content-Length")
-        total = start + int(length) if length is not None else None
+        length = read_integer(response.headers.get("Content-Length"))
+        total = start + length if length is not None else None
         with part.path.open("ab") as sink:
             async for chunk in response.aiter_bytes():
                 sink.write(chunk)

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from splatmill.connection import LONGEST_WISH, Connection, backoff
 from splatmill.errors import Unavailable
 from splatmill.schema.events import EventRecord
+from splatmill.schema.headers import read_token
 
 GIVE_UP_SECONDS = 300.0
 """Time without any data after which the connection counts as lost for good; replacing a server may take this long."""
@@ -92,7 +93,7 @@ async def follow_events(
             async with connection.stream("GET", path, headers=headers, timeout=STREAM_TIMEOUT) as response:
                 heard, tries = time.monotonic(), 0
                 async for message in read_messages(noted(response.aiter_bytes())):
-                    after = message.id or after
+                    after = read_token(message.id) or after
                     try:
                         record = EventRecord.model_validate_json(message.data)
                     except ValidationError:

@@ -63,7 +63,7 @@ def verify_webhook(
         raise InvalidWebhook("The signature does not fit the body and the secret.")
     try:
         payload = json.loads(data)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InvalidWebhook("The body is not JSON.") from error
     if not isinstance(payload, dict):
         raise InvalidWebhook("The body is not a JSON object.")

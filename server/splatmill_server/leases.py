@@ -2,16 +2,21 @@
 
 import asyncio
 import secrets
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 
 import redis
+from redis.exceptions import LockError
+from redis.lock import Lock
 from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane import expiry, keys
 
 SECONDS = 30
 """Seconds until the lease of a process that was killed expires."""
+
+_WAIT = 10.0
+"""Seconds that a change of a record waits for others of the same record."""
 
 _RELEASE = "if redis.call('get', KEYS[1]) == ARGV[1] then return redis.call('del', KEYS[1]) end return 0"
 _RENEW = (
@@ -39,8 +44,28 @@ async def lease(connection: redis.Redis, kind: str, name: str) -> AsyncIterator[
         with suppress(asyncio.CancelledError):
             await renewal
         with suppress(redis.RedisError):
-            # Not in a thread: this also runs while the server stops.
-            connection.eval(_RELEASE, 1, key, token)
+            # Shielded: a second cancellation, as while the server stops, must not keep the lease for SECONDS.
+            await asyncio.shield(
+                asyncio.ensure_future(run_in_threadpool(connection.eval, _RELEASE, 1, key, token))
+            )
+
+
+@contextmanager
+def exclusive(connection: redis.Redis, kind: str, name: str) -> Iterator[None]:
+    """Hold the lease on a record, from its reading to its writing, and wait for others that do. For threads.
+
+    Raises redis.RedisError, LockError among them, if the lease cannot be taken.
+    """
+    key = keys.lease(kind, name)
+    lock = Lock(connection, key, timeout=SECONDS, thread_local=False, raise_on_release_error=False)
+    if not lock.acquire(blocking_timeout=_WAIT):
+        expiry.shorten(connection, key, SECONDS)
+        raise LockError("The record is being changed by other requests")
+    try:
+        yield
+    finally:
+        with suppress(redis.RedisError):
+            lock.release()
 
 
 async def _renew(connection: redis.Redis, key: str, token: str) -> None:

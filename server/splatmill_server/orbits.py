@@ -14,11 +14,12 @@ import httpx
 import structlog
 from pydantic import BaseModel, ValidationError
 from redis import Redis
+from redis.exceptions import RedisError
 from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane import layout, rendering
 from splatmill.backplane.records import FORMAT, reason, warn
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import (
     DEFAULT_OWNER,
     PROBLEMS,
@@ -234,6 +235,13 @@ class Orbits:
                 after = _failed(found, delay.problem)
             except ProblemError as error:
                 after = _failed(found, error.problem)
+            except (StorageError, RedisError):
+                raise  # the video waits until storage and Redis answer
+            except Exception as error:
+                log.exception("an orbit video failed unexpectedly", model=model_id, id=orbit_id)
+                after = _failed(
+                    found, _orbit_problem("render_failed", f"Unexpected error: {type(error).__name__}.")
+                )
             if after is not None:
                 await run_in_threadpool(self._write, name, after)
         if found is None:

@@ -20,6 +20,8 @@ from functools import cached_property
 import httpcore
 import httpx
 
+from splatmill.schema.headers import read_integer
+
 PORTS = frozenset({80, 443, 8080, 8443})
 """Ports that may be used. Others belong to services that do not speak HTTP and might be confused by it."""
 
@@ -64,8 +66,7 @@ class Answer:
     @property
     def size(self) -> int | None:
         """The announced size of the body in bytes, or None."""
-        text = self.headers.get("content-length", "")
-        return int(text) if text.isascii() and text.isdigit() and len(text) < 16 else None
+        return read_integer(self.headers.get("content-length"))
 
     async def beginning(self, limit: int) -> bytes:
         """Return the first bytes of the body, at most `limit`."""
@@ -104,10 +105,7 @@ class Outgoing:
             raise AddressRefused(f"The address has more than {MAX_URL} characters.")
         if not shown.isprintable() or " " in shown:
             raise AddressRefused(f"{shown[:200]!r} contains spaces or control characters.")
-        try:
-            parsed = httpx.URL(url)
-        except (httpx.InvalidURL, ValueError) as error:
-            raise AddressRefused(f"{shown[:200]!r} is not an address: {error}.") from error
+        parsed = _parsed(shown)
         if parsed.scheme not in ("http", "https") or not parsed.host:
             raise AddressRefused(
                 f"{shown[:200]!r} is not the address of a web server: begin it with https://."
@@ -137,7 +135,7 @@ class Outgoing:
             raise NoAnswer(
                 f"The name {host} was not resolved within {CONNECT_SECONDS:.0f} seconds."
             ) from error
-        except (OSError, UnicodeError) as error:
+        except (OSError, ValueError) as error:
             raise NoAnswer(f"The name {host} cannot be resolved.") from error
         addresses = list(dict.fromkeys(str(entry[4][0]) for entry in found))
         if not addresses:
@@ -208,16 +206,25 @@ class Outgoing:
     def _redirected(self, target: httpx.URL, location: str, left: int) -> httpx.URL:
         if not location or left == 0:
             raise NoAnswer(f"{target.host} redirects too often, or nowhere.")
-        try:
-            following = self.checked(target.join(location))
-        except httpx.InvalidURL as error:
-            raise NoAnswer(f"{target.host} redirects to an address that is not one.") from error
+        following = self.checked(_parsed(location, target))
         if target.scheme == "https" and following.scheme == "http":
             raise AddressRefused(f"{target.host} redirects from https to http, which is not followed.")
         return following
 
     def _allows(self, host: str, port: int) -> bool:
         return bool({(host.lower(), None), (host.lower(), port)} & self._allowed)
+
+
+def _parsed(address: str, base: httpx.URL | None = None) -> httpx.URL:
+    """Return the parsed address, relative to `base`. Raises AddressRefused unless every part of it can be read."""
+    try:
+        url = httpx.URL(address) if base is None else base.join(address)
+        _ = url.host, url.netloc  # httpx decodes a name like xn-- only here
+        if (url.port or 0) > 65535:
+            raise ValueError("there is no such port")
+    except (httpx.InvalidURL, ValueError) as error:
+        raise AddressRefused(f"{address[:200]!r} is not an address: {str(error)[:200]}.") from error
+    return url
 
 
 def allowed_hosts(allow: str) -> set[tuple[str, int | None]]:
@@ -283,7 +290,7 @@ def _no_answer(url: httpx.URL) -> Iterator[None]:
         yield
     except httpcore.TimeoutException as error:
         raise NoAnswer(f"{url.host} did not answer in time.") from error
-    except (httpcore.NetworkError, httpcore.ProtocolError, OSError) as error:
+    except (httpcore.NetworkError, httpcore.ProtocolError, OSError, ValueError) as error:
         raise NoAnswer(f"The connection to {url.host} failed ({_reason(error)}).") from error
 
 
@@ -303,9 +310,9 @@ def _port(url: httpx.URL) -> int:
 
 def _host_and_port(entry: str) -> tuple[str, int | None]:
     try:
-        url = httpx.URL(f"http://{entry}")
-    except httpx.InvalidURL as error:
-        raise ValueError(f"{entry!r} is not a host: {error}.") from error
+        url = _parsed(f"http://{entry}")
+    except AddressRefused as error:
+        raise ValueError(f"{entry!r} is not a host.") from error
     if not url.host or url.raw_path != b"/" or url.userinfo:
         raise ValueError(f"{entry!r} is not a host; write it as name or name:port.")
     explicit_80 = entry.endswith(":80")  # httpx leaves out the default port

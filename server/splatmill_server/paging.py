@@ -3,6 +3,7 @@
 import base64
 import binascii
 
+from splatmill.schema.headers import read_integer
 from splatmill_server.problems import ProblemError
 
 MAX_LIMIT = 200
@@ -21,9 +22,10 @@ def read_cursor(cursor: str) -> tuple[int, str]:
         moment, _, entry_id = (
             base64.b64decode(padded, altchars=b"-_", validate=True).decode("ascii").partition("/")
         )
-        if not entry_id:
+        milliseconds = read_integer(moment)
+        if milliseconds is None or not entry_id:
             raise ValueError(cursor)
-        return int(moment), entry_id
+        return milliseconds, entry_id
     except (ValueError, binascii.Error) as error:
         raise ProblemError(
             "cursor_invalid",

@@ -186,3 +186,23 @@ def test_heartbeats_show_that_a_quiet_connection_lives():
 
     assert asyncio.run(run()) == ["line 1"]
     assert connections == 3
+
+
+def test_an_id_that_no_header_can_hold_is_not_sent_back(peer, reply):
+    parts = [message(n, LogEvent(message=f"line {n}")) for n in range(3)]
+    parts[1] = parts[1].replace(b"id: 1-0", "id: é🦊".encode(), 1)
+    streams = iter(
+        [
+            reply(body=b"".join(parts), cut=len(parts[2]), headers=SSE),
+            reply(body=parts[2], headers=SSE),
+        ]
+    )
+    states = iter(["training", "succeeded"])
+    peer.answer = lambda seen: (
+        next(streams) if seen.path.endswith("/events") else reply(body=job(next(states)))
+    )
+    with Client(peer.url) as client:
+        records = list(client.job("j1").events())
+    assert [said(record) for record in records] == ["line 0", "line 1", "line 2"]
+    asked = [seen.headers.get("last-event-id") for seen in peer.seen if seen.path.endswith("/events")]
+    assert asked == [None, "0-0"]

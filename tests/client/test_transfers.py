@@ -10,7 +10,7 @@ import random
 
 import pytest
 
-from splatmill import Client
+from splatmill import Client, uploads
 from splatmill.errors import ConnectionFailed, DownloadFailed, InvalidRequest, NotFound, Unavailable
 from splatmill.schema import SHA256_HEADER, Problem, Progress
 
@@ -257,3 +257,32 @@ def test_an_orbit_is_waited_for_as_long_as_asked_and_asked_for_once(peer, reply,
     with Client(peer.url) as client, pytest.raises(ConnectionFailed):
         client.model("m1").orbit(tmp_path, timeout=0.3, keep=False)
     assert [seen.method for seen in peer.seen] == ["GET", "POST"]
+
+
+def test_a_version_that_no_header_can_hold_is_not_sent_back(peer, reply, tmp_path):
+    tries = []
+
+    def answer(seen):
+        tries.append(seen.headers.get("range"))
+        return ranged(seen, reply, etag='"é"', cut=100_000 if len(tries) < 3 else 0)
+
+    serve(peer, reply, answer)
+    with Client(peer.url) as client:
+        assert client.model("m1").download(tmp_path).read_bytes() == DATA
+    assert tries == [None, None, None]  # without a version, the file is begun anew
+
+
+@pytest.mark.parametrize("address", ["http://xn--/", "//evil.example/x", "https://evil.example/x", "/é"])
+def test_an_upload_does_not_go_on_at_another_server(peer, reply, tmp_path, monkeypatch, address):
+    monkeypatch.setattr(uploads, "PIECE", 1000)
+    (tmp_path / "film.mp4").write_bytes(DATA)
+
+    def answer(seen):
+        if seen.method == "PUT":
+            return reply(status=201, headers={"Location": address, "Upload-Offset": "0"})
+        return reply(body=CAPTURE)
+
+    peer.answer = answer
+    with Client(peer.url, retries=0) as client, pytest.raises(ConnectionFailed, match="several requests"):
+        client.upload(tmp_path / "film.mp4")
+    assert {seen.method for seen in peer.seen} <= {"GET", "POST", "PUT", "DELETE"}

@@ -346,3 +346,20 @@ def test_the_command_shows_progress_and_an_interrupt_cancels_the_video(
         renderer.send_signal(signal.SIGCONT)
     assert marks(app) == []
     assert not (tmp_path / "never.mp4").exists()
+
+
+def test_a_video_has_failed_after_an_error_that_nobody_expected(
+    app: ServedApp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    async def broken(*_: object) -> None:
+        asked.append(1)
+        raise RecursionError
+
+    monkeypatch.setattr(orbits, "post", broken)
+    made = begun(app)
+    wait_for(lambda: app.http.get(made["links"]["self"]).json()["state"] == "failed")
+    assert "RecursionError" in app.http.get(made["links"]["self"]).json()["problem"]["detail"]
+    assert not list(app.service.storage.entries(layout.unfinished_orbits()))
+    assert len(asked) == 1

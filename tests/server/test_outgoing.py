@@ -298,3 +298,30 @@ def test_the_allowed_hosts_are_names_with_or_without_a_port() -> None:
     for wrong in ("http://a.example", "a.example/path", "u@a.example"):
         with pytest.raises(ValueError, match="is not a host"):
             allowed_hosts(wrong)
+
+
+@pytest.mark.parametrize(
+    "url", ["http://xn--/", "http://xn--a.com/", "http://[v1.x]/", f"http://a:{'9' * 1900}/"]
+)
+def test_an_address_that_python_cannot_read_is_refused(url: str) -> None:
+    with pytest.raises(AddressRefused, match="is not an address"):
+        Outgoing().checked(url)
+    with pytest.raises(AddressRefused, match="is not an address"):
+        asyncio.run(Outgoing().check(url))
+
+
+@pytest.mark.parametrize(
+    "location", ["http://xn--/", "//xn--/x", "http://[", "http://a:99999999999", "?" + "a" * 70_000]
+)
+def test_a_redirect_to_such_an_address_is_refused(peer: ScriptedServer, location: str) -> None:
+    peer.answer = lambda _: Reply(status=302, headers={"Location": location})
+    outgoing = Outgoing(allow=peer.url.removeprefix("http://"))
+    with pytest.raises((AddressRefused, NoAnswer)):
+        fetch(outgoing, peer.url, redirects=5)
+    assert len(peer.seen) == 1
+
+
+def test_an_announced_size_of_many_digits_is_an_error_of_the_other_server(peer: ScriptedServer) -> None:
+    peer.answer = lambda _: Reply(headers={"Content-Length": "9" * 5000})
+    with pytest.raises(NoAnswer):
+        fetch(Outgoing(allow=peer.url.removeprefix("http://")), peer.url)

@@ -7,6 +7,9 @@ _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 _DURATION = re.compile(r"(?:(?:\d+(?:\.\d+)?)[smhd])+", re.ASCII)
 _DURATION_PART = re.compile(r"(\d+(?:\.\d+)?)([smhd])", re.ASCII)
 
+_LONGEST = 40
+"""Characters of a size. Longer ones may be infinite as a number."""
+
 _BYTES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 _BYTES_BINARY = {"k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 _SIZE = re.compile(r"(\d+(?:\.\d+)?) ?([kmgt]?)(i?)b?", re.ASCII | re.IGNORECASE)
@@ -24,7 +27,7 @@ def parse_duration(value: Any) -> Any:
     if _PLAIN.fullmatch(text):
         return float(text)
     if not _DURATION.fullmatch(text):
-        raise ValueError(f"{value!r} is not a duration; write seconds (90), or 90s, 5m, 1h30m")
+        raise ValueError(f"{value[:80]!r} is not a duration; write seconds (90), or 90s, 5m, 1h30m")
     return sum(float(number) * _SECONDS[unit] for number, unit in _DURATION_PART.findall(text))
 
 
@@ -35,12 +38,12 @@ def parse_bytes(value: Any) -> Any:
     """
     if not isinstance(value, str):
         return value
-    match = _SIZE.fullmatch(value.strip())
+    match = _SIZE.fullmatch(value.strip()) if len(value) <= _LONGEST else None
     if match is None:
-        raise ValueError(f"{value!r} is not a size; write bytes (500000000), or 500MB, 1.5GB, 2GiB")
+        raise ValueError(f"{value[:80]!r} is not a size; write bytes (500000000), or 500MB, 1.5GB, 2GiB")
     number, unit, binary = match.groups()
     if binary and not unit:
-        raise ValueError(f"{value!r} is not a size; write bytes (500000000), or 500MB, 1.5GB, 2GiB")
+        raise ValueError(f"{value[:80]!r} is not a size; write bytes (500000000), or 500MB, 1.5GB, 2GiB")
     factor = _BYTES_BINARY[unit.lower()] if binary else _BYTES[unit.lower()]
     return round(float(number) * factor)
 

@@ -53,7 +53,7 @@ def check_origin(scope: Scope, headers: Headers, allowed: Sequence[str], *, requ
         site = headers.get("sec-fetch-site")
         if site in ("same-origin", "none") or (site is None and not required):
             return
-    elif _same(origin, headers.get("host", "")) or _among(_name(urlsplit(origin).netloc), allowed):
+    elif _same(origin, headers.get("host", "")) or _among(_name(origin.partition("//")[2]), allowed):
         return
     raise ProblemError(
         "origin_not_allowed",

@@ -1,5 +1,6 @@
 """Responses with stored files: ETag, If-None-Match, Range and HEAD (RFC 9110). Files are streamed."""
 
+import re
 from datetime import UTC
 from email.utils import format_datetime
 from urllib.parse import quote
@@ -11,6 +12,9 @@ from starlette.responses import Response, StreamingResponse
 from splatmill.backplane.storage import Entry, Storage, joined
 from splatmill.backplane.storage_errors import StorageChangedError
 from splatmill_server.problems import ProblemError
+
+_RANGE = re.compile(r"\s*bytes\s*=\s*([0-9]{0,19})-([0-9]{0,19})\s*", re.ASCII | re.IGNORECASE)
+"""A single range of bytes. Some clients name the largest integer of 64 bits for the end of the file."""
 
 _LOOKS = 3
 """How often a file is looked up that is replaced each time before it is read."""
@@ -90,18 +94,17 @@ def matches(header: str | None, etag: str) -> bool:
 def _range(header: str | None, entry: Entry, headers: dict[str, str]) -> tuple[int, int] | None:
     """Return the bytes [start, end) of a single range. Return None without a range, and for several ranges or a
     malformed one, which a server may ignore (RFC 9110)."""
-    unit, _, spec = (header or "").partition("=")
-    first, dash, last = spec.strip().partition("-")
-    digits = all(not part or (part.isascii() and part.isdigit() and len(part) < 20) for part in (first, last))
-    if unit.strip().lower() != "bytes" or not dash or not digits or not (first or last):
+    found = _RANGE.fullmatch(header or "")
+    if found is None or not any(found.groups()):
         return None
+    first, last = (int(text) if text else None for text in found.groups())
     size = entry.size
-    if first:
-        start, end = int(first), min(int(last) + 1, size) if last else size
-        if last and int(last) < start:
-            return None
+    if first is None:
+        start, end = max(size - (last or 0), 0), size
+    elif last is None or last >= first:
+        start, end = first, size if last is None else min(last + 1, size)
     else:
-        start, end = max(size - int(last), 0), size
+        return None
     if start >= size or start >= end:
         raise ProblemError(
             "range_not_satisfiable",

@@ -159,7 +159,14 @@ class Imports:
             except StorageError as error:
                 problem = problem_of_storage(error)
                 found = found.model_copy(update={"state": ImportState.failed, "problem": problem})
-            except NoAnswer as error:
+            except redis.RedisError:
+                raise  # the import waits until Redis answers, without which no lease is given
+            except (
+                Exception
+            ) as error:  # counted, whatever it is: what others send must not be fetched for ever
+                if not isinstance(error, NoAnswer):
+                    log.exception("an attempt ended unexpectedly", id=import_id)
+                    error = NoAnswer(f"The attempt ended in an unexpected error ({type(error).__name__}).")
                 if found.attempts >= MAX_ATTEMPTS:
                     tried = f"It was tried {found.attempts} times."
                     found = _failed(found, "import_failed", f"{error} {tried}")

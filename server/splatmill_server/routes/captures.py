@@ -7,6 +7,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import SHA256_HEADER, Capture, CaptureFile, CapturePage, CreateCapture, Role, safe_name
+from splatmill.schema.headers import read_integer
 from splatmill.schema.uploads import UPLOAD_COMPLETE, UPLOAD_LENGTH, read_boolean
 from splatmill_server.access.caller import Who
 from splatmill_server.filters import Filter
@@ -163,8 +164,7 @@ async def put_file(
         )
     if read_boolean(complete) is False:
         return await uploads.begin(service, who, request, capture_id, role, name, digest, total)
-    length = request.headers.get("content-length", "")
-    size = int(length) if length.isdigit() else None
+    size = read_integer(request.headers.get("content-length"))
     name = safe_name(name)
     async with service.quota.upload(
         who,

@@ -18,6 +18,7 @@ from starlette.concurrency import run_in_threadpool
 from splatmill.backplane import layout
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import DeliveryAttempt, DeliveryState, format_duration
+from splatmill.schema.headers import read_retry_after
 from splatmill.webhook_signature import sign
 from splatmill_server.leases import lease
 from splatmill_server.metrics import Metrics
@@ -131,6 +132,9 @@ class Deliveries:
         if webhook is not None and found is not None and found.state is DeliveryState.pending:
             assert found.next_at is not None
             if found.next_at <= datetime.now(UTC):
+                found = _counted(found)
+                # Before it is sent: an attempt that cannot be counted is not made, or it would be made for ever.
+                await run_in_threadpool(self.webhooks.write_delivery, found)
                 found = await self._send(webhook, found)
                 await run_in_threadpool(self.webhooks.write_delivery, found)
                 result = "retried" if found.state is DeliveryState.pending else found.state.value
@@ -142,35 +146,32 @@ class Deliveries:
         await run_in_threadpool(self.storage.delete, mark)
 
     async def _send(self, webhook: WebhookRecord, found: DeliveryRecord) -> DeliveryRecord:
-        """Return the delivery after one attempt. A webhook that refuses for good is disabled."""
+        """Return a counted delivery after its attempt. A webhook that refuses for good is disabled."""
         if webhook.disabled_at is not None:
             return _failed(found, "The webhook is disabled.")
         begun, at, body = time.monotonic(), datetime.now(UTC), found.body.encode()
-        timestamp = int(at.timestamp())
-        headers = {
-            "Content-Type": "application/json",
-            "webhook-id": found.message,
-            "webhook-timestamp": str(timestamp),
-            "webhook-signature": " ".join(
-                sign(secret, found.message, timestamp, body) for secret in webhook.valid_secrets()
-            ),
-        }
-        status, answer, failure, retry_after = None, None, None, 0
+        status, answer, failure, retry_after = None, None, None, 0.0
         try:
             async with (
                 asyncio.timeout(ANSWER_SECONDS),
                 self.outgoing.request(
-                    "POST", webhook.url, headers=headers, body=body, read_seconds=ANSWER_SECONDS
+                    "POST",
+                    webhook.url,
+                    headers=_headers(webhook, found, int(at.timestamp()), body),
+                    body=body,
+                    read_seconds=ANSWER_SECONDS,
                 ) as reply,
             ):
                 status = reply.status
-                wished = reply.headers.get("retry-after", "")
-                retry_after = int(wished) if wished.isascii() and wished.isdigit() else 0
+                retry_after = read_retry_after(reply.headers.get("retry-after")) or 0.0
                 answer = (await reply.beginning(MAX_ANSWER)).decode("utf-8", "replace")
         except TimeoutError:
             failure = f"There was no whole answer within {ANSWER_SECONDS:.0f} seconds."
         except OutgoingError as error:
             failure = str(error)
+        except Exception as error:
+            log.exception("an attempt ended unexpectedly", webhook=webhook.id, delivery=found.id)
+            failure = f"The attempt ended in an unexpected error ({type(error).__name__})."
         made = DeliveryAttempt(
             at=at,
             seconds=round(time.monotonic() - begun, 3),
@@ -178,7 +179,7 @@ class Deliveries:
             answer=answer or None,
             error=failure,
         )
-        found = found.model_copy(update={"attempts": [*found.attempts, made], "tries": found.tries + 1})
+        found = found.model_copy(update={"attempts": [*found.attempts, made]})
         if status is not None and 200 <= status < 300:
             return found.model_copy(update={"state": DeliveryState.delivered, "next_at": None})
         if status == 410:
@@ -190,9 +191,31 @@ class Deliveries:
             reason += failure or f"the answer had the status {status}."
             await run_in_threadpool(self.webhooks.disable, webhook.id, reason)
             return _failed(found, reason)
-        pause = PAUSES[found.tries - 1] * random.uniform(1 - JITTER, 1 + JITTER)
-        pause = max(pause, min(retry_after, LONGEST_RETRY_AFTER))
+        pause = max(_pause(found.tries), min(retry_after, LONGEST_RETRY_AFTER))
         return found.model_copy(update={"next_at": datetime.now(UTC) + timedelta(seconds=pause)})
+
+
+def _counted(found: DeliveryRecord) -> DeliveryRecord:
+    """Return the delivery with one attempt more, and the time of the next one if nothing more becomes known of this."""
+    tries = found.tries + 1
+    return found.model_copy(
+        update={"tries": tries, "next_at": datetime.now(UTC) + timedelta(seconds=_pause(tries))}
+    )
+
+
+def _pause(tries: int) -> float:
+    """Return the seconds after this many attempts."""
+    return PAUSES[min(tries, len(PAUSES)) - 1] * random.uniform(1 - JITTER, 1 + JITTER)
+
+
+def _headers(webhook: WebhookRecord, found: DeliveryRecord, timestamp: int, body: bytes) -> dict[str, str]:
+    signatures = [sign(secret, found.message, timestamp, body) for secret in webhook.valid_secrets()]
+    return {
+        "Content-Type": "application/json",
+        "webhook-id": found.message,
+        "webhook-timestamp": str(timestamp),
+        "webhook-signature": " ".join(signatures),
+    }
 
 
 def _failed(found: DeliveryRecord, reason: str) -> DeliveryRecord:

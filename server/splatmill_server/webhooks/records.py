@@ -11,6 +11,8 @@ import json
 import math
 import secrets
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 
 import structlog
@@ -32,6 +34,7 @@ from splatmill.schema import (
 )
 from splatmill.webhook_signature import SECRET_PREFIX
 from splatmill_server.jobs.records import Jobs
+from splatmill_server.leases import exclusive
 from splatmill_server.problems import ProblemError
 
 log = structlog.get_logger()
@@ -86,15 +89,23 @@ class DeliveryRecord(Delivery):
 
 
 class Webhooks:
-    """All operations on webhooks but sending. Methods raise ProblemError and StorageError."""
+    """All operations on webhooks but sending. Methods raise ProblemError, StorageError and redis.RedisError.
+
+    A record is read, changed and written under a lease, so that of two changes at once neither is lost.
+    """
 
     def __init__(self, storage: Storage, jobs: Jobs) -> None:
         self.storage = storage
         self.jobs = jobs
+        self.connection = jobs.connection
         jobs.on_end.append(self.announce)
 
     def create(self, request: CreateWebhook, owner: str) -> WebhookWithSecret:
         """Create a webhook with a new secret. The caller has checked its address."""
+        with exclusive(self.connection, "webhooks", owner):
+            return self._create(request, owner)
+
+    def _create(self, request: CreateWebhook, owner: str) -> WebhookWithSecret:
         if len(self.of_owner(owner)) >= MAX_WEBHOOKS:
             raise ProblemError(
                 "too_many_requests",
@@ -140,31 +151,33 @@ class Webhooks:
 
     def delete(self, webhook_id: str) -> None:
         """Delete a webhook and the log of its deliveries. Those that are pending are not sent any more."""
-        self.get(webhook_id)
-        self.storage.delete(layout.webhook_record(webhook_id))
-        self.storage.delete_prefix(layout.webhook(webhook_id))
+        with self._changing(webhook_id):
+            self.storage.delete(layout.webhook_record(webhook_id))
+            self.storage.delete_prefix(layout.webhook(webhook_id))
 
     def rotate(self, webhook_id: str) -> WebhookWithSecret:
         """Give a webhook a new secret. For GRACE, each request carries a signature with the former one too."""
-        record = self.get(webhook_id)
-        former = record.secrets[0].model_copy(update={"until": datetime.now(UTC) + GRACE})
-        record = record.model_copy(update={"secrets": [_new_secret(), former]})
-        self._write(record)
+        with self._changing(webhook_id) as record:
+            former = record.secrets[0].model_copy(update={"until": datetime.now(UTC) + GRACE})
+            record = record.model_copy(update={"secrets": [_new_secret(), former]})
+            self._write(record)
         return _with_secret(record)
 
     def enable(self, webhook_id: str) -> WebhookRecord:
         """Send to a disabled webhook again. Deliveries that have failed meanwhile can be repeated one by one."""
-        record = self.get(webhook_id).model_copy(update={"disabled_at": None, "disabled_reason": None})
-        self._write(record)
+        with self._changing(webhook_id) as record:
+            record = record.model_copy(update={"disabled_at": None, "disabled_reason": None})
+            self._write(record)
         return record
 
     def disable(self, webhook_id: str, reason: str) -> None:
         """Send nothing to a webhook any more."""
-        record = self.read(webhook_id)
-        if record is not None and record.disabled_at is None:
-            log.warning("webhook disabled", webhook=webhook_id, reason=reason)
-            now = datetime.now(UTC)
-            self._write(record.model_copy(update={"disabled_at": now, "disabled_reason": reason}))
+        with exclusive(self.connection, "webhook", webhook_id):
+            record = self.read(webhook_id)
+            if record is not None and record.disabled_at is None:
+                log.warning("webhook disabled", webhook=webhook_id, reason=reason)
+                now = datetime.now(UTC)
+                self._write(record.model_copy(update={"disabled_at": now, "disabled_reason": reason}))
 
     def deliveries(self, webhook_id: str) -> list[Delivery]:
         """Return the deliveries of a webhook, newest first. Those that are over are kept for KEPT_DAYS."""
@@ -187,19 +200,27 @@ class Webhooks:
     def repeat(self, webhook_id: str, delivery_id: str) -> Delivery:
         """Send a delivery that is over once more, with the same message id. Raises a 404 problem."""
         found = self.delivery(webhook_id, delivery_id) if layout.is_id(delivery_id) else None
+        if found is not None and found.state is not DeliveryState.pending:
+            with exclusive(self.connection, "delivery", f"{webhook_id}.{delivery_id}"):
+                found = self._repeated(webhook_id, delivery_id)
         if found is None:
             raise ProblemError(
                 "delivery_not_found",
                 f"The webhook has no delivery {delivery_id[:80]!r}.",
                 advice="List the deliveries with GET /v1/webhooks/{id}/deliveries.",
             )
-        if found.state is not DeliveryState.pending:
+        return found.public()
+
+    def _repeated(self, webhook_id: str, delivery_id: str) -> DeliveryRecord | None:
+        """Make a delivery that is over pending again, unless another request has."""
+        found = self.delivery(webhook_id, delivery_id)
+        if found is not None and found.state is not DeliveryState.pending:
             now = datetime.now(UTC)
             update = {"state": DeliveryState.pending, "next_at": now, "tries": 0, "reason": None}
             found = found.model_copy(update=update)
             self.write_delivery(found)
             self.mark(found)
-        return found.public()
+        return found
 
     def write_delivery(self, record: DeliveryRecord) -> None:
         """Store a delivery, unless its webhook was deleted."""
@@ -257,6 +278,13 @@ class Webhooks:
                     self.storage.delete(entry.path)
                     deleted += 1
         return deleted
+
+    @contextmanager
+    def _changing(self, webhook_id: str) -> Iterator[WebhookRecord]:
+        """Yield a webhook that is to be changed, and keep other changes away meanwhile. Raises a 404 problem."""
+        self.get(webhook_id)
+        with exclusive(self.connection, "webhook", webhook_id):
+            yield self.get(webhook_id)
 
     def _write(self, record: WebhookRecord) -> None:
         path = layout.webhook_record(record.id)

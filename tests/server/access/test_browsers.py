@@ -242,3 +242,14 @@ def test_a_server_with_keys_answers_to_any_name(app: ServedApp) -> None:
     assert app.http.get("/v1/jobs", headers={"Host": "splat.example.org"}).status_code == 200
     answer = app.http.post("/v1/captures", headers={"Origin": "https://elsewhere.example"})
     assert answer.status_code == 201  # a page that knows the key
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://[", "http://[::1", "http://a]", f"http://a:{'9' * 5000}", "null", "//"]
+)
+def test_an_origin_that_cannot_be_read_is_refused_with_a_session_too(
+    app: ServedApp, ann: dict[str, Any], origin: str
+) -> None:
+    _, cookie = begin(app, ann["secret"])
+    answer = app.http.post("/v1/captures", json={}, headers=with_cookie(cookie, Origin=origin))
+    problem(answer, 403, "origin_not_allowed")

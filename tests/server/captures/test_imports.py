@@ -171,3 +171,26 @@ def test_the_import_into_a_deleted_capture_leaves_nothing(app: ServedApp, peer: 
     peer.answer = late
     begin(app, capture_id, f"{peer.url}/a.mp4")
     wait_for(lambda: stored(app) == [])
+
+
+def test_a_redirect_to_an_address_that_cannot_be_read_ends_the_import(
+    app: ServedApp, peer: ScriptedServer
+) -> None:
+    peer.answer = lambda _: Reply(status=302, headers={"Location": "http://xn--/"})
+    done = ended(app, begin(app, capture(app), f"{peer.url}/a.jpg"))
+    assert (done["state"], done["problem"]["code"], done["attempts"]) == ("failed", "url_refused", 1)
+    assert "'http://xn--/' is not an address" in done["problem"]["detail"]
+    assert len(peer.seen) == 1
+
+
+def test_an_error_that_nobody_expected_counts_as_an_attempt(
+    app: ServedApp, peer: ScriptedServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(_: object) -> None:
+        raise RecursionError
+
+    monkeypatch.setattr(imports, "_check", broken)
+    done = ended(app, begin(app, capture(app), f"{peer.url}/a.jpg"))
+    assert (done["state"], done["attempts"]) == ("failed", imports.MAX_ATTEMPTS)
+    assert "unexpected error (RecursionError)" in done["problem"]["detail"]
+    assert len(peer.seen) == imports.MAX_ATTEMPTS

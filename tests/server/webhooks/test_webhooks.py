@@ -8,6 +8,7 @@ import asyncio
 import itertools
 import json
 from collections.abc import AsyncIterator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -16,7 +17,10 @@ import pytest
 
 from splatmill import verify_webhook
 from splatmill.backplane import keys, layout, row
+from splatmill.backplane.storage import StorageFullError
 from splatmill.schema import Job, JobState, Problem, StateEvent
+from splatmill_server.leases import exclusive
+from splatmill_server.problems import ProblemError
 from splatmill_server.webhooks import deliveries
 from tests.support.scripted_server import Reply, ScriptedServer, Seen, scripted_server
 from tests.support.served_app import Serve, ServedApp, problem, stored
@@ -374,3 +378,89 @@ def test_old_deliveries_are_deleted_and_unreadable_records_harm_no_other(
     assert app.service.webhooks.delete_old() == 1
     assert log(app, made) == []
     assert json.loads(app.http.get("/v1/webhooks").text)["webhooks"] != []
+
+
+@pytest.mark.parametrize(
+    "wished", ["9" * 5000, "-1", "\u00b2", "Mon, 01 Jan 2024 00:00:00 +99999999999999999999"]
+)
+def test_a_pause_that_cannot_be_read_does_not_keep_an_attempt_from_being_counted(
+    app: ServedApp, peer: ScriptedServer, wished: str
+) -> None:
+    made = webhook(app, peer)
+    peer.answer = lambda _: Reply(status=503, headers={"Retry-After": wished})
+    ended(app)
+    [delivery] = over(app, made)
+    assert (delivery["state"], len(delivery["attempts"])) == ("failed", 4)
+    assert len(peer.seen) == 4
+
+
+def test_an_error_that_nobody_expected_counts_as_an_attempt(
+    app: ServedApp, peer: ScriptedServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = webhook(app, peer)
+
+    def broken(*_: object) -> str:
+        raise RecursionError
+
+    monkeypatch.setattr(deliveries, "sign", broken)
+    ended(app)
+    [delivery] = over(app, made)
+    assert (delivery["state"], len(delivery["attempts"])) == ("failed", 4)
+    assert "unexpected error (RecursionError)" in delivery["attempts"][0]["error"]
+
+
+def test_an_attempt_that_cannot_be_counted_is_not_made(app: ServedApp, peer: ScriptedServer) -> None:
+    """As on a full disk: it would be made again and again, with nobody to count."""
+    made = webhook(app, peer)
+    peer.answer = lambda _: Reply(status=503)
+    refusing = app.service.webhooks.storage.put
+    tried: list[str] = []
+
+    def full(path: str, data: bytes) -> None:
+        if path.startswith("webhooks/") and "/deliveries/" in path:
+            tried.append(path)
+            raise StorageFullError("The disk is full.")
+        refusing(path, data)
+
+    app.service.webhooks.storage.put = full  # type: ignore[assignment]  # a full disk
+    ended(app)
+    wait_for(lambda: len(tried) >= 3)
+    assert peer.seen == []
+    app.service.webhooks.storage.put = refusing  # type: ignore[method-assign]  # room again
+    [delivery] = over(app, made)
+    assert len(delivery["attempts"]) == len(peer.seen) == 4
+
+
+def test_of_two_changes_of_a_webhook_at_once_neither_is_lost(app: ServedApp, peer: ScriptedServer) -> None:
+    made = webhook(app, peer)
+    service = app.service.webhooks
+    with ThreadPoolExecutor(3) as pool:
+        with exclusive(app.redis, "webhook", made["id"]):
+            # The others wait, and read what is written here.
+            rotation = pool.submit(service.rotate, made["id"])
+            end = pool.submit(service.disable, made["id"], "gone")
+            wait_for(lambda: rotation.running() and end.running())
+            record = service.get(made["id"])
+            service._write(record.model_copy(update={"name": "renamed"}))
+            assert not rotation.done()
+            assert not end.done()
+        rotated = rotation.result(20)
+        end.result(20)
+    found = service.get(made["id"])
+    assert (found.name, found.disabled_reason) == ("renamed", "gone")
+    assert [secret.value for secret in found.secrets] == [rotated.secret, made["secret"]]
+
+
+def test_a_webhook_that_is_deleted_while_it_is_changed_stays_deleted(
+    app: ServedApp, peer: ScriptedServer
+) -> None:
+    made = webhook(app, peer)
+    service = app.service.webhooks
+    with ThreadPoolExecutor(1) as pool:
+        with exclusive(app.redis, "webhook", made["id"]):
+            change = pool.submit(service.enable, made["id"])
+            wait_for(change.running)
+            app.service.storage.delete(layout.webhook_record(made["id"]))
+        with pytest.raises(ProblemError, match="no webhook"):
+            change.result(20)
+    assert service.of_owner(None) == []

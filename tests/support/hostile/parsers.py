@@ -12,8 +12,14 @@ from functools import cache
 from pathlib import Path
 
 from hypothesis import strategies as st
+from starlette.datastructures import Headers
 
+from splatmill.schema.headers import read_retry_after
+from splatmill_server.access.browsers import check_origin
 from splatmill_server.answers.sse import Position
+from splatmill_server.outgoing import AddressRefused, Outgoing
+from splatmill_server.paging import read_cursor, write_cursor
+from splatmill_server.problems import ProblemError
 from splatmill_worker.splat.formats import registry
 from tests.support.gaussians import some_gaussians
 from tests.support.hostile import archives, models, pictures, videos
@@ -107,6 +113,39 @@ def _position(bench: Bench, data: bytes) -> str:
     return "not used" if position is None else "used"
 
 
+def _pause(bench: Bench, data: bytes) -> str:
+    seconds = read_retry_after(data.decode("latin-1"))
+    assert seconds is None or 0.0 <= seconds < 1e15
+    return "not used" if seconds is None else "used"
+
+
+def _cursor(bench: Bench, data: bytes) -> str:
+    try:
+        moment, _ = read_cursor(data.decode("latin-1"))
+    except ProblemError as error:
+        return error.problem.code
+    assert 0 <= moment < 10**15
+    return "used"
+
+
+def _address(bench: Bench, data: bytes) -> str:
+    try:
+        url = Outgoing().checked(data.decode("latin-1"))
+    except AddressRefused:
+        return "refused"
+    assert url.host
+    return "used"
+
+
+def _origin(bench: Bench, data: bytes) -> str:
+    headers = Headers({"host": "localhost", "origin": data.decode("latin-1")})
+    try:
+        check_origin({"method": "POST"}, headers, ["*.example.org"], required=True)
+    except ProblemError as error:
+        return error.problem.code
+    return "used"
+
+
 PARSERS: dict[str, Parser] = {
     "JPEG": _photo("photo.jpg", pictures.photo),
     "PNG": _photo("photo.png", lambda: pictures.encoded(pictures.noise(), "PNG")),
@@ -142,6 +181,10 @@ PARSERS: dict[str, Parser] = {
     ".sog": _start(".sog", lambda: _written(".sog")),
     ".glb": _start(".glb", lambda: _written(".glb")),
     "form": Parser(lambda: _FORM, mutations, _form),
+    "Retry-After": Parser(lambda: b"Mon, 01 Jan 2024 00:00:00 GMT", text_mutations, _pause),
+    "cursor": Parser(lambda: write_cursor(1_700_000_000_000, "0" * 16).encode(), text_mutations, _cursor),
+    "address": Parser(lambda: b"https://xn--bcher-kva.example:8443/a%20b.jpg?c", text_mutations, _address),
+    "Origin": Parser(lambda: b"https://a.example.org:8443", text_mutations, _origin),
     "Last-Event-ID": Parser(
         lambda: b"1700000000000-3_1700000000000-1_2_5-0_6-1_7-2", text_mutations, _position
     ),
