@@ -2,24 +2,33 @@
 
 A follower reads what came before by itself, once, and then waits here. It holds no connection to Redis: the reader
 holds one, whatever the number of followers and jobs, and decodes each event once.
+
+The reader's positions come from Redis alone. The position that a client sends bounds only what that client is sent.
 """
 
 import asyncio
 import heapq
+import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import redis
+import structlog
 from redis.asyncio import Redis as AsyncRedis
 
 from splatmill.backplane import events, keys
-from splatmill.backplane.events import StoredEvent
+from splatmill.backplane.events import START, StoredEvent, stream_order
+
+log = structlog.get_logger()
 
 BLOCK_MS = 250
 """Milliseconds that the reader waits for new entries, after which it reads the rows again and sees who else follows."""
+
+_CHECK_SECONDS = 5.0
+"""Seconds between two comparisons of the reader's positions with the ends of the streams."""
 
 _READS = 16
 """Number of followers that read what came before at once."""
@@ -99,6 +108,7 @@ class Feed:
         self._followed: dict[str, _Followed] = {}
         self._reading: asyncio.Task[None] | None = None
         self._turn = asyncio.Semaphore(_READS)
+        self._checked = time.monotonic()
 
     @property
     def followers(self) -> int:
@@ -130,28 +140,62 @@ class Feed:
 
         Raises redis.RedisError.
         """
-        job = self._followed[subscription.job_id]
+        name = subscription.job_id
+        job = self._followed[name]
         # What the reader has begun to read before this is either in this reply or comes by the feed.
         begun = job.entries is not None
         async with self._turn:
-            rows, positions = await self._read([subscription.job_id], {subscription.job_id: entries}, None)
-        batch = _batch(subscription.job_id, rows[0], positions, entries)
-        if not begun and job.entries is None:
-            job.entries, begun = list(batch.end), True
+            # Before the events: what is appended between the two replies comes after these ends.
+            ends = None if begun else (await self.ends([name]))[name]
+            rows, reply = await self._read([name], {name: entries}, None)
+        if ends is not None and job.entries is None:
+            job.entries, begun = _end(name, reply, ends), True
         if begun and self._reading is None:
             self._reading = asyncio.create_task(self._run())
-        return batch, begun
+        return _batch(name, rows[0], reply, entries), begun
+
+    async def ends(self, job_ids: Sequence[str]) -> dict[str, list[str]]:
+        """Return the last entry of each stream of these jobs, or START. Raises redis.RedisError."""
+        pipe = self._redis.pipeline(transaction=False)
+        for job_id in job_ids:
+            for stream in events.BOUNDS:
+                pipe.xrevrange(stream(job_id), count=1)
+        last = iter([reply[0][0].decode() if reply else START for reply in await pipe.execute()])
+        return {job_id: [next(last) for _ in events.BOUNDS] for job_id in job_ids}
 
     async def _run(self) -> None:
         try:
             while self._followed:
                 await self._pass_on()
+                if time.monotonic() - self._checked >= _CHECK_SECONDS:
+                    await self._check()
+                    self._checked = time.monotonic()
         except redis.RedisError as error:
-            for job in self._followed.values():
-                for subscription in job.subscriptions:
-                    subscription.fail(error)
+            self._fail(self._followed.values(), error)
+        except Exception as error:
+            log.exception("the events of jobs cannot be read")
+            self._fail(self._followed.values(), redis.RedisError(str(error)))
         finally:
             self._reading = None
+
+    async def _check(self) -> None:
+        """End the streams of jobs of which Redis has less than was read: it was restored, and its clock may be behind.
+
+        Their new entries may come before the position of the reader, which would never read them.
+        """
+        read = {name: job.entries for name, job in self._followed.items() if job.entries is not None}
+        ends = await self.ends(list(read)) if read else {}
+        for name, entries in read.items():
+            job = self._followed.get(name)
+            if job is not None and job.entries is entries and any(map(is_beyond, entries, ends[name])):
+                self._fail([job], redis.RedisError("Redis has lost entries of a stream."))
+
+    def _fail(self, jobs: Iterable[_Followed], error: redis.RedisError) -> None:
+        """End the streams of all who follow these jobs; clients come back, and the reader then begins anew."""
+        for job in jobs:
+            job.entries = job.row = None
+            for subscription in job.subscriptions:
+                subscription.fail(error)
 
     async def _pass_on(self) -> None:
         """Read what is new of all followed jobs, and pass it on."""
@@ -187,16 +231,26 @@ class Feed:
         return rows, {name.decode(): found for name, found in reply or []}
 
 
+def is_beyond(entry: str, end: str) -> bool:
+    """Return whether a position lies after the last entry of its stream; not if the stream has no entries."""
+    return end != START and stream_order(entry) > stream_order(end)
+
+
 def _batch(job_id: str, row: Row, reply: Mapping[str, Any], entries: Sequence[str]) -> Batch:
     """Return what a reply has of a job, read after these entries."""
-    streams = [stream(job_id) for stream in events.BOUNDS]
-    end = [
-        reply[name][-1][0].decode() if reply.get(name) else entry
-        for name, entry in zip(streams, entries, strict=True)
-    ]
     read = [
         [(stored, number) for stored in events.decode(reply.get(name, []), name)]
-        for number, name in enumerate(streams)
+        for number, name in enumerate(stream(job_id) for stream in events.BOUNDS)
     ]
     # The order within each stream is kept.
-    return Batch(row, list(heapq.merge(*read, key=lambda found: events.time_order(found[0]))), end)
+    found = list(heapq.merge(*read, key=lambda found: events.time_order(found[0])))
+    return Batch(row, found, _end(job_id, reply, entries))
+
+
+def _end(job_id: str, reply: Mapping[str, Any], entries: Sequence[str]) -> list[str]:
+    """Return the last entry of each stream in a reply; where it has none, the one in `entries`."""
+    names = [stream(job_id) for stream in events.BOUNDS]
+    return [
+        reply[name][-1][0].decode() if reply.get(name) else entry
+        for name, entry in zip(names, entries, strict=True)
+    ]

@@ -20,7 +20,7 @@ from splatmill.backplane.fold import Fold
 from splatmill.backplane.records import UnreadableRecord, warn
 from splatmill.backplane.row import JobRow
 from splatmill.schema import EventRecord, Job, JobState, StateEvent, Time
-from splatmill_server.feed import Batch, Row
+from splatmill_server.feed import Batch, Row, is_beyond
 from splatmill_server.service import Service
 
 _ENTRY = r"\d{1,19}-\d{1,19}"
@@ -80,9 +80,22 @@ class Follower:
         self.position = position
 
     async def begin(self, row: JobRow) -> bool:
-        """Apply the events that the client has already seen; return False if the job had ended by then."""
+        """Apply the events that the client has already seen; return False if the job had ended by then.
+
+        A position beyond the end of a stream was never issued by this Redis, or Redis was restored from an older copy.
+        What the client has seen is then unknown, so that it is sent everything from the first event on.
+        """
         self.fold = Fold(row)
         self._stored: Row = {}
+        ends = (await self.feed.ends([self.job_id]))[self.job_id]
+        if self.position.row_events > 2 * row.generation + 1 or any(
+            map(is_beyond, self.position.entries, ends)
+        ):
+            self.position = Position()
+        # A stream without entries was deleted when the job had ended; what a restart appends is new to everybody.
+        self.position.entries = [
+            START if end == START else entry for entry, end in zip(self.position.entries, ends, strict=True)
+        ]
         if self.position.states != START:
             seen = await cast(Any, self.redis.xrange(keys.states(self.job_id), max=self.position.states))
             for stored in events.decode(seen, keys.states(self.job_id)):
@@ -140,8 +153,8 @@ class Follower:
         ]
         if self.fold.final:
             return
-        verdict = row.verdict
-        if verdict is not None and stream_order(self.position.states) >= stream_order(verdict.after):
+        # The row was read before the events, so that all up to its verdict were among them.
+        if (verdict := row.verdict) is not None:
             event = StateEvent(state=JobState(verdict.state), problem=verdict.problem)
             yield self._row_event(2 * row.generation + 1, verdict.at, event)
             return

@@ -12,6 +12,7 @@ import pytest
 
 from splatmill.backplane import events, keys
 from splatmill.schema import JobState, LogEvent, MetricEvent, PlanEvent, Problem, ProgressEvent, StateEvent
+from splatmill_server.jobs.shrinking import shrink
 from tests.support.served_app import Serve, ServedApp, problem
 from tests.support.server_events import brief, follow, messages
 
@@ -95,6 +96,19 @@ def test_what_a_superseded_attempt_still_says_is_not_told(app: ServedApp) -> Non
     app.say(job_id, ProgressEvent(stage="training", done=7), StateEvent(state=JobState.succeeded))
     found = follow(app, job_id)
     assert brief(found) == ["queued", "preparing", "preparing", 7, "succeeded"]
+
+
+def test_a_cancelled_job_whose_last_state_did_not_count_still_ends_its_stream(app: ServedApp) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.begin(job_id)
+    app.say(job_id, StateEvent(state=JobState.sfm), attempt=1)
+    app.http.post(f"/v1/jobs/{job_id}/cancel")
+    app.service.reaper.tick()
+    shrink(app.redis, job_id)
+    found = follow(app, job_id)
+    assert brief(found) == ["queued", "preparing", "preparing", "cancelled"]
+    assert follow(app, job_id, found[-1]["id"]) == []
 
 
 def test_a_restarted_job_goes_on_after_the_last_id(app: ServedApp) -> None:

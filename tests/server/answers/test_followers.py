@@ -1,5 +1,7 @@
 """Many who follow the events of jobs: each is told everything once, and all of them share one connection to Redis.
 
+What one of them sends as its position changes nothing for the others, and neither does a Redis that was restored.
+
 Not proved here: a thousand of them, and seconds (`splatmill bench capacity` measures both).
 """
 
@@ -25,8 +27,13 @@ FOLLOWERS = 150
 """More than an asyncio client of redis has connections by default."""
 
 
-async def _follow(http: httpx.AsyncClient, job_id: str) -> list[dict[str, Any]]:
-    async with http.stream("GET", f"/v1/jobs/{job_id}/events") as answer:
+FAR = "9999999999999999999-0"
+"""An entry's id that no stream reaches."""
+
+
+async def _follow(http: httpx.AsyncClient, job_id: str, after: str | None = None) -> list[dict[str, Any]]:
+    headers = {"Last-Event-ID": after} if after is not None else {}
+    async with http.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers) as answer:
         assert answer.status_code == 200
         return [
             json.loads(line.removeprefix("data: "))
@@ -35,12 +42,21 @@ async def _follow(http: httpx.AsyncClient, job_id: str) -> list[dict[str, Any]]:
         ]
 
 
-async def followed(app: ServedApp, job_ids: Sequence[str], act: Any) -> list[list[dict[str, Any]]]:
-    """What followers of these jobs are told, while `act` runs in a thread once all of them are there."""
+async def followed(
+    app: ServedApp, job_ids: Sequence[str], act: Any, after: Sequence[str | None] | None = None
+) -> list[list[dict[str, Any]]]:
+    """What followers of these jobs are told, while `act` runs in a thread once all of them are there.
+
+    after: the `Last-Event-ID` of each; they come one after another, in this order.
+    """
     limits = httpx.Limits(max_connections=None)
     base = str(app.http.base_url)
     async with httpx.AsyncClient(base_url=base, limits=limits, timeout=60, trust_env=False) as http:
-        tasks = [asyncio.create_task(_follow(http, job_id)) for job_id in job_ids]
+        tasks: list[asyncio.Task[list[dict[str, Any]]]] = []
+        for number, job_id in enumerate(job_ids):
+            tasks.append(asyncio.create_task(_follow(http, job_id, after[number] if after else None)))
+            if after:
+                await asyncio.to_thread(wait_for, lambda: app.service.feed.followers == len(tasks), 30)
         await asyncio.to_thread(wait_for, lambda: app.service.feed.followers == len(job_ids), 30)
         await asyncio.to_thread(act)
         return await asyncio.gather(*tasks)
@@ -157,3 +173,73 @@ def test_a_follower_that_is_too_slow_reads_again_what_it_has_missed(
         await client.aclose()
 
     asyncio.run(slow())
+
+
+@pytest.mark.parametrize(
+    "after", [f"{FAR}_{FAR}_1", "_".join([FAR, FAR, "1", FAR, FAR, FAR]), f"0-0_{FAR}_1", "0-0_0-0_999999999"]
+)
+def test_a_position_beyond_the_end_concerns_nobody_else_and_misses_nothing(
+    app: ServedApp, after: str
+) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.say(job_id, ProgressEvent(stage="training", done=1), LogEvent(message="early"))
+
+    def act() -> None:
+        app.say(job_id, ProgressEvent(stage="training", done=2), LogEvent(message="late"))
+        app.say(job_id, StateEvent(state=JobState.succeeded))
+
+    found = asyncio.run(followed(app, [job_id] * 3, act, [after, None, after]))
+    expected = ["queued", "preparing", 1, "log", 2, "log", "succeeded"]
+    assert [brief(told) for told in found] == [expected] * 3
+
+
+def test_followers_hear_of_a_redis_that_was_restored_with_an_older_clock(
+    app: ServedApp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feed, "_CHECK_SECONDS", 0.1)
+    job_id = app.job()
+    app.begin(job_id)
+    app.say(job_id, LogEvent(message="before"), ProgressEvent(stage="training", done=1))
+    last: list[str] = []
+
+    def restored() -> None:
+        """The streams as an older copy has them, with entries whose ids are lower than those that were told."""
+        for stream in (keys.states, keys.log, keys.progress):
+            entries: Any = app.redis.xrange(stream(job_id))
+            app.redis.delete(stream(job_id))
+            for number, (_, fields) in enumerate(entries):
+                app.redis.xadd(stream(job_id), fields, id=f"{1000 + number}-0")
+
+    # The streams of those who follow end, so that they come back.
+    found = asyncio.run(followed(app, [job_id] * 2, restored))
+    assert [brief(told)[:2] for told in found] == [["queued", "preparing"]] * 2
+    assert [len(told) for told in found] == [4, 4]
+    last.append(found[0][-1]["id"])
+
+    def act() -> None:
+        fields: Any = {"g": 1, "a": 1, "e": StateEvent(state=JobState.succeeded).model_dump_json()}
+        app.redis.xadd(keys.states(job_id), fields, id="2000-0")
+
+    found = asyncio.run(followed(app, [job_id] * 2, act, [last[0], None]))
+    assert [brief(told)[0] for told in found] == ["queued"] * 2
+    assert [brief(told)[-1] for told in found] == ["succeeded"] * 2
+    assert [len(told) for told in found] == [5, 5]
+
+
+def test_a_reader_that_cannot_go_on_ends_the_streams(app: ServedApp, monkeypatch: pytest.MonkeyPatch) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+
+    async def broken() -> None:
+        raise ValueError("whatever is raised must not leave clients in silence")
+
+    def act() -> None:
+        monkeypatch.setattr(app.service.feed, "_pass_on", broken)
+        app.say(job_id, LogEvent(message="after"))
+
+    found = asyncio.run(followed(app, [job_id] * 2, act))
+    assert [brief(told)[:2] for told in found] == [["queued", "preparing"]] * 2
+    monkeypatch.undo()
+    app.say(job_id, StateEvent(state=JobState.failed))
+    assert brief(follow(app, job_id)) == ["queued", "preparing", "log", "failed"]

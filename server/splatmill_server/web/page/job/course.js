@@ -86,6 +86,8 @@ export class Course {
         this.plan = event.plan;
         break;
       case "log":
+        // After a restore of its Redis, the server sends lines again.
+        if (this.lines.some((line) => line.at === at && line.message === event.message)) break;
         this.lines.push({ at, level: event.level ?? "info", message: event.message });
         this.logged += 1;
         if (this.lines.length > MOST_LINES) this.lines.shift();
