@@ -36,6 +36,9 @@ from splatmill_server.captures.records import (
 from splatmill_server.captures.unfinished_uploads import UnfinishedUploads
 from splatmill_server.problems import ProblemError, problem_of_storage
 
+_Key = tuple[str, str]
+"""Ids of a capture and of an upload. The id of an upload alone is the same in every capture that gets the same file."""
+
 
 class UploadRecord(Response):
     """What an upload will be. `stored` is the file that it became, once it is complete."""
@@ -73,8 +76,8 @@ class PartialUploads:
         # Per upload, a lock around each block, and the request that may append. A later request takes over, since a
         # client that comes back has given up its earlier request, which may hang in a dead connection. Other processes
         # are held off by `Part.append`.
-        self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
-        self._writers: dict[str, object] = {}
+        self._locks: WeakValueDictionary[_Key, asyncio.Lock] = WeakValueDictionary()
+        self._writers: dict[_Key, object] = {}
         self._unfinished = UnfinishedUploads(storage, self._is_complete)
 
     async def create(
@@ -117,8 +120,9 @@ class PartialUploads:
     async def standing(self, capture_id: str, upload_id: str) -> Standing:
         """Return how far an upload is, and end requests that still append to it. Raises a 404 problem."""
         record = await run_in_threadpool(self._existing, capture_id, upload_id)
-        async with _named(record.path), self._lock(upload_id):
-            self._writers.pop(upload_id, None)
+        key = (capture_id, upload_id)
+        async with _named(record.path), self._lock(key):
+            self._writers.pop(key, None)
             record = await run_in_threadpool(self._existing, capture_id, upload_id)
             return await run_in_threadpool(self._standing, capture_id, record)
 
@@ -156,8 +160,8 @@ class PartialUploads:
         record = await run_in_threadpool(self._existing, capture_id, upload_id)
         async with _named(record.path):
             part = open_part(self.storage, capture_id, upload_id)
-            me = object()
-            async with self._lock(upload_id):
+            me, key = object(), (capture_id, upload_id)
+            async with self._lock(key):
                 record = await run_in_threadpool(self._existing, capture_id, upload_id)
                 held = (await run_in_threadpool(self._standing, capture_id, record)).offset
                 if record.stored is not None:
@@ -167,35 +171,36 @@ class PartialUploads:
                 record = await run_in_threadpool(
                     self._with_length, capture_id, record, offset, length, body_size, complete
                 )
-                self._writers[upload_id] = me
+                self._writers[key] = me
             try:
-                end = await self._append_all(upload_id, part, chunks, me, offset, record.length)
+                end = await self._append_all(key, part, chunks, me, offset, record.length)
                 if not complete:
                     return Standing(record, end, STALE_SECONDS), None, False
                 if record.length is not None and end != record.length:
                     raise _wrong_length(record.length, end, offset=end)
-                async with self._lock(upload_id):
-                    if self._writers.get(upload_id) is not me:
+                async with self._lock(key):
+                    if self._writers.get(key) is not me:
                         raise _superseded(end)
                     file, new = await self._complete(capture_id, record, part)
                 return Standing(record, file.size, STALE_SECONDS), file, new
             except FileNotFoundError:
                 raise await run_in_threadpool(self._gone, capture_id, upload_id) from None
             finally:
-                if self._writers.get(upload_id) is me:
-                    del self._writers[upload_id]
+                if self._writers.get(key) is me:
+                    del self._writers[key]
                 await run_in_threadpool(self._tidy, capture_id)
 
     async def cancel(self, capture_id: str, upload_id: str) -> None:
         """Delete an upload and its bytes; a file that it has become stays. Raises a 404 problem."""
         await run_in_threadpool(self._existing, capture_id, upload_id)
-        async with self._lock(upload_id):
-            self._writers.pop(upload_id, None)
+        key = (capture_id, upload_id)
+        async with self._lock(key):
+            self._writers.pop(key, None)
             await run_in_threadpool(self._delete, capture_id, upload_id)
 
     async def _append_all(
         self,
-        upload_id: str,
+        key: _Key,
         part: Part,
         chunks: AsyncIterator[bytes],
         me: object,
@@ -208,8 +213,8 @@ class PartialUploads:
 
         async def write() -> None:
             nonlocal end
-            async with self._lock(upload_id):
-                if self._writers.get(upload_id) is not me:
+            async with self._lock(key):
+                if self._writers.get(key) is not me:
                     block.clear()
                     raise _superseded(end)
                 end = await run_in_threadpool(part.append, end, bytes(block))
@@ -284,8 +289,8 @@ class PartialUploads:
         self.captures.check_room(capture_id, needed, offset)
         return record
 
-    def _lock(self, upload_id: str) -> asyncio.Lock:
-        return self._locks.setdefault(upload_id, asyncio.Lock())
+    def _lock(self, key: _Key) -> asyncio.Lock:
+        return self._locks.setdefault(key, asyncio.Lock())
 
     def _tidy(self, capture_id: str) -> None:
         """Delete what was written into a capture that was deleted meanwhile. Raises its 404 problem."""

@@ -67,8 +67,9 @@ class Captures:
         """Whether a capture was made, or may have been, and is not listed."""
         self.digests = Digests(storage)
         self._recent: dict[str, tuple[float, Capture]] = {}
-        # Number of files per capture, as last seen: listing the folder at each upload would take quadratic time.
-        self._counts: dict[str, int] = {}
+        # Number of files per capture, as last seen: listing the folder at each upload would take quadratic time. The
+        # time of its creation tells a capture from a deleted one that had its id, maybe deleted by another process.
+        self._counts: dict[tuple[str, datetime], int] = {}
 
     def create(self, name: str | None = None, *, owner: str, key: str | None = None) -> tuple[Capture, bool]:
         """Create an empty capture; return its record, and whether it is new.
@@ -225,7 +226,6 @@ class Captures:
         self._recent.pop(capture_id, None)
         self.storage.delete(layout.capture_record(capture_id))
         self.storage.delete_prefix(layout.capture(capture_id))
-        self._counts.pop(capture_id, None)
         self._recent.pop(capture_id, None)
         self.unlist(capture_id, owner)
 
@@ -383,10 +383,12 @@ class Captures:
             self._recent.pop(capture_id, None)
             self.storage.delete_prefix(layout.capture(capture_id))
             raise capture_not_found(capture_id)
-        self.digests.remember(self.recent(capture_id), file)
+        capture = self.recent(capture_id)
+        self.digests.remember(capture, file)
         self.metrics.uploaded.inc(file.size)
         self.metrics.files.inc()
-        self._counts[capture_id] = self._counts.get(capture_id, 0) + 1
+        counted = (capture_id, capture.created_at)
+        self._counts[counted] = self._counts.get(counted, 0) + 1
 
     def _in_the_way(self, capture_id: str, role: Role, name: str) -> str | None:
         """Return the name of a stored file that lies above `name` in the folders, or below it."""
@@ -403,13 +405,13 @@ class Captures:
         A file may be larger than the limit (413), or than what the disk has left (507). `held` is the number of its
         bytes that are stored already.
         """
-        self.recent(capture_id)
+        counted = (capture_id, self.recent(capture_id).created_at)
         limit = self.settings.max_files_per_capture
-        if capture_id not in self._counts:
+        if counted not in self._counts:
             if len(self._counts) >= _COUNTED_CAPTURES:
                 self._counts.clear()
-            self._counts[capture_id] = sum(1 for _ in self.storage.entries(layout.capture_files(capture_id)))
-        if self._counts[capture_id] >= limit:
+            self._counts[counted] = sum(1 for _ in self.storage.entries(layout.capture_files(capture_id)))
+        if self._counts[counted] >= limit:
             raise ProblemError(
                 "body_too_large",
                 f"The capture already holds {limit} files, and no more are accepted.",

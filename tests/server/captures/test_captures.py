@@ -19,6 +19,7 @@ import pytest
 
 from splatmill.backplane import layout
 from splatmill.schema import Role
+from splatmill_server.captures import records
 from tests.support.served_app import Serve, ServedApp, problem, raw, stored
 from tests.support.waiting import wait_for
 
@@ -321,3 +322,18 @@ def test_a_key_gives_no_capture_that_is_being_deleted(app: ServedApp) -> None:
     app.service.storage.delete_prefix(layout.capture(first))
     again = app.http.post("/v1/captures", json=body)
     assert (again.status_code, again.json()["id"]) == (200, second.json()["id"])
+
+
+def test_files_of_a_deleted_capture_do_not_count_for_one_with_its_id(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(records, "_RECENT_SECONDS", 0.0)
+    first, second = (serve(max_files_per_capture=1) for _ in range(2))
+    key = {"key": "once"}
+    made = [first.http.post("/v1/captures", json=key).json()["id"]]
+    assert second.http.put(f"/v1/captures/{made[0]}/images/a.jpg", content=b"a").status_code == 201
+    problem(second.http.put(f"/v1/captures/{made[0]}/images/b.jpg", content=b"b"), 413, "body_too_large")
+    assert first.http.delete(f"/v1/captures/{made[0]}").status_code == 204
+    made.append(first.http.post("/v1/captures", json=key).json()["id"])
+    assert made[0] == made[1]
+    assert second.http.put(f"/v1/captures/{made[1]}/images/a.jpg", content=b"a").status_code == 201

@@ -189,13 +189,44 @@ def test_a_later_request_takes_over_from_one_that_hangs(app: ServedApp) -> None:
         assert append(app, address, at, DATA[at:2_000_000]).status_code == 204
         # What the earlier request still brings is refused, and its connection learns why.
         hanging.sendall(b"\0" * (len(DATA) - 1_000_000))
-        answer = b""
-        while b"}" not in answer and (more := hanging.recv(65536)):
-            answer += more
+        answer = _answer(hanging)
         assert b"409" in answer.split(b"\r\n")[0]
         assert b"upload_offset_differs" in answer
     assert append(app, address, 2_000_000, DATA[2_000_000:], complete=True).status_code == 201
     assert file_of(app, capture_id) == DATA
+
+
+def test_two_captures_receive_the_same_file_at_once(app: ServedApp) -> None:
+    addresses = [begin(app, capture(app)).headers["location"] for _ in range(2)]
+    assert addresses[0].split("/")[5] == addresses[1].split("/")[5]  # the id follows from the file alone
+    links = [socket.create_connection(app.address, 10) for _ in addresses]
+    try:
+        for address, link in zip(addresses, links, strict=True):
+            head = (
+                f"PATCH {address} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(DATA)}\r\nUpload-Offset: 0\r\n"
+                "Upload-Complete: ?1\r\nContent-Type: application/partial-upload\r\n\r\n"
+            )
+            link.sendall(head.encode() + DATA[:1_500_000])
+        wait_for(lambda: len(app.service.partial_uploads._writers) == 2)
+        # Neither the end of one upload nor its cancellation concerns the other one.
+        links[1].sendall(DATA[1_500_000:])
+        assert _answer(links[1]).startswith(b"HTTP/1.1 201")
+        other = begin(app, capture(app)).headers["location"]
+        assert offset(app, other) == 0
+        assert app.http.delete(other).status_code == 204
+        links[0].sendall(DATA[1_500_000:])
+        assert _answer(links[0]).startswith(b"HTTP/1.1 201")
+    finally:
+        for link in links:
+            link.close()
+    assert [file_of(app, address.split("/")[3]) for address in addresses] == [DATA] * 2
+
+
+def _answer(link: socket.socket) -> bytes:
+    answer = b""
+    while b"}" not in answer and (more := link.recv(65536)):
+        answer += more
+    return answer
 
 
 def test_of_two_writers_at_the_same_offset_one_wins_and_bytes_are_never_mixed(
