@@ -68,6 +68,16 @@ def exclusive(connection: redis.Redis, kind: str, name: str) -> Iterator[None]:
             lock.release()
 
 
+async def keep_for(connection: redis.Redis, kind: str, name: str, seconds: float) -> None:
+    """Let nobody work on a thing for some seconds, at most SECONDS. Called while its lease is held.
+
+    Raises redis.RedisError.
+    """
+    milliseconds = max(1, min(round(seconds * 1000), SECONDS * 1000))
+    # With another value than the token of the lease, which its end therefore leaves.
+    await run_in_threadpool(lambda: connection.set(keys.lease(kind, name), "pause", px=milliseconds))
+
+
 async def _renew(connection: redis.Redis, key: str, token: str) -> None:
     while True:
         await asyncio.sleep(SECONDS / 3)

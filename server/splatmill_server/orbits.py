@@ -5,7 +5,6 @@ with the first frame that is not stored. Its id follows from the model and the r
 the same video.
 """
 
-import asyncio
 import hashlib
 import json
 from datetime import UTC, datetime
@@ -35,6 +34,7 @@ from splatmill_server.models import Models
 from splatmill_server.problems import ProblemError
 from splatmill_server.renderer import no_renderer, post
 from splatmill_server.space.quota import RECORD_BYTES, Quota
+from splatmill_server.turns import Turns
 from splatmill_server.unfinished import Unfinished
 
 log = structlog.get_logger()
@@ -98,15 +98,17 @@ class Orbits:
         self._renderer = renderer
         self._quota = quota
         self._seconds = seconds
-        self._asking: dict[str, asyncio.Task[None]] = {}
+        self._failures: dict[str, int] = {}
+        """By the name of a mark, the times in a row that the renderer was asked for the same part and failed."""
         self.unfinished = Unfinished(
             connection,
             storage,
             "orbit",
             layout.unfinished_orbits(),
             self._work,
-            at_once=_AT_ONCE,
-            of_line=1,
+            line=lambda name: name.partition(".")[0],
+            exists=self._exists,
+            turns=Turns(_AT_ONCE, 1),
             look_seconds=_LOOK_SECONDS,
         )
 
@@ -202,8 +204,8 @@ class Orbits:
     async def delete(self, model_id: str, orbit_id: str) -> None:
         """Delete an orbit video. One that is not whole is not rendered any further. Raises the problems of `get`."""
         name = await run_in_threadpool(self._forget, model_id, orbit_id)
-        if (asking := self._asking.get(name)) is not None:
-            asking.cancel()
+        self._failures.pop(name, None)
+        self.unfinished.cancel(name.__eq__)
 
     def _forget(self, model_id: str, orbit_id: str) -> str:
         self.get(model_id, orbit_id)
@@ -218,20 +220,25 @@ class Orbits:
         if self._renderer is not None:
             await self.unfinished.run()
 
-    async def _work(self, name: str) -> None:
-        """Have an orbit video rendered to its end."""
+    def _exists(self, name: str) -> bool:
+        """Return whether an orbit video is to be rendered: neither it nor its model was deleted."""
+        marked = self._storage.exists(f"{layout.unfinished_orbits()}/{name}")
+        return marked and self._storage.exists(layout.job_record(name.split(".")[1]))
+
+    async def _work(self, name: str) -> float | None:
+        """Have an orbit video rendered to its end, or return the seconds after which the renderer is asked again."""
         _, model_id, orbit_id = name.split(".")
-        attempts = 0
+        failures = self._failures.pop(name, 0)
         while (found := await run_in_threadpool(self._read, model_id, orbit_id)) and not found.state.final:
             try:
                 after = await self._next(name, found)
-                attempts = 0
+                failures = 0
             except _Delayed as delay:
-                attempts += delay.counts
+                failures += delay.counts
                 log.info("an orbit video waits", model=model_id, id=orbit_id, reason=str(delay))
-                if attempts < MAX_ATTEMPTS:
-                    await asyncio.sleep(_PAUSE_SECONDS)
-                    continue
+                if failures < MAX_ATTEMPTS:
+                    self._failures[name] = failures
+                    return _PAUSE_SECONDS
                 after = _failed(found, delay.problem)
             except ProblemError as error:
                 after = _failed(found, error.problem)
@@ -249,6 +256,7 @@ class Orbits:
         elif found.state is OrbitState.succeeded:
             await run_in_threadpool(self._storage.delete_prefix, layout.orbit_frames(model_id, orbit_id))
         await run_in_threadpool(self._storage.delete, f"{layout.unfinished_orbits()}/{name}")
+        return None
 
     async def _next(self, name: str, found: Orbit) -> Orbit | None:
         """Have the next part rendered, or the video made of all, and return the record; None if it was deleted."""
@@ -257,13 +265,11 @@ class Orbits:
             count = min(_part_frames(found.request), found.frames - first)
             body = OrbitFrames(orbit=found.request, first=first, count=count)
             path = layout.orbit_frames(model_id, found.id, first)
-            if not await self._asked(name, rendering.orbit_frames_path(model_id), body, path):
-                return None
+            await self._ask(name, rendering.orbit_frames_path(model_id), body, path)
             return found.model_copy(update={"state": OrbitState.running, "frames_done": first + count})
         path = layout.orbit_video(model_id, found.id)
         whole = JoinOrbit(orbit=found.id, frames=found.frames)
-        if not await self._asked(name, rendering.orbit_join_path(model_id), whole, path):
-            return None
+        await self._ask(name, rendering.orbit_join_path(model_id), whole, path)
         entry = await run_in_threadpool(self._storage.head, path)
         if entry is None:
             return None
@@ -271,21 +277,8 @@ class Orbits:
             update={"state": OrbitState.succeeded, "bytes": entry.size, "finished_at": datetime.now(UTC)}
         )
 
-    async def _asked(self, name: str, address: str, body: BaseModel, path: str) -> bool:
-        """Store what the renderer answers at `path`. Return False if the video was deleted meanwhile."""
-        task = self._asking[name] = asyncio.create_task(self._ask(name, address, body, path))
-        try:
-            await asyncio.wait({task})
-        finally:
-            self._asking.pop(name, None)
-            task.cancel()
-            await asyncio.wait({task})
-        if task.cancelled():
-            return False
-        task.result()
-        return True
-
     async def _ask(self, name: str, address: str, body: BaseModel, path: str) -> None:
+        """Store what the renderer answers at `path`."""
         # Owners take turns in the renderer, and the videos of an owner with the views that its people look at.
         headers = {rendering.CLIENT_HEADER: f"orbits of {name.partition('.')[0]}"}
         try:

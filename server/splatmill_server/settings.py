@@ -98,6 +98,12 @@ class Settings(BaseSettings):
     import_seconds: float = Field(
         default=6 * 3600, gt=0, description="Seconds that the import of a file may take."
     )
+    min_import_rate: ByteSize = Field(
+        default=10_000,
+        ge=0,
+        description="Least bytes per second of an import, over each minute of waiting for the other server. A slower "
+        "one fails. 0 admits any rate.",
+    )
 
     quota: ByteSize | None = Field(
         default=None,

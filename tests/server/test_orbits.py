@@ -144,7 +144,7 @@ def test_a_video_that_is_deleted_is_not_rendered_any_further(
     renderer.send_signal(signal.SIGSTOP)
     try:
         made = begun(app)
-        wait_for(lambda: bool(app.service.orbits._asking))
+        wait_for(lambda: bool(app.service.orbits.unfinished._working))
         found = problem(app.http.get(made["links"]["video"]), 409, "orbit_not_ready")
         assert found["facts"]["frames"] == 10
         assert app.http.delete(f"{ORBITS}/{made['id']}").status_code == 204
@@ -243,7 +243,7 @@ def test_the_video_of_a_deleted_model_leaves_nothing(
     renderer.send_signal(signal.SIGSTOP)
     try:
         begun(app)
-        wait_for(lambda: bool(app.service.orbits._asking))
+        wait_for(lambda: bool(app.service.orbits.unfinished._working))
         app.service.storage.delete_prefix(layout.model(MODEL))
     finally:
         renderer.send_signal(signal.SIGCONT)
@@ -333,7 +333,7 @@ def test_the_command_shows_progress_and_an_interrupt_cancels_the_video(
     renderer.send_signal(signal.SIGSTOP)
     try:
         command = spawn("orbit", MODEL, "-o", tmp_path / "never.mp4", *server)
-        wait_for(lambda: bool(app.service.orbits._asking))
+        wait_for(lambda: bool(app.service.orbits.unfinished._working))
         # It has heard of its video once it shows how far that is.
         assert command.stdout is not None
         assert "rendering  0/144" in command.stdout.readline()

@@ -20,12 +20,17 @@ class Seen:
 
 @dataclass
 class Reply:
-    """A response. `cut`: number of bytes that are announced but not sent, because the connection is closed."""
+    """A response.
+
+    cut: number of bytes that are announced but not sent, because the connection is closed.
+    pace: seconds before each byte of the body; 0 sends it at once.
+    """
 
     status: int = 200
     body: bytes = b"{}"
     headers: dict[str, str] = field(default_factory=dict)
     cut: int = 0
+    pace: float = 0.0
     dropped: bool = False  # close the connection without a response
 
     def encode(self) -> bytes:
@@ -39,10 +44,14 @@ class Reply:
 
 @dataclass
 class ScriptedServer:
-    """The server: `answer` makes the response to a request, `seen` are the requests so far."""
+    """The server: `answer` makes the response to a request, `seen` are the requests so far.
+
+    left: number of clients that closed their connection before the whole response was sent.
+    """
 
     url: str = ""
     seen: list[Seen] = field(default_factory=list)
+    left: int = 0
     answer: Callable[[Seen], Reply | Awaitable[Reply]] = lambda _: Reply()
 
     def script(self, *replies: Reply) -> None:
@@ -58,10 +67,19 @@ class ScriptedServer:
         body = await reader.readexactly(int(headers.get("content-length", 0)))
         request = Seen(method, path, headers, body)
         self.seen.append(request)
-        reply = self.answer(request)
+        answer = self.answer(request)
         try:
-            writer.write((await reply if isinstance(reply, Awaitable) else reply).encode())
+            reply = await answer if isinstance(answer, Awaitable) else answer
+            whole = reply.encode()
+            begin = whole.index(b"\r\n\r\n") + 4 if reply.pace else len(whole)
+            writer.write(whole[:begin])
             await writer.drain()
+            for byte in whole[begin:]:
+                await asyncio.sleep(reply.pace)
+                writer.write(bytes([byte]))
+                await writer.drain()
+        except ConnectionError:
+            self.left += 1
         finally:
             writer.close()
 

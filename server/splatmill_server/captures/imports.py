@@ -2,6 +2,9 @@
 
 An import is a record in storage and a mark that it has not ended, so it survives a restart: any API process takes up
 marked imports, under a lease in Redis. A file is always fetched from its beginning, and stored as an upload is.
+
+Owners take turns. An import fails if the other server does not answer or sends too slowly, holds up no other import
+between two attempts, and ends with its capture.
 """
 
 import asyncio
@@ -9,6 +12,7 @@ import json
 import secrets
 import time
 from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack
 from datetime import UTC, datetime
 from urllib.parse import unquote
 
@@ -18,14 +22,24 @@ import structlog
 from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane import layout
-from splatmill.backplane.records import FORMAT, warn
+from splatmill.backplane.records import FORMAT, UnreadableRecord, warn
 from splatmill.backplane.storage import Storage, StorageError
-from splatmill.schema import CreateImport, Import, ImportState, Problem, UnsafeName, safe_name
+from splatmill.schema import (
+    DEFAULT_OWNER,
+    CreateImport,
+    Import,
+    ImportState,
+    Problem,
+    UnsafeName,
+    safe_name,
+)
 from splatmill_server.captures.records import Captures
+from splatmill_server.least_rate import TooSlow, at_least
 from splatmill_server.outgoing import AddressRefused, Answer, NoAnswer, Outgoing
 from splatmill_server.problems import ProblemError, problem_of_storage
 from splatmill_server.settings import Settings
 from splatmill_server.space.quota import Quota, bytes_beside
+from splatmill_server.turns import Turns
 from splatmill_server.unfinished import Unfinished
 
 log = structlog.get_logger()
@@ -35,8 +49,15 @@ MAX_ATTEMPTS = 4
 MAX_UNFINISHED = 100
 """Imports of one capture that may be unfinished at once."""
 
-_CONCURRENT = 4
-"""Imports that one API process runs at once."""
+MAX_OF_OWNER = 500
+"""Imports of one owner that may be unfinished at once."""
+
+_CONCURRENT = 8
+_CONCURRENT_EACH = 3
+"""Imports that one API process runs at once, in all and of one owner. Each holds some blocks of its file in memory."""
+
+_ANSWER_SECONDS = 60.0
+"""Seconds until the other server must have begun to send the file, redirects included."""
 
 _LOOK_SECONDS = 15.0
 """Seconds between two looks for imports that another process has left."""
@@ -71,9 +92,13 @@ class Imports:
             "import",
             layout.unfinished_imports(),
             self._work,
-            at_once=_CONCURRENT,
-            of_line=_CONCURRENT,
+            line=self._owner,
+            exists=self._exists,
+            turns=Turns(_CONCURRENT, _CONCURRENT_EACH),
             look_seconds=_LOOK_SECONDS,
+        )
+        captures.on_delete.append(
+            lambda capture_id: self.unfinished.cancel(lambda name: name.startswith(f"{capture_id}."))
         )
 
     async def create(self, capture_id: str, request: CreateImport) -> Import:
@@ -102,15 +127,21 @@ class Imports:
 
     def _accept(self, made: Import) -> None:
         self.captures.check_room(made.capture, None)
-        marks = self.storage.entries(layout.unfinished_imports())
-        if sum(entry.path.split("/")[-1].startswith(made.capture) for entry in marks) >= MAX_UNFINISHED:
-            raise ProblemError(
-                "too_many_requests",
-                f"The capture has {MAX_UNFINISHED} imports that have not ended.",
-                advice="Wait until some have ended, or import one zip archive in place of many files.",
-            )
+        marks = [entry.path.split("/")[-1] for entry in self.storage.entries(layout.unfinished_imports())]
+        mark = layout.unfinished_import(made.capture, made.id)
+        owner = self.unfinished.line_of(mark.split("/")[-1])
+        for count, most, whose in (
+            (sum(name.startswith(f"{made.capture}.") for name in marks), MAX_UNFINISHED, "The capture"),
+            (sum(self.unfinished.line_of(name) == owner for name in marks), MAX_OF_OWNER, "The owner"),
+        ):
+            if count >= most:
+                raise ProblemError(
+                    "too_many_requests",
+                    f"{whose} has {most} imports that have not ended.",
+                    advice="Wait until some have ended, or import one zip archive in place of many files.",
+                )
         self._write(made)
-        self.storage.put(layout.unfinished_import(made.capture, made.id), b"{}")
+        self.storage.put(mark, b"{}")
 
     def get(self, capture_id: str, import_id: str) -> Import:
         """Return an import. Raises a 404 problem."""
@@ -135,56 +166,78 @@ class Imports:
         """Take up unfinished imports until this task is cancelled. A cancelled import is taken up again later."""
         await self.unfinished.run()
 
-    async def _work(self, name: str) -> None:
-        capture_id, _, import_id = name.partition(".")
-        await self._fetch_to_the_end(capture_id, import_id)
+    def _owner(self, name: str) -> str:
+        """Return the owner of an import, by the name of its mark; "" if its capture was deleted."""
+        try:
+            return self.captures.recent(name.partition(".")[0]).owner or DEFAULT_OWNER
+        except (ProblemError, UnreadableRecord):
+            return ""
 
-    async def _fetch_to_the_end(self, capture_id: str, import_id: str) -> None:
+    def _exists(self, name: str) -> bool:
+        return self.storage.exists(layout.capture_record(name.partition(".")[0]))
+
+    async def _work(self, name: str) -> float | None:
+        """Make an attempt. Return the seconds until the next one, or None at the end of the import."""
+        capture_id, _, import_id = name.partition(".")
         found = await run_in_threadpool(self._read, capture_id, import_id)
-        while found is not None and not found.state.final:
+        if found is not None and not found.state.final and await run_in_threadpool(self._exists, name):
             found = found.model_copy(
                 update={"state": ImportState.running, "attempts": found.attempts + 1, "received": 0}
             )
             await run_in_threadpool(self._write, found)
-            try:
-                async with asyncio.timeout(self.settings.import_seconds):
-                    found = await self._fetch(found)
-            except TimeoutError:
-                limit = f"{self.settings.import_seconds:.0f} seconds"
-                found = _failed(found, "import_failed", f"The file did not arrive within {limit}.")
-            except AddressRefused as error:
-                found = _failed(found, "url_refused", str(error))
-            except ProblemError as error:
-                found = found.model_copy(update={"state": ImportState.failed, "problem": error.problem})
-            except StorageError as error:
-                problem = problem_of_storage(error)
-                found = found.model_copy(update={"state": ImportState.failed, "problem": problem})
-            except redis.RedisError:
-                raise  # the import waits until Redis answers, without which no lease is given
-            except (
-                Exception
-            ) as error:  # counted, whatever it is: what others send must not be fetched for ever
-                if not isinstance(error, NoAnswer):
-                    log.exception("an attempt ended unexpectedly", id=import_id)
-                    error = NoAnswer(f"The attempt ended in an unexpected error ({type(error).__name__}).")
-                if found.attempts >= MAX_ATTEMPTS:
-                    tried = f"It was tried {found.attempts} times."
-                    found = _failed(found, "import_failed", f"{error} {tried}")
-                else:
-                    log.info(
-                        "an import is tried again", id=import_id, attempt=found.attempts, reason=str(error)
-                    )
-                    await asyncio.sleep(_PAUSE_SECONDS * 2 ** (found.attempts - 1))
+            found = await self._attempt(found)
             if found.state.final:
                 found = found.model_copy(update={"finished_at": datetime.now(UTC)})
-                await run_in_threadpool(self._write, found)
+            await run_in_threadpool(self._write, found)
+            if not found.state.final:
+                return _PAUSE_SECONDS * float(2 ** (found.attempts - 1))
+        elif found is not None and not found.state.final:  # written while the capture was being deleted
+            await run_in_threadpool(self.storage.delete, layout.import_record(capture_id, import_id))
         await run_in_threadpool(self.storage.delete, layout.unfinished_import(capture_id, import_id))
+        return None
+
+    async def _attempt(self, found: Import) -> Import:
+        """Return the import after an attempt: ended, or waiting for the next one."""
+        try:
+            async with asyncio.timeout(self.settings.import_seconds):
+                return await self._fetch(found)
+        except TimeoutError:
+            limit = f"{self.settings.import_seconds:.0f} seconds"
+            return _failed(found, "import_failed", f"The file did not arrive within {limit}.")
+        except TooSlow as error:
+            return _failed(found, "import_failed", str(error))
+        except AddressRefused as error:
+            return _failed(found, "url_refused", str(error))
+        except ProblemError as error:
+            return found.model_copy(update={"state": ImportState.failed, "problem": error.problem})
+        except StorageError as error:
+            problem = problem_of_storage(error)
+            return found.model_copy(update={"state": ImportState.failed, "problem": problem})
+        except redis.RedisError:
+            raise  # the import waits until Redis answers, without which no lease is given
+        except Exception as error:
+            # Counted, whatever it is: what others send must not be fetched for ever.
+            if not isinstance(error, NoAnswer):
+                log.exception("an attempt ended unexpectedly", id=found.id)
+                error = NoAnswer(f"The attempt ended in an unexpected error ({type(error).__name__}).")
+            if found.attempts >= MAX_ATTEMPTS:
+                tried = f"It was tried {found.attempts} times."
+                return _failed(found, "import_failed", f"{error} {tried}")
+            log.info("an import is tried again", id=found.id, attempt=found.attempts, reason=str(error))
+            return found.model_copy(update={"state": ImportState.queued})
 
     async def _fetch(self, found: Import) -> Import:
-        async with self.outgoing.request("GET", found.url, redirects=MAX_REDIRECTS) as answer:
+        async with AsyncExitStack() as stack:
+            try:
+                async with asyncio.timeout(_ANSWER_SECONDS):
+                    asked = self.outgoing.request("GET", found.url, redirects=MAX_REDIRECTS)
+                    answer = await stack.enter_async_context(asked)
+            except TimeoutError:
+                limit = f"{_ANSWER_SECONDS:.0f} seconds"
+                raise NoAnswer(f"The other server did not begin to answer within {limit}.") from None
             _check(answer)
             found = found.model_copy(update={"size": answer.size})
-            chunks = self._recorded(found, answer.chunks)
+            chunks = self._recorded(found, at_least(answer.chunks, self.settings.min_import_rate))
             async with self.quota.upload(
                 None, found.capture, answer.size, beside=bytes_beside(found.name)
             ) as arrival:

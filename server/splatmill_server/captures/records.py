@@ -5,7 +5,7 @@ import json
 import secrets
 import shutil
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
 
@@ -65,6 +65,8 @@ class Captures:
         self.metrics = metrics
         self.unlisted = False
         """Whether a capture was made, or may have been, and is not listed."""
+        self.on_delete: list[Callable[[str], None]] = []
+        """Called with the id of a capture once its record is deleted."""
         self.digests = Digests(storage)
         self._recent: dict[str, tuple[float, Capture]] = {}
         # Number of files per capture, as last seen: listing the folder at each upload would take quadratic time. The
@@ -225,6 +227,9 @@ class Captures:
             owner = None
         self._recent.pop(capture_id, None)
         self.storage.delete(layout.capture_record(capture_id))
+        self._recent.pop(capture_id, None)
+        for forget in self.on_delete:
+            forget(capture_id)
         self.storage.delete_prefix(layout.capture(capture_id))
         self._recent.pop(capture_id, None)
         self.unlist(capture_id, owner)

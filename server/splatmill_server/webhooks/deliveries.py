@@ -3,11 +3,14 @@
 Every API process runs one loop. Pending deliveries are marked in storage by the time of their next attempt, and a lease
 in Redis lets one process at a time make an attempt. If Redis is lost in that moment, a delivery may be sent twice, with
 the same `webhook-id`; none is lost.
+
+Owners take turns, and a delivery ends with its webhook.
 """
 
 import asyncio
 import random
 import time
+from collections import Counter
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 
@@ -23,6 +26,7 @@ from splatmill.webhook_signature import sign
 from splatmill_server.leases import lease
 from splatmill_server.metrics import Metrics
 from splatmill_server.outgoing import Outgoing, OutgoingError
+from splatmill_server.turns import Turns
 from splatmill_server.webhooks.records import DeliveryRecord, WebhookRecord, Webhooks, mark_of
 
 log = structlog.get_logger()
@@ -48,9 +52,11 @@ _LOOK_SECONDS = 5.0
 _OLD_SECONDS = 3600.0
 """Seconds between two looks for old records of deliveries."""
 
-_CONCURRENT = 8
+_CONCURRENT = 16
+_CONCURRENT_OWNER = 4
 _CONCURRENT_EACH = 2
-"""Attempts that one process makes at once, in all and for one webhook: a slow one must not hold up the others."""
+"""Attempts that one process makes at once, in all, of one owner and for one webhook: a slow one must not hold up the
+others."""
 
 
 class Deliveries:
@@ -64,7 +70,12 @@ class Deliveries:
         self.storage = webhooks.storage
         self.outgoing = outgoing
         self.metrics = metrics
+        self._turns = Turns(_CONCURRENT, _CONCURRENT_OWNER)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        # By ids of webhook and delivery, and the owners by id of a webhook.
         self._running: dict[tuple[str, str], asyncio.Task[None]] = {}
+        self._owners: dict[str, str] = {}
+        webhooks.on_delete.append(self._forget)
         self._looked_at = float("-inf")
         self._wake = asyncio.Event()
 
@@ -72,8 +83,23 @@ class Deliveries:
         """Look for deliveries now."""
         self._wake.set()
 
+    def _forget(self, webhook_id: str) -> None:
+        """End the attempts for a webhook that was deleted; those of other processes end within ANSWER_SECONDS.
+
+        Any thread may call.
+        """
+        if self._loop is not None:
+            with suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(self._cancel, webhook_id)
+
+    def _cancel(self, webhook_id: str) -> None:
+        for key, task in self._running.items():
+            if key[0] == webhook_id:
+                task.cancel()
+
     async def run(self) -> None:
         """Send what is due until this task is cancelled."""
+        self._loop = asyncio.get_running_loop()
         try:
             while True:
                 self._wake.clear()
@@ -97,33 +123,50 @@ class Deliveries:
             await run_in_threadpool(self.webhooks.delete_old)
         marks = await run_in_threadpool(lambda: list(self.storage.entries(layout.due_deliveries())))
         self.metrics.webhooks_waiting.set(len(marks))
+        waiting: dict[tuple[str, str], str] = {}
+        of_webhook = Counter(webhook_id for webhook_id, _ in self._running)
         for entry in marks:  # sorted by the time at which they are due
             due, _, rest = entry.path.rsplit("/", 1)[-1].partition(".")
             webhook_id, _, delivery_id = rest.partition(".")
             key = (webhook_id, delivery_id)
             if not (due.isdigit() and layout.is_id(webhook_id) and layout.is_id(delivery_id)):
                 continue
-            if int(due) > time.time() or len(self._running) >= _CONCURRENT:
+            if int(due) > time.time():
                 break
-            each = sum(running[0] == webhook_id for running in self._running)
-            if key not in self._running and each < _CONCURRENT_EACH:
-                self._running[key] = asyncio.create_task(self._work(key, entry.path))
+            if key not in self._running and key not in waiting and of_webhook[webhook_id] < _CONCURRENT_EACH:
+                of_webhook[webhook_id] += 1
+                waiting[key] = entry.path
+        await run_in_threadpool(self._read_owners, {webhook_id for webhook_id, _ in waiting})
+        working = [self._owners.get(webhook_id, "") for webhook_id, _ in self._running]
+        lines = [(self._owners.get(key[0], ""), key) for key in waiting if key not in self._running]
+        for key in self._turns.choose(working, lines):
+            self._running[key] = asyncio.create_task(self._work(key, waiting[key]))
+
+    def _read_owners(self, waiting: set[str]) -> None:
+        """Note the owners of the webhooks with deliveries that wait. One that was deleted has none."""
+        running = {webhook_id for webhook_id, _ in [*self._running]}
+        self._owners = {name: owner for name, owner in self._owners.items() if name in waiting | running}
+        for webhook_id in waiting - self._owners.keys():
+            found = self.webhooks.read(webhook_id)
+            self._owners[webhook_id] = found.owner if found is not None else ""
 
     async def _work(self, key: tuple[str, str], mark: str) -> None:
-        ended = False
+        ended = True
         try:
             async with lease(self.connection, "delivery", ".".join(key)) as mine:
                 if mine:
                     await self._attempt(key, mark)
-                    ended = True
+                ended = mine
         except (StorageError, redis.RedisError) as error:
+            ended = False
             log.warning("a delivery waits", webhook=key[0], delivery=key[1], error=str(error))
         except Exception:
+            ended = False
             log.exception("a delivery waits", webhook=key[0], delivery=key[1])
         finally:
             self._running.pop(key, None)
             if ended:
-                self.wake()  # for the next one of this webhook
+                self.wake()  # for the next one that waits
 
     async def _attempt(self, key: tuple[str, str], mark: str) -> None:
         """Make the attempt that a mark announces, unless another process has made it, and remove the mark."""

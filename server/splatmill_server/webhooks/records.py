@@ -11,7 +11,7 @@ import json
 import math
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 
@@ -98,6 +98,8 @@ class Webhooks:
         self.storage = storage
         self.jobs = jobs
         self.connection = jobs.connection
+        self.on_delete: list[Callable[[str], None]] = []
+        """Called with the id of a webhook once its record is deleted."""
         jobs.on_end.append(self.announce)
 
     def create(self, request: CreateWebhook, owner: str) -> WebhookWithSecret:
@@ -153,6 +155,8 @@ class Webhooks:
         """Delete a webhook and the log of its deliveries. Those that are pending are not sent any more."""
         with self._changing(webhook_id):
             self.storage.delete(layout.webhook_record(webhook_id))
+            for forget in self.on_delete:
+                forget(webhook_id)
             self.storage.delete_prefix(layout.webhook(webhook_id))
 
     def rotate(self, webhook_id: str) -> WebhookWithSecret:
