@@ -142,7 +142,10 @@ class Conversions:
 
     async def _convert(self, model_id: str, form: ModelFormat, room: Arrival) -> None:
         content = ConversionRequest(format=form.key).model_dump_json()
-        answer = await post(self._renderer, rendering.convert_path(model_id), content, {}, self._seconds)
+        # Whoever asks, the conversion is for everybody who may read the model, and counts for its owner.
+        owner = await run_in_threadpool(self._models.owner, model_id)
+        headers = {rendering.CLIENT_HEADER: rendering.client_of(owner or DEFAULT_OWNER, "conversions")}
+        answer = await post(self._renderer, rendering.convert_path(model_id), content, headers, self._seconds)
         try:
             if answer.status_code != 200:
                 raise _refused(await answer.aread())

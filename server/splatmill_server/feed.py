@@ -68,8 +68,9 @@ class _Followed:
 class Subscription:
     """A follower's place in the feed."""
 
-    def __init__(self, job_id: str) -> None:
+    def __init__(self, job_id: str, owner: str) -> None:
         self.job_id = job_id
+        self.owner = owner
         self._batches: deque[Batch] = deque()
         self._came = asyncio.Event()
         self._error: redis.RedisError | None = None
@@ -115,9 +116,14 @@ class Feed:
         """Number of those who follow jobs."""
         return sum(len(job.subscriptions) for job in self._followed.values())
 
-    def subscribe(self, job_id: str) -> Subscription:
-        """Return a new place in the feed of a job. It must be closed."""
-        subscription = Subscription(job_id)
+    def followers_of(self, owner: str) -> int:
+        """Return the number of those among the followers who have this owner's keys."""
+        places = (place for job in self._followed.values() for place in job.subscriptions)
+        return sum(place.owner == owner for place in places)
+
+    def subscribe(self, job_id: str, owner: str = "") -> Subscription:
+        """Return a new place in the feed of a job, of a follower with a key of this owner. It must be closed."""
+        subscription = Subscription(job_id, owner)
         self._followed.setdefault(job_id, _Followed()).subscriptions.add(subscription)
         return subscription
 
@@ -146,7 +152,7 @@ class Feed:
         begun = job.entries is not None
         async with self._turn:
             # Before the events: what is appended between the two replies comes after these ends.
-            ends = None if begun else (await self.ends([name]))[name]
+            ends = None if begun else (await self._ends([name]))[name]
             rows, reply = await self._read([name], {name: entries}, None)
         if ends is not None and job.entries is None:
             job.entries, begun = _end(name, reply, ends), True
@@ -154,8 +160,12 @@ class Feed:
             self._reading = asyncio.create_task(self._run())
         return _batch(name, rows[0], reply, entries), begun
 
-    async def ends(self, job_ids: Sequence[str]) -> dict[str, list[str]]:
-        """Return the last entry of each stream of these jobs, or START. Raises redis.RedisError."""
+    async def ends(self, job_id: str) -> list[str]:
+        """Return the last entry of each stream of a job, or START. Raises redis.RedisError."""
+        async with self._turn:
+            return (await self._ends([job_id]))[job_id]
+
+    async def _ends(self, job_ids: Sequence[str]) -> dict[str, list[str]]:
         pipe = self._redis.pipeline(transaction=False)
         for job_id in job_ids:
             for stream in events.BOUNDS:
@@ -184,7 +194,7 @@ class Feed:
         Their new entries may come before the position of the reader, which would never read them.
         """
         read = {name: job.entries for name, job in self._followed.items() if job.entries is not None}
-        ends = await self.ends(list(read)) if read else {}
+        ends = await self._ends(list(read)) if read else {}
         for name, entries in read.items():
             job = self._followed.get(name)
             if job is not None and job.entries is entries and any(map(is_beyond, entries, ends[name])):

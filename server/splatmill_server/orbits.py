@@ -279,8 +279,9 @@ class Orbits:
 
     async def _ask(self, name: str, address: str, body: BaseModel, path: str) -> None:
         """Store what the renderer answers at `path`."""
-        # Owners take turns in the renderer, and the videos of an owner with the views that its people look at.
-        headers = {rendering.CLIENT_HEADER: f"orbits of {name.partition('.')[0]}"}
+        # The videos of an owner take turns with the views that its people look at.
+        owner = await run_in_threadpool(self._models.owner, name.split(".")[1])
+        headers = {rendering.CLIENT_HEADER: rendering.client_of(owner or DEFAULT_OWNER, "orbits")}
         try:
             answer = await post(self._renderer, address, body.model_dump_json(), headers, self._seconds)
         except ProblemError as error:

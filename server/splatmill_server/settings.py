@@ -161,7 +161,8 @@ class Settings(BaseSettings):
     max_event_streams: int = Field(
         default=2000,
         gt=0,
-        description="Largest number of clients that follow events on one API process. Each holds a connection.",
+        description="Largest number of clients that follow events on one API process; one owner gets three quarters of "
+        "the places. Each holds a connection.",
     )
 
     @model_validator(mode="after")

@@ -5,13 +5,15 @@ only forwards them; for what it keeps, it asks in its own name. The renderer com
 itself.
 """
 
+import hashlib
+
 from pydantic import BaseModel
 
 HEALTH = "/healthz"
 """The path at which the renderer answers that it runs, and with its `RendererState`."""
 
 CLIENT_HEADER = "Splatmill-Client"
-"""Header of a request to the renderer: a text that is the same for all requests of one client, who take turns."""
+"""Header of a request to the renderer: whose it is, as `client_of` writes it."""
 
 
 REQUEST_HEADER = "X-Request-ID"
@@ -29,6 +31,14 @@ class RendererState(BaseModel):
     status: str | None = None
     admitted: int = 0
     cached: int = 0
+
+
+def client_of(owner: str, client: str) -> str:
+    """Return the text of CLIENT_HEADER. Owners take turns, and the clients of one owner take turns among themselves.
+
+    owner: whose request it is. client: what distinguishes it from other clients of this owner.
+    """
+    return "/".join(hashlib.sha256(text.encode()).hexdigest()[:16] for text in (owner, client))
 
 
 def render_path(model_id: str) -> str:

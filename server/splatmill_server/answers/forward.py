@@ -1,7 +1,6 @@
 """Forwards render requests to the renderer process, and streams its responses back."""
 
 import asyncio
-import hashlib
 from collections.abc import AsyncIterator, Coroutine
 from typing import Any, TypeVar
 
@@ -33,15 +32,23 @@ _OWN_PREFIX = "splatmill-"
 
 
 async def forward(
-    renderer: httpx.AsyncClient | None, request: Request, path: str, body: BaseModel, seconds: float
+    renderer: httpx.AsyncClient | None,
+    request: Request,
+    path: str,
+    body: BaseModel,
+    seconds: float,
+    *,
+    visited: str | None = None,
 ) -> Response:
     """Post `body` to the renderer and return its response, whatever its status.
+
+    visited: for a visitor who opened a link, the owner of the model.
 
     When the client closes its connection, that to the renderer is closed as well, so that it renders no further.
 
     Raises a 503 problem if there is no renderer, and a 504 problem if it does not answer within `seconds`.
     """
-    headers = {"Content-Type": "application/json", rendering.CLIENT_HEADER: _client(request)}
+    headers = {"Content-Type": "application/json", rendering.CLIENT_HEADER: client_of(request, visited)}
     if (known := read_token(request.headers.get("if-none-match"))) is not None:
         headers["If-None-Match"] = known
     content = body.model_dump_json(exclude_none=True)
@@ -59,12 +66,15 @@ async def forward(
     return StreamingResponse(_pass(answer), answer.status_code, passed)
 
 
-def _client(request: Request) -> str:
-    """Return a text for the caller and the machine of a request, without telling who they are."""
+def client_of(request: Request, visited: str | None = None) -> str:
+    """Return a text for the caller and the machine of a request, without telling who they are.
+
+    Visitors of the models of one owner are one owner of requests, apart from the owner itself.
+    """
     caller = getattr(request.state, "caller", None)
     owner = caller.owner if isinstance(caller, Caller) else ""
     host = request.client.host if request.client is not None else ""
-    return hashlib.sha256(f"{owner}\0{host}".encode()).hexdigest()[:16]
+    return rendering.client_of(owner if visited is None else f"visitors of {visited}", host)
 
 
 async def while_connected(request: Request, pending: Coroutine[Any, Any, T]) -> T | None:

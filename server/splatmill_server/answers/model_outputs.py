@@ -49,4 +49,7 @@ async def rendered_by_query(service: Service, model_id: str, request: Request) -
         located = [{**found, "loc": ("query", *found["loc"])} for found in error.errors()]
         raise RequestValidationError(located) from error
     path, seconds = rendering.render_path(model_id), service.settings.render_timeout
-    return await forward(service.renderer, request, path, body, seconds)
+    visited = None
+    if not request.state.caller.owner:
+        visited = await run_in_threadpool(service.models.owner, model_id) or ""
+    return await forward(service.renderer, request, path, body, seconds, visited=visited)

@@ -7,7 +7,7 @@ in each generation of a job.
 
 import asyncio
 import re
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -67,12 +67,19 @@ class Follower:
     """Reads the events of a job from a position on. Raises redis.RedisError if Redis cannot be reached.
 
     permitted: whether the reader may go on; asked again and again, because keys can be revoked.
+    owner: whose key the reader has.
     """
 
     def __init__(
-        self, service: Service, job_id: str, position: Position, permitted: Callable[[], Awaitable[bool]]
+        self,
+        service: Service,
+        job_id: str,
+        position: Position,
+        permitted: Callable[[], Awaitable[bool]],
+        owner: str,
     ) -> None:
         self.permitted = permitted
+        self.owner = owner
         self.redis = service.redis_async
         self.feed = service.feed
         self.closing = service.closing
@@ -80,22 +87,11 @@ class Follower:
         self.position = position
 
     async def begin(self, row: JobRow) -> bool:
-        """Apply the events that the client has already seen; return False if the job had ended by then.
-
-        A position beyond the end of a stream was never issued by this Redis, or Redis was restored from an older copy.
-        What the client has seen is then unknown, so that it is sent everything from the first event on.
-        """
+        """Apply the events that the client has already seen; return False if the job had ended by then."""
         self.fold = Fold(row)
         self._stored: Row = {}
-        ends = (await self.feed.ends([self.job_id]))[self.job_id]
-        if self.position.row_events > 2 * row.generation + 1 or any(
-            map(is_beyond, self.position.entries, ends)
-        ):
-            self.position = Position()
-        # A stream without entries was deleted when the job had ended; what a restart appends is new to everybody.
-        self.position.entries = [
-            START if end == START else entry for entry, end in zip(self.position.entries, ends, strict=True)
-        ]
+        if self.position != Position():
+            self.position = _issued(self.position, row, await self.feed.ends(self.job_id))
         if self.position.states != START:
             seen = await cast(Any, self.redis.xrange(keys.states(self.job_id), max=self.position.states))
             for stored in events.decode(seen, keys.states(self.job_id)):
@@ -106,7 +102,7 @@ class Follower:
 
     async def records(self) -> AsyncIterator[EventRecord]:
         """Yield the events that count, until the job ends, the server stops or the reader may not go on."""
-        subscription = self.feed.subscribe(self.job_id)
+        subscription = self.feed.subscribe(self.job_id, self.owner)
         try:
             live = False
             while not self.closing.is_set() and await self.permitted():
@@ -163,6 +159,21 @@ class Follower:
     def _row_event(self, number: int, at: Time, event: StateEvent) -> EventRecord:
         self.position.row_events = number
         return EventRecord(id=str(self.position), attempt=0, at=at, event=event)
+
+
+def _issued(position: Position, row: JobRow, ends: Sequence[str]) -> Position:
+    """Return a client's position, or the first one if it lies beyond the events that the job has.
+
+    This Redis never issued such a position, or was restored from an older copy. What the client has seen is then
+    unknown, so that it is sent everything.
+
+    ends: the last entry of each stream.
+    """
+    if position.row_events > 2 * row.generation + 1 or any(map(is_beyond, position.entries, ends)):
+        return Position()
+    # A stream without entries was deleted when the job had ended; what a restart appends is new to everybody.
+    entries = zip(position.entries, ends, strict=True)
+    return Position([START if end == START else entry for entry, end in entries], position.row_events)
 
 
 async def event_stream(follower: Follower, heartbeat: float, open_streams: Gauge) -> AsyncIterator[bytes]:

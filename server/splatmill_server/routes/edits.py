@@ -11,7 +11,7 @@ from starlette.responses import JSONResponse, Response
 from splatmill.backplane import rendering
 from splatmill.schema import EDIT_HEADER, Edited, EditModel
 from splatmill_server.access.caller import Who
-from splatmill_server.answers.forward import CLIENT_GONE, while_connected
+from splatmill_server.answers.forward import CLIENT_GONE, client_of, while_connected
 from splatmill_server.edits import store_edited
 from splatmill_server.problems import ProblemError
 from splatmill_server.renderer import post
@@ -66,7 +66,7 @@ async def _edit(
         service.renderer,
         rendering.edits_path(model_id),
         body.model_dump_json(exclude_none=True),
-        {"Content-Type": "application/json"},
+        {rendering.CLIENT_HEADER: client_of(request)},
         service.settings.orbit_timeout,
     )
     found = await while_connected(request, asked)

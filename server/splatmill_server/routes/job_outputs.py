@@ -11,6 +11,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response, Strea
 from splatmill.backplane import events, layout
 from splatmill.backplane.records import check_format
 from splatmill.schema import Curve, LogPage, Report
+from splatmill_server.access.caller import Who
 from splatmill_server.answers.files import file_response
 from splatmill_server.answers.sse import Follower, Position, event_stream, stored_stream
 from splatmill_server.jobs import curve as job_curve
@@ -36,6 +37,7 @@ router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
 )
 async def follow_events(
     service: Shared,
+    who: Who,
     request: Request,
     job_id: JobId,
     last_event_id: Annotated[
@@ -52,13 +54,15 @@ async def follow_events(
             "event.",
         )
     most = service.settings.max_event_streams
-    if (count := service.feed.followers) >= most:
+    count, own = service.feed.followers, service.feed.followers_of(who.owner)
+    of_owner = most - most // 4  # so that one owner cannot take all
+    if count >= most or own >= of_owner:
         raise ProblemError(
             "too_many_followers",
-            f"{count} clients follow events on this server process, and it takes {most} at most "
-            "(SPLATMILL_MAX_EVENT_STREAMS).",
+            f"{count} clients follow events on this server process, {own} of them with keys of this owner; it takes "
+            f"{most} (SPLATMILL_MAX_EVENT_STREAMS), and {of_owner} of one owner.",
             advice="Ask for the job with GET /v1/jobs/{id} every few seconds instead, or start another API process.",
-            facts={"followers": count, "limit": most},
+            facts={"followers": count, "limit": most, "of_owner": own, "limit_of_owner": of_owner},
             headers={"Retry-After": "10"},
         )
     headers = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
@@ -71,7 +75,7 @@ async def follow_events(
         if last_event_id:
             return Response(status_code=204)
         return StreamingResponse(stored_stream(job), media_type="text/event-stream", headers=headers)
-    follower = Follower(service, job_id, position, service.authentication.again(request))
+    follower = Follower(service, job_id, position, service.authentication.again(request), who.owner)
     if not await follower.begin(row):
         return Response(status_code=204)
     stream = event_stream(follower, service.settings.heartbeat, service.metrics.streams)

@@ -13,11 +13,13 @@ from typing import Any
 import httpx
 import pytest
 import redis
+from starlette.datastructures import Headers
 
 from splatmill.backplane import events, keys
 from splatmill.backplane.connection import connect_async
 from splatmill.schema import JobState, LogEvent, ProgressEvent, StateEvent
 from splatmill_server import feed
+from splatmill_server.access.caller import Caller
 from splatmill_server.feed import Batch, Feed
 from tests.support.served_app import Serve, ServedApp, problem
 from tests.support.server_events import brief, follow
@@ -97,7 +99,7 @@ def test_more_followers_than_the_process_takes_are_told_why(serve: Serve) -> Non
 
     def act() -> None:
         refused = problem(app.http.get(f"/v1/jobs/{job_id}/events"), 503, "too_many_followers")
-        assert refused["facts"] == {"followers": 2, "limit": 2}
+        assert refused["facts"] == {"followers": 2, "limit": 2, "of_owner": 2, "limit_of_owner": 2}
         assert "SPLATMILL_MAX_EVENT_STREAMS" in refused["detail"]
         app.http.post(f"/v1/jobs/{job_id}/cancel")
 
@@ -105,6 +107,26 @@ def test_more_followers_than_the_process_takes_are_told_why(serve: Serve) -> Non
     assert [brief(told) for told in found] == [["queued", "cancelled"]] * 2
     wait_for(lambda: app.service.feed.followers == 0)
     assert brief(follow(app, job_id)) == ["queued", "cancelled"]
+
+
+def test_followers_of_one_owner_leave_places_to_others(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    app = serve(max_event_streams=4)
+    job_id = app.job()
+
+    async def admin(asked: object, headers: Headers) -> Caller:
+        return Caller(headers.get("x-owner", "default"))
+
+    monkeypatch.setattr(app.service.authentication, "caller", admin)
+
+    def act() -> None:
+        refused = problem(app.http.get(f"/v1/jobs/{job_id}/events"), 503, "too_many_followers")
+        assert (refused["facts"]["of_owner"], refused["facts"]["limit_of_owner"]) == (3, 3)
+        with app.http.stream("GET", f"/v1/jobs/{job_id}/events", headers={"X-Owner": "bob"}) as answer:
+            assert answer.status_code == 200
+        app.http.post(f"/v1/jobs/{job_id}/cancel")
+
+    found = asyncio.run(followed(app, [job_id] * 3, act))
+    assert [brief(told) for told in found] == [["queued", "cancelled"]] * 3
 
 
 def test_a_follower_that_comes_later_misses_nothing_and_hears_nothing_twice(app: ServedApp) -> None:
@@ -201,10 +223,10 @@ def test_followers_hear_of_a_redis_that_was_restored_with_an_older_clock(
     job_id = app.job()
     app.begin(job_id)
     app.say(job_id, LogEvent(message="before"), ProgressEvent(stage="training", done=1))
-    last: list[str] = []
 
     def restored() -> None:
         """The streams as an older copy has them, with entries whose ids are lower than those that were told."""
+        wait_for(lambda: app.service.feed._followed[job_id].entries is not None)
         for stream in (keys.states, keys.log, keys.progress):
             entries: Any = app.redis.xrange(stream(job_id))
             app.redis.delete(stream(job_id))
@@ -212,16 +234,15 @@ def test_followers_hear_of_a_redis_that_was_restored_with_an_older_clock(
                 app.redis.xadd(stream(job_id), fields, id=f"{1000 + number}-0")
 
     # The streams of those who follow end, so that they come back.
-    found = asyncio.run(followed(app, [job_id] * 2, restored))
-    assert [brief(told)[:2] for told in found] == [["queued", "preparing"]] * 2
-    assert [len(told) for told in found] == [4, 4]
-    last.append(found[0][-1]["id"])
+    found = asyncio.run(followed(app, [job_id], restored))
+    assert [brief(told)[:2] for told in found] == [["queued", "preparing"]]
+    assert [len(told) for told in found] == [4]
 
     def act() -> None:
         fields: Any = {"g": 1, "a": 1, "e": StateEvent(state=JobState.succeeded).model_dump_json()}
         app.redis.xadd(keys.states(job_id), fields, id="2000-0")
 
-    found = asyncio.run(followed(app, [job_id] * 2, act, [last[0], None]))
+    found = asyncio.run(followed(app, [job_id] * 2, act, [found[0][-1]["id"], None]))
     assert [brief(told)[0] for told in found] == ["queued"] * 2
     assert [brief(told)[-1] for told in found] == ["succeeded"] * 2
     assert [len(told) for told in found] == [5, 5]

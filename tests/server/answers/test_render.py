@@ -16,7 +16,8 @@ import uvicorn
 from fastapi import FastAPI, Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
-from splatmill.schema import RenderRequest
+from splatmill.backplane import rendering
+from splatmill.schema import DEFAULT_OWNER, RenderRequest
 from tests.support.served_app import Serve, ServedApp, problem, store_model
 from tests.support.waiting import wait_for
 
@@ -31,6 +32,9 @@ SLOW_FPS = 7
 
 ASKED, LEFT = threading.Event(), threading.Event()
 
+CLIENTS: list[tuple[str, str]] = []
+"""The kind of each request, and whose it is as the renderer learns."""
+
 
 @pytest.fixture
 def renderer(tmp_path: Path) -> Iterator[str]:
@@ -40,6 +44,7 @@ def renderer(tmp_path: Path) -> Iterator[str]:
     @echo.post("/v1/models/{model_id}/{kind}")
     async def answer(model_id: str, kind: str, request: Request) -> Response:
         body = await request.body()
+        CLIENTS.append((kind, request.headers.get("splatmill-client", "")))
         if json.loads(body).get("fps") == SLOW_FPS:
             ASKED.set()
             while not await request.is_disconnected():
@@ -194,6 +199,25 @@ def test_the_renderers_own_problems_pass_through(app: ServedApp) -> None:
     wish = {"camera": CAMERA, "format": "jpeg"}
     answer = app.http.post(f"/v1/models/{MODEL}/render", json=wish)
     assert (answer.status_code, answer.json()) == (500, {"code": "render_failed"})
+
+
+def test_the_renderer_learns_whose_each_request_is(app: ServedApp) -> None:
+    CLIENTS.clear()
+    address = f"/v1/models/{MODEL}"
+    assert app.http.post(f"{address}/render", json={"camera": CAMERA}).status_code == 200
+    app.http.post(f"{address}/edits", json={"min_opacity": 0.5, "preview": True})
+    app.http.get(f"{address}/download/sog")
+    link = app.http.post(f"{address}/shares", json={}).json()["token"]
+    query = RenderRequest.model_validate({"camera": CAMERA}).to_query()
+    assert app.http.get(f"/s/{link}/model/render", params=query).status_code == 200
+    kinds = [kind for kind, _ in CLIENTS]
+    assert kinds == ["render", "edits", "convert", "render"]
+    owners = [client.split("/")[0] for _, client in CLIENTS]
+    machines = [client.split("/")[1] for _, client in CLIENTS]
+    assert owners[:3] == [rendering.client_of(DEFAULT_OWNER, "").split("/")[0]] * 3
+    # Visitors of a link are apart from the owner of the model, and from visitors of other owners' models.
+    assert owners[3] == rendering.client_of(f"visitors of {DEFAULT_OWNER}", "").split("/")[0]
+    assert machines[0] == machines[1] == machines[3] != machines[2]
 
 
 def test_without_a_renderer_pictures_are_503_and_files_still_come(serve: Serve, tmp_path: Path) -> None:

@@ -1,8 +1,9 @@
-"""Proves that requests run one at a time, clients in turn, and that those beyond the bounds are sent away at once; and
-that nothing runs for a client that has left, which frees its place before its turn."""
+"""Proves that requests run one at a time, owners and clients in turn, and that those beyond the bounds are sent away;
+and that nothing runs for a client that has left, which frees its place before its turn."""
 
 import asyncio
 import threading
+from contextlib import AsyncExitStack
 from functools import partial
 
 import pytest
@@ -121,6 +122,42 @@ def test_one_client_cannot_take_all_places() -> None:
             return refused, True
 
     assert asyncio.run(crowd()) == (1, True)
+
+
+def test_owners_take_turns_and_so_do_the_clients_of_each() -> None:
+    async def mixed() -> list[str]:
+        queue, release, order = RenderQueue(max_waiting=20), threading.Event(), list[str]()
+        first = asyncio.create_task(queue.run(lambda: release.wait(60), client="ann/0"))
+        await asyncio.sleep(0)
+        names = ("ann/1", "ann/1", "ann/2", "ann/3", "bob/1", "bob/1")
+        waiting = [asyncio.create_task(queue.run(partial(order.append, name), client=name)) for name in names]
+        await asyncio.sleep(0)
+        release.set()
+        await asyncio.gather(first, *waiting)
+        return order
+
+    assert asyncio.run(mixed()) == ["ann/1", "bob/1", "ann/2", "bob/1", "ann/3", "ann/1"]
+
+
+def test_an_owner_with_many_clients_leaves_places_to_others() -> None:
+    async def admitted(queue: RenderQueue, stack: AsyncExitStack, owner: str, count: int) -> int:
+        """Number of requests that are admitted, of as many clients of an owner."""
+        for number in range(count):
+            try:
+                await stack.enter_async_context(queue.admitted(f"{owner}/{number}"))
+            except QueueFull:
+                return number
+        return count
+
+    async def crowd() -> list[int]:
+        queue = RenderQueue(max_waiting=9, max_of_client=3, max_of_owner=5, reserved=2)
+        async with AsyncExitStack() as stack:
+            found = [await admitted(queue, stack, owner, 20) for owner in ("ann", "bob", "eve", "dan", "fay")]
+        assert queue.admitted_count == 0
+        return found
+
+    # The last two places are for owners with no other request.
+    assert asyncio.run(crowd()) == [5, 3, 1, 1, 0]
 
 
 def test_a_client_that_leaves_while_it_waits_frees_its_place_at_once() -> None:

@@ -45,8 +45,14 @@ from splatmill_worker.render_service.render_queue import ClientGone, QueueFull, 
 from splatmill_worker.render_service.scratch import ScratchMiddleware, scratch
 from splatmill_worker.scene import Camera
 
-MAX_WAITING = 32
+MAX_WAITING = 48
 """Number of requests that may wait while one is rendered. An image takes a fraction of a second."""
+
+MAX_OF_OWNER = 24
+"""Number of requests of one owner among them, with the one that is rendered."""
+
+RESERVED = 12
+"""Number of places that only owners with no other request in the queue get."""
 
 MAX_OF_CLIENT = 9
 """Number of requests of one client among them, with the one that is rendered. A browser requests a few at a time."""
@@ -84,7 +90,7 @@ class RenderApp:
         self._storage = storage
         self._backend = backend
         self._cache = ModelCache(storage, cache_bytes, backend)
-        self._queue = RenderQueue(MAX_WAITING, MAX_OF_CLIENT)
+        self._queue = RenderQueue(MAX_WAITING, MAX_OF_CLIENT, MAX_OF_OWNER, RESERVED)
 
     def asgi(self) -> Starlette:
         """Return the ASGI application."""
@@ -162,7 +168,8 @@ class RenderApp:
         except QueueFull:
             problem = Problem.of(
                 "renderer_unavailable",
-                f"The renderer is busy: {MAX_WAITING} requests wait already, or {MAX_OF_CLIENT} of this client.",
+                f"The renderer is busy: its {MAX_WAITING} places for requests that wait are taken, or "
+                f"{MAX_OF_CLIENT} by this client, or {MAX_OF_OWNER} by this owner.",
                 advice=f"Try again in {RETRY_AFTER} seconds.",
             )
             return _problem_response(problem, {"Retry-After": str(RETRY_AFTER)})
