@@ -7,7 +7,7 @@ in each generation of a job.
 
 import asyncio
 import re
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -87,18 +87,32 @@ class Follower:
         self.position = position
 
     async def begin(self, row: JobRow) -> bool:
-        """Apply the events that the client has already seen; return False if the job had ended by then."""
+        """Apply the events that the client has already seen; return False if the job had ended by then.
+
+        A position beyond the events that the job has was not issued by this Redis, or Redis was restored from an older
+        copy. What the client has seen of a job that goes on is then unknown, so that it is sent everything.
+        """
         self.fold = Fold(row)
         self._stored: Row = {}
-        if self.position != Position():
-            self.position = _issued(self.position, row, await self.feed.ends(self.job_id))
+        if self.position == Position():
+            return True
+        ends = await self.feed.ends(self.job_id)
+        beyond = any(map(is_beyond, self.position.entries, ends))
+        beyond |= self.position.row_events > 2 * row.generation + 1
+        # A stream without entries was deleted when the job had ended; what a restart appends is new to everybody.
+        known = zip(self.position.entries, ends, strict=True)
+        self.position.entries = [min(pair, key=stream_order) for pair in known]
         if self.position.states != START:
             seen = await cast(Any, self.redis.xrange(keys.states(self.job_id), max=self.position.states))
             for stored in events.decode(seen, keys.states(self.job_id)):
                 self.fold.apply(stored)
         if self.position.row_events > 2 * row.generation:
             self.fold.close()
-        return not self.fold.final
+        if self.fold.final:
+            return False
+        if beyond:
+            self.position, self.fold = Position(), Fold(row)
+        return True
 
     async def records(self) -> AsyncIterator[EventRecord]:
         """Yield the events that count, until the job ends, the server stops or the reader may not go on."""
@@ -159,21 +173,6 @@ class Follower:
     def _row_event(self, number: int, at: Time, event: StateEvent) -> EventRecord:
         self.position.row_events = number
         return EventRecord(id=str(self.position), attempt=0, at=at, event=event)
-
-
-def _issued(position: Position, row: JobRow, ends: Sequence[str]) -> Position:
-    """Return a client's position, or the first one if it lies beyond the events that the job has.
-
-    This Redis never issued such a position, or was restored from an older copy. What the client has seen is then
-    unknown, so that it is sent everything.
-
-    ends: the last entry of each stream.
-    """
-    if position.row_events > 2 * row.generation + 1 or any(map(is_beyond, position.entries, ends)):
-        return Position()
-    # A stream without entries was deleted when the job had ended; what a restart appends is new to everybody.
-    entries = zip(position.entries, ends, strict=True)
-    return Position([START if end == START else entry for entry, end in entries], position.row_events)
 
 
 async def event_stream(follower: Follower, heartbeat: float, open_streams: Gauge) -> AsyncIterator[bytes]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from tests.support.hostile.entry import Hostile
 from tests.support.hostile.table_files import FILES
 from tests.support.hostile.table_headers import HEADERS
+from tests.support.hostile.table_others import OTHERS
 from tests.support.hostile.table_poses import POSES
 from tests.support.hostile.table_requests import REQUESTS
 from tests.support.hostile.table_services import SERVICES
 from tests.support.hostile.table_unpacked import UNPACKED
 
-HOSTILE: tuple[Hostile, ...] = (*REQUESTS, *HEADERS, *SERVICES, *FILES, *UNPACKED, *POSES)
+HOSTILE: tuple[Hostile, ...] = (*REQUESTS, *HEADERS, *SERVICES, *OTHERS, *FILES, *UNPACKED, *POSES)
