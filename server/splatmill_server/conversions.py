@@ -138,13 +138,12 @@ class Conversions:
     async def _make(self, model_id: str, form: ModelFormat) -> None:
         owner = await run_in_threadpool(self._models.owner, model_id) or DEFAULT_OWNER
         async with self._quota.storing(None, owner, model_id, RECORD_BYTES) as room:
-            await self._convert(model_id, form, room)
+            await self._convert(model_id, form, owner, room)
 
-    async def _convert(self, model_id: str, form: ModelFormat, room: Arrival) -> None:
+    async def _convert(self, model_id: str, form: ModelFormat, owner: str, room: Arrival) -> None:
         content = ConversionRequest(format=form.key).model_dump_json()
         # Whoever asks, the conversion is for everybody who may read the model, and counts for its owner.
-        owner = await run_in_threadpool(self._models.owner, model_id)
-        headers = {rendering.CLIENT_HEADER: rendering.client_of(owner or DEFAULT_OWNER, "conversions")}
+        headers = {rendering.CLIENT_HEADER: rendering.client_of(owner, "conversions")}
         answer = await post(self._renderer, rendering.convert_path(model_id), content, headers, self._seconds)
         try:
             if answer.status_code != 200:

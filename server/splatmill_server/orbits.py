@@ -280,8 +280,9 @@ class Orbits:
     async def _ask(self, name: str, address: str, body: BaseModel, path: str) -> None:
         """Store what the renderer answers at `path`."""
         # The videos of an owner take turns with the views that its people look at.
-        owner = await run_in_threadpool(self._models.owner, name.split(".")[1])
-        headers = {rendering.CLIENT_HEADER: rendering.client_of(owner or DEFAULT_OWNER, "orbits")}
+        model_id = name.split(".")[1]
+        owner = await run_in_threadpool(self._owner, model_id)
+        headers = {rendering.CLIENT_HEADER: rendering.client_of(owner, "orbits")}
         try:
             answer = await post(self._renderer, address, body.model_dump_json(), headers, self._seconds)
         except ProblemError as error:
@@ -290,8 +291,6 @@ class Orbits:
         try:
             if answer.status_code != 200:
                 raise _refusal(await answer.aread())
-            _, model_id, _ = name.split(".")
-            owner = await run_in_threadpool(self._owner, model_id)
             async with self._quota.storing(None, owner, model_id) as room:
                 await run_in_threadpool(room.announce, answer.headers.get("content-length"))
                 await self._storage.stream_put(path, room.counted(answer.aiter_raw()))
