@@ -35,7 +35,7 @@ from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.capacity import resolved
 from splatmill_worker.splat.plan.decide import decide
 from splatmill_worker.splat.plan.facts import Facts, measure
-from splatmill_worker.splat.plan.light import light_of
+from splatmill_worker.splat.plan.light import Light
 from splatmill_worker.splat.plan.photos import loading_size
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.plan_file import read_plan, write_plan
@@ -107,14 +107,17 @@ def run(
         emit(StateEvent(state=JobState.sfm))
         cameras = _recover_cameras(task, stages)
         emit(StateEvent(state=JobState.training))
-        probed = _load_photos(cameras, loading_size(options, task.kernels), stages)
+        photos = _load_photos(cameras, loading_size(options, task.kernels), stages)
         with stages.measured("plan"):
-            first, start = _first_gaussians(task, cameras, probed)
-            facts = _measure_facts(task, cameras, probed, first, start)
+            first, start = _first_gaussians(task, cameras, photos)
+            facts, light = _measure_facts(task, cameras, photos, first, start)
             plan = _make_plan(task, facts, revise)
         emit(PlanEvent(plan=plan.as_dict()))
-        photos = _relit(cameras, probed, plan, _resize_photos(cameras, probed, plan, facts, stages))
-        del probed  # memory: photos are kept once
+        if plan.image_size < max(facts.width, facts.height):
+            del photos  # both sizes at once would be the most memory that photos ever take
+            photos = _load_photos(cameras, plan.image_size, stages)
+        if plan.exposure and light is not None:
+            photos = photos.relit(light)
         engine = open_engine(_seeded(first, cameras, photos, plan), plan.kernels)
         training = _train(task, cameras, engine, photos, plan)
     except Cancelled:
@@ -183,6 +186,16 @@ class Photos:
         """The view of previews and of the progress film: a held-out one where there is any."""
         return (self.held_out or self.training)[0]
 
+    def relit(self, light: Light) -> Photos:
+        """The photos, with those to train on brought to the light of the photos around them.
+
+        light: of the training photos, in their order, measured at any size of them.
+
+        Held-out photos stay as they are: to fit them to the model would flatter the score.
+        """
+        changes = zip(self.training, light.departures, strict=True)
+        return replace(self, training=[view.relit(departure) for view, departure in changes])
+
 
 @dataclass(frozen=True)
 class Training:
@@ -238,28 +251,6 @@ def _load_photos(cameras: Cameras, size: int, stages: Stages) -> Photos:
     return Photos(training, held_out)
 
 
-def _resize_photos(cameras: Cameras, loaded: Photos, plan: Plan, facts: Facts, stages: Stages) -> Photos:
-    """`loaded`, or the photos loaded again at the plan's image size where that is smaller; `loaded` is then empty."""
-    if plan.image_size >= max(facts.width, facts.height):
-        return loaded
-    # Freed first: both sizes at once would be the most memory that photos ever take.
-    loaded.training.clear()
-    loaded.held_out.clear()
-    return _load_photos(cameras, plan.image_size, stages)
-
-
-def _relit(cameras: Cameras, probed: Photos, plan: Plan, photos: Photos) -> Photos:
-    """`photos`, those to train on with the light that the photos around them have, where the plan says so.
-
-    Held-out photos stay as they are: to fit them to the model would flatter the score.
-    """
-    light = light_of(cameras.world, probed.training) if plan.exposure else None
-    if light is None:
-        return photos
-    relit = [view.relit(change) for view, change in zip(photos.training, light.departures, strict=True)]
-    return replace(photos, training=relit)
-
-
 def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaussians, GivenModel | None]:
     """The Gaussians to start from, and the assessment of the given model; None where no model was given."""
     path = start_model_path(task.capture, task.workdir, task.options)
@@ -286,14 +277,15 @@ def _doubt_message(start: GivenModel) -> str:
 
 def _measure_facts(
     task: Task, cameras: Cameras, photos: Photos, gaussians: Gaussians, start: GivenModel | None
-) -> Facts:
-    """What can be measured before training: the scene, and how fast this machine trains it."""
+) -> tuple[Facts, Light | None]:
+    """What can be measured before training: the scene, how fast this machine trains it, and the photos' light."""
     pixels = photos.training[0].full.rgb[..., 0].numel()
     most = resolved(pixels, len(photos.training)) if start is None else 0
     speed = probe(open_engine(gaussians, task.kernels), photos.training, most=most)
-    facts = replace(measure(cameras.world, photos.training, len(photos.held_out), speed), start=start)
+    facts, light = measure(cameras.world, photos.training, len(photos.held_out), speed)
+    facts = replace(facts, start=start)
     card = describe() if task.kernels == "gpu" else None
-    return facts if card is None else replace(facts, memory_available=card.free_bytes)
+    return (facts if card is None else replace(facts, memory_available=card.free_bytes)), light
 
 
 def _make_plan(task: Task, facts: Facts, revise: Revise) -> Plan:

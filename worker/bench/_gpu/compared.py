@@ -131,7 +131,8 @@ def _ours(capture: Path, size: int, seconds: float, seed: int) -> Iterator[Row]:
     speed = probe(open_engine(first, "gpu"), views)
     card = device.describe()
     assert card is not None
-    facts = replace(measure(world, views, len(held_out), speed), memory_available=card.free_bytes)
+    measured, _ = measure(world, views, len(held_out), speed)
+    facts = replace(measured, memory_available=card.free_bytes)
     plan = decide(facts, TrainOptions(image_size=size, seed=seed, time_budget=seconds), "gpu")
     done = train(open_engine(first, "gpu"), views, held_out, plan, extent=EXTENT)
     common = {"scene": capture.name, "views": len(views), "held_out": len(held_out), "seed": seed}

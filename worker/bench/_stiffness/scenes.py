@@ -85,7 +85,7 @@ def planned(
     """
     options = TrainOptions(image_size=small.longest, steps=steps, max_gaussians=most)
     first = _first(small, seed)
-    facts = measure(small.world, small.training, len(small.held_out), None)
+    facts, _ = measure(small.world, small.training, len(small.held_out), None)
     plan = replace(revised(decide(facts, options, "cpu"), changes), seed=seed)
     gaussians = most_opaque(first, plan.max_gaussians)
     if plan.initial == "points":

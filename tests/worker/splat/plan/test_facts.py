@@ -21,7 +21,7 @@ from tests.support.training import sparse_scene
 
 
 def facts(world: Scene, views: list[TrainingView]) -> Facts:
-    return measure(world, views, 0, None)
+    return measure(world, views, 0, None)[0]
 
 
 def darkened(views: list[TrainingView], gains: tuple[float, float, float]) -> None:
@@ -154,7 +154,7 @@ def test_equal_exposures_agree_and_unequal_ones_do_not() -> None:
     spreads = []
     for gains in (np.ones(count), np.where(np.arange(count) % 2, 0.6, 1.0)):
         scene, views = tracked(gains)
-        spreads.append(measure(scene, views, 0, None).exposure_spread)
+        spreads.append(facts(scene, views).exposure_spread)
     assert spreads[0] is not None
     assert spreads[1] is not None
     assert spreads[0] < 0.04
@@ -164,7 +164,7 @@ def test_equal_exposures_agree_and_unequal_ones_do_not() -> None:
 
 def test_geometry_is_measured() -> None:
     scene, views = tracked(np.ones(len(still_life.scene().views)))
-    seen = measure(scene, views, 2, None)
+    seen, _ = measure(scene, views, 2, None)
     assert seen.view_angle is not None
     assert 20.0 < seen.view_angle < 180.0
     assert seen.distance_ratio is not None
@@ -172,7 +172,7 @@ def test_geometry_is_measured() -> None:
     assert (seen.views, seen.held_out, seen.width, seen.height) == (14, 2, 96, 72)
     directions = np.array([view.full.camera.viewmat[2, :3] for view in views])
     assert seen.alignment == pytest.approx(float(np.sqrt((directions @ directions.T).mean())))
-    without = measure(still_life.scene(), still_life.training_views(), 0, None)
+    without = facts(still_life.scene(), still_life.training_views())
     assert without.exposure_spread is None
     assert without.view_angle is None
 

@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from splatmill_worker.scene import PointViews, Scene
-from splatmill_worker.splat.plan.light import Light, compared, light_of
+from splatmill_worker.splat.plan.facts import measure
+from splatmill_worker.splat.plan.light import Light, compared
 from splatmill_worker.splat.plan.observations import Observations
 from splatmill_worker.splat.views import Target, TrainingView
 from splatmill_worker.synthetic import look_at
@@ -31,7 +32,13 @@ def lit(gains: np.ndarray) -> tuple[Scene, list[TrainingView]]:
 
 
 def light(gains: np.ndarray) -> Light:
-    found = light_of(*lit(gains))
+    return light_of(*lit(gains))
+
+
+def light_of(scene: Scene, views: list[TrainingView]) -> Light:
+    seen = Observations.of(scene, views)
+    assert seen is not None
+    found = compared(seen, views)
     assert found is not None
     return found
 
@@ -132,14 +139,13 @@ def test_a_photo_that_shows_too_little_keeps_its_light() -> None:
     counts = [int((track[a:b] != 5).sum()) for a, b in pairwise(offsets)]
     scene = Scene(**{**vars(world), "point_views": PointViews(np.cumsum([0, *counts]), track[kept])})
     found = light_of(scene, views)
-    assert found is not None
     assert np.isinf(found.errors[5])
     assert (found.departures[5] == 0).all()
     assert np.isfinite(found.tail)
 
 
 def test_without_tracks_light_cannot_be_compared() -> None:
-    assert light_of(still_life.scene(), still_life.training_views()) is None
+    assert measure(still_life.scene(), still_life.training_views(), 0, None)[1] is None
 
 
 def test_a_photo_is_brought_to_other_light_and_clipped_values_count_no_more() -> None:

@@ -14,7 +14,7 @@ import torch
 from splatmill_worker import memory
 from splatmill_worker.images.lens import distortion
 from splatmill_worker.scene import Scene
-from splatmill_worker.splat.plan.light import compared
+from splatmill_worker.splat.plan.light import Light, compared
 from splatmill_worker.splat.plan.observations import Observations
 from splatmill_worker.splat.start.cells import cells_of
 from splatmill_worker.splat.start.far_shell import shell_points
@@ -129,8 +129,10 @@ class Facts:
         return asdict(self)
 
 
-def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: Speed | None) -> Facts:
-    """Facts of `scene`, whose training photos are `views` in the same world, of any origin and unit.
+def measure(
+    scene: Scene, views: Sequence[TrainingView], held_out: int, speed: Speed | None
+) -> tuple[Facts, Light | None]:
+    """Facts of `scene`, whose training photos are `views` in the same world, of any origin and unit, and their light.
 
     held_out: number of held-out photos. speed: of this machine; None where it was not probed.
     """
@@ -138,7 +140,7 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
     width, height = (int(value) for value in np.median(sizes, axis=0))
     seen = Observations.of(scene, views)
     light = None if seen is None else compared(seen, views)
-    return Facts(
+    facts = Facts(
         views=len(views),
         held_out=held_out,
         width=width,
@@ -165,6 +167,7 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
         no_points=scene.facts.get("no_points"),
         **_coverage(scene, views),
     )
+    return facts, light
 
 
 def halving_loss(rgb: torch.Tensor) -> float:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatmill_worker.scene import Scene
 from splatmill_worker.splat.plan.observations import Observations
 from splatmill_worker.splat.views import TrainingView
 
@@ -90,12 +89,6 @@ class Light:
     def _known(self) -> npt.NDArray[np.bool_]:
         known: npt.NDArray[np.bool_] = np.isfinite(self.errors)
         return known
-
-
-def light_of(scene: Scene, views: Sequence[TrainingView]) -> Light | None:
-    """The light of the photos `views` of `scene`, in the same world; None where it cannot be compared."""
-    seen = Observations.of(scene, views)
-    return None if seen is None else compared(seen, views)
 
 
 def compared(seen: Observations, views: Sequence[TrainingView]) -> Light | None:
