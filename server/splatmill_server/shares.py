@@ -26,9 +26,9 @@ MAX_SHARES = 100
 KEPT_ENDED = timedelta(days=90)
 """Time for which the record of a link that has ended is kept, so that its page can say so."""
 
-HIDDEN_FILES = frozenset({"job.json", "frame.json"})
-"""Files of a model that no link gives out: the record names the owner and the options of the job, and the frame tells
-where the photos were taken."""
+HIDDEN_FILES = frozenset({"job.json", "frame.json", "report.json"})
+"""Files of a model that no link gives out: the record names the owner and the options of the job, the frame says where
+the photos were taken, and the report for programs names the machine. The page of the report does not."""
 
 _TOKEN = re.compile(r"([a-z0-9]{8,40})-([0-9a-f]{8})-([0-9a-f]{32})", re.ASCII)
 

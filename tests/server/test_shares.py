@@ -84,14 +84,14 @@ def test_a_link_opens_its_model_and_nothing_else(app: ServedApp, stranger: httpx
     model = stranger.get(base).json()
     assert (model["id"], model["name"], model["gaussians"]) == (MODEL, "still life <&>", 2)
     assert not {"owner", "job", "links"} & set(model)
-    assert not {"job.json", "frame.json"} & {file["name"] for file in model["files"]}
+    assert not {"job.json", "frame.json", "report.json"} & {file["name"] for file in model["files"]}
     own = app.http.get(f"/v1/models/{MODEL}/files/model.ply")
     assert stranger.get(f"{base}/files/model.ply").content == own.content
     part = stranger.get(f"{base}/files/model.ply", headers={"Range": "bytes=0-2"})
     assert (part.status_code, part.content) == (206, b"ply")
     assert stranger.head(f"{base}/files/model.ply").headers["etag"] == own.headers["etag"]
     assert stranger.get(f"{base}/cameras").json() == {"cameras": []}
-    for hidden in ("job.json", "frame.json"):
+    for hidden in ("job.json", "frame.json", "report.json"):
         problem(stranger.get(f"{base}/files/{hidden}"), 404, "file_not_found")
     problem(stranger.get(f"{base}/files/..%2f..%2f{OTHER}%2fmodel.ply"), 404, "file_not_found")
 

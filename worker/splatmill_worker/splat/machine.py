@@ -16,12 +16,11 @@ PACKAGES = ("splatmill", "splatmill-worker", "torch", "pycolmap", "numpy")
 
 
 def machine() -> dict[str, Any]:
-    """Processor, usable cores, memory in bytes, operating system and GPU (None without one)."""
+    """Processor, usable cores, memory in bytes and GPU (None without one): what times depend on."""
     return {
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "memory": psutil.virtual_memory().total,
-        "system": platform.platform(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
 

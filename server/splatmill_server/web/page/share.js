@@ -8,7 +8,7 @@ import { address, showShared } from "./shared_model.js";
 import { startShell } from "./shell.js";
 
 const KINDS = /** @type {Record<string, string>} */ ({
-  "report.html": "Report", "report.json": "Report as JSON",
+  "report.html": "Report",
   "report.png": "Error against time", "cameras.json": "Cameras of the photos", "preview.jpg": "Picture", "progress.mp4": "Film of the training",
 });
 

@@ -50,8 +50,13 @@ def trained(psnrs: list[float], held_out: bool) -> Trained:
     )
 
 
-def report_of(out: Path, result: Trained, left_out: tuple[tuple[str, str], ...] = ()) -> dict[str, Any]:
-    scene = replace(still_life.scene(), left_out=left_out)
+def report_of(
+    out: Path,
+    result: Trained,
+    left_out: tuple[tuple[str, str], ...] = (),
+    said: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    scene = replace(still_life.scene(), left_out=left_out, facts=said or {})
     views = still_life.training_views()
     measured, _ = facts.measure(scene, views, 0, None)
     held_out = views[:1] if result.held_out is not None else []
@@ -82,6 +87,33 @@ def test_photos_without_a_camera_are_counted_and_named(tmp_path: Path) -> None:
     named = "x0.png, x1.png, x2.png, x3.png, x4.png and 2 more"
     assert f"7 of 21 photos are not used: {named}. The report lists the reasons." in report["warnings"]
     assert {"photo": "x6.png", "why": "It shares too little."} in report["left_out"]
+
+
+def test_of_absolute_paths_only_names_of_files_are_left(tmp_path: Path) -> None:
+    """Messages of the operating system and of libraries name files by where they lie on this machine."""
+    reasons = {
+        "a.png": str(OSError(13, "Permission denied", "/srv/my data/jobs/7/images/day one/a.png")),
+        "b.png": "cannot identify image file '/srv/data/b.png'",
+        "c.png": "Check failed at /build/src/scene.cc:77: /srv/data/c.png is empty",
+    }
+    said = {"folder": Path("/srv/data/jobs/7"), "rate": "4 photos/s and/or 3/4, see https://example.org/a/b"}
+    report = report_of(tmp_path, trained([30.0], held_out=True), tuple(reasons.items()), said)
+    assert [row["why"] for row in report["left_out"] if "photo" in row] == [
+        "[Errno 13] Permission denied: 'a.png'",
+        "cannot identify image file 'b.png'",
+        "Check failed at scene.cc:77: c.png is empty",
+    ]
+    assert report["sfm"] == {"folder": "7", "rate": said["rate"]}
+    assert "/srv/" not in (tmp_path / "report.html").read_text()
+
+
+def test_the_page_names_the_backend_and_not_the_machine(tmp_path: Path) -> None:
+    report = report_of(tmp_path, trained([30.0], held_out=True))
+    page = (tmp_path / "report.html").read_text()
+    assert f"backend cpu, instruction set {report['versions']['instruction_set']}, " in page
+    assert f"{report['machine']['cores']} cores. " in page
+    assert report["machine"]["processor"] not in page
+    assert set(report["machine"]) == {"processor", "cores", "memory", "gpu"}
 
 
 def test_the_stages_the_offset_and_the_headline_are_those_of_the_run(tmp_path: Path) -> None:

@@ -34,6 +34,10 @@ COLOR_FITTED = (
 )
 
 
+OPEN_VERSIONS = ("splatmill", "backend", "instruction_set")
+"""Versions of report.json that the page shows, too: it is given out by links to the model."""
+
+
 @dataclass(frozen=True)
 class ViewComparison:
     """A rendered view beside its photo.
@@ -185,7 +189,7 @@ def _ended(stopped: str) -> str:
 
 
 def _footer(report: dict[str, Any]) -> str:
-    machine, versions = report["machine"], report["versions"]
-    named = ", ".join(f"{name} {value}" for name, value in versions.items() if value)
-    where = f"{machine['processor']}, {machine['cores']} cores, {format_bytes(machine['memory'])}"
-    return f"{where}. {named}. {_ended(report['result']['stopped'])}"
+    """What times depend on, as far as anybody may know it who has a link: report.json names the machine."""
+    versions, cores = report["versions"], report["machine"]["cores"]
+    named = [f"{name.replace('_', ' ')} {versions[name]}" for name in OPEN_VERSIONS if versions.get(name)]
+    return f"{', '.join([*named, f'{cores} cores'])}. {_ended(report['result']['stopped'])}"

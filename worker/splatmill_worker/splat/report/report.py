@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -77,6 +78,9 @@ class FinishedTraining:
     warnings: Sequence[str]
     time_lapse: Sequence[Mapping[str, Any]] = ()
 
+
+_FOLDERS = re.compile(r"""(?<=['"])/(?:[^'"/]+/)+|(?<![\w.:/'"-])/(?:[^\s/'"]+/)+""")
+"""The folders of an absolute path, which may hold spaces where it is quoted."""
 
 FORMAT = 1
 """Version of the format of report.json. A report without one has version 1."""
@@ -152,7 +156,10 @@ def _compared_part(target: Target, background: Tensor) -> Tensor:
 
 
 def plain(value: Any) -> Any:
-    """`value` in JSON's types: numbers that are not finite become None, arrays lists, and other objects their text."""
+    """`value` in JSON's types: numbers that are not finite become None, arrays lists, and other objects their text.
+
+    Of an absolute path, as in the message of an OSError, only the name of the file is left: reports are passed on.
+    """
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -161,7 +168,9 @@ def plain(value: Any) -> Any:
         return plain(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, bool | int | str) else str(value)
+    if value is None or isinstance(value, bool | int):
+        return value
+    return _FOLDERS.sub("", str(value))
 
 
 def _frame(frame: ModelFrame | None) -> dict[str, Any] | None:
