@@ -50,7 +50,7 @@ export class Edit {
         h("div", { class: "field" }, h("label", { for: "edit-size" }, "Largest size, in units"), this.size)),
       h("div", { class: "row" }, this.measureButton, this.makeButton),
       this.state,
-      h("p", { class: "hint" }, "This model is kept. The error is measured on up to 16 held-out photos; outside of a box these show nothing any more, so a crop lowers it."));
+      h("p", { class: "hint" }, "This model is kept. The error is measured on up to 16 held-out photos, which show what lies outside of a box, so a crop raises it."));
   }
 
   /** @param {View} view */

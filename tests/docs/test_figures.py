@@ -1,0 +1,205 @@
+"""The limits, times and defaults that the guides name are those of the program.
+
+A sentence of a page is written here with the values from the code in it, and must be in the page. Does not prove what
+the guides say in other words, nor that the program keeps to its constants: tests of each part do.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import pytest
+
+from splatmill import chunked_uploads
+from splatmill.backplane import bucket, entries, events, leases, memory, storage
+from splatmill.backplane import keys as redis_keys
+from splatmill.schema import CreateJob
+from splatmill_server import lists as listing
+from splatmill_server import orbits, outgoing, paging
+from splatmill_server.access import keys
+from splatmill_server.captures import imports, records
+from splatmill_server.jobs import estimate, restoring
+from splatmill_server.routes import job_live
+from splatmill_server.settings import Settings
+from splatmill_server.space import sweeper, usage
+from splatmill_server.up import supervisor
+from splatmill_server.webhooks import deliveries
+from splatmill_server.webhooks import records as webhooks
+from splatmill_worker import live, settings, time_lapse
+from splatmill_worker import memory as worker_memory
+from splatmill_worker.render_service import edit
+from splatmill_worker.service import mirror, redis_patience, rq_worker
+from splatmill_worker.splat.plan import photos
+from splatmill_worker.splat.report import report
+from splatmill_worker.splat.train import disagreement, evaluations
+from tests.support.paths import ROOT
+
+WORDS = (
+    "zero",
+    "one",
+    "two",
+    "three",
+    "four",
+    "five",
+    "six",
+    "seven",
+    "eight",
+    "nine",
+    "ten",
+    "eleven",
+    "twelve",
+)
+SCRIPTS = ROOT / "server" / "splatmill_server" / "web" / "page"
+
+
+def word(number: float) -> str:
+    """A small whole number in letters."""
+    assert number == int(number)
+    return WORDS[int(number)]
+
+
+def share(value: float) -> str:
+    """One over a whole number, as in `a tenth`."""
+    return {10: "a tenth", 20: "a twentieth", 100: "a hundredth"}[round(1 / value)]
+
+
+def default(name: str) -> Any:
+    """The default of a setting of the API."""
+    return Settings.model_fields[name].default
+
+
+def bound(field: str, name: str) -> int:
+    """A bound, ge or le, of a field of a new job."""
+    return next(
+        int(getattr(mark, name)) for mark in CreateJob.model_fields[field].metadata if hasattr(mark, name)
+    )
+
+
+def script(path: str, name: str) -> int:
+    """A constant of the web page: a number, or one shifted to the left."""
+    found = re.search(rf"\bconst {name} = (\d+)(?: << (\d+))?;", (SCRIPTS / path).read_text())
+    assert found is not None
+    return int(found[1]) << int(found[2] or 0)
+
+
+def pauses() -> str:
+    """The pauses of deliveries as the page writes them."""
+    hours = [pause // 3600 for pause in deliveries.PAUSES[3:]]
+    assert deliveries.PAUSES[:3] == (5, 300, 1800)
+    return f"5 seconds, 5 minutes, 30 minutes, {', '.join(map(str, hours[:-1]))} and {hours[-1]} hours"
+
+
+MIB, HOUR = 1 << 20, 3600
+
+SENTENCES: list[tuple[str, Callable[[], str]]] = [
+    ("serving", lambda: f"starts it again, up to {word(entries.MAX_RETRIES)} times"),
+    ("serving", lambda: f"waits again after about {leases.LEASE + default('reaper_interval'):.0f} seconds"),
+    ("serving", lambda: f"loses {word(leases.MAX_LOST)} workers in a row without a new checkpoint fails"),
+    ("serving", lambda: f"For {leases.LEASE} seconds after its return, none is taken for lost"),
+    (
+        "serving",
+        lambda: f"has {rq_worker.STOP_GRACE:.0f} seconds (`--stop-grace`; {supervisor._STOP_GRACE:.0f} under",
+    ),
+    ("serving", lambda: f"when it has run for {(settings.max_run_time() or 0) / HOUR:.0f} hours"),
+    ("serving", lambda: f"more than {100 * worker_memory.SHARE:.0f}% of the memory of the machine"),
+    ("serving", lambda: f"one waits {word(redis_patience.PATIENCE / 60)} minutes"),
+    ("serving", lambda: f"in the queue again after {restoring.GRACE} seconds"),
+    ("serving", lambda: f"before the last {default('min_free_bytes') // MIB} MiB are used"),
+    ("serving", lambda: f"its last {settings.DISK_RESERVE // MIB} MiB are used (`SPLATMILL_DISK_RESERVE`)"),
+    ("serving", lambda: f"At most {storage.SLOTS} requests of an API process"),
+    ("serving", lambda: f"a block of {bucket.BLOCK // MIB} MiB"),
+    ("serving", lambda: f"copying takes at most {share(mirror.CHECKPOINT_SHARE)} of the time"),
+    (
+        "serving",
+        lambda: f"copy takes over {word(mirror.CHECKPOINT_SHARE * mirror.CHECKPOINT_INTERVAL)} seconds",
+    ),
+    ("serving", lambda: f"clients that follow events ({default('max_event_streams')})"),
+    ("serving", lambda: f"one that ends {word(orbits.MAX_ATTEMPTS)} times in the same part"),
+    ("serving", lambda: f"more than {100 * memory.ALARM:.0f}% of its `maxmemory`"),
+    ("serving", lambda: f"(from {bound('priority', 'ge')} to {bound('priority', 'le')}, by default 0)"),
+    ("webhooks", lambda: f"is sent again** after {pauses()}"),
+    ("webhooks", lambda: f"within {deliveries.ANSWER_SECONDS:.0f} seconds"),
+    (
+        "webhooks",
+        lambda: f"the first {deliveries.MAX_ANSWER} bytes of the answer, for {webhooks.KEPT_DAYS} days",
+    ),
+    ("webhooks", lambda: f"After {word(len(deliveries.PAUSES) + 1)} failures of one delivery"),
+    ("webhooks", lambda: f"For {webhooks.GRACE.total_seconds() / HOUR:.0f} hours, requests carry signatures"),
+    ("uploads", lambda: f"max-size={default('max_file_bytes')}, max-age={records.STALE_SECONDS}"),
+    ("uploads", lambda: f"is deleted** after {records.STALE_SECONDS // HOUR} hours without a byte"),
+    ("uploads", lambda: f"is asked {word(imports.MAX_ATTEMPTS)} times"),
+    ("uploads", lambda: f"every redirect (at most {word(imports.MAX_REDIRECTS)})"),
+    ("uploads", lambda: "ports besides {}, {}, {} and {}".format(*sorted(outgoing.PORTS))),
+    ("uploads", lambda: f"send files over {chunked_uploads.PIECE // MIB} MB in pieces"),
+    ("uploads", lambda: f"blocks of {bucket.BLOCK // MIB} MB are kept as objects"),
+    ("access", lambda: f"reads the keys again after {word(keys.CACHE_SECONDS)} seconds"),
+    ("access", lambda: f"ends after {word(default('session_seconds') / HOUR)} hours"),
+    (
+        "storage",
+        lambda: f"looks every {word(default('sweep_interval') / 60)} minutes (`SPLATMILL_SWEEP_INTERVAL`)",
+    ),
+    ("storage", lambda: f"deletes up to {sweeper.MOST} records at a time"),
+    ("storage", lambda: f"Listings take at most {share(usage.SCAN_SHARE)} of the time"),
+    (
+        "rest",
+        lambda: f"at most {orbits.MAX_UNFINISHED} wait, and a model keeps at most {orbits.MAX_OF_MODEL}",
+    ),
+    ("rest", lambda: f"are kept apart, up to {events.BOUNDS[redis_keys.log]} each"),
+    ("rest", lambda: f"up to {word(estimate.ALIKE)} jobs that are most alike"),
+    ("rest", lambda: f"the newest entries first, {paging.DEFAULT_LIMIT} at a time"),
+    ("rest", lambda: f"at most {listing.SCANNED} records are read for one page"),
+    ("web", lambda: f"at most {time_lapse.MOST} and {time_lapse.MOST_BYTES // 10**6} MB"),
+    ("web", lambda: f"take at most {share(time_lapse.SHARE)} of the training"),
+    ("web", lambda: f"at most {live.MOST_GAUSSIANS:,} Gaussians"),
+    ("web", lambda: f"comes every {word(live.INTERVAL)} seconds"),
+    ("web", lambda: f"at most {100 * live.SHARE:.0f} % of the time that the job is watched"),
+    ("web", lambda: f"stops making snapshots {job_live.WATCH_SECONDS:.0f} seconds after"),
+    ("web", lambda: f"up to {edit.MOST_PHOTOS} held-out photos"),
+    ("web", lambda: f"Files over {script('new/one_file.js', 'PIECE') // MIB} MB go in pieces"),
+    ("web", lambda: f"Up to {word(script('new/sending.js', 'CONCURRENT'))} files are sent at once"),
+    (
+        "report",
+        lambda: (
+            f"at most {len(evaluations.EVALUATED_AT)} in a run, and {len(evaluations.SHORT_EVALUATED_AT)} in a short"
+        ),
+    ),
+    ("report", lambda: f"together take at most {share(evaluations.SHARE)} of the training time"),
+    (
+        "report",
+        lambda: (
+            f"up to {word(evaluations.ALSO_EVALUATED)} of the training photos, at the last dot over "
+            f"{evaluations.FINALLY_EVALUATED} to {2 * evaluations.FINALLY_EVALUATED - 1}"
+        ),
+    ),
+    (
+        "report",
+        lambda: (
+            f"one in {word(photos.PHOTOS_PER_VALIDATION)} of the training photos is set aside, at most "
+            f"{word(photos.MOST_VALIDATION)}"
+        ),
+    ),
+    ("report", lambda: f"departs by {100 * photos.LIGHT_DEPARTS:.1f} % or more"),
+    ("report", lambda: f"more than {report.MISFIT:.0f} dB under their median"),
+    ("report", lambda: f"by {disagreement.WHOLLY_OFF_DB:.1f} dB or more"),
+    (
+        "report",
+        lambda: (
+            f"after {word(disagreement.VISITS)} steps on each photo or {word(10 * disagreement.LATEST)} tenths of "
+            "the run"
+        ),
+    ),
+]
+"""Pages of docs/, and what each says."""
+
+
+@cache
+def text(page: str) -> str:
+    return " ".join((ROOT / "docs" / f"{page}.md").read_text().split())
+
+
+@pytest.mark.parametrize(("page", "sentence"), SENTENCES, ids=range(len(SENTENCES)))
+def test_the_figures_are_those_of_the_program(page: str, sentence: Callable[[], str]) -> None:
+    assert sentence() in text(page)
