@@ -19,7 +19,7 @@ WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 3)))
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: help install demo quick test coverage check wheels docs screenshots pictures bench soak capacity fleet load fuzz serve sanitize clean
+.PHONY: help install demo quick test coverage check wheels docs screenshots pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -73,6 +73,9 @@ fleet: $(VENV)/.installed-dev ## what 10 to 1,000 simulated workers ask of Redis
 
 load: $(VENV)/.installed-dev ## p50, p99, errors and memory against the number of clients (some minutes)
 	$(BIN)/splatmill bench load $(LOAD_ARGS)
+
+abuse: $(VENV)/.installed-dev ## what one owner who abuses the service costs another who trains (some minutes)
+	$(BIN)/splatmill bench abuse $(ABUSE_ARGS)
 
 fuzz: $(VENV)/.installed-dev ## ten thousand requests made up from the OpenAPI document, and changed files for every parser (two hours)
 	$(BIN)/splatmill bench openapi $(OPENAPI_ARGS)

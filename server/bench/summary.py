@@ -1,6 +1,6 @@
 """The table of the README on what the service survives and how fast it answers, from the newest rows of its benches.
 
-    splatmill bench summary      # after soak, load, capacity, fleet, openapi or fuzz
+    splatmill bench summary      # after soak, load, abuse, capacity, fleet, openapi or fuzz
 
 Each bench writes its own page; this writes a line of each into the README, between two comments. A test compares them.
 """
@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import abuse
 from _rows import Row, footer, lines
 
 HERE = Path(__file__).resolve().parent
@@ -86,6 +87,28 @@ def _load(rows: list[Row]) -> Told:
         )
 
 
+def _abuse(rows: list[Row]) -> Told:
+    if not rows:
+        return
+    alone, abused = abuse.newest(rows)
+    figures = [
+        f"{what} {abuse.shown(abuse.median(abused, name))} ({abuse.shown(abuse.median(alone, name))})"
+        for name, what in (
+            ("waiting_s", "its job starts after"),
+            ("first_event_s", "its first event comes after"),
+            ("import_s", "its import takes"),
+            ("webhook_s", "its webhook comes after"),
+        )
+    ]
+    row = abused[-1]
+    yield (
+        "one owner abuses events, uploads, imports, webhooks, its quota and a link at once, while another trains",
+        f"of the other, beside what it is alone: {', '.join(figures)}; of {row['limit'] / 1e6:.1f} MB that the first "
+        f"may store, it held {row['most_bytes'] / 1e6:.1f} MB at most",
+        [row],
+    )
+
+
 def _capacity(rows: list[Row]) -> Told:
     if not rows:
         return
@@ -140,6 +163,7 @@ def _fuzz(rows: list[Row]) -> Told:
 TOLD: dict[str, Callable[[list[Row]], Told]] = {
     "soak": _soak,
     "load": _load,
+    "abuse": _abuse,
     "capacity": _capacity,
     "fleet": _fleet,
     "openapi": _openapi,
