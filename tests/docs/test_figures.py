@@ -16,12 +16,13 @@ import pytest
 from splatmill import chunked_uploads
 from splatmill.backplane import bucket, entries, events, leases, memory, storage
 from splatmill.backplane import keys as redis_keys
-from splatmill.schema import CreateJob
+from splatmill.schema import MAX_PHOTO_PIXELS, MIN_PHOTO_SIDE, CreateJob, TrainOptions
 from splatmill_server import lists as listing
 from splatmill_server import orbits, outgoing, paging
 from splatmill_server.access import keys
 from splatmill_server.captures import imports, records
 from splatmill_server.jobs import estimate, restoring
+from splatmill_server.jobs import records as jobs
 from splatmill_server.routes import job_live
 from splatmill_server.settings import Settings
 from splatmill_server.space import sweeper, usage
@@ -30,8 +31,10 @@ from splatmill_server.webhooks import deliveries
 from splatmill_server.webhooks import records as webhooks
 from splatmill_worker import live, settings, time_lapse
 from splatmill_worker import memory as worker_memory
+from splatmill_worker.images import archive, guarded, video
 from splatmill_worker.render_service import edit
 from splatmill_worker.service import mirror, redis_patience, rq_worker
+from splatmill_worker.sfm import checks
 from splatmill_worker.splat.plan import photos
 from splatmill_worker.splat.report import report
 from splatmill_worker.splat.train import disagreement, evaluations
@@ -151,6 +154,7 @@ SENTENCES: list[tuple[str, Callable[[], str]]] = [
     ("rest", lambda: f"up to {word(estimate.ALIKE)} jobs that are most alike"),
     ("rest", lambda: f"the newest entries first, {paging.DEFAULT_LIMIT} at a time"),
     ("rest", lambda: f"at most {listing.SCANNED} records are read for one page"),
+    ("rest", lambda: f"`Idempotency-Key` within {word(jobs.IDEMPOTENCY_DAYS)} days make one job"),
     ("web", lambda: f"at most {time_lapse.MOST} and {time_lapse.MOST_BYTES // 10**6} MB"),
     ("web", lambda: f"take at most {share(time_lapse.SHARE)} of the training"),
     ("web", lambda: f"at most {live.MOST_GAUSSIANS:,} Gaussians"),
@@ -191,6 +195,24 @@ SENTENCES: list[tuple[str, Callable[[], str]]] = [
             "the run"
         ),
     ),
+    ("photographing", lambda: f"At most {TrainOptions().max_video_frames} frames are taken from it"),
+    ("photographing", lambda: f"about {video.FEWEST} are taken"),
+    ("photographing", lambda: f"more than {MAX_PHOTO_PIXELS // 10**6} million pixels is left out"),
+    ("photographing", lambda: f"a side under {MIN_PHOTO_SIDE} pixels"),
+    ("photographing", lambda: f"up to {word(guarded.MAX_VIDEO_SECONDS / HOUR)} hours long"),
+    ("photographing", lambda: f"frames of up to {guarded.MAX_FRAME_PIXELS // 10**6} million pixels"),
+    (
+        "photographing",
+        lambda: f"hold up to {archive.MAX_ENTRIES:,} files and {archive.MAX_TOTAL_BYTES // (1 << 30)} GiB",
+    ),
+    (
+        "photographing",
+        lambda: (
+            f"(in sets of up to {word(checks.SMALL_SET)}), or fewer than {100 * checks.MIN_SHARE:.0f} % (in larger "
+            f"sets), could be placed, or fewer than {checks.MIN_POINTS} points"
+        ),
+    ),
+    ("photographing", lambda: f"below {checks.MIN_TRIANGULATION_ANGLE} degrees the job fails"),
 ]
 """Pages of docs/, and what each says."""
 

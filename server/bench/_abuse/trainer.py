@@ -24,7 +24,7 @@ JOB_LONGEST = 180.0
 PIECES, TRICKLE = 3, 8
 """Requests in which one photo is uploaded, and parts of each, a tenth of a second apart, as over a slow line."""
 
-FOLLOWS_AFTER = 1.0
+FOLLOWS_AFTER = 2.0
 """Seconds from the start of a job until it is followed, as by somebody who opens its page."""
 
 STEPS = 400
