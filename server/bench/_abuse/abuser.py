@@ -60,6 +60,14 @@ class Abuser:
         self.answers[f"{what} {answer.status_code}"] += 1
         return answer
 
+    async def _made(self, what: str, path: str, body: dict[str, Any]) -> str:
+        """Return the id of a new record, which is asked for until there is room for it."""
+        while True:
+            made = await self.ask(what, "POST", path, json=body)
+            if made is not None and made.is_success:
+                return str(made.json()["id"])
+            await asyncio.sleep(0.5)
+
     async def events(self) -> None:
         """Follow each job of the other owner before anybody else does, from a position that is never reached.
 
@@ -100,10 +108,7 @@ class Abuser:
         await asyncio.gather(*(self._upload(content, headers) for _ in range(CAPTURES)))
 
     async def _upload(self, content: bytes, headers: dict[str, str]) -> None:
-        made = await self.ask("capture", "POST", "/v1/captures", json={})
-        if made is None or made.status_code != 201:
-            return
-        path = f"/v1/captures/{made.json()['id']}/images/{self.photo.name}"
+        path = f"/v1/captures/{await self._made('capture', '/v1/captures', {})}/images/{self.photo.name}"
         while True:
             begun = await self.ask("upload", "PUT", path, headers=headers)
             if begun is None or "Location" not in begun.headers:
@@ -128,11 +133,7 @@ class Abuser:
     async def imports(self) -> None:
         """Have files fetched that never arrive, into new captures when one takes no more."""
         while True:
-            made = await self.ask("capture", "POST", "/v1/captures", json={})
-            if made is None or made.status_code != 201:
-                await asyncio.sleep(1)
-                continue
-            capture = made.json()["id"]
+            capture = await self._made("capture", "/v1/captures", {})
             for number in range(30):
                 kind = ("slow", "endless", "later")[number % 3]
                 body = {"url": f"{self.host.url}/{kind}?{number}", "name": f"{number}.jpg"}
@@ -144,9 +145,8 @@ class Abuser:
         for number in range(HOOKS):
             await self.ask("webhook", "POST", "/v1/webhooks", json={"url": f"{self.host.url}/hang?{number}"})
         while True:
-            made = await self.ask("job", "POST", "/v1/jobs", json=self._job())
-            if made is not None and made.status_code == 202:
-                await self.ask("cancel", "POST", f"/v1/jobs/{made.json()['id']}/cancel")
+            job = await self._made("job", "/v1/jobs", self._job())
+            await self.ask("cancel", "POST", f"/v1/jobs/{job}/cancel")
             await asyncio.sleep(0.5)
 
     async def edits(self) -> None:
@@ -178,11 +178,7 @@ class Abuser:
 
     async def restarts(self) -> None:
         """Restart a cancelled job from many connections at the same moment, and cancel it."""
-        made = None
-        while made is None or made.status_code != 202:
-            made = await self.ask("job", "POST", "/v1/jobs", json=self._job())
-            await asyncio.sleep(1)
-        path = f"/v1/jobs/{made.json()['id']}"
+        path = f"/v1/jobs/{await self._made('job', '/v1/jobs', self._job())}"
         while True:
             await self.ask("cancel", "POST", f"{path}/cancel")
             await asyncio.sleep(0.5)
@@ -228,12 +224,13 @@ async def main(asked: dict[str, Any]) -> None:
     tasks = [asyncio.ensure_future(abuse()) for abuse in abuser.abuses]
     end = asyncio.ensure_future(asyncio.to_thread(sys.stdin.read))
     await asyncio.wait([*tasks, end], return_when=asyncio.FIRST_COMPLETED)
+    ended = [task for task in tasks if task.done()]
     for task in tasks:
-        if task.done():
-            task.result()  # an abuse ends only by a fault of this program
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
     server.close()
+    for task in ended:
+        raise RuntimeError("An abuse has ended, which is a fault of this program.") from task.exception()
     print(json.dumps(dict(sorted(abuser.answers.items()))), flush=True)
 
 
