@@ -51,7 +51,7 @@ NAMED: dict[str, dict[str, Forced]] = {
     "undistortion": {"some": Forced(capture=("distorted",)), "none": Forced()},
     "end": {
         "steps": Forced({"steps": STEPS}),
-        "time": Forced({"time_budget": 1}, {"schedule.budget": Budget(STEPS, 1.0)}),
+        "time": Forced({"time_budget": 600}, {"schedule.budget": Budget(STEPS, 600.0)}),
         "target": Forced({"target_psnr": 45}, {"schedule.budget": ALL}),
         "flat": Forced(plan={"schedule.budget": ALL, "stops_when_flat": True, "validation": 1}),
     },
