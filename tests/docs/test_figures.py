@@ -203,7 +203,10 @@ SENTENCES: list[tuple[str, Callable[[], str]]] = [
     ("photographing", lambda: f"frames of up to {guarded.MAX_FRAME_PIXELS // 10**6} million pixels"),
     (
         "photographing",
-        lambda: f"hold up to {archive.MAX_ENTRIES:,} files and {archive.MAX_TOTAL_BYTES // (1 << 30)} GiB",
+        lambda: (
+            f"hold up to {archive.MAX_ENTRIES:,} files, and with the frames of its videos "
+            f"{settings.MAX_UNPACKED // (1 << 30)} GiB. A zip as a whole is compressed up to {archive.MAX_RATIO} to 1"
+        ),
     ),
     (
         "photographing",

@@ -21,6 +21,7 @@ from splatmill_worker import pipeline
 from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.lock import JobLock
 from splatmill_worker.service.publish import publish
+from splatmill_worker.service.room import Room
 from splatmill_worker.splat.machine import machine
 from tests.support import still_life
 from tests.support.served_app import Serve, problem
@@ -66,6 +67,7 @@ def test_a_link_gives_out_nothing_about_the_machine(serve: Serve, tmp_path: Path
         Attempt(app.redis, job, found.generation, 1, JobLock(app.redis, job, "token")),
         found,
         outcome.out,
+        Room(app.redis, found.owner, job),
     )
     link = app.http.post(f"/v1/models/{job}/shares", json={}).raise_for_status().json()["path"]
     with httpx.Client(base_url=app.http.base_url) as stranger:
