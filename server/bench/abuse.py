@@ -57,6 +57,7 @@ LIMIT = 8_000_000
 MEASURED = {
     "waiting_s": "until the job starts",
     "first_event_s": "until the first event",
+    "job_s": "the job itself, whose work shares the cores",
     "longest_gap_s": "longest time between two events",
     "upload_s": "upload in pieces",
     "import_s": "import",

@@ -130,8 +130,9 @@ class Trainer:
 
         done = _within(JOB_LONGEST, over)
         times = stream.end()
-        webhook = None
+        webhook = worked = None
         if done:
+            worked = _time(record["finished_at"]) - _time(record["started_at"])
             _within(LONGEST, lambda: self._told(job) is not None)
             told = self._told(job)
             webhook = None if told is None else max(0.0, told - _time(record["finished_at"]))
@@ -140,7 +141,7 @@ class Trainer:
         waited = (
             _time(record["started_at"]) - _time(record["created_at"]) if record.get("started_at") else None
         )
-        return {"state": record["state"], "waiting_s": waited, **times, "webhook_s": webhook}
+        return {"state": record["state"], "waiting_s": waited, **times, "job_s": worked, "webhook_s": webhook}
 
     def _told(self, job: str) -> float | None:
         """The time at which the webhook of a job came."""
