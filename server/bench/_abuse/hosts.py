@@ -53,7 +53,7 @@ class Host:
     async def _behave(self, method: str, path: str, body: bytes, writer: asyncio.StreamWriter) -> None:
         match path:
             case "/slow":
-                writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: 1000000\r\n\r\n")
+                writer.write(b"HTTP/1.1 200 OK\r\nConnection: close\r\nContent-Length: 1000000\r\n\r\n")
                 while True:
                     writer.write(b"x")
                     await writer.drain()
@@ -65,7 +65,9 @@ class Host:
                     await writer.drain()
                     await asyncio.sleep(0.1)
             case "/later":
-                writer.write(b"HTTP/1.1 429 Later\r\nRetry-After: 86400\r\nContent-Length: 0\r\n\r\n")
+                writer.write(
+                    b"HTTP/1.1 429 Later\r\nConnection: close\r\nRetry-After: 86400\r\nContent-Length: 0\r\n\r\n"
+                )
             case "/hang":
                 await asyncio.sleep(3600)
             case "/file" if method == "POST":
