@@ -169,11 +169,10 @@ def _disk() -> Iterator[Finding]:
 def _decoders() -> Iterator[Finding]:
     from splatmill_worker.images.decoders import confined
 
-    with confined([], []) as decoders:
-        held = set(decoders.ready())
-    lacking = sorted({"files", "network"} - held)
+    with confined([]) as decoders:
+        lacking = decoders.lacking()
     if lacking:
-        seen = f"Photos are decoded in processes without secrets, but not kept from {' and '.join(lacking)}"
+        seen = f"Photos are decoded in processes without secrets, but {lacking}"
         advice = (
             "Landlock and seccomp of Linux do that. Where photos come from strangers, run workers in "
             "containers, or as a user with no other rights."
@@ -181,7 +180,9 @@ def _decoders() -> Iterator[Finding]:
         yield Finding("decoders", "warning", seen, advice)
     else:
         yield Finding(
-            "decoders", "ok", "Photos are decoded in processes without secrets, network or other files"
+            "decoders",
+            "ok",
+            "Photos are decoded in processes without secrets, network, files to write, or other files",
         )
 
 

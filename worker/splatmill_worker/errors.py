@@ -10,6 +10,7 @@
     ├── CaptureIncomplete    files of the capture did not reach the training
     ├── SfmFailed            structure from motion ended without a usable scene
     ├── TrainingFailed       training ended with a numerical failure
+    ├── DecoderNotStarted  no process that decodes files can be started
     ├── ModelNotFound        there is no finished model with the requested id
     ├── ModelUnreadable      a model file cannot be read as 3D Gaussians, or is of an unknown format
     ├── QuotaReached         the owner has no room left for what the job stores or unpacks
@@ -103,7 +104,7 @@ class StartUnusable(Refusal):
 class UnusablePicture(Refusal):
     """A picture cannot be read, or exceeds a limit.
 
-    code: file_empty, not_an_image, image_truncated, image_too_small or image_too_large.
+    code: file_empty, not_an_image, image_truncated, image_too_small, image_too_large or decoder_ended.
     reason: what is wrong with it, as a part of a sentence.
     """
 
@@ -202,6 +203,17 @@ class TrainingFailed(WorkerError):
         self.name = name
         self.seen = seen
         self.step = step
+
+
+class DecoderNotStarted(WorkerError):
+    """No process that decodes the files of a capture can be started; `how` says how the last one ended."""
+
+    def __init__(self, how: str) -> None:
+        super().__init__(
+            "decoder_ended",
+            f"No process that decodes photos could be started: {how}.",
+            advice="Run `splatmill doctor` on the worker's machine, then restart the job.",
+        )
 
 
 class ModelNotFound(WorkerError):

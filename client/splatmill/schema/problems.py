@@ -81,6 +81,7 @@ PROBLEMS: dict[str, Kind] = {
     "import_failed": Kind(502, "The other server did not deliver the file"),
     "not_an_image": Kind(422, "The file is not an image that can be read"),
     "image_truncated": Kind(422, "The image file is incomplete"),
+    "decoder_ended": Kind(500, "The process that decodes a file was ended"),
     "image_too_small": Kind(422, "The image is too small"),
     "image_too_large": Kind(422, "The image has too many pixels"),
     "archive_bomb": Kind(422, "The archive would unpack to too much data"),

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -39,9 +36,8 @@ def photos(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def confinement(photos: Path, tmp_path: Path) -> Iterator[Decoders]:
-    (tmp_path / "work").mkdir()
-    with confined([photos], [tmp_path / "work"]) as started:
+def confinement(photos: Path) -> Iterator[Decoders]:
+    with confined([photos]) as started:
         yield started
 
 
@@ -63,7 +59,7 @@ def test_a_folder_with_a_video_is_prepared_alike(tmp_path: Path, photos: Path) -
     own = prepare(photos, None, tmp_path / "own", frames=3)
     work = tmp_path / "work"
     work.mkdir()
-    with confined([photos], [work]):
+    with confined([photos, work]):
         there = prepare(photos, None, work, frames=3)
     assert [photo.sha256 for photo in there.photos] == [photo.sha256 for photo in own.photos]
     assert [photo.exif for photo in there.photos] == [photo.exif for photo in own.photos]
@@ -89,28 +85,11 @@ def test_a_decoder_has_no_secret_and_only_the_files_of_its_job(
             decoders.decode(other)
 
 
-def test_a_decoder_that_dies_costs_one_picture(photos: Path, confinement: Decoders) -> None:
-    """SIGSEGV stands for what a fault in a decoder of pictures does."""
-    big = photos / "big.png"
-    Image.new("L", (12_000, 12_000)).save(big)
-    decoders.sizes(big, "big.png")
-
-    def kill() -> None:
-        time.sleep(0.05)
-        os.kill(children()[0], signal.SIGSEGV)
-
-    threading.Thread(target=kill).start()
-    with pytest.raises(UnusablePicture, match=r"big.png: its decoder ended unexpectedly \(signal 11\)"):
-        decoders.decode(big)
-    assert decoders.decode(big).size == (12_000, 12_000)  # by a new process
-
-
 def test_a_picture_that_takes_too_long_is_given_up(photos: Path, confinement: Decoders) -> None:
     big = photos / "big.png"
     Image.new("L", (12_000, 12_000)).save(big)
-    given = {"path": str(big), "at_least": None, "upright": True}
     with pytest.raises(UnusablePicture, match="decoding it took longer than 0 seconds"):
-        confinement.call(big, "decode", given, seconds=0.01)
+        decoders.call(here.pixels, big, None, True, check=here.picture_of, seconds=0.01)
 
 
 def test_reading_a_video_is_cancelled(photos: Path, tmp_path: Path, confinement: Decoders) -> None:
@@ -121,7 +100,7 @@ def test_reading_a_video_is_cancelled(photos: Path, tmp_path: Path, confinement:
 
 
 def test_no_process_is_left(photos: Path) -> None:
-    with confined([photos], []):
+    with confined([photos]):
         decoders.sizes(photos / "deep.png", "deep.png")
         assert len(children()) == 1
     assert children() == []

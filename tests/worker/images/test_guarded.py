@@ -16,7 +16,7 @@ from PIL import Image
 
 from splatmill_worker import memory
 from splatmill_worker.errors import Refusal, UnusablePicture, UnusableVideo
-from splatmill_worker.images import archive, decode, guarded, video
+from splatmill_worker.images import archive, decode, decoders, guarded
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.service.problems import problem_of
 from tests.support.hostile import archives, pictures, videos
@@ -151,26 +151,26 @@ def test_the_memory_for_decoding_is_a_part_of_the_containers(
 @pytest.mark.parametrize("data", [videos.PLAYLIST, videos.CONCAT, b"x" * 5000, videos.video()[:300]])
 def test_what_is_no_video_of_the_list_opens_nothing_else(tmp_path: Path, data: bytes) -> None:
     with pytest.raises(UnusableVideo, match=r"walk\.mp4: it does not decode as an MP4, MOV"):
-        video.keyframes(write(tmp_path / "walk.mp4", data), tmp_path / "out", 4)
+        decoders.keyframes(write(tmp_path / "walk.mp4", data), tmp_path / "out", 4)
 
 
 @pytest.mark.parametrize("form", ["mpegts", "flv", "nut"])
 def test_containers_that_are_not_on_the_list_are_not_read(tmp_path: Path, form: str) -> None:
     data = videos.video(form)
     with pytest.raises(UnusableVideo):
-        video.keyframes(write(tmp_path / "walk.mp4", data), tmp_path / "out", 4)
+        decoders.keyframes(write(tmp_path / "walk.mp4", data), tmp_path / "out", 4)
 
 
 def test_a_video_without_length_is_measured(tmp_path: Path) -> None:
     with av.open(str(write(tmp_path / "walk.webm", videos.without_length()))) as container:
         assert container.duration is None
-    assert len(video.keyframes(tmp_path / "walk.webm", tmp_path / "out", 4)) == 4
+    assert len(decoders.keyframes(tmp_path / "walk.webm", tmp_path / "out", 4)) == 4
 
 
 def test_frames_larger_than_8k_are_refused_before_one_is_decoded(tmp_path: Path) -> None:
     path = write(tmp_path / "walk.avi", videos.larger_than_8k())
     with pytest.raises(UnusableVideo, match="35 million"):
-        video.keyframes(path, tmp_path / "out", 4)
+        decoders.keyframes(path, tmp_path / "out", 4)
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ def test_the_limits_of_a_video_name_it(
 ) -> None:
     monkeypatch.setattr(guarded, limit, value)
     with pytest.raises(UnusableVideo, match=said):
-        video.keyframes(write(tmp_path / "walk.mp4", videos.video()), tmp_path / "out", 4)
+        decoders.keyframes(write(tmp_path / "walk.mp4", videos.video()), tmp_path / "out", 4)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageFilter
 
 from splatmill_worker.errors import Cancelled, UnusableVideo
-from splatmill_worker.images import flow, video
+from splatmill_worker.images import decoders, flow, video
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.images.video import Candidate
 
@@ -97,7 +97,7 @@ def test_frames_lie_at_equal_distances_where_the_camera_went_unevenly(tmp_path: 
     steps = [0.0] * 60 + [30.0] * 30 + [10.0] * 60 + [0.0] * 50
     lefts = np.cumsum(steps)
     path = filmed(tmp_path / "walk.mp4", [seen(left) for left in lefts])
-    taken = lefts[numbers(video.keyframes(path, tmp_path / "out", 40))]
+    taken = lefts[numbers(decoders.keyframes(path, tmp_path / "out", 40))]
     gaps = np.diff(taken)
     assert 32 <= len(taken) <= 40
     assert taken[0] <= 60
@@ -109,7 +109,7 @@ def test_frames_lie_at_equal_distances_where_the_camera_went_unevenly(tmp_path: 
 def test_the_sharpest_of_neighbouring_frames_is_taken(tmp_path: Path) -> None:
     """Every fourth frame is sharp, the others are blurred along the way."""
     frames = [seen(4.0 * number, 0.0 if number % 4 == 1 else 6.0) for number in range(120)]
-    taken = numbers(video.keyframes(filmed(tmp_path / "walk.mp4", frames), tmp_path / "out", 15))
+    taken = numbers(decoders.keyframes(filmed(tmp_path / "walk.mp4", frames), tmp_path / "out", 15))
     assert 13 <= len(taken) <= 15
     assert all(number % 4 == 1 for number in taken)
 
@@ -122,7 +122,7 @@ def test_a_camera_that_stands_gives_few_frames(tmp_path: Path) -> None:
         Image.fromarray((still + random.normal(0, 3, still.shape)).clip(0, 255).astype(np.uint8))
         for _ in range(150)
     ]
-    taken = video.keyframes(filmed(tmp_path / "tripod.mp4", frames), tmp_path / "out", 100)
+    taken = decoders.keyframes(filmed(tmp_path / "tripod.mp4", frames), tmp_path / "out", 100)
     assert video.FEWEST // 2 <= len(taken) <= video.FEWEST
 
 
@@ -138,14 +138,14 @@ def test_frames_come_in_order_under_their_numbers(tmp_path: Path) -> None:
 
 def test_one_frame_is_enough(tmp_path: Path) -> None:
     path = filmed(tmp_path / "blink.mp4", [seen(0)])
-    assert numbers(video.keyframes(path, tmp_path / "out", 150)) == [0]
+    assert numbers(decoders.keyframes(path, tmp_path / "out", 150)) == [0]
 
 
 def test_of_a_video_with_a_damaged_end_the_frames_before_it_are_used(tmp_path: Path) -> None:
     whole = filmed(tmp_path / "whole.mkv", [seen(10.0 * number) for number in range(90)]).read_bytes()
     path = tmp_path / "cut.mkv"
     path.write_bytes(whole[: len(whole) * 2 // 3])
-    taken = numbers(video.keyframes(path, tmp_path / "out", 20))
+    taken = numbers(decoders.keyframes(path, tmp_path / "out", 20))
     assert 10 <= len(taken) <= 20
     assert 40 < taken[-1] < 75
 
@@ -174,7 +174,7 @@ def turned(path: Path) -> Path:
 
 
 def test_a_video_whose_frames_change_their_size_gives_frames_of_both(tmp_path: Path) -> None:
-    found = video.keyframes(turned(tmp_path / "walk.avi"), tmp_path / "out", 10)
+    found = decoders.keyframes(turned(tmp_path / "walk.avi"), tmp_path / "out", 10)
     assert len(found) == 10
     assert {frame_size(path) for path in found} == {(WIDTH, HEIGHT), (HEIGHT, WIDTH)}
 
@@ -184,15 +184,15 @@ def test_reading_is_cancelled_in_both_passes(tmp_path: Path) -> None:
     for after in (5, 45):
         asked = iter(range(1000))
         with pytest.raises(Cancelled):
-            video.keyframes(path, tmp_path / "out", 10, cancelled=lambda: next(asked) >= after)  # noqa: B023
+            decoders.keyframes(path, tmp_path / "out", 10, cancelled=lambda: next(asked) >= after)  # noqa: B023
 
 
 def test_no_frames_cannot_be_asked_for(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="at least 1"):
-        video.keyframes(tmp_path / "walk.mp4", tmp_path / "out", 0)
+        decoders.keyframes(tmp_path / "walk.mp4", tmp_path / "out", 0)
     (tmp_path / "walk.mp4").write_bytes(b"no video")
     with pytest.raises(UnusableVideo):
-        video.keyframes(tmp_path / "walk.mp4", tmp_path / "out", 5)
+        decoders.keyframes(tmp_path / "walk.mp4", tmp_path / "out", 5)
 
 
 @given(

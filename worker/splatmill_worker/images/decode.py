@@ -99,6 +99,23 @@ def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool
             return photo.copy() if photo is image else photo
 
 
+def pixels(path: Path, at_least: tuple[int, int] | None, upright: bool) -> Pixels:
+    """The photo that `decode` returns, as an array [H,W] or [H,W,C]. Raises as `decode` does."""
+    return np.asarray(decode(path, at_least=at_least, upright=upright))
+
+
+def picture_of(values: Pixels) -> Image.Image:
+    """The photo of the array that `pixels` returns. Raises ValueError for another array."""
+    modes = {(): "L", (3,): "RGB", (4,): "RGBA"}
+    if not isinstance(values, np.ndarray) or values.dtype != np.uint8 or 0 in values.shape:
+        raise ValueError("the pixels of a photo are bytes")
+    mode = modes.get(values.shape[2:]) if values.ndim in (2, 3) else None
+    if mode is None:
+        raise ValueError("a photo has one, three or four channels")
+    height, width = values.shape[:2]
+    return Image.frombuffer(mode, (width, height), values.reshape(-1), "raw", mode, 0, 1)
+
+
 def whole(image: Image.Image, name: str) -> Image.Image:
     """An opened picture decoded to its end, as RGB, RGBA or grey with 8 bits per channel, as stored.
 

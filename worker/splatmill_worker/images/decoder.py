@@ -1,44 +1,37 @@
-"""The process that decodes strangers' pictures and videos: `python -I -m splatmill_worker.images.decoder`.
+"""The process that reads strangers' files: `python -IB -m splatmill_worker.images.decoder`.
 
 It confines itself before it reads the first byte of a file, and then answers the calls of `decoders`, one after the
-other, on standard input and output. It has no secrets, no network, and only the folders that it was given.
+other, on standard input and output. It has no secrets, no network, no file to write, and only the folders that it was
+given to read.
 """
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import os
 import signal
 import struct
 import sys
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 from splatmill_worker.sandbox import confine
 
 LENGTHS = struct.Struct("=QQ")
-"""Before each message: the bytes of its JSON text, and of the pixels behind it."""
+"""Before each message: the bytes of its JSON text, and of the arrays behind it."""
 
-Answer = tuple[dict[str, Any], bytes]
-
-
-def read_message(stream: IO[bytes]) -> Answer | None:
-    """Return the next message and its pixels, or None at the end of the stream."""
-    head = stream.read(LENGTHS.size)
-    if len(head) < LENGTHS.size:
-        return None
-    text, pixels = LENGTHS.unpack(head)
-    return json.loads(stream.read(text)), stream.read(pixels)
+PACKAGE = "splatmill_worker."
+"""Beginning of the modules whose functions are called."""
 
 
-def write_message(stream: IO[bytes], message: dict[str, Any], pixels: bytes = b"") -> None:
-    text = json.dumps(message).encode()
-    stream.write(LENGTHS.pack(len(text), len(pixels)))
+def write_message(stream: IO[bytes], text: bytes, arrays: Sequence[memoryview] = ()) -> None:
+    stream.write(LENGTHS.pack(len(text), sum(array.nbytes for array in arrays)))
     stream.write(text)
-    stream.write(pixels)
+    for array in arrays:
+        stream.write(array)
     stream.flush()
 
 
@@ -48,25 +41,22 @@ def main() -> None:
     # Libraries may print; only answers may reach the caller.
     calls, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    first = read_message(calls)
+    first = _read_call(calls)
     if first is None:
         return
-    given = first[0]
-    held = confine(
-        [*map(Path, given["read"]), *program_files()], map(Path, given["write"]), int(given["memory"])
-    )
-    from splatmill_worker.images import guarded
+    held = confine([*map(Path, first["read"]), *program_files()], int(first["memory"]))
+    from splatmill_worker.images import guarded, messages
 
-    guarded.share_room(int(given["pixels"]), int(given["room"]))
-    answered = _answers()
-    write_message(answers, {"held": held})
-    while (message := read_message(calls)) is not None:
-        call = message[0]
+    guarded.share_room(int(first["pixels"]), int(first["room"]))
+    write_message(answers, *messages.packed({"held": held}))
+    while (call := _read_call(calls)) is not None:
         try:
-            result, pixels = answered[call["name"]](call["arguments"])
+            for answer in _answered(call):
+                write_message(answers, *messages.packed(answer))
+        except BrokenPipeError:
+            return  # the caller has ended
         except Exception as error:  # the caller raises it again
-            result, pixels = {"error": _described(error)}, b""
-        write_message(answers, result, pixels)
+            write_message(answers, *messages.packed({"error": messages.described(error)}))
 
 
 def program_files() -> list[Path]:
@@ -81,56 +71,33 @@ def program_files() -> list[Path]:
     return [*modules, *imported, *linked, Path(sys.prefix), Path(sys.base_prefix), *system]
 
 
-def _answers() -> dict[str, Callable[[dict[str, Any]], Answer]]:
-    from splatmill_worker.images.decode import decode, sizes
-    from splatmill_worker.images.examine import examine
-    from splatmill_worker.images.masks import mask_fault
-    from splatmill_worker.images.video import keyframes
-
-    def decoded(given: dict[str, Any]) -> Answer:
-        least = given["at_least"]
-        image = decode(
-            Path(given["path"]), at_least=tuple(least) if least else None, upright=given["upright"]
-        )
-        return {"mode": image.mode, "size": image.size}, image.tobytes()
-
-    def sized(given: dict[str, Any]) -> Answer:
-        return {"sizes": sizes(Path(given["path"]), given["name"])}, b""
-
-    def examined(given: dict[str, Any]) -> Answer:
-        found = examine(Path(given["path"]), given["name"])
-        return {"reason": found} if isinstance(found, str) else {"picture": asdict(found)}, b""
-
-    def fault(given: dict[str, Any]) -> Answer:
-        return {
-            "fault": mask_fault(Path(given["mask"]), tuple(given["photo"]), upright=given["upright"])
-        }, b""
-
-    def frames(given: dict[str, Any]) -> Answer:
-        written = keyframes(Path(given["path"]), Path(given["target"]), given["count"])
-        return {"names": [path.name for path in written]}, b""
-
-    return {
-        "decode": decoded,
-        "sizes": sized,
-        "examine": examined,
-        "mask_fault": fault,
-        "keyframes": frames,
-    }
+def _read_call(stream: IO[bytes]) -> dict[str, Any] | None:
+    """Return the next message, which has no arrays; None at the end of the stream."""
+    head = stream.read(LENGTHS.size)
+    if len(head) < LENGTHS.size:
+        return None
+    text: dict[str, Any] = json.loads(stream.read(LENGTHS.unpack(head)[0]))
+    return text
 
 
-def _described(error: Exception) -> dict[str, Any]:
-    from splatmill_worker.errors import UnusablePicture, UnusableVideo
+def _answered(call: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Call the function, and yield its result; of a generator, each part, and then an answer without a value."""
+    arguments = [tuple(value) if isinstance(value, list) else value for value in call["arguments"]]
+    result = _function(call["function"])(Path(call["path"]), *arguments)
+    if not isinstance(result, Iterator):
+        yield {"value": result}
+        return
+    for part in result:
+        yield {"part": part}
+    yield {"value": None}
 
-    if isinstance(error, UnusablePicture):
-        return {"kind": "picture", "code": error.code, "name": error.facts["file"], "reason": error.reason}
-    if isinstance(error, UnusableVideo):
-        return {"kind": "video", "name": error.facts["file"], "reason": error.reason}
-    if isinstance(error, OSError) and error.errno is not None:
-        return {"kind": "system", "errno": error.errno, "text": error.strerror, "path": error.filename}
-    if isinstance(error, MemoryError):
-        return {"kind": "memory"}
-    return {"kind": "other", "text": f"{type(error).__name__}: {error}"[:1000]}
+
+def _function(name: str) -> Callable[..., Any]:
+    module, _, own = name.partition(":")
+    if not module.startswith(PACKAGE):
+        raise ValueError(f"{name} is no function of this package.")
+    function: Callable[..., Any] = getattr(importlib.import_module(module), own)
+    return function
 
 
 if __name__ == "__main__":

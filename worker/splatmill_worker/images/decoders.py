@@ -1,77 +1,91 @@
-"""Decodes pictures and videos in processes of their own while an attempt runs, and in this process otherwise.
+"""Reads strangers' files in processes of their own while an attempt runs, and in this process otherwise.
 
 What reads strangers' files is the part that such a file may take over. Within `confined`, that part runs in processes
-without secrets, network, or files but those of the job (see `decoder` and `sandbox`), and one that crashes costs one
-photo. Programs on a user's own files (`fit-image`, the engine as a library) decode in their own process.
+without secrets, network, files to write, or files to read but those of the job (see `decoder` and `sandbox`). One that
+ends costs a second try, and one that ends twice the file. Programs on a user's own files (`fit-image`, the engine as a
+library) read in their own process.
+
+`call` runs any function of this package there: what `decode` and the others below do for pictures.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import queue
-import select
-import subprocess
-import sys
 import tempfile
-import time
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from PIL import Image
 from pydantic import TypeAdapter
 
+from splatmill.files import atomic_write
 from splatmill.schema.photos import MAX_PHOTO_PIXELS
-from splatmill_worker.errors import Cancelled, UnusablePicture, UnusableVideo
+from splatmill_worker.errors import DecoderNotStarted, UnusablePicture, UnusableVideo
 from splatmill_worker.images import decode as decode_here
 from splatmill_worker.images import examine as examine_here
-from splatmill_worker.images import guarded, masks, video
-from splatmill_worker.images.decoder import LENGTHS, write_message
+from splatmill_worker.images import guarded, masks, messages, video
+from splatmill_worker.images.decoder_process import (
+    MAX_ARRAYS,
+    PICTURE_SECONDS,
+    Call,
+    DecoderProcess,
+    Ended,
+    TimeIsUp,
+)
 from splatmill_worker.images.examine import Picture
 
 PROCESSES = min(os.cpu_count() or 1, 8)
 """Decoding processes of an attempt."""
 
-MEMORY = 16 * MAX_PHOTO_PIXELS + 2 * 2**30
-"""Bytes of address space of a decoding process: the largest photo, a few copies of it, and the libraries."""
+STARTS = 5
+"""Processes that are started for one call, if each ends before it has begun."""
 
-PICTURE_SECONDS = 300.0
-"""Time after which decoding one picture is given up. The largest ones take about a minute on a slow core."""
+LIBRARIES = 2 * 2**30
+"""Bytes of address space of a decoding process without a photo."""
 
-MAX_TEXT = 2**20
-"""Bytes of an answer besides its pixels."""
+_LACKING = {
+    "files": "they can read other files",
+    "calls": "they can use the network, start programs and change files",
+    "memory": "their memory is not limited",
+}
+"""What a decoding process can do without each of what `sandbox.confine` returns."""
 
-PIPE_BYTES = 2**20
-"""Size of the pipes: with Linux's default of 64 KiB, the two processes would take turns a thousand times a photo."""
+Fault = Callable[[str, str, str], Exception]
+"""Makes the error of a file that cannot be read, of a code, its name, and a reason as a part of a sentence. Codes:
+image_truncated (also of other files that are damaged), image_too_large, and decoder_ended. An error with the last code
+lets the job be tried again."""
 
-_KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "LD_LIBRARY_PATH")
-"""Environment variables that a decoding process is given."""
-
-_BYTES = {"L": 1, "RGB": 3, "RGBA": 4}
-
-Answer = tuple[dict[str, Any], bytearray]
-"""What a process answers, and pixels."""
+T = TypeVar("T")
 
 # What a process answers is checked, since a file may have taken the process over.
 _SIZES: TypeAdapter[tuple[tuple[int, int], tuple[int, int]]] = TypeAdapter(
     tuple[tuple[int, int], tuple[int, int]]
 )
-_PICTURE = TypeAdapter(Picture)
+_PICTURE: TypeAdapter[Picture | str] = TypeAdapter(Picture | str)
 _FAULT: TypeAdapter[str | None] = TypeAdapter(str | None)
+_ENDED: TypeAdapter[dict[str, str]] = TypeAdapter(dict[str, str])
+
+log = logging.getLogger("splatmill.decoders")
 
 _active: Decoders | None = None
 
 
 @contextmanager
-def confined(read: list[Path], write: list[Path]) -> Iterator[Decoders]:
+def confined(read: list[Path], ended: Path | None = None) -> Iterator[Decoders]:
     """Let decoding processes open the files of strangers within the block.
 
-    read, write: the files and folders that they may open.
+    read: the files and folders that they may open.
+    ended: a file that keeps which files have ended their process twice, for the next attempt: these are not opened
+        again.
     """
     global _active
-    decoders = Decoders(read, write)
+    decoders = Decoders(read, ended)
     _active = decoders
     try:
         yield decoders
@@ -80,58 +94,89 @@ def confined(read: list[Path], write: list[Path]) -> Iterator[Decoders]:
         decoders.close()
 
 
+def call(
+    function: Callable[..., Any],
+    path: Path,
+    *arguments: Any,
+    check: Callable[[Any], T],
+    fault: Fault = UnusablePicture,
+    seconds: float = PICTURE_SECONDS,
+    max_bytes: int = MAX_ARRAYS,
+) -> T:
+    """Return check(function(path, *arguments)), with the function called in a decoding process.
+
+    function: of a module of this package, not nested. It returns dicts, lists, tuples, dataclasses, str, numbers, None,
+        bytes and NumPy arrays; tuples arrive as lists, and dataclasses as dicts.
+    arguments: None, str, numbers, and tuples of these.
+    check: makes the value to return of what arrives, and raises ValueError, TypeError or KeyError for what the function
+        never returns.
+    fault: makes the error that is raised where the process ended twice or took longer than `seconds`, and where
+        its answer is none.
+    max_bytes: of the arrays of an answer.
+
+    Raises what the function raises: the errors of `messages`, OSError and ValueError. Others become a `fault`.
+    """
+    if _active is None:
+        return check(function(path, *arguments))
+    return _active.call(Call(function, path, arguments, seconds, max_bytes), check, fault)
+
+
 def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool = True) -> Image.Image:
     """Like `splatmill_worker.images.decode.decode`."""
     if _active is None:
         return decode_here.decode(path, at_least=at_least, upright=upright)
-    answer, pixels = _active.call(
-        path, "decode", {"path": str(path), "at_least": at_least, "upright": upright}
-    )
-    mode, (width, height) = answer["mode"], answer["size"]
-    if mode not in _BYTES or len(pixels) != width * height * _BYTES[mode]:
-        raise UnusablePicture("image_truncated", path.name, "its decoder gave an answer of another size")
-    return Image.frombuffer(mode, (width, height), pixels, "raw", mode, 0, 1)
+    return call(decode_here.pixels, path, at_least, upright, check=decode_here.picture_of)
 
 
 def sizes(path: Path, name: str) -> tuple[tuple[int, int], tuple[int, int]]:
     """Like `splatmill_worker.images.decode.sizes`."""
-    if _active is None:
-        return decode_here.sizes(path, name)
-    answer, _ = _active.call(path, "sizes", {"path": str(path), "name": name})
-    return _SIZES.validate_python(answer["sizes"])
+    return call(decode_here.sizes, path, name, check=_SIZES.validate_python)
 
 
 def examine(path: Path, name: str) -> Picture | str:
     """Like `splatmill_worker.images.examine.examine`."""
-    if _active is None:
-        return examine_here.examine(path, name)
     try:
-        answer, _ = _active.call(path, "examine", {"path": str(path), "name": name})
+        return call(examine_here.examine, path, name, check=_PICTURE.validate_python)
     except UnusablePicture as error:
         return error.reason
-    if "reason" in answer:
-        return str(answer["reason"])
-    return _PICTURE.validate_python(answer["picture"])
 
 
 def mask_fault(mask: Path, photo: tuple[int, int], *, upright: bool = True) -> str | None:
     """Like `splatmill_worker.images.masks.mask_fault`."""
-    if _active is None:
-        return masks.mask_fault(mask, photo, upright=upright)
-    answer, _ = _active.call(mask, "mask_fault", {"mask": str(mask), "photo": photo, "upright": upright})
-    return _FAULT.validate_python(answer["fault"])
+    return call(masks.mask_fault, mask, photo, upright, check=_FAULT.validate_python)
 
 
 def keyframes(
     path: Path, target: Path, count: int, *, cancelled: Callable[[], bool] = lambda: False
 ) -> list[Path]:
-    """Like `splatmill_worker.images.video.keyframes`."""
-    if _active is None:
-        return video.keyframes(path, target, count, cancelled=cancelled)
+    """Write at most `count` frames of the video at `path` as JPEGs in `target`, and return their paths in order.
+
+    The files are called <stem>_<frame number>.jpg. The frames are those of `splatmill_worker.images.video.keyframes`,
+    which raises the same errors.
+    """
     target.mkdir(parents=True, exist_ok=True)
-    given = {"path": str(path), "target": str(target), "count": count}
-    answer, _ = _active.call(path, "keyframes", given, 2 * guarded.MAX_READING_SECONDS, cancelled)
-    return [target / Path(str(name)).name for name in answer["names"]]
+    written: dict[int, Path] = {}
+
+    def write(number: int, picture: bytes) -> None:
+        written[number] = target / f"{path.stem}_{number:06d}.jpg"
+        written[number].write_bytes(picture)
+
+    if _active is None:
+        for frame in video.keyframes(path, count, cancelled):
+            write(*frame)
+    else:
+        _active.keyframes(path, count, write, cancelled)
+    return [written[number] for number in sorted(written)]
+
+
+def ended(path: Path) -> str | None:
+    """Why a file is not opened again, as a part of a sentence; None for one that has not ended its process twice."""
+    return None if _active is None else _active.ended(path)
+
+
+def forget_ended() -> bool:
+    """Let the files that ended their process twice be tried again. Return whether there were any."""
+    return _active is not None and _active.forget_ended()
 
 
 class Decoders:
@@ -140,171 +185,226 @@ class Decoders:
     held: what confines them, as `sandbox.confine` returns it; None before the first answer.
     """
 
-    def __init__(self, read: list[Path], write: list[Path], processes: int = PROCESSES) -> None:
+    def __init__(self, read: list[Path], ended: Path | None = None, processes: int = PROCESSES) -> None:
         self.held: tuple[str, ...] | None = None
         self._room = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `close`
+        self._root = read[0] if read else Path("/")
+        self._ended = _EndedFiles(ended)
+        self._memory = memory_limit()
         self._start = {
             "read": [str(path) for path in read],
-            "write": [str(path) for path in write],
-            "memory": MEMORY,
+            "memory": self._memory,
             "pixels": guarded.decoding_pixels() // processes,
             "room": self._room.fileno(),
         }
-        self._free: queue.LifoQueue[_Process | None] = queue.LifoQueue()
+        self._turns = _Turns()
+        self._processes = processes
+        self._free: queue.LifoQueue[DecoderProcess | None] = queue.LifoQueue()
         for _ in range(processes - 1):
             self._free.put(None)
-        self._free.put(_Process(self._start, self._room.fileno()))
-        self._processes = processes
+        first = None
+        with suppress(OSError):  # the first call tries again
+            first = DecoderProcess(self._start, self._room.fileno())
+        self._free.put(first)
 
-    def call(
-        self,
-        path: Path,
-        name: str,
-        arguments: dict[str, Any],
-        seconds: float = PICTURE_SECONDS,
-        cancelled: Callable[[], bool] = lambda: False,
-    ) -> Answer:
-        """Let a process answer a call about the file `path`; wait for a process if all are busy.
+    def call(self, call: Call, check: Callable[[Any], T], fault: Fault) -> T:
+        """Let a process answer a call; wait for a process if all are busy. See `decoders.call`.
 
-        Raises what the call raised, UnusablePicture or UnusableVideo when the process died of the file or took longer
-        than `seconds`, and Cancelled.
+        Raises DecoderNotStarted, and Cancelled.
         """
-        process = self._free.get()
-        try:
-            process = process or _Process(self._start, self._room.fileno())
-            self.held = process.ready()
-            answer = process.ask({"name": name, "arguments": arguments}, seconds, cancelled)
-        except _Died as error:
-            process = None
-            kind = UnusableVideo if name == "keyframes" else _unusable_picture
-            raise kind(path.name, str(error)) from error
-        except BaseException:
-            if process is not None:
-                process.kill()
-                process = None
-            raise
-        finally:
-            self._free.put(process)
-        _raise_described(answer[0].get("error"), path)
-        return answer
+        name = call.path.name
+        if (reason := self.ended(call.path)) is not None:
+            raise fault("decoder_ended", name, reason)
+        how = ""
+        for alone in (False, True):
+            try:
+                with self._turns.taken(alone=alone):
+                    answer = self._answer(call)
+                if "error" in answer:
+                    raise self._error(answer["error"], name, fault)
+                return check(answer["value"])
+            except _Answered as error:
+                raise error.error from None
+            except Ended as error:
+                how = str(error)
+            except TimeIsUp:
+                reason = f"decoding it took longer than {call.seconds:.0f} seconds"
+                raise fault("image_truncated", name, reason) from None
+            except (ValueError, TypeError, KeyError) as error:
+                raise fault(
+                    "image_truncated", name, "its decoder gave an answer that is not valid"
+                ) from error
+        reason = f"it could not be decoded: its decoder was ended twice ({how})"
+        self._ended.add(self._key(call.path), reason)
+        raise fault("decoder_ended", name, reason)
+
+    def keyframes(
+        self, path: Path, count: int, write: Callable[[int, bytes], None], cancelled: Callable[[], bool]
+    ) -> None:
+        """Call `write` with the number and the JPEG of each frame of `video.keyframes`; from the first one again if a
+        process ends. Raises UnusableVideo and Cancelled."""
+        sizes = dict[int, int]()
+
+        def part(value: Any) -> None:
+            number, picture = value
+            if type(number) is not int or type(picture) is not bytes or number < 0:
+                raise ValueError("a frame is a number and its JPEG")
+            sizes[number] = len(picture)
+            if len(sizes) > count or sum(sizes.values()) > video.MAX_WRITTEN_BYTES:
+                raise ValueError("there are more or larger frames than were asked for")
+            write(number, picture)
+
+        seconds = 2 * guarded.MAX_READING_SECONDS
+        call = Call(video.keyframes, path, (count,), seconds, MAX_ARRAYS, part, cancelled)
+        self.call(call, lambda value: None, lambda code, name, reason: UnusableVideo(name, reason))
 
     def ready(self) -> tuple[str, ...]:
-        """Wait until a process is confined, and return what holds. Raises RuntimeError if it does not start."""
-        process = self._free.get() or _Process(self._start, self._room.fileno())
-        self._free.put(process)
+        """Wait until a process is confined, and return what holds. Raises DecoderNotStarted."""
+        process = None
+        slot = self._free.get()
+        try:
+            process = self._started(slot)
+        finally:
+            self._free.put(process)
         return process.ready()
+
+    def lacking(self) -> str:
+        """What does not confine the processes here, as a part of a sentence; "" if all does."""
+        return _lacking(self.ready())
+
+    def ended(self, path: Path) -> str | None:
+        """See `decoders.ended`."""
+        return self._ended.reason(self._key(path))
+
+    def forget_ended(self) -> bool:
+        """See `decoders.forget_ended`."""
+        return self._ended.forget()
 
     def close(self) -> None:
         """End the processes. No call may be under way."""
         for _ in range(self._processes):
             process = self._free.get()
             if process is not None:
-                process.kill()
+                process.end()
         self._room.close()
 
+    def _key(self, path: Path) -> str:
+        return os.path.relpath(path, self._root)
 
-class _Died(Exception):
-    """A decoding process ended or was ended; the message is a part of a sentence about its file."""
-
-
-class _Process:
-    def __init__(self, start: dict[str, Any], inherited: int) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-I", "-m", "splatmill_worker.images.decoder"],
-            env={name: os.environ[name] for name in _KEPT if name in os.environ} | {"OMP_NUM_THREADS": "1"},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            bufsize=0,
-            pipesize=PIPE_BYTES,
-            pass_fds=(inherited,),
-        )
-        self._held: tuple[str, ...] | None = None
-        self._send(start)
-
-    def ready(self) -> tuple[str, ...]:
-        """Wait until the process is confined, and return what holds. Raises RuntimeError if it does not start."""
-        if self._held is None:
+    def _answer(self, call: Call) -> dict[str, Any]:
+        """The last answer of a process, which is kept if it can answer another call."""
+        slot, kept = self._free.get(), None
+        try:
+            process = self._started(slot)
             try:
-                answer, _ = self._answer(PICTURE_SECONDS, lambda: False)
-            except _Died as error:
-                raise RuntimeError(f"A process that decodes photos could not be started: {error}.") from error
-            self._held = tuple(answer["held"])
-        return self._held
+                answer = process.ask(call)
+            except BaseException:
+                process.end()
+                raise
+            kept = process
+            return answer
+        finally:
+            self._free.put(kept)
 
-    def ask(self, message: dict[str, Any], seconds: float, cancelled: Callable[[], bool]) -> Answer:
-        """Send a message and return the answer. Raises _Died when there is none in time, and Cancelled."""
-        self._send(message)
-        return self._answer(seconds, cancelled)
+    def _started(self, process: DecoderProcess | None) -> DecoderProcess:
+        """A process that waits for a call: `process`, or a new one where it has ended meanwhile."""
+        how = ""
+        for _ in range(STARTS):
+            try:
+                if process is None or not process.runs():
+                    if process is not None:
+                        process.end()
+                    process = DecoderProcess(self._start, self._room.fileno())
+                held = process.ready()
+                if self.held is None and (lacking := _lacking(held)):
+                    log.warning("Photos are decoded in processes without secrets, but %s.", lacking)
+                self.held = held
+                return process
+            except Ended as error:
+                how = str(error)
+            except TimeIsUp:
+                how = f"it was not ready after {PICTURE_SECONDS:.0f} seconds"
+            except OSError as error:
+                how = str(error)
+            process = None
+        raise DecoderNotStarted(how)
 
-    def _send(self, message: dict[str, Any]) -> None:
-        assert self._process.stdin is not None
-        with suppress(BrokenPipeError):  # there will be no answer, either
-            write_message(self._process.stdin, message)
+    def _error(self, description: Any, name: str, fault: Fault) -> Exception:
+        """The error that a process described, to be raised as it is."""
+        error = messages.error_of(description, lambda reason: fault("image_truncated", name, reason))
+        if isinstance(error, MemoryError):
+            limit = f"{self._memory / 2**30:.0f} GiB"
+            error = fault("image_too_large", name, f"decoding it takes more than {limit} of memory")
+        return _Answered(error)
 
-    def _answer(self, seconds: float, cancelled: Callable[[], bool]) -> Answer:
-        deadline = time.monotonic() + seconds
+
+def _lacking(held: tuple[str, ...]) -> str:
+    return " and ".join(words for name, words in _LACKING.items() if name not in held)
+
+
+def memory_limit() -> int:
+    """Bytes of address space of a decoding process: the largest photo and a few copies of it, or what the machine has
+    if that is less, and the libraries."""
+    return min(16 * MAX_PHOTO_PIXELS, guarded.machine_bytes()) + LIBRARIES
+
+
+class _Answered(Exception):
+    """Carries the error of a function, so that it is not taken for one of the answer."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__()
+        self.error = error
+
+
+class _Turns:
+    """Lets calls run together, or one of them alone: a photo whose process has ended, perhaps for want of memory."""
+
+    def __init__(self) -> None:
+        self._running = 0
+        self._alone = False
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def taken(self, *, alone: bool) -> Iterator[None]:
+        with self._changed:
+            self._changed.wait_for(lambda: not self._alone)
+            if alone:
+                self._alone = True
+                self._changed.wait_for(lambda: self._running == 0)
+            self._running += 1
         try:
-            text, pixels = LENGTHS.unpack(self._read(LENGTHS.size, deadline, cancelled))
-            if text > MAX_TEXT or pixels > 4 * MAX_PHOTO_PIXELS:
-                raise ValueError("the announced answer is too long")
-            return json.loads(self._read(text, deadline, cancelled)), self._read(pixels, deadline, cancelled)
-        except TimeoutError:
-            self.kill()
-            raise _Died(f"decoding it took longer than {seconds:.0f} seconds") from None
-        except (OSError, EOFError, ValueError) as error:
-            raise _Died(f"its decoder ended unexpectedly ({_said(self.kill())})") from error
-
-    def _read(self, length: int, deadline: float, cancelled: Callable[[], bool]) -> bytearray:
-        """Read `length` bytes of an answer. Raises EOFError, TimeoutError and Cancelled."""
-        assert self._process.stdout is not None
-        content = bytearray(length)
-        view, source = memoryview(content), self._process.stdout.fileno()
-        while view:
-            if not select.select([source], [], [], 0.2)[0]:
-                if cancelled():
-                    raise Cancelled("Reading the video was cancelled.")
-                if time.monotonic() > deadline:
-                    raise TimeoutError
-                continue
-            got = os.readv(source, [view])
-            if got == 0:
-                raise EOFError
-            view = view[got:]
-        return content
-
-    def kill(self) -> int:
-        """End the process and return its exit status."""
-        try:
-            status = self._process.wait(timeout=0.2)  # it may be ending by itself, for a reason
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            status = self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout):
-            assert stream is not None
-            with suppress(BrokenPipeError):
-                stream.close()
-        return status
+            yield
+        finally:
+            with self._changed:
+                self._running -= 1
+                self._alone = self._alone and not alone
+                self._changed.notify_all()
 
 
-def _said(status: int) -> str:
-    return f"signal {-status}" if status < 0 else f"exit status {status}"
+class _EndedFiles:
+    """Why files are not opened again, by their path below the job's folder; kept in a file if there is one."""
 
+    def __init__(self, kept: Path | None) -> None:
+        self._kept = kept
+        self._lock = threading.Lock()
+        self._reasons: dict[str, str] = {}
+        if kept is not None:
+            with suppress(OSError, ValueError):
+                self._reasons = _ENDED.validate_json(kept.read_bytes())
 
-def _unusable_picture(name: str, reason: str) -> UnusablePicture:
-    return UnusablePicture("image_truncated", name, reason)
+    def reason(self, key: str) -> str | None:
+        return self._reasons.get(key)
 
+    def add(self, key: str, reason: str) -> None:
+        with self._lock:
+            self._reasons[key] = reason
+            if self._kept is not None:
+                atomic_write(self._kept, json.dumps(self._reasons))
 
-def _raise_described(error: dict[str, Any] | None, path: Path) -> None:
-    """Raise the error that a decoding process described."""
-    if error is None:
-        return
-    if error["kind"] == "picture":
-        raise UnusablePicture(error["code"], error["name"], error["reason"])
-    if error["kind"] == "video":
-        raise UnusableVideo(error["name"], error["reason"])
-    if error["kind"] == "system":
-        raise OSError(error["errno"], error["text"], error["path"])
-    if error["kind"] == "memory":
-        limit = f"{MEMORY / 2**30:.0f} GiB"
-        raise UnusablePicture("image_too_large", path.name, f"decoding it takes more than {limit} of memory")
-    raise UnusablePicture("image_truncated", path.name, f"it does not decode: {error['text']}")
+    def forget(self) -> bool:
+        with self._lock:
+            had = bool(self._reasons)
+            self._reasons = {}
+            if self._kept is not None:
+                self._kept.unlink(missing_ok=True)
+            return had

@@ -283,13 +283,18 @@ class _Room:
                 self._changed.notify_all()
 
 
+def machine_bytes() -> int:
+    """Return the bytes of memory of the machine or container."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return min(total, memory.group_limit() or total)
+
+
 def decoding_pixels() -> int:
     """Return how many pixels may be in decoding at a time: a quarter of the memory of the machine or container.
 
     What is decoded is copied once or twice before it is reduced.
     """
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return min(total, memory.group_limit() or total) // 4 // _BYTES_PER_PIXEL
+    return machine_bytes() // 4 // _BYTES_PER_PIXEL
 
 
 _room = _Room(decoding_pixels())

@@ -35,7 +35,7 @@ def mask_of(name: str, masks: dict[str, Path]) -> Path | None:
     return next((masks[candidate] for candidate in candidates if candidate in masks), None)
 
 
-def mask_fault(mask: Path, photo: tuple[int, int], *, upright: bool = True) -> str | None:
+def mask_fault(mask: Path, photo: tuple[int, int], upright: bool = True) -> str | None:
     """What keeps a mask from being used, as a part of a sentence; None when it fits the photo. It is not decoded.
 
     photo: width and height in pixels.

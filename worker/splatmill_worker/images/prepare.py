@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES
-from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusableVideo
+from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
 from splatmill_worker.images import archive, decoders, exif, unpacked_room
 from splatmill_worker.images.masks import mask_of, masks_under
 
@@ -141,9 +141,19 @@ def prepare(
             mask = mask_of(name, mask_files)
             if mask is None and f"{name}.png" in own_masks:
                 mask = beside[f"{name}.png"]
-            photos[result.sha256] = _with_mask(result, mask, found)
+            try:
+                photos[result.sha256] = _with_mask(result, mask, found)
+            except UnusablePicture as error:
+                if error.code != "decoder_ended":
+                    raise
+                found.skipped.append((name, f"of its mask: {error.reason}"))
+                continue
             if result.several:
                 found.notes.append(f"{name} holds several pictures; the first one is used.")
+    if not photos and found.skipped and decoders.forget_ended():
+        # Whoever ends every process, as the kernel does for want of memory, ends them for healthy photos too.
+        name, reason = found.skipped[0]
+        raise UnusablePicture("decoder_ended", name, f"no photo is left; of this one: {reason}")
     ordered = tuple(sorted(photos.values(), key=lambda photo: photo.name))
     known = {photo.name for photo in ordered} | {name for name, _ in found.skipped} | own_masks | found.opened
     lost = [name for path in given if (name := path.relative_to(images).as_posix()) not in known]

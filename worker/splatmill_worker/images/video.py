@@ -7,6 +7,7 @@ keyframes).
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -61,34 +62,33 @@ class Candidate(NamedTuple):
 
 
 def keyframes(
-    path: Path, target: Path, count: int, *, cancelled: Callable[[], bool] = lambda: False
-) -> list[Path]:
-    """Write at most `count` frames of the video at `path` as JPEGs in `target`, and return their paths in order.
+    path: Path, count: int, cancelled: Callable[[], bool] = lambda: False
+) -> Iterator[tuple[int, bytes]]:
+    """Yield the numbers and the JPEGs of at most `count` frames of the video at `path`, in order.
 
-    The files are called <stem>_<frame number>.jpg. The rotation in the video is applied. Of a video with a damaged end,
-    the frames before the damage are used. The video is decoded twice: to choose the frames, and to write them.
+    The rotation in the video is applied. Of a video with a damaged end, the frames before the damage are used. The
+    video is decoded twice: to choose the frames, and to encode them.
 
     Raises UnusableVideo when the file has no video that decodes or exceeds a limit, and Cancelled.
     """
     if count < 1:
         raise ValueError(f"{count} frames were asked for; ask for at least 1.")
-    target.mkdir(parents=True, exist_ok=True)
     numbers = chosen(_candidates(path, CANDIDATES * count, cancelled), count)
-    written: list[Path] = []
-    size = 0
+    done = size = 0
     with _decoded(path, cancelled) as (_, frames):
         for number, frame in frames:
-            if number == numbers[len(written)]:
-                written.append(_save(frame, target / f"{path.stem}_{number:06d}.jpg"))
-                size += written[-1].stat().st_size
+            if number == numbers[done]:
+                picture = _jpeg(frame)
+                size += len(picture)
                 if size > MAX_WRITTEN_BYTES:
                     raise UnusableVideo(
                         path.name,
                         f"its frames have more than {MAX_WRITTEN_BYTES} bytes as JPEGs; take fewer or smaller frames",
                     )
-                if len(written) == len(numbers):
+                yield number, picture
+                done += 1
+                if done == len(numbers):
                     break
-    return written
 
 
 def chosen(candidates: Sequence[Candidate], count: int) -> list[int]:
@@ -208,8 +208,8 @@ def _grey(frame: av.VideoFrame, side: int) -> Grey:
     return grey
 
 
-def _save(frame: av.VideoFrame, place: Path) -> Path:
-    """Write a frame, upright."""
+def _jpeg(frame: av.VideoFrame) -> bytes:
+    """A frame, upright."""
     image: Image.Image = frame.to_image()  # type: ignore[no-untyped-call]  # PyAV leaves it untyped
     turn = {
         90: Image.Transpose.ROTATE_90,
@@ -218,5 +218,6 @@ def _save(frame: av.VideoFrame, place: Path) -> Path:
     }.get(round(frame.rotation) % 360)
     if turn is not None:
         image = image.transpose(turn)
-    image.save(place, quality=QUALITY, subsampling=0)
-    return place
+    picture = io.BytesIO()
+    image.save(picture, "JPEG", quality=QUALITY, subsampling=0)
+    return picture.getvalue()

@@ -9,9 +9,10 @@ from pathlib import Path
 from splatmill.schema import Problem, format_bytes, format_duration
 from splatmill_worker import memory, settings
 
-OOM_SCORE = 900
-"""`oom_score_adj` of an attempt's processes, of at most 1000. If the machine runs out of memory, the kernel kills them
-before Redis, the API and the worker itself, whose score is 0."""
+OOM_SCORE = 500
+"""`oom_score_adj` of an attempt, of at most 1000, which its decoding processes have (`sandbox`). If the machine runs
+out of memory, the kernel kills these first, unless the attempt has more than half of it, and the attempt before Redis,
+the API and the worker itself, whose score is 0."""
 
 _MEMORY_SECONDS = 0.5  # between two looks at the memory in use
 

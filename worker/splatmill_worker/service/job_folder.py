@@ -32,6 +32,9 @@ START, FILM, CHECKPOINTS, SNAPSHOTS = "start.ply", "film", "checkpoints", TIME_L
 """Names in the run folder: the model to start from, the frames of the progress film, the checkpoints, and the snapshots
 of the time-lapse."""
 
+ENDED = "ended_decoders.json"
+"""Name in the run folder of the list of files that are not opened again (`images.decoders`)."""
+
 _CAMERAS = "sfm"
 
 _RESTORING = "restoring"

@@ -8,7 +8,7 @@ from pathlib import Path
 from splatmill.backplane import layout
 from splatmill.backplane.storage import StorageError
 from splatmill_worker.errors import QuotaReached
-from splatmill_worker.service.job_folder import CHECKPOINTS, FILM, SNAPSHOTS, START, JobFolder
+from splatmill_worker.service.job_folder import CHECKPOINTS, ENDED, FILM, SNAPSHOTS, START, JobFolder
 from splatmill_worker.service.room import Room
 
 INTERVAL = 15.0
@@ -22,7 +22,7 @@ fails; a stop copies it at once."""
 CHECKPOINT_SHARE = 0.1
 """Largest share of the time that goes into copies of the checkpoint: a gigabyte over a slow line takes minutes."""
 
-MIRRORED = (START, CHECKPOINTS, "plan.json", "stages.json", FILM, SNAPSHOTS)
+MIRRORED = (START, CHECKPOINTS, "plan.json", "stages.json", ENDED, FILM, SNAPSHOTS)
 """Files and folders of `run` that are copied. The recovered cameras are not among them: `sfm_cache` stores those."""
 
 

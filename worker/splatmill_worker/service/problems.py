@@ -25,6 +25,8 @@ def is_transient(error: BaseException) -> bool:
     """Return whether the same attempt may succeed a little later: the cause lies outside of the job."""
     if isinstance(error, StorageError):
         return not isinstance(error, StorageFullError)
+    if isinstance(error, WorkerError) and error.code == "decoder_ended":
+        return True  # the next attempt leaves the file out, or finds the machine with more memory
     return isinstance(error, RedisError | FolderInUse)
 
 

@@ -37,7 +37,7 @@ from splatmill_worker.service import hand_back, publish, sfm_cache
 from splatmill_worker.service.attempt import LONGEST_MESSAGE, Attempt
 from splatmill_worker.service.disk_reserve import DiskWatch
 from splatmill_worker.service.hand_back import HandedBack
-from splatmill_worker.service.job_folder import JobFolder, remove_remade
+from splatmill_worker.service.job_folder import ENDED, JobFolder, remove_remade
 from splatmill_worker.service.live_view import LiveView
 from splatmill_worker.service.lock import LockState
 from splatmill_worker.service.mirror import Mirror
@@ -226,7 +226,7 @@ def _train(
 
         folder.run.mkdir(parents=True, exist_ok=True)
         with (
-            decoders.confined(read=[folder.path], write=[folder.run]),
+            decoders.confined([folder.path], folder.run / ENDED),
             unpacked_room.claimed_by(room.unpack),
         ):
             result = _pipeline()(

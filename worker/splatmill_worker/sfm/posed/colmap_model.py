@@ -45,6 +45,8 @@ def load(folder: Path, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
             unusable[path] = (name, error.reason)
     if not views and unusable:
         name, reason = next(iter(unusable.values()))
+        if decoders.forget_ended():
+            raise UnusablePicture("decoder_ended", name, f"no photo is left; of this one: {reason}")
         raise ValueError(
             f"None of the {len(unusable)} photos with a camera can be used, such as {name!r}: {reason}."
         )
@@ -91,6 +93,8 @@ def fit_to_file(posed: tuple[Camera, Lens | None], name: str, path: Path, mask: 
     as those of most tools do.
     """
     camera, lens = posed
+    if mask is not None and (reason := decoders.ended(mask)) is not None:
+        raise UnusablePicture("decoder_ended", name, f"of its mask: {reason}")
     stored, upright = decoders.sizes(path, name)
     aspect = camera.width / camera.height
     stored_fits = abs(stored[0] / stored[1] / aspect - 1.0) < MAX_ASPECT_ERROR

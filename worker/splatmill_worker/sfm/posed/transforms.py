@@ -74,6 +74,8 @@ def load(
             messages += [note] if note else []
     if not views and unusable:
         name, reason = next(iter(unusable.items()))
+        if decoders.forget_ended():
+            raise UnusablePicture("decoder_ended", name, f"no photo is left; of this one: {reason}")
         raise ValueError(
             f"None of the {len(unusable)} photos with a camera can be used, such as {name!r}: {reason}."
         )
