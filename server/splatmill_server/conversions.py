@@ -154,10 +154,17 @@ class Conversions:
             await self._storage.stream_put(
                 layout.conversion(model_id, form.key), room.counted(answer.aiter_raw())
             )
-        except (httpx.TransportError, ValidationError) as error:
+        except httpx.TransportError as error:
+            raise ProblemError(
+                "renderer_unavailable",
+                f"The renderer ended while it sent the conversion ({type(error).__name__}).",
+                advice="Nothing was stored. Try again in a few seconds.",
+                headers={"Retry-After": "5"},
+            ) from error
+        except ValidationError as error:
             raise ProblemError(
                 "conversion_failed",
-                f"The renderer did not finish the conversion ({type(error).__name__}).",
+                "The renderer answered without a record of the conversion.",
                 advice="Try again. If the problem persists, read the log of the renderer.",
             ) from error
         finally:

@@ -20,12 +20,20 @@ import pytest
 from splatmill.backplane import layout
 from splatmill.client import Client
 from splatmill.errors import NotFound
-from splatmill.schema import CameraSpec, ModelCamera, ModelCameras
+from splatmill.schema import (
+    CONVERSION_HEADER,
+    CONVERSION_VERSION,
+    CameraSpec,
+    Conversion,
+    ModelCamera,
+    ModelCameras,
+)
 from splatmill_server.answers.single_file import WEB
 from splatmill_worker.splat.formats import registry
 from tests.support.ball import write_ply
 from tests.support.command_line import invoke
 from tests.support.rendering import hold_out, renderer_in
+from tests.support.scripted_server import Reply, scripted_server
 from tests.support.served_app import Serve, ServedApp, problem, store_model
 from tests.support.waiting import wait_for
 
@@ -172,6 +180,22 @@ def test_refusals(app: ServedApp, serve: Serve, folder: Path) -> None:
     assert without.http.get(f"/v1/models/{MODEL}/download/ply").status_code == 200
     app.service.storage.put(layout.model_file(MODEL, "model.ply"), b"ply\nnot a model")
     problem(app.http.get(f"/v1/models/{MODEL}/download/sog"), 500, "model_corrupt")
+
+
+def test_a_renderer_that_ends_within_its_answer_is_asked_again(
+    serve: Serve, folder: Path, app: ServedApp
+) -> None:
+    """The problem lets a client repeat its request, and nothing of the answer is kept."""
+    record = Conversion(model="etag", version=CONVERSION_VERSION, gaussians=1, seconds=0.1)
+    cut = Reply(200, b"x" * 1000, {CONVERSION_HEADER: record.model_dump_json()}, cut=500)
+    with scripted_server() as server:
+        server.answer = lambda _: cut
+        broken = serve(renderer_url=server.url, storage=str(folder / "storage"))
+        answer = broken.http.get(f"/v1/models/{MODEL}/download/spz")
+    found = problem(answer, 503, "renderer_unavailable")
+    assert "ended while it sent" in found["detail"]
+    assert answer.headers["retry-after"] == "5"
+    assert _formats(app)["spz"]["bytes"] is None
 
 
 def test_the_model_with_its_viewer_in_one_file(app: ServedApp) -> None:

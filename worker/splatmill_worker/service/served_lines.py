@@ -11,6 +11,9 @@ _DEVICES = ("nvidia[0-9]*", "nvidiactl", "dxg", "kfd")
 
 _ASK = "from splatmill_worker.kernels.gpu.device import absence; print(absence() or '')"
 _ASK_SECONDS = 120.0
+_ASKS = (
+    3  # processes that ask, if a signal ends them: a worker would leave its GPU unused for as long as it runs
+)
 
 
 class UnservedLines(ValueError):
@@ -43,11 +46,16 @@ def gpu_absence() -> str:
     if not any(any(Path("/dev").glob(pattern)) for pattern in _DEVICES):
         return "No driver of a GPU is loaded."
     try:
-        asked = subprocess.run(
-            [sys.executable, "-c", _ASK], capture_output=True, text=True, timeout=_ASK_SECONDS
-        )
+        for _ in range(_ASKS):
+            asked = subprocess.run(
+                [sys.executable, "-c", _ASK], capture_output=True, text=True, timeout=_ASK_SECONDS
+            )
+            if asked.returncode >= 0:
+                break
     except subprocess.TimeoutExpired:
         return f"torch did not say within {_ASK_SECONDS:g} s whether it sees a GPU."
+    if asked.returncode < 0:
+        return f"torch could not be asked: the process that did was ended by signal {-asked.returncode}."
     if asked.returncode != 0:
         return f"torch could not be asked: {(asked.stderr.strip().splitlines() or ['it crashed'])[-1]}"
     return asked.stdout.strip()
