@@ -127,7 +127,7 @@ def main(count: int) -> None:
 
 
 @contextmanager
-def _nothing_to_decode(read: list[Path], write: list[Path]) -> Iterator[None]:
+def _nothing_to_decode(read: list[Path], ended: Path | None = None) -> Iterator[None]:
     yield
 
 

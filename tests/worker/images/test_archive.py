@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from splatmill_worker.errors import Refusal, UnusableVideo
-from splatmill_worker.images import archive, prepare, video
+from splatmill_worker.images import archive, decoders, prepare, video
 from splatmill_worker.images.archive import Allowance, UnsafeArchive, unpack
 from tests.support.hostile import archives, videos
 
@@ -79,5 +79,5 @@ def test_frames_of_a_video_are_bounded_while_they_are_written_and_with_the_archi
     assert refused.value.code == "archive_bomb"
     monkeypatch.setattr(video, "MAX_WRITTEN_BYTES", 1000)
     with pytest.raises(UnusableVideo, match="more than 1000 bytes as JPEGs"):
-        video.keyframes(images / "a.mp4", tmp_path / "frames", 4)
+        decoders.keyframes(images / "a.mp4", tmp_path / "frames", 4)
     assert len(list((tmp_path / "frames").iterdir())) <= 2

@@ -4,6 +4,9 @@ Does not prove that each place raises the right error. The errors of the engine'
 """
 
 import errno
+import signal
+import subprocess
+import sys
 
 import pytest
 import redis
@@ -54,3 +57,20 @@ def test_an_outage_of_storage_or_redis_is_transient(error: Exception, code: str)
     problem = problem_of(error)
     assert problem.code == code
     assert problem.advice
+
+
+@pytest.mark.parametrize(
+    ("end", "again"), [(f"os.kill(os.getpid(), {signal.SIGKILL:d})", True), ("exit(3)", False)]
+)
+def test_a_helper_of_a_library_that_a_signal_ends_is_no_fault_of_the_job(end: str, again: bool) -> None:
+    """As the compiler that Triton starts: it wraps the error in one of its own."""
+
+    def compiled() -> None:
+        try:
+            subprocess.run([sys.executable, "-c", f"import os; {end}"], check=True)
+        except subprocess.CalledProcessError as error:
+            raise RuntimeError("the compiler failed") from error
+
+    with pytest.raises(RuntimeError) as caught:
+        compiled()
+    assert is_transient(caught.value) is again

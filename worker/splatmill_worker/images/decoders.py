@@ -26,6 +26,7 @@ from pydantic import TypeAdapter
 
 from splatmill.files import atomic_write
 from splatmill.schema.photos import MAX_PHOTO_PIXELS
+from splatmill_worker import settings
 from splatmill_worker.errors import DecoderNotStarted, UnusablePicture, UnusableVideo
 from splatmill_worker.images import decode as decode_here
 from splatmill_worker.images import examine as examine_here
@@ -43,7 +44,7 @@ from splatmill_worker.images.examine import Picture
 PROCESSES = min(os.cpu_count() or 1, 8)
 """Decoding processes of an attempt."""
 
-STARTS = 5
+STARTS = 10
 """Processes that are started for one call, if each ends before it has begun."""
 
 LIBRARIES = 2 * 2**30
@@ -194,7 +195,7 @@ class Decoders:
         self._start = {
             "read": [str(path) for path in read],
             "memory": self._memory,
-            "pixels": guarded.decoding_pixels() // processes,
+            "pixels": guarded.decoding_pixels(settings.max_memory()) // processes,
             "room": self._room.fileno(),
         }
         self._turns = _Turns()
@@ -343,9 +344,10 @@ def _lacking(held: tuple[str, ...]) -> str:
 
 
 def memory_limit() -> int:
-    """Bytes of address space of a decoding process: the largest photo and a few copies of it, or what the machine has
-    if that is less, and the libraries."""
-    return min(16 * MAX_PHOTO_PIXELS, guarded.machine_bytes()) + LIBRARIES
+    """Bytes of address space of a decoding process: the largest photo and a few copies of it, or what the machine or
+    the attempt has if that is less, and the libraries."""
+    machine = guarded.machine_bytes()
+    return min(16 * MAX_PHOTO_PIXELS, machine, settings.max_memory() or machine) + LIBRARIES
 
 
 class _Answered(Exception):

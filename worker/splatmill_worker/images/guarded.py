@@ -289,12 +289,13 @@ def machine_bytes() -> int:
     return min(total, memory.group_limit() or total)
 
 
-def decoding_pixels() -> int:
-    """Return how many pixels may be in decoding at a time: a quarter of the memory of the machine or container.
+def decoding_pixels(limit: int | None = None) -> int:
+    """Return how many pixels may be in decoding at a time: a quarter of the memory of the machine or container, or of
+    `limit` bytes if that is less.
 
     What is decoded is copied once or twice before it is reduced.
     """
-    return machine_bytes() // 4 // _BYTES_PER_PIXEL
+    return min(machine_bytes(), limit or machine_bytes()) // 4 // _BYTES_PER_PIXEL
 
 
 _room = _Room(decoding_pixels())

@@ -1,6 +1,7 @@
 """Turns an error that ended an attempt into the problem document that the user sees."""
 
 import errno
+import subprocess
 import traceback
 
 from redis.exceptions import RedisError
@@ -27,7 +28,17 @@ def is_transient(error: BaseException) -> bool:
         return not isinstance(error, StorageFullError)
     if isinstance(error, WorkerError) and error.code == "decoder_ended":
         return True  # the next attempt leaves the file out, or finds the machine with more memory
-    return isinstance(error, RedisError | FolderInUse)
+    return isinstance(error, RedisError | FolderInUse) or _helper_ended(error)
+
+
+def _helper_ended(error: BaseException) -> bool:
+    """Return whether a program that a library had started, such as a compiler of kernels, was ended by a signal."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, subprocess.CalledProcessError) and seen.returncode < 0:
+            return True
+        seen = seen.__cause__ or seen.__context__
+    return False
 
 
 def keeps_progress(error: BaseException) -> bool:

@@ -1,0 +1,428 @@
+"""Decoding processes that are ended at any moment, and answers of one that a file has taken over.
+
+A kill of the kernel for want of memory, of an operator or of a fault in a library are one SIGKILL here. Each moment is
+met exactly; `tests/service/test_ended_children.py` ends processes at random ones.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from splatmill.schema import TrainOptions
+from splatmill_worker import pipeline, synthetic
+from splatmill_worker.errors import DecoderNotStarted, UnusablePicture, UnusableVideo
+from splatmill_worker.images import decode as here
+from splatmill_worker.images import decoders
+from splatmill_worker.images import video as video_here
+from splatmill_worker.images.decoder import LENGTHS
+from splatmill_worker.images.decoder_process import Call, DecoderProcess
+from splatmill_worker.images.decoders import STARTS, Decoders, confined
+from splatmill_worker.images.prepare import prepare
+from splatmill_worker.service.problems import is_transient, keeps_progress, problem_of
+from splatmill_worker.sfm import posed
+from tests.support.acting import acts
+from tests.support.hostile.videos import video
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the moments are those of processes of Linux")
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    """A folder with four different photos."""
+    folder = tmp_path / "job" / "photos"
+    folder.mkdir(parents=True)
+    random = np.random.default_rng(6)
+    for name in "abcd":
+        Image.fromarray(random.integers(0, 256, (96, 160, 3), np.uint8)).save(folder / f"{name}.png")
+    return folder
+
+
+@pytest.fixture
+def confinement(photos: Path, tmp_path: Path) -> Iterator[Decoders]:
+    with confined([tmp_path / "job"], tmp_path / "ended.json") as started:
+        yield started
+
+
+def kill(process: DecoderProcess) -> None:
+    """Kill a process, and wait until it has ended, without reaping it."""
+    pid = process._process.pid
+    os.kill(pid, signal.SIGKILL)
+    os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+
+
+class Killer:
+    """Kills the process at the first `times` calls of one of its methods: before it, or between stop and call."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, method: str, times: int, *, after: bool = False) -> None:
+        self.calls = 0
+        original: Callable[..., Any] = getattr(DecoderProcess, method)
+
+        def killing(process: DecoderProcess, *arguments: Any) -> Any:
+            self.calls += 1
+            if self.calls > times:
+                return original(process, *arguments)
+            if not after:
+                kill(process)
+                return original(process, *arguments)
+            os.kill(process._process.pid, signal.SIGSTOP)  # it cannot answer before it is killed
+            result = original(process, *arguments)
+            kill(process)
+            return result
+
+        patch.setattr(DecoderProcess, method, killing)
+
+
+def same(path: Path) -> bool:
+    return np.array_equal(np.asarray(decoders.decode(path)), np.asarray(here.decode(path)))
+
+
+@pytest.mark.parametrize("method", ["ready", "runs", "ask"])
+def test_one_end_is_not_noticed_by_the_caller(
+    method: str, photos: Path, confinement: Decoders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the start, while it waits for a call, and when the call is written, which is then a broken pipe."""
+    assert same(photos / "a.png")
+    killer = Killer(monkeypatch, method, 1)
+    assert same(photos / "b.png")
+    assert killer.calls >= 1
+    assert same(photos / "c.png")
+
+
+def test_an_end_between_call_and_answer_gives_a_second_try(
+    photos: Path, confinement: Decoders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    confinement.ready()
+    killer = Killer(monkeypatch, "_send", 1, after=True)
+    assert same(photos / "a.png")
+    assert killer.calls > 1
+
+
+def test_an_end_within_an_answer_gives_a_second_try(
+    photos: Path, confinement: Decoders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The answer is longer than the pipe, so that a part of it never comes."""
+    big = photos / "big.png"
+    Image.fromarray(np.random.default_rng(7).integers(0, 256, (1800, 1600), np.uint8)).save(big)
+    killed = 0
+    original = DecoderProcess._read
+
+    def read(process: DecoderProcess, length: int, *arguments: Any) -> Any:
+        nonlocal killed
+        if length > 2**21 and not killed:
+            killed += 1
+            kill(process)
+        return original(process, length, *arguments)
+
+    monkeypatch.setattr(DecoderProcess, "_read", read)
+    assert same(big)
+    assert killed == 1
+
+
+def test_a_photo_that_ends_its_process_twice_is_left_out_by_name(
+    photos: Path, confinement: Decoders, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    confinement.ready()
+    with monkeypatch.context() as patch:
+        killer = Killer(patch, "ask", 2)
+        with pytest.raises(UnusablePicture) as caught:
+            decoders.decode(photos / "b.png")
+        assert killer.calls == 2
+    assert caught.value.code == "decoder_ended"
+    assert "b.png: it could not be decoded: its decoder was ended twice (signal 9)" in str(caught.value)
+    assert is_transient(caught.value)
+    assert keeps_progress(caught.value)
+    assert problem_of(caught.value).code == "decoder_ended"
+    prepared = prepare(photos, None, tmp_path / "work")
+    assert [photo.name for photo in prepared.photos] == ["a.png", "c.png", "d.png"]
+    assert prepared.skipped == (("b.png", "it could not be decoded: its decoder was ended twice (signal 9)"),)
+
+
+def test_the_next_attempt_does_not_open_it_again(photos: Path, tmp_path: Path) -> None:
+    kept = tmp_path / "ended.json"
+    kept.write_text(json.dumps({"photos/b.png": "it could not be decoded: its decoder was ended twice"}))
+    with confined([tmp_path / "job"], kept):
+        prepared = prepare(photos, None, tmp_path / "work")
+        assert [name for name, _ in prepared.skipped] == ["b.png"]
+        assert decoders.forget_ended()
+        assert len(prepare(photos, None, tmp_path / "work").photos) == 4
+    assert not kept.exists()
+
+
+def test_a_damaged_list_of_ended_files_is_none(photos: Path, tmp_path: Path) -> None:
+    kept = tmp_path / "ended.json"
+    kept.write_text('["no list"')
+    with confined([tmp_path / "job"], kept):
+        assert same(photos / "a.png")
+
+
+def test_where_no_photo_is_left_the_job_is_tried_again(
+    photos: Path, confinement: Decoders, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever ends the process of every photo has nothing to do with photos."""
+    with monkeypatch.context() as patch:
+        Killer(patch, "ask", 1000)
+        with pytest.raises(UnusablePicture, match="no photo is left") as caught:
+            prepare(photos, None, tmp_path / "work")
+    assert is_transient(caught.value)
+    assert len(prepare(photos, None, tmp_path / "work").photos) == 4
+
+
+def test_photos_with_cameras_are_left_out_and_the_job_is_tried_again_likewise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = tmp_path / "capture"
+    (capture / "images").mkdir(parents=True)
+    frames = []
+    for number in range(3):
+        Image.new("RGB", (64, 48), (number, 0, 0)).save(capture / "images" / f"{number}.png")
+        matrix = np.eye(4)
+        matrix[0, 3] = number
+        frames.append({"file_path": f"images/{number}.png", "transform_matrix": matrix.tolist()})
+    (capture / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+    given = posed.find(capture)
+    assert given is not None
+    with confined([capture]):
+        with monkeypatch.context() as patch:
+            Killer(patch, "ask", 2)
+            scene = given.load()
+            assert [view.name for view in scene.views] == ["1.png", "2.png"]
+            assert "ended twice" in dict(scene.left_out)["0.png"]
+        with monkeypatch.context() as patch:
+            Killer(patch, "ask", 1000)
+            with pytest.raises(UnusablePicture, match="no photo is left") as caught:
+                given.load()
+            assert is_transient(caught.value)
+        assert len(given.load().views) == 3
+
+
+@pytest.mark.slow
+def test_a_photo_that_ends_its_process_when_it_is_loaded_is_left_out_by_the_next_attempt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its header is whole, so that it is known only when the photos to train on are loaded."""
+    cameras = synthetic.capture(tmp_path / "photos", 8, 96, 72)
+    capture, work, kept = tmp_path / "capture", tmp_path / "work", tmp_path / "ended.json"
+    capture.mkdir()
+    (tmp_path / "photos").rename(capture / "images")
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = [
+        {"file_path": f"images/{name}", "transform_matrix": (np.linalg.inv(camera.viewmat) @ flip).tolist()}
+        for name, camera in cameras.items()
+    ]
+    (capture / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+    bad = sorted(cameras)[3]
+    original = DecoderProcess.ask
+
+    def ask(process: DecoderProcess, asked: Call) -> Any:
+        if asked.function is here.pixels and asked.path.name == bad:
+            kill(process)
+        return original(process, asked)
+
+    monkeypatch.setattr(DecoderProcess, "ask", ask)
+    said: list[Any] = []
+    options = TrainOptions(steps=5, max_gaussians=500, holdout=0, image_size=48)
+
+    def attempt() -> str:
+        with confined([tmp_path], kept):
+            return pipeline.run(capture, work, options, said.append, lambda: False).ended
+
+    with pytest.raises(UnusablePicture, match=bad) as caught:
+        attempt()
+    assert is_transient(caught.value)
+    assert attempt() == "succeeded"
+    assert any(bad in str(event) and "ended twice" in str(event) for event in said)
+    written = json.loads((work / "out" / "cameras.json").read_text())
+    assert sorted(row["name"] for row in written["cameras"]) == sorted(set(cameras) - {bad})
+
+
+def test_a_photo_is_left_out_if_its_mask_ends_the_process_twice(
+    photos: Path, confinement: Decoders, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Training on it without the mask would give another scene."""
+    masks = tmp_path / "job" / "masks"
+    masks.mkdir()
+    Image.new("L", (160, 96), 255).save(masks / "a.png")
+    original = decoders.mask_fault
+
+    def fault(mask: Path, *arguments: Any) -> str | None:
+        with monkeypatch.context() as patch:
+            Killer(patch, "ask", 2)
+            return original(mask, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(decoders, "mask_fault", fault)
+        patch.setattr("splatmill_worker.images.prepare.ThreadPoolExecutor", OneByOne)
+        prepared = prepare(photos, masks, tmp_path / "work")
+    assert [photo.name for photo in prepared.photos] == ["b.png", "c.png", "d.png"]
+    assert "of its mask" in dict(prepared.skipped)["a.png"]
+
+
+class OneByOne:
+    """A pool that calls when it is asked for the result, so that no other call is under way."""
+
+    def __init__(self, threads: int) -> None: ...
+
+    def __enter__(self) -> OneByOne:
+        return self
+
+    def __exit__(self, *error: object) -> None: ...
+
+    def map(self, function: Callable[[Any], Any], items: Any) -> Iterator[Any]:
+        return map(function, items)
+
+
+def test_a_video_is_begun_anew(photos: Path, confinement: Decoders, tmp_path: Path) -> None:
+    (photos / "walk.mp4").write_bytes(video(frames=40))
+    wanted = dict(video_here.keyframes(photos / "walk.mp4", 6))
+    written: list[tuple[int, bytes]] = []
+
+    def write(number: int, picture: bytes) -> None:
+        written.append((number, picture))
+        if len(written) == 2:
+            for pid in children():
+                os.kill(pid, signal.SIGKILL)
+
+    confinement.keyframes(photos / "walk.mp4", 6, write, lambda: False)
+    assert dict(written) == wanted
+    assert len(written) >= len(wanted)
+
+
+def test_a_video_that_ends_its_process_twice_is_left_out(
+    photos: Path, confinement: Decoders, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (photos / "walk.mp4").write_bytes(video())
+    with monkeypatch.context() as patch:
+        Killer(patch, "ask", 2)
+        with pytest.raises(UnusableVideo, match=r"ended twice \(signal 9\)"):
+            decoders.keyframes(photos / "walk.mp4", tmp_path / "out", 3)
+    prepared = prepare(photos, None, tmp_path / "work")
+    assert [name for name, _ in prepared.skipped] == ["walk.mp4"]
+
+
+def test_a_process_that_never_starts_says_why_and_the_job_is_tried_again(
+    photos: Path, confinement: Decoders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killer = Killer(monkeypatch, "ready", 1000)
+    with pytest.raises(DecoderNotStarted, match="could be started: signal 9") as caught:
+        decoders.decode(photos / "a.png")
+    assert killer.calls == STARTS
+    assert is_transient(caught.value)
+    assert problem_of(caught.value).code == "decoder_ended"
+
+
+def test_why_it_does_not_start_is_its_last_line(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "splatmill_worker.images.decoder_process._COMMAND", (sys.executable, "-c", "import no_such_part")
+    )
+    with (
+        confined([photos]),
+        pytest.raises(DecoderNotStarted, match="exit status 1: ModuleNotFoundError: No module named"),
+    ):
+        decoders.decode(photos / "a.png")
+    monkeypatch.setattr("splatmill_worker.images.decoder_process._COMMAND", ("/no/such/program",))
+    with confined([photos]), pytest.raises(DecoderNotStarted, match="No such file"):
+        decoders.decode(photos / "a.png")
+
+
+def test_processes_that_have_ended_do_not_disturb_the_end(photos: Path) -> None:
+    with confined([photos]):
+        assert same(photos / "a.png")
+        for pid in children():
+            os.kill(pid, signal.SIGKILL)
+    assert children() == []
+
+
+def test_the_second_try_runs_alone() -> None:
+    """It may have been ended for want of memory, which other photos took."""
+    turns = decoders._Turns()
+    order: list[str] = []
+    entered = threading.Event()
+
+    def second() -> None:
+        with turns.taken(alone=True):
+            order.append("alone")
+
+    def third() -> None:
+        with turns.taken(alone=False):
+            order.append("after")
+
+    with turns.taken(alone=False):
+        alone = threading.Thread(target=second)
+        alone.start()
+        while not turns._alone:
+            entered.wait(0.001)
+        after = threading.Thread(target=third)
+        after.start()
+        assert order == []
+        order.append("before")
+    alone.join()
+    after.join()
+    assert order == ["before", "alone", "after"]
+
+
+def told(value: Any, arrays: bytes = b"") -> bytes:
+    text = json.dumps(value).encode()
+    return LENGTHS.pack(len(text), len(arrays)) + text + arrays
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "answer",
+    [
+        told({"value": {"": ["|u1", [10**9, 10**9]]}}),
+        told({"value": {"": ["|u1", [-1, 5]]}}),
+        told({"value": {"": ["|u1", [1.5]]}}),
+        told({"value": {"": ["|O8", [1]]}}, bytes(8)),
+        told({"value": {"": ["V8", [1]]}}, bytes(8)),
+        told({"value": {"": ["|u1", [4]]}}, bytes(9)),
+        told({"value": {"": ["<f4", [2, 2]]}}, bytes(16)),
+        told({"value": {"": ["|u1", [2, 2, 2]]}}, bytes(8)),
+        told({"value": {"": "no array"}}),
+        told({"value": "no array"}),
+        told({"value": {"": ["|u1", [0, 0]]}}),
+        told({"other": 1}),
+        told([1, 2]),
+        told({"error": "no description"}),
+        told({"error": {"name": "picture", "given": []}}),
+        told({"error": {"name": "picture", "given": ["no_such_code", "a", "b"]}}),
+        told({"error": {"name": "system", "given": ["x"]}}),
+        told({"part": 1}) * 2 + told({"value": 1}),
+        LENGTHS.pack(2**40, 0),
+        LENGTHS.pack(2, 2**40),
+        LENGTHS.pack(4, 0) + b"{{{{",
+        LENGTHS.pack(2**17, 0) + b"[" * 2**17,
+    ],
+)
+def test_an_answer_that_is_none_costs_the_file(
+    answer: bytes, photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = acts(monkeypatch)
+    with confined([photos]):
+        with pytest.raises(UnusablePicture, match=r"a.png: its decoder gave an answer that is not valid"):
+            decoders.call(known.answer, photos / "a.png", answer.hex(), check=here.picture_of)
+        assert same(photos / "b.png")
+
+
+def test_what_a_decoder_says_of_a_file_is_cut(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = acts(monkeypatch)
+    long = told({"error": {"name": "picture", "given": ["image_truncated", "a" * 9000, "b" * 9000]}})
+    with confined([photos]), pytest.raises(UnusablePicture) as caught:
+        decoders.call(known.answer, photos / "a.png", long.hex(), check=here.picture_of)
+    assert len(str(caught.value)) < 2500
+
+
+def children() -> list[int]:
+    """The ids of this process's decoding processes."""
+    found = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+    return [pid for pid in map(int, found) if b"images.decoder" in Path(f"/proc/{pid}/cmdline").read_bytes()]
