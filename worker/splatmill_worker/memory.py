@@ -40,6 +40,16 @@ def available() -> int:
     return min(found)
 
 
+def mapped_files() -> int:
+    """Return the bytes of address space that the files mapped by this process take, such as its libraries."""
+    if sys.platform != "linux":
+        return 0
+    with open("/proc/self/maps") as file:
+        lines = [line.split() for line in file]
+    ends = [words[0].split("-") for words in lines if len(words) > 5 and words[5].startswith("/")]
+    return sum(int(end, 16) - int(begin, 16) for begin, end in ends)
+
+
 def group_limit() -> int | None:
     """Return the smallest memory limit among this process's control groups in bytes, or None where there is none."""
     return min((limit for limit, _ in _groups()), default=None)

@@ -21,6 +21,7 @@ from splatmill.schema import (
     Switch,
     TrainOptions,
 )
+from splatmill_worker import memory
 from splatmill_worker.capture import choose_kernels, posed_scene, split_views, start_model_path
 from splatmill_worker.errors import Cancelled, Refusal
 from splatmill_worker.events import Emit, TrainingEvents, progress_events
@@ -45,9 +46,9 @@ from splatmill_worker.splat.report.progress_film import ProgressFilm
 from splatmill_worker.splat.report.report import FinishedTraining, PlannedScene, write_report
 from splatmill_worker.splat.report.stages import Stages
 from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS, sample_frusta
-from splatmill_worker.splat.start.given_model import GivenModel, assess, read_given_model
+from splatmill_worker.splat.start.given_model import LEAST_ASSESSED, GivenModel, assess, read_given_model
 from splatmill_worker.splat.start.points import ENOUGH_POINTS, from_points
-from splatmill_worker.splat.start.seeding import add_seeds, most_opaque
+from splatmill_worker.splat.start.seeding import add_seeds
 from splatmill_worker.splat.train import checkpoint
 from splatmill_worker.splat.train.loop import Hooks, Trained, train
 from splatmill_worker.splat.train.renderer import renderer
@@ -255,7 +256,9 @@ def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaus
     """The Gaussians to start from, and the assessment of the given model; None where no model was given."""
     path = start_model_path(task.capture, task.workdir, task.options)
     if path is not None:
-        given = read_given_model(path, cameras.normalization)
+        given, count = read_given_model(path, cameras.normalization, _most_given(task.options))
+        if count > given.count:
+            task.emit(LogEvent(level="warning", message=_reduced_message(path, count, given.count)))
         start = assess(given, photos.training)
         if start.doubtful:
             task.emit(LogEvent(level="warning", message=_doubt_message(start)))
@@ -265,6 +268,19 @@ def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaus
         return from_points(torch.from_numpy(world.points), torch.from_numpy(world.colors)), None
     targets = [view.full for view in photos.training]
     return from_points(*sample_frusta(targets, RANDOM_GAUSSIANS, task.options.seed)), None
+
+
+def _most_given(options: TrainOptions) -> int:
+    """Number of Gaussians of a given model that are kept: as many as memory can train, and as the options ask for."""
+    most = Plan.gaussians_within(options.max_memory or memory.available() // 2)
+    return most if options.max_gaussians is None else min(most, max(options.max_gaussians, LEAST_ASSESSED))
+
+
+def _reduced_message(path: Path, count: int, kept: int) -> str:
+    return (
+        f"{path.name} has {count:,} Gaussians, more than this job can hold. Training starts from the {kept:,} most "
+        "opaque ones. Set a larger max_gaussians, or use a machine with more memory, to keep more."
+    )
 
 
 def _doubt_message(start: GivenModel) -> str:
@@ -311,7 +327,7 @@ def _make_plan(task: Task, facts: Facts, revise: Revise) -> Plan:
 
 def _seeded(first: Gaussians, cameras: Cameras, photos: Photos, plan: Plan) -> Gaussians:
     """The first Gaussians within the plan's limit, with what the plan adds to those made from points."""
-    gaussians = most_opaque(first, plan.max_gaussians)
+    gaussians = first.most_opaque(plan.max_gaussians)
     if plan.initial != "points":
         return gaussians
     return add_seeds(

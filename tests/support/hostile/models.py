@@ -43,6 +43,11 @@ def transforms(count: int = 3, **changes: Any) -> bytes:
     return json.dumps({"fl_x": 60.0, "w": 64, "h": 48, "frames": frames}).encode()
 
 
+def transforms_with_points() -> bytes:
+    """The same, with its points in points.ply."""
+    return json.dumps(json.loads(transforms()) | {"ply_file_path": "points.ply"}).encode()
+
+
 def matrix(x: float) -> list[list[float]]:
     return [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 5.0], [0.0, 0.0, 0.0, 1.0]]
 

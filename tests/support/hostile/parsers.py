@@ -20,6 +20,7 @@ from splatmill_server.answers.sse import Position
 from splatmill_server.outgoing import AddressRefused, Outgoing
 from splatmill_server.paging import read_cursor, write_cursor
 from splatmill_server.problems import ProblemError
+from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.formats import registry
 from tests.support.gaussians import some_gaussians
 from tests.support.hostile import archives, models, pictures, videos
@@ -82,7 +83,19 @@ def _colmap(stem: str, suffix: str) -> Parser:
 
 
 def _start(suffix: str, valid: Callable[[], bytes]) -> Parser:
-    return Parser(valid, mutations, lambda bench, data: _outcome(bench.start(data, suffix)))
+    """The reader of a format, in this process: one of its own for each file would be most of the time."""
+
+    def give(bench: Bench, data: bytes) -> str:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"start{suffix}"
+            path.write_bytes(data)
+            try:
+                registry.read(path)
+            except ModelUnreadable:
+                return "not used"
+        return "used"
+
+    return Parser(valid, mutations, give)
 
 
 @cache
@@ -172,6 +185,13 @@ PARSERS: dict[str, Parser] = {
         models.transforms,
         text_mutations,
         lambda bench, data: _outcome(bench.posed({"poses/transforms.json": data})),
+    ),
+    "points of transforms.json": Parser(
+        lambda: models.ply(3),
+        mutations,
+        lambda bench, data: _outcome(
+            bench.posed({"poses/transforms.json": models.transforms_with_points(), "poses/points.ply": data})
+        ),
     ),
     ".ply": _start(".ply", lambda: models.ply(3)),
     ".compressed.ply": _start(".compressed.ply", lambda: models.compressed_ply(chunks=1, count=256)),

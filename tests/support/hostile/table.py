@@ -6,10 +6,21 @@ from tests.support.hostile.entry import Hostile
 from tests.support.hostile.table_decoders import DECODERS
 from tests.support.hostile.table_files import FILES
 from tests.support.hostile.table_headers import HEADERS
+from tests.support.hostile.table_models import MODELS
 from tests.support.hostile.table_others import OTHERS
 from tests.support.hostile.table_poses import POSES
 from tests.support.hostile.table_requests import REQUESTS
 from tests.support.hostile.table_services import SERVICES
 from tests.support.hostile.table_unpacked import UNPACKED
 
-HOSTILE: tuple[Hostile, ...] = (*REQUESTS, *HEADERS, *SERVICES, *OTHERS, *FILES, *UNPACKED, *POSES, *DECODERS)
+HOSTILE: tuple[Hostile, ...] = (
+    *REQUESTS,
+    *HEADERS,
+    *SERVICES,
+    *OTHERS,
+    *FILES,
+    *UNPACKED,
+    *POSES,
+    *MODELS,
+    *DECODERS,
+)

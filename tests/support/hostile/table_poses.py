@@ -169,13 +169,13 @@ POSES = (
     _start(
         "an .spz of 90 bytes that announces 4 thousand million Gaussians",
         gzip.compress(models.spz_header(2**32 - 1) + bytes(900), mtime=0),
-        said="announces 85899345900 bytes",
+        said="4,294,967,295 Gaussians would take",
         suffix=".spz",
     ),
     _start(
         "an .spz of 200 kB that expands to 200 MB",
         archives.gzip_of_zeros(models.spz_header(10**7), 200),
-        said="more than 100 times",
+        said="more than 400 times",
         suffix=".spz",
     ),
     _start(

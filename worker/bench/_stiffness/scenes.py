@@ -23,7 +23,7 @@ from splatmill_worker.splat.plan.facts import measure
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS, sample_frusta
 from splatmill_worker.splat.start.points import ENOUGH_POINTS, from_points
-from splatmill_worker.splat.start.seeding import add_seeds, most_opaque
+from splatmill_worker.splat.start.seeding import add_seeds
 from splatmill_worker.splat.views import TrainingView
 from splatmill_worker.synthetic import orbit, photograph, still_life
 
@@ -87,7 +87,7 @@ def planned(
     first = _first(small, seed)
     facts, _ = measure(small.world, small.training, len(small.held_out), None)
     plan = replace(revised(decide(facts, options, "cpu"), changes), seed=seed)
-    gaussians = most_opaque(first, plan.max_gaussians)
+    gaussians = first.most_opaque(plan.max_gaussians)
     if plan.initial == "points":
         gaussians = add_seeds(
             gaussians,

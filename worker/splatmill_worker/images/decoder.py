@@ -23,6 +23,9 @@ from splatmill_worker.sandbox import confine
 LENGTHS = struct.Struct("=QQ")
 """Before each message: the bytes of its JSON text, and of the arrays behind it."""
 
+_SYSTEM = ("/usr", "/lib", "/lib64", "/etc/ld.so.cache", "/dev/null", "/dev/urandom", "/proc/cpuinfo")
+"""Files and folders of the system that libraries read; the last one by PyTorch."""
+
 PACKAGE = "splatmill_worker."
 """Beginning of the modules whose functions are called."""
 
@@ -45,8 +48,10 @@ def main() -> None:
     if first is None:
         return
     held = confine([*map(Path, first["read"]), *program_files()], int(first["memory"]))
+    from splatmill_worker import reader_memory
     from splatmill_worker.images import guarded, messages
 
+    reader_memory.set_limit(int(first["limit"]))
     guarded.share_room(int(first["pixels"]), int(first["room"]))
     write_message(answers, *messages.packed({"held": held}))
     while (call := _read_call(calls)) is not None:
@@ -63,9 +68,7 @@ def program_files() -> list[Path]:
     """Return what the interpreter and its modules are read from."""
     found = [importlib.util.find_spec(name) for name in ("splatmill", "splatmill_worker")]
     modules = [Path(place) for spec in found if spec for place in spec.submodule_search_locations or ()]
-    system = [
-        Path(place) for place in ("/usr", "/lib", "/lib64", "/etc/ld.so.cache", "/dev/null", "/dev/urandom")
-    ]
+    system = [Path(place) for place in _SYSTEM]
     imported = [Path(place) for place in sys.path if os.path.isdir(place)]
     linked = [entry.resolve() for place in imported for entry in place.iterdir() if entry.is_symlink()]
     return [*modules, *imported, *linked, Path(sys.prefix), Path(sys.base_prefix), *system]

@@ -26,7 +26,7 @@ from pydantic import TypeAdapter
 
 from splatmill.files import atomic_write
 from splatmill.schema.photos import MAX_PHOTO_PIXELS
-from splatmill_worker import settings
+from splatmill_worker import memory, reader_memory, settings
 from splatmill_worker.errors import DecoderNotStarted, UnusablePicture, UnusableVideo
 from splatmill_worker.images import decode as decode_here
 from splatmill_worker.images import examine as examine_here
@@ -49,6 +49,12 @@ STARTS = 10
 
 LIBRARIES = 2 * 2**30
 """Bytes of address space of a decoding process without a photo."""
+
+READING_SECONDS = 300.0
+"""Time after which reading a model, or a file of cameras or points, is given up."""
+
+OWN_MEMORY = 2**30
+"""Bytes of address space that a process needs to read models, besides the files of its libraries."""
 
 _LACKING = {
     "files": "they can read other files",
@@ -122,6 +128,27 @@ def call(
     return _active.call(Call(function, path, arguments, seconds, max_bytes), check, fault)
 
 
+def call_once(
+    function: Callable[..., Any],
+    path: Path,
+    *arguments: Any,
+    check: Callable[[Any], T],
+    fault: Fault,
+) -> T:
+    """Like `call`, in a process that ends with the call, since the libraries that read models are large.
+
+    It may take all the memory that is free (`reader_memory.limit`), and so may its answer.
+    """
+    if _active is None:
+        return check(function(path, *arguments))
+    limit = reader_memory.limit()
+    own = Decoders(_active.read, processes=1, limit=limit, libraries=OWN_MEMORY + memory.mapped_files())
+    try:
+        return own.call(Call(function, path, arguments, READING_SECONDS, limit), check, fault)
+    finally:
+        own.close()
+
+
 def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool = True) -> Image.Image:
     """Like `splatmill_worker.images.decode.decode`."""
     if _active is None:
@@ -184,17 +211,30 @@ class Decoders:
     """Decoding processes: one from the beginning, others when all are busy.
 
     held: what confines them, as `sandbox.confine` returns it; None before the first answer.
+    read: the files and folders that they may open.
+    limit, libraries: bytes of address space of each for what it reads, by default `memory_limit()`, and besides that.
     """
 
-    def __init__(self, read: list[Path], ended: Path | None = None, processes: int = PROCESSES) -> None:
+    def __init__(
+        self,
+        read: list[Path],
+        ended: Path | None = None,
+        processes: int = PROCESSES,
+        *,
+        limit: int | None = None,
+        libraries: int = LIBRARIES,
+    ) -> None:
+        self.read = read
         self.held: tuple[str, ...] | None = None
         self._room = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `close`
         self._root = read[0] if read else Path("/")
         self._ended = _EndedFiles(ended)
-        self._memory = memory_limit()
+        limit = memory_limit() if limit is None else limit
+        self._memory = limit + libraries
         self._start = {
             "read": [str(path) for path in read],
             "memory": self._memory,
+            "limit": limit,
             "pixels": guarded.decoding_pixels(settings.max_memory()) // processes,
             "room": self._room.fileno(),
         }
@@ -344,10 +384,10 @@ def _lacking(held: tuple[str, ...]) -> str:
 
 
 def memory_limit() -> int:
-    """Bytes of address space of a decoding process: the largest photo and a few copies of it, or what the machine or
-    the attempt has if that is less, and the libraries."""
+    """Bytes of address space of a decoding process besides its libraries: the largest photo and a few copies of it, or
+    what the machine or the attempt has if that is less."""
     machine = guarded.machine_bytes()
-    return min(16 * MAX_PHOTO_PIXELS, machine, settings.max_memory() or machine) + LIBRARIES
+    return min(16 * MAX_PHOTO_PIXELS, machine, settings.max_memory() or machine)
 
 
 class _Answered(Exception):

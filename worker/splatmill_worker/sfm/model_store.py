@@ -19,6 +19,7 @@ from splatmill_worker.sfm.colors import color_points
 from splatmill_worker.sfm.final_model import FinalModel
 from splatmill_worker.sfm.frame import choose, in_frame
 from splatmill_worker.sfm.posed.colmap_model import posed_view, scene_of
+from splatmill_worker.sfm.posed.model_files import ModelPoints
 from splatmill_worker.sfm.run import SfmRun, torch_threads
 
 STEREO = "stereo.npz"
@@ -43,7 +44,7 @@ def store_model(run: SfmRun, final: FinalModel, folder: Path) -> None:
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     final.model.write_binary(partial)
-    scene = scene_of(final.model, views, source="sfm")
+    scene = scene_of(ModelPoints.of(final.model), views, source="sfm")
     if run.options.stereo and stereo.has_few_points(scene):
         # Photos are swept one after the other, so that each torch call gets all threads.
         with run.clock("stereo"), torch_threads(run.threads):
@@ -72,7 +73,7 @@ def load_model(prepared: Prepared, folder: Path, known: KnownDistance | None = N
     model = pycolmap.Reconstruction(folder)
     document: dict[str, Any] = json.loads((folder / FACTS).read_text("utf-8"))
     scene = scene_of(
-        model,
+        ModelPoints.of(model),
         _views(prepared, model),
         source="sfm",
         left_out=(*prepared.skipped, *document["left_out"].items()),

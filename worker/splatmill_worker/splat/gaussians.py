@@ -78,6 +78,13 @@ class Gaussians:
         """The rows picked by a boolean mask [N] or by indices."""
         return self.map(lambda value: value[rows])
 
+    def most_opaque(self, limit: int) -> Gaussians:
+        """The `limit` most opaque rows, in their order; all of them where there are no more."""
+        if self.count <= limit:
+            return self
+        order = torch.argsort(self.logit_opacities, descending=True, stable=True)
+        return self.select(torch.sort(order[:limit]).values)
+
     def finite(self) -> Tensor:
         """bool [N]: rows whose every parameter is finite and whose quaternion has a direction."""
         keep: Tensor = torch.linalg.vector_norm(self.quats, dim=1) > 0

@@ -11,10 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatmill_worker import colmap_files, point_file
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.posed import model_files
-from tests.support.hostile import models, pictures
+from tests.support.hostile import model_bombs, models, pictures
 from tests.support.hostile.pictures import write
+from tests.support.reader_peak import peaks
+
+READ = "splatmill_worker.sfm.posed.model_files:read"
+TRANSFORMS = "splatmill_worker.sfm.posed.transforms"
 
 
 def text(folder: Path, **changes: str) -> Path:
@@ -39,8 +45,9 @@ def test_points_may_be_missing(tmp_path: Path, make: type[Path], points: str) ->
     elif points == "missing":
         path.unlink()
     model = model_files.read(folder)
-    assert model.num_reg_images() == 3
-    np.testing.assert_allclose(model.images[2].cam_from_world().translation, [2.0, 0.0, 5.0])
+    assert sorted(model.images) == [1, 2, 3]
+    np.testing.assert_allclose(model.images[2].viewmat[:3, 3], [2.0, 0.0, 5.0])
+    assert len(model.points.errors) == 0
 
 
 def test_a_capture_with_a_model_without_points_has_cameras(tmp_path: Path) -> None:
@@ -67,6 +74,75 @@ for folder in sys.argv[1:]:
     except ValueError as error:
         print(error)
 """
+
+PEAKS_ONLY = pytest.mark.skipif(sys.platform != "linux", reason="peaks are read from /proc")
+
+
+@pytest.mark.slow
+@PEAKS_ONLY
+def test_small_files_do_not_become_large(tmp_path: Path) -> None:
+    """Points of text take COPIES times their file at most; files that announce more entries than are read, little."""
+    folders = {
+        "small": text(tmp_path / "small"),
+        "points": text(tmp_path / "points", points3D=model_bombs.dense_text(500_000)),
+        "cameras": text(
+            tmp_path / "cameras",
+            cameras="".join(f"{number} FOV 9 9 1 1 1 1 1\n" for number in range(300_000)),
+        ),
+        "images": binary(tmp_path / "images", images=model_bombs.short_images(2_000_000)),
+        "track": text(tmp_path / "track", points3D="1 0 0 0 9 9 9 0.5" + " 1 0" * 10**7),
+        "features": text(
+            tmp_path / "features", images="1 1 0 0 0 1 0 5 1 1.jpg\n" + "0 0 -1 " * 5_000_000 + "\n"
+        ),
+    }
+    found = dict(zip(list(folders)[1:], peaks(READ, list(folders.values())), strict=True))
+    assert found["points"][1] == "read"
+    assert found["points"][0] < colmap_files.COPIES * (folders["points"] / "points3D.txt").stat().st_size
+    assert "more than 200000 cameras" in found["cameras"][1]
+    assert "more than 200000 images" in found["images"][1]
+    assert "line 1 has 1048576 bytes or more" in found["track"][1]
+    assert found["features"][1] == "read"
+    assert all(size < 200 * 10**6 for size, _ in found.values()), found
+
+
+@pytest.mark.slow
+@PEAKS_ONLY
+def test_points_and_transforms_that_would_fill_the_memory_are_refused(tmp_path: Path) -> None:
+    write(tmp_path / "small.json", models.transforms())
+    write(tmp_path / "nested.json", model_bombs.nested_json(10**7))
+    ((size, said),) = peaks(f"{TRANSFORMS}:_read", [tmp_path / "small.json", tmp_path / "nested.json"])
+    assert "its lists and objects would take 1.3 GB" in said
+    assert size < 100 * 10**6
+    write(tmp_path / "small.ply", models.ply(3))
+    write(tmp_path / "points.ply", model_bombs.ply_of_bytes(1_000_000))
+    ((size, said),) = peaks(
+        "splatmill_worker.point_file:read", [tmp_path / "small.ply", tmp_path / "points.ply"]
+    )
+    assert said == "read"
+    assert size < point_file.POINT_BYTES * 1_000_000
+
+
+def test_the_table_of_camera_models_is_that_of_colmap() -> None:
+    expected = {
+        int(kind.value): (kind.name, len(pycolmap.Camera.create_from_model_id(1, kind, 1.0, 1, 1).params))
+        for kind in pycolmap.CameraModelId.__members__.values()
+        if kind.name != "INVALID"
+    }
+    assert expected == colmap_files.MODELS
+
+
+def test_text_is_read_with_comments_features_and_names_of_several_words(tmp_path: Path) -> None:
+    images = "# a comment\n\n7 1 0 0 0 1 2 3 1 a b.jpg\n1.5 2.5 4 3 4 -1\n9 0 0 0 1 4 5 6 1 c.jpg"
+    points = "4 1 2 3 10 20 30 0.25 7 0 9 1 7 2\n5 4 5 6 1 2 3 0.5\n"
+    model = model_files.read(text(tmp_path, images=images, points3D=points))
+    assert {number: image.name for number, image in model.images.items()} == {7: "a b.jpg", 9: "c.jpg"}
+    np.testing.assert_allclose(model.images[9].viewmat[:3], [[-1, 0, 0, 4], [0, -1, 0, 5], [0, 0, 1, 6]])
+    np.testing.assert_array_equal(model.points.positions, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(model.points.colors, [[10, 20, 30], [1, 2, 3]])
+    np.testing.assert_array_equal(model.points.errors, [0.25, 0.5])
+    np.testing.assert_array_equal(model.points.offsets, [0, 3, 3])
+    np.testing.assert_array_equal(model.points.images, [7, 9, 7])
+
 
 HUGE = struct.pack("<Q", 1 << 50)
 

@@ -118,7 +118,10 @@ def _primitive(document: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda d: d["accessors"][0].update(count=10**9), "outside of its binary data"),
+        (lambda d: d["accessors"][0].update(count=10**9), "more than 400 times"),
+        (lambda d: [a.update(count=31) for a in d["accessors"]], "outside of its binary data"),
+        (lambda d: [a.update(count="3" * 99) for a in d["accessors"]], "POSITION has '333"),
+        (lambda d: d["accessors"][0].update(count=-1), "outside of its binary data|has 30 values"),
         (lambda d: d["bufferViews"][2].update(byteOffset=-4), "outside of its binary data"),
         (lambda d: d["accessors"][4].update(count=20), "has 20 values, and POSITION 30"),
         (

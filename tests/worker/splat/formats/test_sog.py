@@ -113,7 +113,8 @@ def _outside(meta: dict[str, Any]) -> None:
     ("change", "says"),
     [
         (_without_version, "version None, and only version 2"),
-        (lambda meta: meta.update(count=10**9), "pixels for 1000000000 Gaussians"),
+        (lambda meta: meta.update(count=10**9), "more than 400 times"),
+        (lambda meta: meta.update(count=10**5), "pixels for 100000 Gaussians"),
         (lambda meta: meta.update(count=-1), "its count is -1"),
         (lambda meta: meta["scales"].update(codebook=[0.0]), "without 256 finite numbers"),
         (lambda meta: meta["means"].update(mins=[None, 0, 0]), "without 3 finite numbers|could not be read"),

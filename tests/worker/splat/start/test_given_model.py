@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatmill.schema import Event, TrainOptions
+from splatmill.schema import Event, LogEvent, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.errors import Refusal
 from splatmill_worker.splat.formats import ply, registry
@@ -108,6 +108,19 @@ def test_the_degree_of_the_model_is_kept(trained: Path, started: dict[str, Any])
 def test_a_model_larger_than_allowed_keeps_its_most_opaque_part(trained: Path, tmp_path: Path) -> None:
     outcome, _ = run(trained, tmp_path, start="m.ply", max_gaussians=500, steps=20)
     assert ply.read(outcome.out / "model.ply").gaussians.count <= 500
+
+
+def test_a_model_that_the_job_cannot_hold_is_reduced_and_the_user_told(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "LEAST_ASSESSED", 400)
+    count = ply.read(trained / "poses" / "m.ply").gaussians.count
+    outcome, events = run(trained, tmp_path, start="m.ply", max_gaussians=500, steps=20)
+    assert report_of(outcome)["facts"]["start"]["gaussians"] == 500
+    warnings = [event.message for event in events if isinstance(event, LogEvent) and event.level == "warning"]
+    assert any(
+        f"m.ply has {count:,} Gaussians" in text and "from the 500 most opaque" in text for text in warnings
+    )
 
 
 def test_the_offset_of_a_model_far_from_the_origin_is_added_again(tmp_path: Path) -> None:

@@ -47,8 +47,8 @@ def test_the_most_opaque_gaussians_stay_in_their_order() -> None:
     world, _ = sparse_scene()
     first = from_points(torch.from_numpy(world.points), torch.from_numpy(world.colors))
     first.logit_opacities.copy_(torch.linspace(-1.0, 1.0, first.count).roll(3))
-    kept = seeding.most_opaque(first, 5)
+    kept = first.most_opaque(5)
     assert torch.equal(
         kept.logit_opacities, first.logit_opacities[[0, 1, 2, first.count - 2, first.count - 1]]
     )
-    assert seeding.most_opaque(first, first.count) is first
+    assert first.most_opaque(first.count) is first

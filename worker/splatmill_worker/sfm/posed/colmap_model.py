@@ -15,6 +15,9 @@ from splatmill_worker.images.lens import lens_of, pinhole, without_distortion
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
 from splatmill_worker.sfm.posed import model_files
 from splatmill_worker.sfm.posed.files import ImageFiles
+from splatmill_worker.sfm.posed.model_files import ModelPoints
+
+Integers = npt.NDArray[np.int64]
 
 MAX_ASPECT_ERROR = 0.02
 """Relative difference of aspect ratios up to which a camera fits a photo: sizes are rounded to whole pixels."""
@@ -30,8 +33,7 @@ def load(folder: Path, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
     views: dict[int, View] = {}
     missing: list[tuple[str, str]] = []
     unusable: dict[Path, tuple[str, str]] = {}
-    for image_id in sorted(model.reg_image_ids(), key=lambda image_id: model.images[image_id].name):
-        image = model.images[image_id]
+    for image_id, image in sorted(model.images.items(), key=lambda item: item[1].name):
         found = files.photo(image.name)
         if found is None:
             missing.append(
@@ -40,7 +42,8 @@ def load(folder: Path, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
             continue
         name, path = found
         try:
-            views[image_id] = posed_view(model, image_id, name, path, files.mask(name))
+            camera = camera_and_lens(image.camera, image.viewmat)
+            views[image_id] = fit_to_file(camera, name, path, files.mask(name))
         except UnusablePicture as error:
             unusable[path] = (name, error.reason)
     if not views and unusable:
@@ -64,7 +67,7 @@ def load(folder: Path, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
         if path not in used and path not in unusable
     ]
     left_out = (*missing, *unusable.values(), *without)
-    return scene_of(model, views, source="colmap", left_out=left_out, notes=notes)
+    return scene_of(model.points, views, source="colmap", left_out=left_out, notes=notes)
 
 
 def posed_view(
@@ -105,57 +108,57 @@ def fit_to_file(posed: tuple[Camera, Lens | None], name: str, path: Path, mask: 
 
 
 def scene_of(
-    model: pycolmap.Reconstruction,
+    points: ModelPoints,
     views: dict[int, View],
     *,
     source: Source,
     left_out: tuple[tuple[str, str], ...] = (),
     notes: tuple[str, ...] = (),
 ) -> Scene:
-    """The scene of `views`, by COLMAP's image id, with the model's points that at least one of them observes.
+    """The scene of `views`, by COLMAP's image id, with the points that at least one of them observes.
 
     Where most points have no track at all, the scene has these points instead, and no tracks: `points.with_points`
     judges them by the photos.
     """
-    loose = [point for point in model.points3D.values() if not point.track.elements]
-    if 2 * len(loose) > len(model.points3D):
-        finite = [point for point in loose if np.isfinite(point.xyz).all()]
+    lengths = np.diff(points.offsets)
+    finite = np.asarray(np.isfinite(points.positions).all(axis=1))
+    loose = lengths == 0
+    if 2 * loose.sum() > len(lengths):
+        kept = loose & finite
         return Scene(
             tuple(views.values()),
-            np.array([point.xyz for point in finite], np.float64).reshape(-1, 3),
-            np.array([point.color for point in finite], np.uint8).reshape(-1, 3),
+            points.positions[kept],
+            points.colors[kept],
             source,
             left_out=left_out,
             notes=notes,
         )
-    if loose:
-        notes = (
-            *notes,
-            f"{len(loose)} points without tracks are not used: {len(model.points3D) - len(loose)} have.",
-        )
-    order = {image_id: index for index, image_id in enumerate(views)}
-    points, colors, errors, rows = [], [], [], []
-    for point in model.points3D.values():
-        row = sorted(
-            {order[element.image_id] for element in point.track.elements if element.image_id in order}
-        )
-        if row and np.isfinite(point.xyz).all():
-            points.append(point.xyz)
-            colors.append(point.color)
-            errors.append(point.error)
-            rows.append(row)
-    lengths = np.array([len(row) for row in rows], np.int32)
+    if loose.any():
+        notes = (*notes, f"{loose.sum()} points without tracks are not used: {(~loose).sum()} have.")
+    of_point, of_view = _tracks(points, list(views))
+    counted = finite[of_point]
+    of_point, of_view = of_point[counted], of_view[counted]
+    used, counts = np.unique(of_point, return_counts=True)
     return Scene(
         views=tuple(views.values()),
-        points=np.array(points, np.float64).reshape(-1, 3),
-        colors=np.array(colors, np.uint8).reshape(-1, 3),
+        points=points.positions[used],
+        colors=points.colors[used],
         source=source,
-        point_errors=np.array(errors, np.float64),
-        track_lengths=lengths,
-        point_views=PointViews(
-            np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)]).astype(np.int64),
-            np.array([index for row in rows for index in row], np.int32),
-        ),
+        point_errors=points.errors[used],
+        track_lengths=counts.astype(np.int32),
+        point_views=PointViews(np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), of_view),
         left_out=left_out,
         notes=notes,
     )
+
+
+def _tracks(points: ModelPoints, image_ids: list[int]) -> tuple[Integers, npt.NDArray[np.int32]]:
+    """Index of the point and of the image of each observation by one of `image_ids`, once each, in order."""
+    by_id = np.argsort(image_ids, kind="stable")
+    ids = np.array(image_ids, np.int64)[by_id]
+    known = np.flatnonzero(np.isin(points.images, ids))
+    of_point = np.repeat(np.arange(len(points.errors)), np.diff(points.offsets))[known]
+    of_view = by_id[np.searchsorted(ids, points.images[known])]
+    views = max(1, len(ids))
+    pairs = np.unique(of_point * views + of_view)
+    return pairs // views, (pairs % views).astype(np.int32)

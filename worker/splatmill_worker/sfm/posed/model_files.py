@@ -1,29 +1,19 @@
-"""Reads the files of COLMAP models, also of strangers' and without points.
-
-COLMAP's readers believe the counts in binary files, and allocate for them. The structure of those is therefore walked
-first. https://colmap.github.io/format.html describes the files.
-"""
+"""A COLMAP model that came with photos: its cameras and poses, checked, and its points."""
 
 from __future__ import annotations
 
-import mmap
-import struct
-import tempfile
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from splatmill_worker import colmap_files
 from splatmill_worker.colmap import pycolmap
-
-FILES = ("cameras", "images", "points3D")
-"""Stems of the files that are read; COLMAP's rigs and frames repeat the poses of the images."""
-
-MAX_FILE_BYTES = 2 * 2**30
-"""Bytes of one file of a model."""
-
-MAX_NAME_BYTES = 4096
-"""Bytes of a photo's name."""
+from splatmill_worker.colmap_files import Arrays
+from splatmill_worker.errors import Refusal
+from splatmill_worker.images import decoders
 
 MAX_SIDE = 1_000_000
 """Pixels of a side of a camera."""
@@ -34,126 +24,172 @@ MAX_PARAMETER = 1e7
 MAX_DISTANCE = 1e12
 """Distance of a camera from the origin, in units of the model: squares of it are exact enough."""
 
+Float = npt.NDArray[np.float64]
 
-def read(folder: Path) -> pycolmap.Reconstruction:
+
+@dataclass(frozen=True)
+class ModelPoints:
+    """The points of a COLMAP model.
+
+    positions: [N,3]. colors: uint8 [N,3]. errors: reprojection errors in pixels [N].
+    offsets, images: the track of point i are the images with the ids `images[offsets[i]:offsets[i + 1]]`, which may
+        repeat.
+    """
+
+    positions: Float
+    colors: npt.NDArray[np.uint8]
+    errors: Float
+    offsets: npt.NDArray[np.int64]
+    images: npt.NDArray[np.int64]
+
+    @staticmethod
+    def of(model: pycolmap.Reconstruction) -> ModelPoints:
+        """The points of a model in memory."""
+        points = list(model.points3D.values())
+        tracks = [[element.image_id for element in point.track.elements] for point in points]
+        return ModelPoints(
+            np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
+            np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+            np.array([point.error for point in points], np.float64),
+            np.cumsum([0, *map(len, tracks)], dtype=np.int64),
+            np.array([image for track in tracks for image in track], np.int64),
+        )
+
+
+@dataclass(frozen=True)
+class GivenImage:
+    """A photo of a given model: its name, its camera, and its world-to-camera matrix [4,4]."""
+
+    name: str
+    camera: pycolmap.Camera
+    viewmat: Float
+
+
+@dataclass(frozen=True)
+class GivenModel:
+    """A COLMAP model that came with photos; the images by their ids."""
+
+    images: dict[int, GivenImage]
+    points: ModelPoints
+
+
+def read(folder: Path) -> GivenModel:
     """The model in `folder`, as .bin or as .txt; without points where points3D is missing or empty.
 
     Raises ValueError, naming the file or the entry, when a file is missing, too large, damaged or contradicts another,
     and when a camera or a pose is not valid.
     """
-    suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
-    with tempfile.TemporaryDirectory(prefix="splatmill-model-") as place:
-        for stem in FILES:
-            source, target = folder / f"{stem}{suffix}", Path(place) / f"{stem}{suffix}"
-            size = source.stat().st_size if source.is_file() else 0
-            if size > MAX_FILE_BYTES:
-                raise ValueError(f"{source.name} has {size} bytes; at most {MAX_FILE_BYTES} are read.")
-            if size > 0:
-                target.symlink_to(source.absolute())
-            elif stem == "points3D":
-                target.write_bytes(struct.pack("<Q", 0) if suffix == ".bin" else b"")
-            else:
-                raise ValueError(
-                    f"The COLMAP model in {folder.name}/ has no {source.name}, or an empty one. "
-                    "Give the files cameras and images, both as .bin or both as .txt; points3D is not required."
-                )
-            if size > 0 and suffix == ".bin":
-                _check_structure(source, _ENTRIES[stem])
-        try:
-            model = pycolmap.Reconstruction(place)
-        except (RuntimeError, ValueError, OSError, IndexError) as error:
+    arrays = decoders.call_once(colmap_files.read, folder, check=_arrays, fault=_fault)
+    return GivenModel(_images(arrays, _cameras(arrays)), _points(arrays))
+
+
+def _fault(code: str, name: str, reason: str) -> Exception:
+    message = f"The COLMAP model in {name}/ could not be read: {reason}."
+    if code != "decoder_ended":
+        return ValueError(message)
+    return Refusal(code, message, advice="Restart the job, or remove the poses.")
+
+
+def _arrays(answer: Any) -> Arrays:
+    """The arrays that `colmap_files.read` returns. Raises ValueError and KeyError for others."""
+    cameras, images = len(answer["camera_ids"]), len(answer["image_ids"])
+    points, tracks = len(answer["points"]), len(answer["track_images"])
+    offsets = answer["track_offsets"]
+    shapes = {
+        "camera_ids": (cameras,),
+        "camera_models": (cameras,),
+        "camera_sizes": (cameras, 2),
+        "camera_params": (cameras, colmap_files.MOST_PARAMETERS),
+        "image_ids": (images,),
+        "image_cameras": (images,),
+        "image_poses": (images, 7),
+        "image_names": (len(answer["image_names"]),),
+        "points": (points, 3),
+        "colors": (points, 3),
+        "errors": (points,),
+        "track_offsets": (points + 1,),
+        "track_images": (tracks,),
+    }
+    if any(answer[name].shape != shape for name, shape in shapes.items()):
+        raise ValueError("an array has another shape")
+    if offsets[0] != 0 or offsets[-1] != tracks or (np.diff(offsets) < 0).any():
+        raise ValueError("the tracks are not in order")
+    if not set(np.unique(answer["camera_models"]).tolist()) <= colmap_files.MODELS.keys():
+        raise ValueError("there is no such camera model")
+    if int((answer["image_names"] == 0).sum()) != images:
+        raise ValueError("there is not a name for each image")
+    return {name: answer[name] for name in shapes}
+
+
+def _cameras(arrays: Arrays) -> dict[int, pycolmap.Camera]:
+    """The cameras by their ids. Raises ValueError for one with which no photo can have been taken."""
+    cameras: dict[int, pycolmap.Camera] = {}
+    for number, kind, (width, height), values in zip(
+        arrays["camera_ids"].tolist(),
+        arrays["camera_models"].tolist(),
+        arrays["camera_sizes"].tolist(),
+        arrays["camera_params"],
+        strict=True,
+    ):
+        name, count = colmap_files.MODELS[kind]
+        parameters = values[:count].astype(np.float64)
+        if number in cameras:
+            raise ValueError(f"The COLMAP model has two cameras {number}.")
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
             raise ValueError(
-                f"The COLMAP model in {folder.name}/ could not be read: {_last_line(error)}. "
-                "Give the files cameras, images and points3D, all as .bin or all as .txt."
-            ) from error
-    _check_values(model)
-    return model
-
-
-def _check_values(model: pycolmap.Reconstruction) -> None:
-    """Raise ValueError for a camera or a pose with which no photo can have been taken."""
-    for number, camera in model.cameras.items():
+                f"Camera {number} of the COLMAP model has {width} x {height} pixels; a side has 1 to {MAX_SIDE}."
+            )
+        camera = pycolmap.Camera(model=name, width=width, height=height, params=parameters)
         if camera.is_spherical():
             raise ValueError(
                 f"Camera {number} of the COLMAP model is spherical; photos of such cameras are not used."
             )
-        focal = [camera.params[index] for index in camera.focal_length_idxs()]
-        if not (np.abs(camera.params).max() <= MAX_PARAMETER and min(focal, default=1.0) > 0.0):
-            raise ValueError(f"Camera {number} of the COLMAP model has the parameters {list(camera.params)}.")
-        if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
-            raise ValueError(
-                f"Camera {number} of the COLMAP model has {camera.width} x {camera.height} pixels; a side has 1 to "
-                f"{MAX_SIDE}."
-            )
-    for number in model.reg_image_ids():
-        image = model.images[number]
-        pose = image.cam_from_world()
-        if not (abs(float(np.linalg.norm(pose.rotation.quat)) - 1.0) < 1e-3):
-            raise ValueError(
-                f"The rotation of {image.name!r} in the COLMAP model is not valid: {pose.rotation.quat}."
-            )
-        if not (np.abs(pose.translation) <= MAX_DISTANCE).all():
-            raise ValueError(
-                f"The translation of {image.name!r} in the COLMAP model is not valid, or too large: {pose.translation}."
-            )
+        focal = [parameters[index] for index in camera.focal_length_idxs()]
+        if not (np.abs(parameters).max() <= MAX_PARAMETER and min(focal, default=1.0) > 0.0):
+            raise ValueError(f"Camera {number} of the COLMAP model has the parameters {parameters.tolist()}.")
+        cameras[number] = camera
+    return cameras
 
 
-def _check_structure(path: Path, entry: Callable[[mmap.mmap, int], int]) -> None:
-    """Raise ValueError when a binary file does not hold exactly as many entries as it says.
+def _images(arrays: Arrays, cameras: dict[int, pycolmap.Camera]) -> dict[int, GivenImage]:
+    """The images by their ids. Raises ValueError for a pose that no photo can have."""
+    images: dict[int, GivenImage] = {}
+    names = arrays["image_names"].tobytes().decode("utf-8", "replace").split("\0")[:-1]
+    for number, of, pose, name in zip(
+        arrays["image_ids"].tolist(),
+        arrays["image_cameras"].tolist(),
+        arrays["image_poses"],
+        names,
+        strict=True,
+    ):
+        quat, translation = pose[:4], pose[4:7]
+        if number in images:
+            raise ValueError(f"The COLMAP model has two images {number}.")
+        if of not in cameras:
+            raise ValueError(
+                f"The COLMAP model could not be read: {name!r} has the camera {of}, which is missing."
+            )
+        if not (abs(float(np.linalg.norm(quat)) - 1.0) < 1e-3):
+            raise ValueError(f"The rotation of {name!r} in the COLMAP model is not valid: {quat}.")
+        if not (np.abs(translation) <= MAX_DISTANCE).all():
+            raise ValueError(
+                f"The translation of {name!r} in the COLMAP model is not valid, or too large: {translation}."
+            )
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = pycolmap.Rotation3d(np.roll(quat / np.linalg.norm(quat), -1)).matrix()
+        viewmat[:3, 3] = translation
+        images[number] = GivenImage(name, cameras[of], viewmat)
+    return images
 
-    entry: returns where the entry ends that begins at an offset; it raises struct.error or ValueError where it cannot.
-    """
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        size = len(data)
-        count, done, at = 0, 0, 8
-        try:
-            (count,) = struct.unpack_from("<Q", data, 0)
-            while done < count and at <= size:
-                at = entry(data, at)
-                done += 1
-            fault = "" if at <= size else "it ends before its last entry does"
-        except (struct.error, ValueError) as error:
-            fault = str(error)
-    if fault:
+
+def _points(arrays: Arrays) -> ModelPoints:
+    """The points. Raises ValueError for a track with an image that the model does not have."""
+    points = ModelPoints(
+        *(arrays[name] for name in ("points", "colors", "errors", "track_offsets", "track_images"))
+    )
+    unknown = np.setdiff1d(points.images, arrays["image_ids"])
+    if len(unknown):
         raise ValueError(
-            f"{path.name} could not be read: it announces {count} entries in {size} bytes, and entry {done + 1} is "
-            f"damaged or missing ({fault})."
+            f"The COLMAP model could not be read: points are observed by image {unknown[0]}, which is missing."
         )
-
-
-def _camera_end(data: mmap.mmap, at: int) -> int:
-    """id u32, model i32, width u64, height u64, and the parameters, f64, of the model."""
-    (kind,) = struct.unpack_from("<i", data, at + 4)
-    if kind not in _PARAMETERS:
-        raise ValueError(f"there is no camera model {kind}")
-    return at + 24 + 8 * _PARAMETERS[kind]
-
-
-def _image_end(data: mmap.mmap, at: int) -> int:
-    """id u32, pose 7 f64, camera u32, name up to a zero byte, number of points u64, and 24 bytes for each."""
-    name = at + 64
-    zero = data.find(b"\0", name, name + MAX_NAME_BYTES)
-    if zero < 0:
-        raise ValueError(f"its name does not end within {MAX_NAME_BYTES} bytes")
-    (points,) = struct.unpack_from("<Q", data, zero + 1)
-    return zero + 9 + 24 * int(points)
-
-
-def _point_end(data: mmap.mmap, at: int) -> int:
-    """id u64, position 3 f64, colour 3 u8, error f64, length of the track u64, and 8 bytes for each of its elements."""
-    (track,) = struct.unpack_from("<Q", data, at + 43)
-    return at + 51 + 8 * int(track)
-
-
-_ENTRIES = {"cameras": _camera_end, "images": _image_end, "points3D": _point_end}
-
-_PARAMETERS = {
-    int(kind.value): len(pycolmap.Camera.create_from_model_id(1, kind, 1.0, 1, 1).params)
-    for kind in pycolmap.CameraModelId.__members__.values()
-    if kind.name != "INVALID"
-}
-"""Number of parameters of each camera model, by COLMAP's number of it."""
-
-
-def _last_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[-1][:200]
+    return points

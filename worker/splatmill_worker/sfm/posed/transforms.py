@@ -13,9 +13,9 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from plyfile import PlyData, PlyParseError
 
-from splatmill_worker import ply_header
+from splatmill.schema.quantities import format_bytes
+from splatmill_worker import point_file
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import decoders
@@ -34,8 +34,11 @@ MIN_DETERMINANT = 1e-12
 """Determinant of the rotation part up to which a matrix counts as singular or mirrored."""
 
 
-MAX_FILE_BYTES = 64 * 2**20
-"""Bytes of a transforms file: 100,000 frames and more."""
+MAX_FILE_BYTES = 32 * 2**20
+"""Bytes of a transforms file: 35,000 frames and more."""
+
+MAX_PARSED_BYTES = 200 * 2**20
+"""Bytes that a transforms file may take once it is parsed."""
 
 
 def load(
@@ -107,7 +110,10 @@ def _read(path: Path) -> dict[str, Any]:
     if size > MAX_FILE_BYTES:
         raise ValueError(f"{path.name} has {size} bytes; at most {MAX_FILE_BYTES} are read.")
     try:
-        document = json.loads(path.read_text("utf-8"))
+        text = path.read_bytes()
+        if parsed_bytes(text) > MAX_PARSED_BYTES:
+            raise ValueError(f"its lists and objects would take {format_bytes(parsed_bytes(text))} of memory")
+        document = json.loads(text)
     except RecursionError as error:
         raise ValueError(f"{path.name} is not readable JSON: it is nested too deeply.") from error
     except (OSError, ValueError) as error:
@@ -117,6 +123,11 @@ def _read(path: Path) -> dict[str, Any]:
             f"{path.name} has no list `frames`. Give a transforms file with one entry in `frames` per photo."
         )
     return document
+
+
+def parsed_bytes(text: bytes) -> int:
+    """Bytes that a JSON text takes once it is parsed, at most: 88 a list or object, and 40 for what follows a comma."""
+    return 2 * len(text) + 88 * (text.count(b"[") + text.count(b"{")) + 40 * text.count(b",")
 
 
 def _test_names(path: Path, document: dict[str, Any]) -> set[str]:
@@ -246,16 +257,19 @@ def _sparse_points(
     if not _within(path, capture):
         return nothing, f"The points in {path.name} are not used: ply_file_path lies outside the capture."
     try:
-        ply_header.check(path)
-        vertex = PlyData.read(path)["vertex"]
-        points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
-        names = {name.name for name in vertex.properties}
-        channels = ("red", "green", "blue")
-        if names >= set(channels):
-            colors = np.stack([np.asarray(vertex[channel], np.uint8) for channel in channels], 1)
-        else:
-            colors = np.full(points.shape, 128, np.uint8)
-    except (OSError, PlyParseError, KeyError, ValueError, IndexError) as error:
+        found = decoders.call_once(point_file.read, path, check=_points_of, fault=_points_fault)
+    except (OSError, ValueError) as error:
         return nothing, f"The points in {path.name} are not used: {error}."
-    finite = np.isfinite(points).all(axis=1)
-    return (points[finite], colors[finite]), None
+    return found, None
+
+
+def _points_of(answer: Any) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
+    """The positions and colours that `point_file.read` returns. Raises ValueError for anything else."""
+    points, colors = answer
+    if not (points.shape == colors.shape == (len(points), 3) and colors.dtype == np.uint8):
+        raise ValueError("they are no points with colours")
+    return points.astype(np.float64), colors
+
+
+def _points_fault(code: str, name: str, reason: str) -> Exception:
+    return ValueError(reason)

@@ -29,7 +29,7 @@ from splatmill_worker.splat.formats.contents import (
     logits,
 )
 from splatmill_worker.splat.formats.morton import morton_order
-from splatmill_worker.splat.gaussians import SH_C0, Gaussians
+from splatmill_worker.splat.gaussians import REST_COEFFICIENTS, SH_C0, Gaussians
 
 CHUNK = 256
 """Gaussians that share their ranges."""
@@ -101,6 +101,7 @@ def decode(path: Path, document: PlyData) -> Contents:
         raise ModelUnreadable(
             f"{path.name} has {rest} harmonics of {sh.count} Gaussians, where 9, 24 or 45 of {n} are possible."
         )
+    ply.check_count(path, n, {3 * k: degree for degree, k in REST_COEFFICIENTS.items()}[rest])
     position, rotation, scale, color = (np.asarray(vertex[name]).astype(np.uint32) for name in _PACKED)
     rgba = _unpacked(color, 8, 8, 8, 8)
     rgb = _spread(rgba[:, :3], chunk, _RANGES[12:]) if colors_too else rgba[:, :3]

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from splatmill.files import replacing
 from splatmill_worker.errors import ModelUnreadable
+from splatmill_worker.reader_memory import check, check_gaussians
 from splatmill_worker.splat.formats.contents import (
     NO_OFFSET,
     Contents,
@@ -33,7 +34,9 @@ from splatmill_worker.splat.formats.frames import turned_about_x
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
-MAX_JSON_BYTES = 2**24
+MAX_JSON_BYTES = 2**22
+"""Bytes of the document, which has some ten kilobytes; Python takes up to thirty times as many to parse it."""
+
 _MAGIC, _VERSION, _JSON, _BIN = b"glTF", 2, b"JSON", b"BIN\0"
 _ARRAY_BUFFER, _POINTS = 34962, 0
 _TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -198,15 +201,16 @@ def _contents(path: Path) -> Contents:
     _check(primitive)
     attributes = primitive["attributes"]
 
-    means = _accessor(document, data, attributes["POSITION"], 3, "POSITION")
+    degree = max(d for d in range(4) if f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
+    count = document["accessors"][attributes["POSITION"]]["count"]
+    if type(count) is not int:
+        raise ValueError(f"its POSITION has {count!r:.20} values")
+    check_gaussians(count, degree, path.stat().st_size)
+    means = _accessor(document, data, attributes["POSITION"], 3, "POSITION", count)
 
     def values(name: str, width: int) -> Tensor:
-        found = _accessor(document, data, attributes[name], width, name)
-        if len(found) != len(means):
-            raise ValueError(f"{name} has {len(found)} values, and POSITION {len(means)}")
-        return found
+        return _accessor(document, data, attributes[name], width, name, count)
 
-    degree = max(d for d in range(4) if f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
     sh = [values(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{order}", 3) for d, order in _harmonics(degree)]
     scales = values(f"{EXTENSION}:SCALE", 3)
     if bool((scales < 0).any()):
@@ -253,6 +257,7 @@ def _chunks(path: Path) -> tuple[dict[str, Any], bytes]:
         length, kind = struct.unpack("<I4s", head)
         if kind != _BIN or length > total:
             raise ValueError("its second chunk is not its binary data")
+        check("reading it", length, total)
         data = file.read(length)
     if len(data) != length:
         raise ValueError(f"its binary chunk announces {length} bytes, and {len(data)} follow")
@@ -275,9 +280,16 @@ def _check(primitive: dict[str, Any]) -> None:
         raise ValueError(f"its Gaussians need {', '.join(extension['extensions'])[:100]}, which is not read")
 
 
-def _accessor(document: dict[str, Any], data: bytes, index: int, width: int, name: str) -> Tensor:
-    """The values [N, width] of an accessor, float32. Raises ValueError where it leaves the binary chunk."""
+def _accessor(
+    document: dict[str, Any], data: bytes, index: int, width: int, name: str, expected: int
+) -> Tensor:
+    """The values [N, width] of an accessor, float32.
+
+    Raises ValueError where N is not `expected`, and where it leaves the binary chunk.
+    """
     accessor = document["accessors"][index]
+    if accessor["count"] != expected:
+        raise ValueError(f"{name} has {accessor['count']!r:.20} values, and POSITION {expected!r:.20}")
     if accessor.get("sparse") is not None or _TYPES.get(accessor["type"]) != width:
         raise ValueError(f"the accessor of {name} is sparse or no {width} values")
     view = document["bufferViews"][accessor["bufferView"]]

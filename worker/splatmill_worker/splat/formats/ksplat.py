@@ -16,6 +16,7 @@ import numpy.typing as npt
 import torch
 
 from splatmill_worker.errors import ModelUnreadable
+from splatmill_worker.reader_memory import check, check_gaussians
 from splatmill_worker.splat.formats.contents import Contents, finite, logits
 from splatmill_worker.splat.formats.splat import log_scales
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
@@ -63,13 +64,16 @@ class _Section:
 
 def read(path: Path) -> Contents:
     """Read a `.ksplat` file. Raises ModelUnreadable, and FileNotFoundError where there is none."""
-    data = path.read_bytes()
+    size = path.stat().st_size
     try:
-        file = _parsed(data[: _head_bytes(data)], len(data))
+        check("reading it", size, size)
+        data = path.read_bytes()
+        file = _parsed(data[: _head_bytes(data)], size)
+        degree = max((section.degree for section in file.sections), default=0)
+        check_gaussians(sum(section.count for section in file.sections), degree, size)
         parts = [_gaussians(data, file, section) for section in file.sections]
     except ValueError as error:
         raise ModelUnreadable(f"{path.name} could not be read as a .ksplat file: {error}.") from error
-    degree = max((part.degree for part in parts), default=0)
     empty = Gaussians(
         torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, 1, 3)
     )

@@ -11,6 +11,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from splatmill.files import replacing
 from splatmill_worker import ply_header
 from splatmill_worker.errors import ModelUnreadable
+from splatmill_worker.reader_memory import check_gaussians
 from splatmill_worker.splat.formats.contents import NO_OFFSET, OPAQUE, Contents, Offset, finite, unit, visible
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -111,6 +112,8 @@ def decode(path: Path, document: PlyData) -> Contents:
             f"{path.name} is not a 3D Gaussian .ply: the properties {', '.join(missing)} are missing."
         )
 
+    check_count(path, vertex.count, degree)
+
     def columns(*names: str) -> torch.Tensor:
         if not names:
             return torch.zeros(vertex.count, 0)
@@ -128,6 +131,14 @@ def decode(path: Path, document: PlyData) -> Contents:
         sh=torch.cat([columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest_columns.transpose(1, 2)], dim=1),
     )
     return Contents(finite(gaussians), offset_of(path, document))
+
+
+def check_count(path: Path, count: int, degree: int) -> None:
+    """Raise ModelUnreadable for more Gaussians than the file, or the memory, can hold."""
+    try:
+        check_gaussians(count, degree, path.stat().st_size)
+    except ValueError as error:
+        raise ModelUnreadable(f"{path.name} could not be read as a .ply file: {error}.") from error
 
 
 def parsed(path: Path) -> PlyData:

@@ -10,9 +10,10 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,8 @@ from splatmill.files import replacing
 from splatmill_worker.errors import ModelUnreadable, UnusablePicture
 from splatmill_worker.images import guarded
 from splatmill_worker.images.archive import DAMAGED
-from splatmill_worker.splat.formats import palette
+from splatmill_worker.reader_memory import check_gaussians
+from splatmill_worker.splat.formats import palette, sog_files
 from splatmill_worker.splat.formats.contents import (
     NO_OFFSET,
     Contents,
@@ -49,14 +51,24 @@ GAUSSIANS_PER_CENTROID = 10
 LEAST_CENTROIDS, MOST_CENTROIDS = 1024, 8192
 """Bounds on the number of centroids; between them, a centroid stands for GAUSSIANS_PER_CENTROID (decisions: sog)."""
 
-_ENCRYPTED = 1
-"""The bit of a zip member's flags that says so."""
+MAX_META_BYTES = 2**20
+"""Bytes of a `meta.json`, which has some ten kilobytes; Python takes up to thirty times as many to parse it."""
 
-MAX_META_BYTES = 2**24
-MAX_IMAGE_BYTES = 2**30
-"""Bytes of a member of the archive after inflation; the images are stored as they are."""
+PIXELS_PER_GAUSSIAN, MORE_PIXELS = 4, 2**16
+"""An image of N Gaussians has this many pixels for each, and more pixels besides, at most. Writers make images of about
+the root of N on a side."""
+
+_IMAGES = {"means": 2, "scales": 1, "quats": 1, "sh0": 1, "shN": 2}
+"""Images of each part."""
+
+FORMATS = ("WEBP", "PNG")
+"""Pillow's names of the formats that are read. The specification has WebP as its default, and allows any with RGBA
+values of 8 bits."""
 
 Plane = npt.NDArray[np.uint8]
+
+_ROWS = 2**16
+"""Quaternions that are unpacked at a time: in float64, all of them would be most of the memory of a reader."""
 
 _ROOT_HALF = math.sqrt(0.5)
 _OTHERS = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
@@ -143,8 +155,8 @@ def read(path: Path) -> Contents:
     Raises ModelUnreadable for any other file and for earlier versions, and FileNotFoundError where there is none.
     """
     try:
-        with _files(path) as file:
-            return _contents(file)
+        with sog_files.opened(path) as files:
+            return _contents(files)
     except FileNotFoundError:
         raise
     except UnusablePicture as error:
@@ -197,13 +209,18 @@ def _packed(quats: Tensor) -> Tensor:
 
 def _unpacked(plane: Plane) -> Tensor:
     """Unit quaternions wxyz [N, 4]. Raises ValueError for an alpha that names no component."""
-    largest = torch.from_numpy(plane[:, 3].astype(np.int64)) - 252
-    if plane.shape[0] and not bool((largest >= 0).all()):
+    if plane.shape[0] and int(plane[:, 3].min()) < 252:
         raise ValueError("quats.webp has alpha values under 252")
-    small = (torch.from_numpy(plane[:, :3].astype(np.float64)) / 255 * 2 - 1) * _ROOT_HALF
-    full = (1 - small.square().sum(1, keepdim=True)).clamp(min=0).sqrt()
-    quats = torch.zeros(plane.shape[0], 4, dtype=torch.float64)
-    return quats.scatter(1, largest[:, None], full).scatter(1, _OTHERS[largest], small).float()
+    quats = torch.zeros(plane.shape[0], 4)
+    for begin in range(0, plane.shape[0], _ROWS):
+        rows = plane[begin : begin + _ROWS]
+        largest = torch.from_numpy(rows[:, 3].astype(np.int64)) - 252
+        small = (torch.from_numpy(rows[:, :3].astype(np.float64)) / 255 * 2 - 1) * _ROOT_HALF
+        full = (1 - small.square().sum(1, keepdim=True)).clamp(min=0).sqrt()
+        part = torch.zeros(len(rows), 4, dtype=torch.float64)
+        part = part.scatter(1, largest[:, None], full).scatter(1, _OTHERS[largest], small)
+        quats[begin : begin + _ROWS] = part.float()
+    return quats
 
 
 def _plane(values: Tensor) -> Plane:
@@ -238,36 +255,8 @@ def _member(name: str) -> zipfile.ZipInfo:
     return zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
 
 
-@contextmanager
-def _files(path: Path) -> Iterator[Callable[[str, int], bytes]]:
-    """A function from a file's name and largest size to its bytes. Raises ValueError for one out of bounds."""
-    if zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-
-            def of_archive(name: str, most: int) -> bytes:
-                member = archive.getinfo(name)
-                if member.file_size > most:
-                    raise ValueError(f"{name[:80]} has more than {most} bytes")
-                if member.flag_bits & _ENCRYPTED:
-                    raise ValueError(f"{name[:80]} is encrypted")
-                return archive.read(name)
-
-            yield of_archive
-        return
-
-    def beside(name: str, most: int) -> bytes:
-        if PurePosixPath(name).name != name:
-            raise ValueError(f"meta.json names a file outside of its folder: {name[:80]!r}")
-        found = path if name == "meta.json" else path.with_name(name)
-        if found.stat().st_size > most:
-            raise ValueError(f"{name[:80]} has more than {most} bytes")
-        return found.read_bytes()
-
-    yield beside
-
-
-def _contents(file: Callable[[str, int], bytes]) -> Contents:
-    meta = json.loads(file("meta.json", MAX_META_BYTES))
+def _contents(files: sog_files.Files) -> Contents:
+    meta = json.loads(sog_files.contents(files, "meta.json", MAX_META_BYTES))
     version = meta.get("version") if isinstance(meta, dict) else None
     if version != VERSION:
         raise ValueError(
@@ -277,34 +266,34 @@ def _contents(file: Callable[[str, int], bytes]) -> Contents:
     count = meta["count"]
     if type(count) is not int or count < 0:
         raise ValueError(f"its count is {count!r:.20}")
-
-    def plane(part: str, index: int, channels: int) -> Plane:
-        return _decoded(file, meta[part]["files"][index], channels)
+    names = _names(meta)
+    degree = _degree(meta["shN"]) if "shN" in meta else 0
+    check_gaussians(count, degree, sum(files.size(name) for part in names.values() for name in part))
+    pixels = max(PIXELS_PER_GAUSSIAN * count + MORE_PIXELS, MAX_CENTROIDS * REST_COEFFICIENTS[degree])
+    most = 4 * pixels + MAX_META_BYTES  # an image that could not be compressed, with its metadata
+    side: tuple[int, int] | None = None
 
     def rows(part: str, index: int, channels: int) -> Plane:
-        pixels = plane(part, index, channels).reshape(-1, channels)
-        if pixels.shape[0] < count:
-            raise ValueError(
-                f"{meta[part]['files'][index][:80]} has {pixels.shape[0]} pixels for {count} Gaussians"
-            )
-        return pixels[:count]
+        nonlocal side
+        name = names[part][index]
+        plane = _decoded(files, name, most, channels, partial(_check_side, name, count, side))
+        side = plane.shape[1], plane.shape[0]
+        return plane.reshape(-1, channels)[:count]
 
-    low, high = (_numbers(meta["means"][name], 3) for name in ("mins", "maxs"))
-    codes = rows("means", 0, 3).astype(np.float64) + 256.0 * rows("means", 1, 3).astype(np.float64)
-    logged = torch.from_numpy(low + (high - low) * codes / 65535)
     colors = rows("sh0", 0, 4)
-    dc = _numbers(meta["sh0"]["codebook"], 256)[colors[:, :3]]
-    scales = _numbers(meta["scales"]["codebook"], 256)[rows("scales", 0, 3)]
-    sh = torch.from_numpy(dc)[:, None].float()
-    if "shN" in meta:
-        sh = torch.cat([sh, _read_harmonics(meta["shN"], plane("shN", 0, 3), rows("shN", 1, 3))], 1)
     gaussians = Gaussians(
-        means=(logged.sign() * logged.abs().expm1()).float(),
-        log_scales=torch.from_numpy(scales).float(),
+        means=_means(meta["means"], rows("means", 0, 3), rows("means", 1, 3)),
+        log_scales=_looked_up(meta["scales"], rows("scales", 0, 3)),
         quats=_unpacked(rows("quats", 0, 4)),
+        sh=_looked_up(meta["sh0"], colors[:, :3])[:, None],
         logit_opacities=logits(torch.from_numpy(colors[:, 3].astype(np.float32)) / 255),
-        sh=sh,
     )
+    if degree:
+        centroids = _decoded(
+            files, names["shN"][0], most, 3, partial(_check_palette, names["shN"][0], degree)
+        )
+        rest = _read_harmonics(meta["shN"], centroids, rows("shN", 1, 3))
+        gaussians = replace(gaussians, sh=torch.cat([gaussians.sh, rest], 1))
     offset = NO_OFFSET
     if isinstance(meta.get("splatmill"), dict):
         x, y, z = _numbers(meta["splatmill"]["offset"], 3).tolist()
@@ -317,17 +306,67 @@ def _contents(file: Callable[[str, int], bytes]) -> Contents:
     )
 
 
+def _names(meta: dict[str, Any]) -> dict[str, list[str]]:
+    """The names of the images of each part. Raises ValueError where one of them serves twice."""
+    names = {
+        part: [str(name) for name in meta[part]["files"]][:images]
+        for part, images in _IMAGES.items()
+        if part in meta or part != "shN"
+    }
+    for part, found in names.items():
+        if len(found) < _IMAGES[part]:
+            raise ValueError(f"its {part} names {len(found)} of {_IMAGES[part]} images")
+    every = [name for part in names.values() for name in part]
+    twice = sorted({name for name in every if every.count(name) > 1})
+    if twice:
+        raise ValueError(f"{twice[0][:80]} is named as several of its images, and each is a file of its own")
+    return names
+
+
+def _degree(part: dict[str, Any]) -> int:
+    degree = part["bands"]
+    if type(degree) is not int or degree not in (1, 2, 3):
+        raise ValueError(f"its harmonics have {degree!r:.20} bands")
+    return degree
+
+
+def _check_side(name: str, count: int, other: tuple[int, int] | None, width: int, height: int) -> None:
+    """Raise ValueError for an image that cannot be one of `count` Gaussians, beside others of the size `other`."""
+    if width * height < count:
+        raise ValueError(f"{name[:80]} has {width * height} pixels for {count} Gaussians")
+    if width * height > PIXELS_PER_GAUSSIAN * count + MORE_PIXELS:
+        raise ValueError(
+            f"{name[:80]} has {width} x {height} pixels, far more than its {count} Gaussians need"
+        )
+    if other not in (None, (width, height)):
+        raise ValueError(f"{name[:80]} has {width} x {height} pixels, and the images before it {other}")
+
+
+def _check_palette(name: str, degree: int, width: int, height: int) -> None:
+    wanted = CENTROIDS_PER_ROW * REST_COEFFICIENTS[degree]
+    if width != wanted:
+        raise ValueError(f"its palette is {width} pixels wide, and degree {degree} needs {wanted}")
+    if height > MAX_CENTROIDS // CENTROIDS_PER_ROW:
+        raise ValueError(
+            f"{name[:80]} has {height} rows of centroids, and labels reach {MAX_CENTROIDS // CENTROIDS_PER_ROW}"
+        )
+
+
+def _means(part: dict[str, Any], lower: Plane, upper: Plane) -> Tensor:
+    low, high = (_numbers(part[name], 3) for name in ("mins", "maxs"))
+    codes = lower.astype(np.uint16) | (upper.astype(np.uint16) << 8)
+    logged = torch.from_numpy(low + (high - low) / 65535 * codes)
+    signs = logged.sign()
+    return logged.abs_().expm1_().mul_(signs).float()
+
+
+def _looked_up(part: dict[str, Any], plane: Plane) -> Tensor:
+    return torch.from_numpy(_numbers(part["codebook"], 256).astype(np.float32)[plane])
+
+
 def _read_harmonics(part: dict[str, Any], centroids: Plane, labels: Plane) -> Tensor:
     """The coefficients above the DC term [N, K, 3]. Labels without a centroid give zeros, as in other readers."""
-    degree = part["bands"]
-    if degree not in (1, 2, 3):
-        raise ValueError(f"its harmonics have {degree!r:.20} bands")
-    coefficients = REST_COEFFICIENTS[degree]
-    if centroids.shape[1] != CENTROIDS_PER_ROW * coefficients:
-        raise ValueError(
-            f"its palette is {centroids.shape[1]} pixels wide, and {coefficients} coefficients need "
-            f"{CENTROIDS_PER_ROW * coefficients}"
-        )
+    coefficients = centroids.shape[1] // CENTROIDS_PER_ROW
     book = _numbers(part["codebook"], 256).astype(np.float32)
     entries = book[centroids.reshape(-1, coefficients, 3)]
     index = labels[:, 0].astype(np.int64) + 256 * labels[:, 1].astype(np.int64)
@@ -336,12 +375,18 @@ def _read_harmonics(part: dict[str, Any], centroids: Plane, labels: Plane) -> Te
     return torch.from_numpy(entries[index])
 
 
-def _decoded(file: Callable[[str, int], bytes], name: str, channels: int) -> Plane:
-    with (
-        guarded.opened_bytes(file(name, MAX_IMAGE_BYTES), name, ("WEBP", "PNG")) as image,
-        guarded.damage(name),
-    ):
-        return np.asarray(image.convert("RGBA"))[..., :channels]
+def _decoded(
+    files: sog_files.Files, name: str, most: int, channels: int, check: Callable[[int, int], None]
+) -> Plane:
+    """The pixels [H, W, channels] of an image of at most `most` bytes.
+
+    check: raises ValueError for a width and height that the image may not have; it is called before it is decoded.
+    """
+    data = sog_files.contents(files, name, most)
+    with guarded.opened_bytes(data, name, FORMATS) as image:
+        check(*image.size)
+        with guarded.damage(name):
+            return np.ascontiguousarray(np.asarray(image.convert("RGBA"))[..., :channels])
 
 
 def _numbers(values: Any, count: int) -> npt.NDArray[np.float64]:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from splatmill_worker.errors import ModelUnreadable
+from splatmill_worker.reader_memory import check_gaussians
 from splatmill_worker.splat.formats.contents import Contents, finite, logits
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 
@@ -39,10 +40,14 @@ def read(path: Path) -> Contents:
 
 
 def check(path: Path) -> None:
-    """Raise ValueError if the file does not consist of whole rows. Raises OSError if it cannot be opened."""
+    """Raise ValueError if the file does not consist of whole rows, or of too many.
+
+    Raises OSError if it cannot be opened.
+    """
     size = path.stat().st_size
     if size % ROW.itemsize:
         raise ValueError(f"its {size} bytes are no whole number of rows of {ROW.itemsize}")
+    check_gaussians(size // ROW.itemsize, 0, size)
 
 
 def log_scales(scales: torch.Tensor) -> torch.Tensor:

@@ -20,8 +20,9 @@ from torch import Tensor
 
 from splatmill.files import atomic_write
 from splatmill_worker.errors import ModelUnreadable
+from splatmill_worker.reader_memory import check, check_gaussians
 from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, finite, logits, unit, visible
-from splatmill_worker.splat.formats.expansion import Gunzip, check_expansion, unzstd
+from splatmill_worker.splat.formats.expansion import Gunzip, unzstd
 from splatmill_worker.splat.formats.frames import turned_about_x
 from splatmill_worker.splat.formats.morton import morton_order
 from splatmill_worker.splat.gaussians import Gaussians
@@ -101,9 +102,10 @@ def read(path: Path) -> Contents:
 
     Raises ModelUnreadable for any other file, and FileNotFoundError where there is none.
     """
-    data = path.read_bytes()
+    size = path.stat().st_size
     try:
-        header, streams, frame = _streams(data)
+        check("reading it", size, size)
+        header, streams, frame = _streams(path.read_bytes())
     except ValueError as error:
         raise ModelUnreadable(f"{path.name} could not be read as an .spz file: {error}.") from error
     positions, alphas, colors, scales, rotations, harmonics = (
@@ -139,7 +141,7 @@ def _parsed(head: bytes, size: int) -> _Header:
         raise ValueError(f"its harmonics are of degree {header.degree}, and 0 to 4 are known")
     if header.fraction_bits > 24:
         raise ValueError(f"its positions have {header.fraction_bits} of 24 bits after the point")
-    check_expansion(size, header.count * sum(header.widths()))
+    check_gaussians(header.count, header.degree, size)
     return header
 
 

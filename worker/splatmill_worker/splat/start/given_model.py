@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from splatmill_worker.errors import ModelUnreadable, StartUnusable
+from splatmill_worker.errors import ModelUnreadable, Refusal, StartUnusable
+from splatmill_worker.images import decoders
 from splatmill_worker.scene import Normalization
 from splatmill_worker.splat.evaluate import benchmark_background, compare
-from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.render import render
+from splatmill_worker.splat.start import given_file
 from splatmill_worker.splat.views import TrainingView
 
 ASSESSED_VIEWS = 8
 """Least number of training views on which a model is assessed; all of them where there are fewer."""
+
+LEAST_ASSESSED = 200_000
+"""Gaussians that are kept of a model whatever max_gaussians is, so that it is compared with the photos as it is."""
 
 DOUBTFUL_MARGIN = 3.0
 """dB of PSNR over the baseline of one colour per photo, up to which a model is doubtful: a trained model in the right
@@ -58,23 +63,41 @@ class GivenModel:
         return self.doubtful and self.another is not None and not self.psnr > self.another + OWN_PHOTO_MARGIN
 
 
-def read_given_model(path: Path, normalization: Normalization) -> Gaussians:
-    """The Gaussians of the file `path`, of any readable format, moved into the training world by `normalization`.
+def read_given_model(path: Path, normalization: Normalization, most: int) -> tuple[Gaussians, int]:
+    """The `most` most opaque Gaussians of the file `path` in the training world, and how many it has.
+
+    The file may be of any readable format; it is moved by `normalization`.
 
     Far from the origin, export subtracts an offset and stores it in the file; it is added again.
     Raises StartUnusable where the file cannot be read or holds no Gaussian.
     """
     try:
-        contents = registry.read(path)
+        gaussians, offset, count = decoders.call_once(given_file.read, path, most, check=_given, fault=_fault)
     except ModelUnreadable as error:
-        raise StartUnusable(str(error)) from error
+        raise StartUnusable(error.message) from error
     except OSError as error:
         raise StartUnusable(f"{path.name} cannot be opened: {error.strerror or error}.") from error
-    gaussians = contents.gaussians
     if gaussians.count == 0:
         raise StartUnusable(f"{path.name} holds no Gaussian with finite values.")
-    shift = normalization.scale * np.array(contents.offset) + normalization.translation
-    return gaussians.moved(normalization.scale, torch.from_numpy(shift))
+    shift = normalization.scale * np.array(offset) + normalization.translation
+    return gaussians.moved(normalization.scale, torch.from_numpy(shift)), count
+
+
+def _given(answer: Any) -> tuple[Gaussians, list[float], int]:
+    """The Gaussians of what `given_file.read` returns, offset, and number. Raises ValueError and KeyError."""
+    values = {field.name: torch.from_numpy(answer[field.name]) for field in fields(Gaussians)}
+    gaussians = Gaussians(**values)
+    x, y, z = (float(value) for value in answer["offset"])
+    if not all(value.dtype == torch.float32 for value in gaussians) or not bool(gaussians.finite().all()):
+        raise ValueError("a parameter is no finite float32")
+    return gaussians, [x, y, z], int(answer["count"])
+
+
+def _fault(code: str, name: str, reason: str) -> Exception:
+    message = f"{name} could not be read: {reason}."
+    if code != "decoder_ended":
+        return StartUnusable(message)
+    return Refusal(code, message, advice="Restart the job, or leave out the option start.")
 
 
 def assess(gaussians: Gaussians, views: Sequence[TrainingView]) -> GivenModel:

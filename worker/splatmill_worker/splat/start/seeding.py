@@ -56,14 +56,6 @@ def add_seeds(
     return concatenate(*parts)
 
 
-def most_opaque(gaussians: Gaussians, limit: int) -> Gaussians:
-    """The `limit` most opaque of `gaussians`, in their order; all of them where there are no more."""
-    if gaussians.count <= limit:
-        return gaussians
-    order = torch.argsort(gaussians.logit_opacities, descending=True, stable=True)
-    return gaussians.select(torch.sort(order[:limit]).values)
-
-
 def _at_most(room: int, points: Float, colors: Pixels) -> tuple[Float, Pixels]:
     """All points and colours, or `room` of them, evenly chosen, where there are more."""
     if len(points) <= room:

@@ -1,0 +1,99 @@
+"""Proves that reading a model takes as much memory as is promised, and a file made to fill the memory next to none.
+
+Measured in processes of their own, by the kernel's peak. Does not prove how long reading takes.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatmill_worker import reader_memory
+from splatmill_worker.splat.formats import registry
+from splatmill_worker.splat.gaussians import Gaussians
+from tests.support.gaussians import some_gaussians
+from tests.support.hostile import model_bombs
+from tests.support.ksplat_files import ksplat
+from tests.support.reader_peak import peaks
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="peaks are read from /proc"),
+]
+
+MOST_GROWTH = 100 * 10**6
+"""Bytes that a refused file may take, by the kernel's count."""
+
+
+def read(paths: list[Path]) -> list[tuple[int, str]]:
+    return peaks("splatmill_worker.splat.formats.registry:read", paths)
+
+
+def test_a_file_made_to_fill_the_memory_takes_next_to_none(tmp_path: Path) -> None:
+    registry.write(tmp_path / "small.ply", some_gaussians(3, 1))
+    paths = [tmp_path / "small.ply"]
+    for index, (suffix, made) in enumerate(model_bombs.MODELS.values()):
+        paths.append(tmp_path / f"{index}{suffix}")
+        paths[-1].write_bytes(made())
+    for what, (size, said) in zip(model_bombs.MODELS, read(paths), strict=True):
+        assert said != "read", what
+        assert size < MOST_GROWTH, (what, size, said)
+
+
+COUNT = 150_000
+
+
+def gaussians(degree: int) -> Gaussians:
+    """Many Gaussians, one of which is not finite, so that the reader copies the others."""
+    made = torch.Generator().manual_seed(1)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=made)
+
+    return Gaussians(
+        normal(COUNT, 3),
+        normal(COUNT, 3) - 4,
+        normal(COUNT, 4),
+        normal(COUNT) + 2,
+        normal(COUNT, (degree + 1) ** 2, 3) / 10,
+    )
+
+
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_a_reader_takes_no_more_than_its_copies(tmp_path: Path, degree: int) -> None:
+    whole = gaussians(degree)
+    registry.write(tmp_path / "small.ply", some_gaussians(3, 1))
+    paths = [tmp_path / "small.ply"]
+    for suffix in (".ply", ".compressed.ply", ".spz", ".glb", ".sog"):
+        paths.append(tmp_path / f"m{suffix}")
+        registry.write(paths[-1], whole)
+    content = bytearray((tmp_path / "m.ply").read_bytes())
+    content[-4:] = b"\xff" * 4  # a part of a quaternion is NaN
+    (tmp_path / "m.ply").write_bytes(content)
+    if degree == 0:
+        paths.append(tmp_path / "m.splat")
+        paths[-1].write_bytes(np.random.default_rng(1).integers(0, 120, 32 * COUNT, np.uint8).tobytes())
+    if degree == 2:
+        paths.append(tmp_path / "m.ksplat")
+        part = whole.select(torch.arange(COUNT // 10))
+        rest = part.sh[:, 1:].transpose(1, 2).flatten(1).numpy()
+        rgba = np.full((part.count, 4), 99, np.uint8)
+        values = (part.means.numpy(), part.log_scales.exp().numpy(), part.quats.numpy(), rgba, rest)
+        paths[-1].write_bytes(ksplat(*values, level=1))
+    parameters = 4 * COUNT * (11 + 3 * (degree + 1) ** 2)
+    for path, (size, said) in zip(paths[1:], read(paths), strict=True):
+        assert said == "read", (path.name, said)
+        assert size < reader_memory.COPIES * parameters, (path.name, size / parameters)
+
+
+def test_a_model_larger_than_the_memory_is_refused_before_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader_memory, "_limit", 10**6)
+    registry.write(tmp_path / "m.ply", some_gaussians(2000, 3))
+    with pytest.raises(Exception, match=r"take 3\.3 MB of memory, and 1\.0 MB are free"):
+        registry.read(tmp_path / "m.ply")

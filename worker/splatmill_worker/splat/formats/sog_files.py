@@ -1,0 +1,91 @@
+"""The files of a model in the SOG format: members of a zip archive, or files beside its `meta.json`."""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import Protocol
+
+MAX_LIST_BYTES = 2**16
+"""Bytes of an archive's list of its members, of which a model has up to eight."""
+
+_LIST_END, _LIST_END_MAGIC = struct.Struct("<4s4H2IH"), b"PK\5\6"
+"""The record at the end of an archive, whose sixth field is the length of the list (APPNOTE.TXT, 4.3.16)."""
+
+_ENCRYPTED = 1
+"""The bit of a member's flags that says so."""
+
+
+class Files(Protocol):
+    """The files of a model: `size` is the bytes of one before it is read, `read` its contents."""
+
+    def size(self, name: str) -> int: ...
+
+    def read(self, name: str) -> bytes: ...
+
+
+class _Members:
+    """The members of an archive. Raises ValueError for one that is encrypted."""
+
+    def __init__(self, archive: zipfile.ZipFile) -> None:
+        self._archive = archive
+
+    def size(self, name: str) -> int:
+        return self._archive.getinfo(name).file_size
+
+    def read(self, name: str) -> bytes:
+        if self._archive.getinfo(name).flag_bits & _ENCRYPTED:
+            raise ValueError(f"{name[:80]} is encrypted")
+        return self._archive.read(name)
+
+
+class _Beside:
+    """The files beside a `meta.json`, which is `path`. Raises ValueError for one in another folder."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def size(self, name: str) -> int:
+        return self._found(name).stat().st_size
+
+    def read(self, name: str) -> bytes:
+        return self._found(name).read_bytes()
+
+    def _found(self, name: str) -> Path:
+        if PurePosixPath(name).name != name:
+            raise ValueError(f"meta.json names a file outside of its folder: {name[:80]!r}")
+        return self._path if name == "meta.json" else self._path.with_name(name)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Files]:
+    """The files of an archive, or those beside a `meta.json`. Raises ValueError, and what `zipfile` does."""
+    if not zipfile.is_zipfile(path):
+        yield _Beside(path)
+        return
+    _check_list(path)
+    with zipfile.ZipFile(path) as archive:
+        yield _Members(archive)
+
+
+def _check_list(path: Path) -> None:
+    """Raise ValueError for an archive whose list of members is long, each of which becomes an object."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 2**16 - _LIST_END.size))
+        tail = file.read()
+    at = tail.rfind(_LIST_END_MAGIC)
+    if at < 0 or len(tail) - at < _LIST_END.size:
+        raise ValueError("its list of files is not complete")
+    length = _LIST_END.unpack_from(tail, at)[5]
+    if length > MAX_LIST_BYTES:
+        raise ValueError(f"its list of files has {length} bytes, and {MAX_LIST_BYTES} at most are read")
+
+
+def contents(files: Files, name: str, most: int) -> bytes:
+    """The contents of a file of at most `most` bytes. Raises ValueError for a larger one."""
+    if files.size(name) > most:
+        raise ValueError(f"{name[:80]} has {files.size(name)} bytes, more than {most}")
+    return files.read(name)
