@@ -16,10 +16,12 @@ PARTS := constraints.txt $(wildcard */pyproject.toml) client/splatmill/__init__.
 # The tests run in this many processes, a file in one process. They wait for servers and browsers a third of the time, so there
 # are three more than cores.
 WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 3)))
+# A Redis of this machine, with which the tests of the service run once more.
+REDIS ?= $(shell command -v redis-server valkey-server | head -n 1)
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: help install demo quick test coverage check wheels docs screenshots pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
+.PHONY: help install demo quick test redis fresh coverage check wheels docs screenshots pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -35,6 +37,16 @@ quick: $(VENV)/.installed-dev ## run the tests that most changes need (not those
 
 test: $(VENV)/.installed-dev ## run all tests (PYTEST_ARGS="..." chooses)
 	$(PYTEST) $(PYTEST_ARGS)
+ifeq ($(PYTEST_ARGS),)
+	@test -z "$(REDIS)" || $(MAKE) redis
+endif
+
+redis: $(VENV)/.installed-dev ## run the tests of the service once more, with the Redis on PATH
+	@test -n "$(REDIS)" || { echo "No redis-server or valkey-server is on PATH (Debian: apt-get install redis-server)."; exit 1; }
+	SPLATMILL_REDIS_SERVER="$(REDIS)" $(PYTEST) $(or $(PYTEST_ARGS),tests/server tests/service tests/worker/service)
+
+fresh: ## make a bare Debian, and run `make demo` and `make test` there (as root; some 40 minutes)
+	.ci/fresh
 
 coverage: $(VENV)/.installed-dev ## run all tests and print their coverage, which takes a good deal longer
 	$(PYTEST) --cov $(PYTEST_ARGS)

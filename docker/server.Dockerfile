@@ -1,6 +1,6 @@
 # The REST API. Build it in the root folder of the repository:
 #   docker build -f docker/server.Dockerfile -t splatmill-server .
-FROM debian:bookworm-slim AS build
+FROM debian:bookworm-20260918-slim@sha256:3783cc01769c7b2b1b83a5c5ad96c815348e28ed7da68e2e3687004faa906251 AS build
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3 python3-venv ca-certificates \
     && rm -rf /var/lib/apt/lists/*
@@ -16,12 +16,12 @@ COPY client client
 COPY server server
 RUN pip install -q -c constraints.txt -U pip setuptools && pip install -q -c constraints.txt ./client ./server
 
-FROM debian:bookworm-slim
+FROM debian:bookworm-20260918-slim@sha256:3783cc01769c7b2b1b83a5c5ad96c815348e28ed7da68e2e3687004faa906251
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3 ca-certificates \
     && rm -rf /var/lib/apt/lists/* \
     && useradd --system --uid 10001 --create-home splatmill \
-    && install -d -m 0700 -o splatmill -g splatmill /data
+    && install -d -m 0700 -o splatmill -g splatmill /data /data/storage /data/storage/models
 COPY --from=build /opt/splatmill /opt/splatmill
 ENV PATH=/opt/splatmill/bin:$PATH PYTHONUNBUFFERED=1 SPLATMILL_DATA=/data SPLATMILL_STORAGE=file:///data/storage
 USER splatmill

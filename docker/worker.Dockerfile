@@ -2,7 +2,7 @@
 #   docker build -f docker/worker.Dockerfile -t splatmill-worker .
 # PIP_ARGS: options of pip that choose another build of torch, such as the CPU-only one.
 # GPU_PACKAGES: set it to "gcc libc6-dev python3-dev" to train on a GPU, because Triton compiles C code at run time.
-FROM debian:bookworm-slim AS build
+FROM debian:bookworm-20260918-slim@sha256:3783cc01769c7b2b1b83a5c5ad96c815348e28ed7da68e2e3687004faa906251 AS build
 ARG PIP_ARGS=""
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3 python3-dev python3-venv ca-certificates g++ make \
@@ -17,13 +17,13 @@ COPY client client
 COPY worker worker
 RUN pip install -q $PIP_ARGS -c constraints.txt ./client ./worker
 
-FROM debian:bookworm-slim
+FROM debian:bookworm-20260918-slim@sha256:3783cc01769c7b2b1b83a5c5ad96c815348e28ed7da68e2e3687004faa906251
 ARG GPU_PACKAGES=""
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3 ca-certificates libgomp1 $GPU_PACKAGES \
     && rm -rf /var/lib/apt/lists/* \
     && useradd --system --uid 10001 --create-home splatmill \
-    && install -d -m 0700 -o splatmill -g splatmill /data
+    && install -d -m 0700 -o splatmill -g splatmill /data /data/storage /data/storage/models
 COPY --from=build /opt/splatmill /opt/splatmill
 ENV PATH=/opt/splatmill/bin:$PATH PYTHONUNBUFFERED=1 SPLATMILL_DATA=/data SPLATMILL_STORAGE=file:///data/storage
 USER splatmill

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from splatmill_server.up.redis_server import find
+from splatmill.backplane.redis_program import find
 
 
 @contextmanager
@@ -15,7 +15,7 @@ def running(folder: Path, **settings: str) -> Iterator[str]:
     path = folder / "r.sock"
     chosen = {"port": "0", "unixsocket": str(path), "save": "", "dir": str(folder), **settings}
     options = [part for name, value in chosen.items() for part in (f"--{name}", value)]
-    process = subprocess.Popen([str(find()[0]), *options], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen([str(find().path), *options], stdout=subprocess.DEVNULL)
     try:
         while not path.exists():
             time.sleep(0.02)

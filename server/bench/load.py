@@ -59,7 +59,7 @@ _COUNTER = "splatmill_http_requests_total{"
 
 _PROCESSES = {
     "api": "splatmill_server.up.api",
-    "redis": "redis-server",
+    "redis": "redis.sock",
     "renderer": "splatmill_worker renderer",
     "worker": "splatmill_worker train",
 }

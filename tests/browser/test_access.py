@@ -11,11 +11,8 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import Open, SmallModel
-from tests.support.paths import ROOT
+from tests.support.programs import npm_package
 from tests.support.up import Up
-
-AXE = ROOT / "server" / "web" / "node_modules" / "axe-core" / "axe.min.js"
-
 
 COUNT = """[...document.querySelectorAll("a[href], button, input, select, [tabindex='0']")]
   .filter((element) => element.checkVisibility()).length"""
@@ -24,9 +21,7 @@ COUNT = """[...document.querySelectorAll("a[href], button, input, select, [tabin
 
 def violations(page: Page) -> list[str]:
     """What axe-core calls serious or critical, with the elements."""
-    if not AXE.is_file():
-        pytest.skip("axe-core is not installed: `python server/web/packages.py fetch --dev`")
-    page.evaluate(AXE.read_text(encoding="utf-8"))
+    page.evaluate((npm_package("axe-core") / "axe.min.js").read_text(encoding="utf-8"))
     result: dict[str, Any] = page.evaluate("axe.run(document)")
     assert len(result["passes"]) > 10, "it has looked at the page"
     found = result["violations"]

@@ -14,13 +14,11 @@ import pytest
 from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.conftest import Open, SmallModel, Visit
-from tests.support.paths import ROOT
+from tests.support.programs import npm_package
 from tests.support.up import Up
 
 WAIT = 20_000
 """Milliseconds to wait for what the renderer answers, which other tests may keep busy."""
-
-AXE = ROOT / "server" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 
 
 def show(page: Page, model: SmallModel) -> None:
@@ -196,12 +194,10 @@ def test_a_phone_shows_the_whole_page(service: Up, model: SmallModel, open_windo
 def test_assistive_technology_finds_nothing_serious(
     service: Up, model: SmallModel, open_window: Open, scheme: str
 ) -> None:
-    if not AXE.is_file():
-        pytest.skip("axe-core is not installed: python server/web/packages.py fetch --dev")
     page = open_window(service, color_scheme=scheme).page
     show(page, model)
     page.get_by_role("button", name="Measure").click()
-    page.evaluate(AXE.read_text())
+    page.evaluate((npm_package("axe-core") / "axe.min.js").read_text())
     found = page.evaluate("axe.run().then((result) => result.violations)")
     serious = [f"{v['id']}: {v['nodes'][0]['html']}" for v in found if v["impact"] in ("serious", "critical")]
     assert not serious

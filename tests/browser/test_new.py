@@ -11,7 +11,6 @@ import io
 import json
 import random
 import re
-import shutil
 import subprocess
 import zipfile
 from collections.abc import Iterator
@@ -27,6 +26,7 @@ from splatmill.schema import describe_options
 from tests.browser.conftest import Open, SmallModel, Visit
 from tests.support import still_life
 from tests.support.paths import ROOT
+from tests.support.programs import node, npm_package
 from tests.support.up import Up
 
 CHECKED = 30_000
@@ -477,10 +477,7 @@ def test_the_code_for_phones_can_be_read(page: Page, tmp_path: Path) -> None:
         import decodeQR from "qr/decode.js"; import fs from "node:fs";
         const data = new Uint8Array(fs.readFileSync({json.dumps(str(tmp_path / "pixels"))}));
         console.log(decodeQR({{ width: {picture.width}, height: {picture.height}, data }}));"""
-    node = shutil.which("node")
-    if node is None or not (WEB / "node_modules" / "qr").is_dir():
-        pytest.skip("needs Node and the package qr: run `python server/web/packages.py fetch`")
-    command = [node, "--input-type=module", "-e", program]
+    command = [*node("qr"), "--input-type=module", "-e", program]
     done = subprocess.run(command, cwd=WEB, capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == address, done.stderr
 
@@ -516,9 +513,7 @@ def test_digests_are_right_without_the_browsers_own(page: Page) -> None:
 
 
 def test_axe_finds_nothing_serious(service: Up, open_window: Open, photos: Path) -> None:
-    axe = WEB / "node_modules" / "axe-core" / "axe.min.js"
-    if not axe.is_file():
-        pytest.skip("axe-core is not installed: `python server/web/packages.py fetch --dev` installs it")
+    axe = npm_package("axe-core") / "axe.min.js"
     visit = open_window(service)
     visit.context.add_init_script(path=axe)
     page = opened(visit.page)

@@ -10,17 +10,17 @@ import io
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from PIL import Image
 from playwright.sync_api import Browser
 
 from splatmill.schema import CameraSpec, ModelCamera, ModelCameras
-from splatmill_server.answers.single_file import WEB, single_file
+from splatmill_server.answers.single_file import single_file
 from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.splat.formats import ply, sog
 from splatmill_worker.splat.render import render
 from tests.support.ball import write_ply
+from tests.support.programs import npm_package
 
 EYES = ((4.0, 1.0, -1.0), (0.5, -4.0, 1.0), (-3.0, 0.5, 2.0))
 
@@ -28,10 +28,8 @@ FLOOR = 34.0
 """PSNR in dB of the file's picture against our renderer's, as in test_viewer."""
 
 
-@pytest.mark.skipif(
-    not (WEB / "vendor/playcanvas").is_dir(), reason="PlayCanvas is not fetched: make install"
-)
 def test_the_file_draws_the_model_and_asks_for_nothing(browser: Browser, tmp_path: Path) -> None:
+    npm_package("playcanvas")  # it is in the file
     write_ply(tmp_path / "model.ply", 800)
     scene = ply.read(tmp_path / "model.ply").gaussians
     specs = [CameraSpec.looking_at(eye, (0, 0, 0), width=480, height=360) for eye in EYES]

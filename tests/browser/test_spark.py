@@ -18,6 +18,7 @@ from playwright.sync_api import Browser, Page, Route
 from splatmill_worker.splat.formats import compressed_ply, ply, registry, sog, spz
 from tests.support.gaussians import some_gaussians
 from tests.support.paths import ROOT
+from tests.support.programs import npm_package
 
 INSTALLED = ROOT / "server/web/node_modules"
 ADDRESS = "http://spark.test"
@@ -43,8 +44,7 @@ WRITERS: dict[str, Any] = {"ply": ply, "compressed.ply": compressed_ply, "sog": 
 @pytest.fixture(scope="module")
 def page(browser: Browser) -> Iterator[Page]:
     """A page that may import Spark."""
-    if not (INSTALLED / "@sparkjsdev/spark").is_dir():
-        pytest.skip("needs Spark: run `python server/web/packages.py fetch --dev`")
+    npm_package("@sparkjsdev/spark")
 
     def answer(route: Route) -> None:
         name = route.request.url.removeprefix(f"{ADDRESS}/")

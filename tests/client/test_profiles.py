@@ -4,7 +4,6 @@ Does not prove that a proxy passes requests on, which is httpx's part; the scrip
 """
 
 import json
-import shutil
 import ssl
 import subprocess
 import threading
@@ -20,6 +19,7 @@ from splatmill.errors import ConfigurationInvalid, ConnectionFailed
 from splatmill.profiles import config_path, profile_names, read_profile
 from splatmill.server_choice import choose_server
 from tests.support.command_line import invoke
+from tests.support.programs import program
 
 LAB = """
 [profiles.lab]
@@ -173,13 +173,10 @@ class _Options(BaseHTTPRequestHandler):
 @pytest.fixture
 def private(tmp_path: Path) -> Iterator[tuple[str, Path]]:
     """A server with a certificate that nobody else has signed: its address, and the certificate."""
-    openssl = shutil.which("openssl")
-    if openssl is None:
-        pytest.skip("openssl is not installed")
     certificate, key = tmp_path / "cert.pem", tmp_path / "key.pem"
     subject = ("-subj", "/CN=localhost", "-addext", "subjectAltName=IP:127.0.0.1")
     made = ("-newkey", "rsa:2048", "-nodes", "-keyout", str(key), "-out", str(certificate), "-days", "2")
-    subprocess.run([openssl, "req", "-x509", *made, *subject], check=True, capture_output=True)
+    subprocess.run([program("openssl"), "req", "-x509", *made, *subject], check=True, capture_output=True)
     server = HTTPServer(("127.0.0.1", 0), _Options)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)

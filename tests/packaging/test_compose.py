@@ -4,11 +4,14 @@ what docker-compose.s3.yml adds to it. Not proved here: that Docker reads them."
 from __future__ import annotations
 
 import json
+import re
+from ipaddress import ip_address, ip_network
 from typing import Any
 
 import pytest
 import yaml
 
+from splatmill.backplane import layout
 from splatmill.schema.quantities import parse_duration
 from splatmill_worker.service.rq_worker import STOP_GRACE
 from tests.support.wheels import ROOT
@@ -58,8 +61,38 @@ def test_what_reads_strangers_files_has_no_way_out() -> None:
     assert "renders" not in SERVICES["redis"]["networks"]
 
 
-def test_the_renderer_cannot_write_to_the_data() -> None:
-    assert SERVICES["renderer"]["volumes"] == ["data:/data:ro"]
+def test_the_renderer_reads_models_and_nothing_else_of_the_data() -> None:
+    (mount,) = SERVICES["renderer"]["volumes"]
+    assert mount["read_only"] is True
+    assert (mount["source"], mount["volume"]["subpath"]) == ("data", "storage/models")
+    storage = SERVICES["renderer"]["environment"]["SPLATMILL_STORAGE"]
+    assert mount["target"] == f"{storage.removeprefix('file://')}/models"
+    for path in (layout.webhook_record("a"), layout.key_record("a"), layout.capture_record("a")):
+        assert not path.startswith("models/")
+    # The server makes the folder before it is healthy, which the renderer waits for.
+    assert f"mkdir -p {mount['target']} && exec " in SERVICES["server"]["command"][-1]
+    assert SERVICES["renderer"]["depends_on"]["server"]["condition"] == "service_healthy"
+
+
+def test_the_command_of_the_server_is_that_of_its_image() -> None:
+    last = (ROOT / "docker/server.Dockerfile").read_text().splitlines()[-1]
+    usual = " ".join(json.loads(last.removeprefix("CMD ")))
+    assert SERVICES["server"]["command"][-1].endswith(f"exec {usual}")
+
+
+def test_only_the_proxy_is_believed_about_a_clients_address() -> None:
+    proxied = [name for name, service in SERVICES.items() if "proxied" in service["networks"]]
+    assert proxied == ["server", "caddy"]
+    shared = set(SERVICES["server"]["networks"]) & set(SERVICES["caddy"]["networks"])
+    assert shared == {"proxied"}, "the proxy finds the server by no other address"
+    believed = SERVICES["server"]["environment"]["FORWARDED_ALLOW_IPS"]
+    assert believed == SERVICES["caddy"]["networks"]["proxied"]["ipv4_address"]
+    network = COMPOSE["networks"]["proxied"]
+    assert network["internal"] is True  # so no published port is reached through it
+    (subnet,) = network["ipam"]["config"]
+    address, within = (re.sub(r"\$\{\w+:-([\d.]+)\}", r"\1", text) for text in (believed, subnet["subnet"]))
+    first, second, *_ = ip_network(within).hosts()
+    assert ip_address(address) == second, f"{first} is the host's, whose users may reach the server, too"
 
 
 @pytest.mark.parametrize("name", ["worker", "worker-cuda"])

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from splatmill.cli.embedded import ALL_PARTS
 from tests.support.wheels import PARTS, ROOT, Built, build, environment, metadata, run, watch
 
 pytestmark = pytest.mark.slow
@@ -50,8 +51,9 @@ def alone(tmp_path_factory: pytest.TempPathFactory, wheels: dict[str, Path]) -> 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory, wheels: dict[str, Path]) -> Path:
-    """The `bin` folder of an environment with all three wheels."""
-    return environment(tmp_path_factory.mktemp("whole"), *wheels.values())
+    """The `bin` folder of an environment with all three wheels, as the command line says to install them."""
+    assert ALL_PARTS == "pip install splatmill 'splatmill-server[embedded]' splatmill-worker"
+    return environment(tmp_path_factory.mktemp("whole"), *wheels.values(), server="embedded")
 
 
 def bare(**more: str) -> dict[str, str]:
@@ -130,7 +132,7 @@ def test_a_missing_part_is_a_sentence_with_the_command_that_installs_it(
     done = run(alone / "splatmill", command, *arguments)
     assert done.returncode == 8
     assert "is not installed" in done.stderr
-    assert "pip install splatmill splatmill-server" in done.stderr
+    assert ALL_PARTS in done.stderr
     assert "Traceback" not in done.stderr
 
 
@@ -142,7 +144,7 @@ def test_the_types_are_shipped(whole: Path) -> None:
 def test_the_three_wheels_train_a_scene_from_the_command_line(whole: Path, tmp_path: Path) -> None:
     log = tmp_path / "log"
     watch(whole, log)
-    environment = bare(PATH=f"{whole}{os.pathsep}{os.environ['PATH']}")
+    environment = bare(PATH=str(whole))  # no program of the machine: the wheels bring their Redis
 
     modules = f"import {', '.join(MODULES)}; print(*(m.__file__ for m in ({', '.join(MODULES)})))"
     files = run(whole / "python", "-c", modules, cwd=tmp_path, env=environment).stdout.split()

@@ -6,7 +6,6 @@ draws of it.
 
 import json
 import re
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from splatmill.schema import PROBLEMS
 from splatmill_server.scrape import SERVICE_FAULTS
 from tests.support.paths import ROOT
+from tests.support.programs import program
 from tests.support.served_app import ServedApp
 
 MONITORING = ROOT / "server" / "monitoring"
@@ -37,10 +37,7 @@ PLAYED = Path(__file__).with_name("alerts_test.yml")
 
 def promtool(*arguments: str) -> None:
     """Run promtool, which must find nothing wrong."""
-    found = shutil.which("promtool")
-    if found is None:
-        pytest.skip("there is no promtool (Debian: apt-get install prometheus)")
-    done = subprocess.run([found, *arguments], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([program("promtool"), *arguments], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

@@ -6,7 +6,6 @@ done with the answers (test_imports, test_webhooks).
 
 import asyncio
 import ipaddress
-import shutil
 import socket
 import ssl
 import subprocess
@@ -25,6 +24,7 @@ from splatmill_server.outgoing import (
     allowed_hosts,
     refusal,
 )
+from tests.support.programs import program
 from tests.support.scripted_server import Reply, ScriptedServer, scripted_server
 
 
@@ -257,13 +257,13 @@ def test_certificates_are_read_for_the_first_request_and_named_where_they_cannot
         fetch(outgoing, peer.url)
 
 
-@pytest.mark.skipif(shutil.which("openssl") is None, reason="makes its certificate with openssl")
 def test_tls_checks_the_certificate_against_the_name(
     names: dict[str, list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     certificate, key = tmp_path / "cert.pem", tmp_path / "key.pem"
-    command = "openssl req -x509 -newkey rsa:2048 -nodes -days 1 -subj /CN=t -addext subjectAltName=DNS:right.example"
-    subprocess.run([*command.split(), "-keyout", key, "-out", certificate], check=True, capture_output=True)
+    options = "-x509 -newkey rsa:2048 -nodes -days 1 -subj /CN=t -addext subjectAltName=DNS:right.example"
+    command = [program("openssl"), "req", *options.split(), "-keyout", key, "-out", certificate]
+    subprocess.run(command, check=True, capture_output=True)
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
     names["right.example"] = names["wrong.example"] = ["127.0.0.1"]
     asked: list[str | None] = []

@@ -11,9 +11,14 @@ from splatmill.backplane import memory
 from splatmill_worker import doctor
 from tests.support.served_app import ServedApp
 
+BALLAST = 32 << 20
+"""Bytes of data beside which the buffers of connections that come and go, up to a megabyte, change no share."""
+
 
 @pytest.fixture(autouse=True)
-def _unlimited(app: ServedApp) -> Iterator[None]:
+def _loaded_and_unlimited(app: ServedApp) -> Iterator[None]:
+    for number in range(256):  # in small pieces, so that no connection needs a large buffer for one
+        app.redis.set(f"ballast:{number}", bytes(BALLAST // 256))
     yield
     app.redis.config_set("maxmemory", 0)
     app.redis.config_set("maxmemory-policy", "noeviction")

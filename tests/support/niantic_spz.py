@@ -5,15 +5,14 @@ It is asked for the frame right-down-front, that of the standard `.ply`, and tur
 """
 
 import json
-import shutil
 import subprocess
 from pathlib import Path
 
-import pytest
 import torch
 
 from splatmill_worker.splat.gaussians import Gaussians
 from tests.support.paths import ROOT
+from tests.support.programs import node
 
 WEB = ROOT / "server/web"
 
@@ -39,11 +38,8 @@ if (task === 'read') {
 
 
 def _run(*arguments: str) -> None:
-    node = shutil.which("node")
-    if node is None or not (WEB / "node_modules/@adobe/spz").is_dir():
-        pytest.skip("needs Node and @adobe/spz: run `python server/web/packages.py fetch --dev`")
     done = subprocess.run(
-        [node, "--input-type=module", "-e", _PROGRAM, *arguments],
+        [*node("@adobe/spz"), "--input-type=module", "-e", _PROGRAM, *arguments],
         cwd=WEB,
         capture_output=True,
         text=True,
@@ -53,7 +49,7 @@ def _run(*arguments: str) -> None:
 
 
 def read(path: Path) -> tuple[Gaussians, bool]:
-    """What the library reads, and its flag `antialiased`. Skips the test where Node or the library is missing."""
+    """What the library reads, and its flag `antialiased`. Skips the test where it is not installed."""
     target = path.with_suffix(".json")
     _run("read", str(path), str(target))
     cloud = json.loads(target.read_text())
@@ -74,7 +70,7 @@ def read(path: Path) -> tuple[Gaussians, bool]:
 
 
 def write(path: Path, gaussians: Gaussians, *, version: int, bits: int) -> None:
-    """Let the library write Gaussians; `bits` of a harmonic. Skips the test where Node or the library is missing."""
+    """Let the library write Gaussians; `bits` of a harmonic. Skips the test where it is not installed."""
     cloud = {
         "numPoints": gaussians.count,
         "shDegree": gaussians.degree,

@@ -10,7 +10,7 @@ import pytest
 import redis
 
 from splatmill.backplane.connection import connect
-from splatmill_server.up.redis_server import find
+from splatmill.backplane.redis_program import find
 from tests.support.waiting import wait_for
 
 
@@ -21,7 +21,7 @@ class RedisServer:
         self.path = folder / "r.sock"
         self.url = f"unix://{self.path}"
         self.connection = connect(self.url, retries=0)
-        self._command = [str(find()[0]), "--port", "0", "--unixsocket", str(self.path)]
+        self._command = [str(find().path), "--port", "0", "--unixsocket", str(self.path)]
         # The default, everysec, holds back writes that were answered while the disk is slow; a kill then loses them.
         self._command += ["--appendonly", "yes", "--appendfsync", "no", "--save", "", "--dir", str(folder)]
         self._process: subprocess.Popen[bytes] | None = None

@@ -3,24 +3,19 @@
 It is a development dependency of `server/web/package.json`, and runs in Node.
 """
 
-import shutil
 import subprocess
 from pathlib import Path
 
-import pytest
-
 from tests.support.paths import ROOT
+from tests.support.programs import node
 
 PROGRAM = ROOT / "server/web/node_modules/@playcanvas/splat-transform/bin/cli.mjs"
 
 
 def convert(source: Path, target: Path, *options: str) -> None:
-    """Convert a file by splat-transform. Skips the test where Node or the program is missing."""
-    node = shutil.which("node")
-    if node is None or not PROGRAM.is_file():
-        pytest.skip("needs Node and splat-transform: run `python server/web/packages.py fetch --dev`")
+    """Convert a file by splat-transform. Skips the test where it is not installed."""
     done = subprocess.run(
-        [node, str(PROGRAM), "-q", "-w", str(source), str(target), *options],
+        [*node("@playcanvas/splat-transform"), str(PROGRAM), "-q", "-w", str(source), str(target), *options],
         capture_output=True,
         text=True,
         timeout=120,

@@ -6,7 +6,7 @@ import subprocess
 import sys
 import venv
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import Distribution, PathDistribution, distribution
 from pathlib import Path
@@ -74,34 +74,41 @@ def metadata(wheel: Path) -> Distribution:
     return PathDistribution(zipfile.Path(wheel, f"{folder}/"))
 
 
-def needed(wheels: Iterable[Path]) -> dict[str, Distribution]:
-    """The distributions that the wheels declare to need, directly or not, as they are installed here."""
+def needed(wheels: Iterable[Path], extras: Mapping[str, str]) -> dict[str, Distribution]:
+    """The distributions that the wheels declare to need, directly or not, as they are installed here.
+
+    `extras` maps names of the parts to the extra that is asked of them.
+    """
     ours: dict[str, Distribution] = {
         canonicalize_name(found.metadata["Name"]): found for found in map(metadata, wheels)
     }
     found: dict[str, Distribution] = {}
     seen: set[tuple[str, frozenset[str]]] = set()
-    waiting: list[tuple[str, frozenset[str]]] = [(name, frozenset()) for name in ours]
+    waiting = [(name, frozenset({extras[name]} if name in extras else ())) for name in ours]
     while waiting:
-        name, extras = waiting.pop()
-        if (name, extras) in seen:
+        name, asked = waiting.pop()
+        if (name, asked) in seen:
             continue
-        seen.add((name, extras))
+        seen.add((name, asked))
         if name not in ours:
             found[name] = distribution(name)
         for text in (ours | found)[name].requires or []:
             requirement = Requirement(text)
             marker = requirement.marker
-            if marker is None or any(marker.evaluate({"extra": extra}) for extra in extras | {""}):
+            if marker is None or any(marker.evaluate({"extra": extra}) for extra in asked | {""}):
                 waiting.append((canonicalize_name(requirement.name), frozenset(requirement.extras)))
     return found
 
 
-def environment(folder: Path, *wheels: Path) -> Path:
-    """Make an environment that holds these wheels and, as links, what they need; returns its `bin` folder."""
+def environment(folder: Path, *wheels: Path, **extras: str) -> Path:
+    """Make an environment that holds these wheels and, as links, what they need; returns its `bin` folder.
+
+    `extras` are as in pip's `server[embedded]`, by the folder of the part: `server="embedded"`.
+    """
+    names = {folder: name for name, folder in PARTS.items()}
     venv.create(folder, with_pip=False, symlinks=True)
     (packages,) = folder.glob("lib/python*/site-packages")
-    for installed in needed(wheels).values():
+    for installed in needed(wheels, {names[part]: extra for part, extra in extras.items()}).values():
         for top in {file.parts[0] for file in installed.files or []}:
             target = Path(str(installed.locate_file(top)))
             if not top.startswith(("..", "__")) and target.exists() and not (packages / top).exists():

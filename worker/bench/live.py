@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import statistics
 import subprocess
 import sys
@@ -39,6 +38,7 @@ from _train import scenes
 from _train.child import prepared
 
 from splatmill.backplane import keys
+from splatmill.backplane.redis_program import find
 from splatmill.schema import Event, JobState, StateEvent, TrainOptions
 
 ARMS = ("without", "unwatched", "watched")
@@ -172,11 +172,6 @@ def _cpu_of(name: str) -> float:
 @contextmanager
 def _redis(folder: Path) -> Iterator[str]:
     """A Redis of our own; yields the path of its socket."""
-    program = next(
-        (found for name in ("redis-server", "valkey-server") if (found := shutil.which(name))), None
-    )
-    if program is None:
-        raise SystemExit("No redis-server is on PATH. Install one (Debian: apt-get install redis-server).")
     path = folder / "redis.sock"
     quiet = [
         "--port",
@@ -190,7 +185,7 @@ def _redis(folder: Path) -> Iterator[str]:
         "--loglevel",
         "warning",
     ]
-    with subprocess.Popen([program, *quiet], stdout=subprocess.DEVNULL) as server:
+    with subprocess.Popen([find().path, *quiet], stdout=subprocess.DEVNULL) as server:
         try:
             while not path.exists():
                 time.sleep(0.02)

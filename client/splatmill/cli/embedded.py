@@ -23,7 +23,7 @@ SUPERVISOR = "splatmill_server.up"
 START_SECONDS = 90.0  # a first start may read several hundred megabytes of libraries from disk
 STOP_SECONDS = 45.0  # a worker that is stopped first writes a checkpoint, and then Redis is stopped
 
-ALL_PARTS = "pip install splatmill splatmill-server[embedded] splatmill-worker"
+ALL_PARTS = "pip install splatmill 'splatmill-server[embedded]' splatmill-worker"
 
 
 @dataclass(frozen=True)

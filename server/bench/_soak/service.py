@@ -23,8 +23,8 @@ from _soak.orphans import Adoption
 from _soak.proxy import Proxy
 from splatmill.backplane.connection import connect
 from splatmill.backplane.process import die_with_parent, start_time
+from splatmill.backplane.redis_program import find
 from splatmill.backplane.storage import Storage
-from splatmill_server.up.redis_server import find
 
 DISK_BYTES = 256 << 20
 """Size of the disk of the data folder, so that it can be filled."""
@@ -107,7 +107,7 @@ class Service:
             "maxmemory-policy": "noeviction",
         }
         options = [part for name, value in settings.items() for part in (f"--{name}", value)]
-        self._redis = self._popen([str(find()[0]), *options], "redis", os.environ | self.clock.environment)
+        self._redis = self._popen([str(find().path), *options], "redis", os.environ | self.clock.environment)
         with self.redis() as connection:
             wait_for(lambda: _answers(connection.ping), 30, "Redis answers")
 
