@@ -262,7 +262,7 @@ def test_tls_checks_the_certificate_against_the_name(
 ) -> None:
     certificate, key = tmp_path / "cert.pem", tmp_path / "key.pem"
     options = "-x509 -newkey rsa:2048 -nodes -days 1 -subj /CN=t -addext subjectAltName=DNS:right.example"
-    command = [program("openssl"), "req", *options.split(), "-keyout", key, "-out", certificate]
+    command = [program("openssl"), "req", *options.split(), "-keyout", str(key), "-out", str(certificate)]
     subprocess.run(command, check=True, capture_output=True)
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
     names["right.example"] = names["wrong.example"] = ["127.0.0.1"]

@@ -24,9 +24,9 @@ from typing import Any
 
 import httpx
 import numpy as np
+import psutil
 import redis
 
-from splatmill.backplane.redis_program import find
 from splatmill_worker.synthetic import capture as photograph
 
 COUNT, WIDTH, HEIGHT = 8, 64, 48
@@ -53,6 +53,8 @@ class Service:
         )
         assert self.process.stdout is not None
         self.http = httpx.Client(base_url=json.loads(self.process.stdout.readline())["url"], timeout=60)
+        children = psutil.Process(self.process.pid).children()
+        self.redis = next(child.exe() for child in children if "redis.sock" in " ".join(child.cmdline()))
 
     def stop(self) -> None:
         assert self.process.stdin is not None
@@ -97,8 +99,8 @@ def posed_capture(folder: Path) -> dict[str, bytes]:
     return files
 
 
-def run_jobs(data: Path, photos: Path) -> dict[str, str]:
-    """Run one job of each kind, end the service while one is trained, and return their ids."""
+def run_jobs(data: Path, photos: Path) -> tuple[dict[str, str], str]:
+    """Run one job of each kind, end the service while one is trained, and return their ids and the service's Redis."""
     service = Service(data)
     try:
         good = service.capture("still life", posed_capture(photos))
@@ -114,16 +116,16 @@ def run_jobs(data: Path, photos: Path) -> dict[str, str]:
         jobs["queued"] = service.job(good, "queued", steps=5, test_views=["still_0001.jpg"])
     finally:
         service.stop()
-    return jobs
+    return jobs, service.redis
 
 
-def dump_redis(data: Path, folder: Path) -> dict[str, Any]:
-    """Return all keys of the Redis whose files lie in `data`: type and contents, as base64 where not text."""
+def dump_redis(program: str, data: Path, folder: Path) -> dict[str, Any]:
+    """Return all keys of the Redis `program` whose files lie in `data`: type and contents, as base64 where not text."""
     address = folder / "r.sock"
     copy = folder / "redis"
     shutil.copytree(data / "redis", copy)
-    program = [str(find().path), "--port", "0", "--unixsocket", str(address), "--dir", str(copy)]
-    server = subprocess.Popen([*program, "--appendonly", "yes"], stdout=subprocess.DEVNULL)
+    command = [program, "--port", "0", "--unixsocket", str(address), "--dir", str(copy)]
+    server = subprocess.Popen([*command, "--appendonly", "yes"], stdout=subprocess.DEVNULL)
     try:
         connection = redis.Redis(unix_socket_path=str(address))
         end = time.monotonic() + 20
@@ -168,10 +170,10 @@ def main(target: Path) -> None:
     """Write the fixtures."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        jobs = run_jobs(folder / "data", folder / "photos")
+        jobs, program = run_jobs(folder / "data", folder / "photos")
         shutil.rmtree(target, ignore_errors=True)
         target.mkdir(parents=True)
-        contents = dump_redis(folder / "data", folder)
+        contents = dump_redis(program, folder / "data", folder)
         text = json.dumps(contents, indent=1).replace(f"{socket.gethostname()}-", "host-")
         (target / "redis.json").write_text(text + "\n")
         (target / "jobs.json").write_text(json.dumps(jobs, indent=1) + "\n")
