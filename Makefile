@@ -108,6 +108,8 @@ $(VENV)/.prerequisites:
 	       "Install one (Debian: apt-get install python3 python3-venv) or name it: make PYTHON=python3.12 ..."; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { \
 	  echo "Python's venv module is missing. Install it (Debian: apt-get install python3-venv)."; exit 1; }
+	@$(PYTHON) -c 'import sysconfig; open(sysconfig.get_path("include") + "/Python.h")' 2>/dev/null || { \
+	  echo "Python's headers are missing, which the kernels are compiled with. Install them (Debian: apt-get install python3-dev)."; exit 1; }
 	@command -v $${CXX:-c++} >/dev/null || { \
 	  echo "A C++17 compiler is missing: '$${CXX:-c++}' was not found." \
 	       "Install one (Debian: apt-get install g++; macOS: xcode-select --install)."; exit 1; }
