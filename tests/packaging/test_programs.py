@@ -35,6 +35,8 @@ def installed_by(text: str) -> list[list[str]]:
 def test_the_readme_names_every_program() -> None:
     text = (ROOT / "README.md").read_text()
     assert installed_by(text) == [packages("demo"), packages("tests")]
+    (guide,) = re.findall(r"^apt-get install (.*)$", (ROOT / "docs/first-splat.md").read_text(), re.M)
+    assert sorted(guide.split()) == packages("demo")
     assert not installed_by((ROOT / "CONTRIBUTING.md").read_text()), "it points to the README"
     assert "`.ci/programs`" in (ROOT / "CONTRIBUTING.md").read_text()
 

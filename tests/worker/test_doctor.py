@@ -48,3 +48,15 @@ def test_what_is_wrong_is_found_and_advised_on(tmp_path: Path) -> None:
     assert all(findings[topic]["advice"] for topic in wrong)
     assert "nothing.sock" in findings["redis"]["seen"]
     assert "ftp://nowhere" in findings["storage"]["seen"]
+
+
+def test_a_redis_with_faults_in_lua_is_warned_of(tmp_path: Path) -> None:
+    old = tmp_path / "redis-server"
+    old.write_text("#!/bin/sh\necho 'Redis server v=7.2.10 sha=00000000:0'\n")
+    old.chmod(0o755)
+    status, findings = doctor(tmp_path, SPLATMILL_REDIS_SERVER=str(old))
+    assert status == 0
+    assert findings["redis"]["verdict"] == "warning"
+    assert "Redis 7.2.10" in findings["redis"]["seen"]
+    assert "CVE-2025-49844" in findings["redis"]["seen"]
+    assert "only the service" in findings["redis"]["advice"]
