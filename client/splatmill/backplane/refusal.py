@@ -24,7 +24,9 @@ _REFUSALS = (
     "MASTERDOWN",
 )
 _CODE = re.compile(rf"(?:^|[ -])({'|'.join(_REFUSALS)})\b")
-_SCRIPT_DENIED = "The user executing the script"  # Redis 7 answers this without a code
+_SCRIPT_DENIED = ("The user executing the script", "ACL failure in script")
+"""What Redis 7 and Valkey answer, without a code, where a script calls a command that the user may not."""
+
 _CODE_OF: dict[type[redis.RedisError], str] = {
     redis.exceptions.OutOfMemoryError: "OOM",
     redis.exceptions.ReadOnlyError: "READONLY",
@@ -68,7 +70,7 @@ def code_of(error: redis.ResponseError) -> str | None:
         if isinstance(error, kind):
             return code
     found = _CODE.search(str(error))
-    if found is None and _SCRIPT_DENIED in str(error):
+    if found is None and any(text in str(error) for text in _SCRIPT_DENIED):
         return "NOPERM"
     return found[1] if found else None
 
