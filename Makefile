@@ -74,7 +74,7 @@ pictures: $(VENV)/.installed ## make the documentation's pictures of what photos
 bench: install ## error against run time: kernels, functions, stability, worst inputs, stiffness, SfM, training, formats (long)
 	for name in kernels functions stability worst stiffness sfm train live formats; do $(BIN)/splatmill bench $$name || exit 1; done
 
-soak: $(VENV)/.installed-dev ## faults at random moments against the whole service (STORAGE=s3, SOAK_ARGS="--faults 30"; some 25 minutes)
+soak: $(VENV)/.installed-dev ## faults at random moments against the whole service (STORAGE=s3, SOAK_ARGS="--faults 30"; some 40 minutes)
 	$(BIN)/splatmill bench soak --storage $(or $(STORAGE),folder) $(SOAK_ARGS)
 
 capacity: $(VENV)/.installed-dev ## pages, memory and start of a service with a hundred thousand records (STORAGE=s3, CAPACITY_ARGS="--records 2000")

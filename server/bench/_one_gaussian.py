@@ -9,8 +9,8 @@ _PROPERTIES = (
 _GAUSSIAN = (0.0, 0.0, 0.0, 1.7, -1.7, -1.7, 4.0, -2.2, -2.2, -2.2, 1.0, 0.0, 0.0, 0.0)
 
 
-def ply(gaussians: int = 1) -> bytes:
-    """Return a `.ply` file with the same Gaussian as often as is asked for."""
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {gaussians}"]
+def ply() -> bytes:
+    """Return a `.ply` file with one Gaussian."""
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 1"]
     header += [f"property float {name}" for name in _PROPERTIES] + ["end_header", ""]
-    return "\n".join(header).encode() + struct.pack(f"<{len(_GAUSSIAN)}f", *_GAUSSIAN) * gaussians
+    return "\n".join(header).encode() + struct.pack(f"<{len(_GAUSSIAN)}f", *_GAUSSIAN)

@@ -1,18 +1,24 @@
 """Faults at random moments against the running service, and the proof that it loses nothing.
 
-    splatmill bench soak                                 # 300 faults, 200 of them kills; some 25 minutes
+    splatmill bench soak                                 # 200 kills and some 90 other faults; some 40 minutes
     splatmill bench soak --storage s3
     splatmill bench soak --faults 30 --seed 7
+    splatmill bench soak --only "decoder of the trainer killed" "worker killed"
     splatmill bench soak --plot-only
 
 `splatmill up` runs with a Redis behind a proxy, on a small disk where this user may mount one, with a clock that can be
-set. Clients upload, start jobs, cancel some and look at models, all the while. Most jobs take steps without photos
-(`_soak/pipeline.py`); every sixteenth trains ten photos of the still life with the engine.
+set. Clients upload, start jobs, cancel some, look at models and have them converted, all the while. Every job is one of
+the engine (`_soak/work.py`): small photos, of which most come without cameras, and videos.
 
-Within 30 s of a fault's end the service answers, takes a capture and shows a model, every job that had begun has taken
-another step or ended, and no process has lost its parent (`_soak/recovery.py`). One fault in four is followed by the
-next at once instead, after which the jobs of both must get on. At the end every job that was accepted has its model or
-its cancellation, no two attempts at a job ran at once, no step whose checkpoint was stored was taken again, no pipeline
+The processes that are killed are found by descent from the supervisor (`_soak/processes.py`), whatever part of the
+service started them, and each role of a process is killed as often as the others. A job is spared once its process or
+its worker was killed so often that the next kill might end it by design (`_soak/target.py`).
+
+Within 30 s of a fault's end the service answers, takes a capture and shows a model, every job that had begun has got on
+or ended, and no process has lost its parent (`_soak/recovery.py`). One fault in four is followed by the
+next at once instead, after which the jobs of both must get on. At the end every job that was accepted has its model, of
+all its photos, or its cancellation, no two attempts at a job ran at once, no step whose checkpoint was stored was taken
+again, no cameras that were stored were recovered again, no pipeline
 ran for a model that was stored, no process is left, every file in storage is whole and explained by a record, and
 Redis, storage and the API's lists agree on every capture, job and model (`_soak/verdict.py`). Otherwise the exit status
 is 1, with a sentence for each thing that does not hold.
@@ -31,24 +37,23 @@ import statistics
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 from _rows import Row, append, footer, lines, origin
-from _soak import faults, verdict
+from _soak import attempts, faults, verdict, words, work
 from _soak.clients import Clients
 from _soak.recovery import MEASURED, RESUME_SECONDS, recover
 from _soak.service import Service
-from _still_life import posed_capture
+from _soak.target import Target
 
 HERE = Path(__file__).resolve().parent
 
 _AT_ONCE = 0.25
 """Share of the faults that are followed by the next without waiting for either."""
 
-_PAUSE = (0.1, 1.5)  # seconds before a fault
-
-PHOTOS, WIDTH, HEIGHT = 10, 160, 120
+_PAUSE = (0.1, 2.5)  # seconds before a fault
 
 
 def main(argv: list[str]) -> int:
@@ -65,7 +70,12 @@ def main(argv: list[str]) -> int:
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--storage", choices=["folder", "s3"], default="folder")
-    parser.add_argument("--no-engine", action="store_true", help="no job is trained by the engine")
+    parser.add_argument(
+        "--patience",
+        type=float,
+        default=1.0,
+        help="multiply all time limits, for a machine that has other work",
+    )
     parser.add_argument("--keep", type=Path, help="copy logs and the record of the attempts to this folder")
     parser.add_argument("--results", type=Path, default=HERE / "results" / "soak.jsonl")
     parser.add_argument("--plot-only", action="store_true", help="write the table of the rows that are there")
@@ -73,14 +83,13 @@ def main(argv: list[str]) -> int:
     table = HERE / "soak.md" if asked.results.parent == HERE / "results" else asked.results.with_suffix(".md")
     complaints: list[str] = []
     if not asked.plot_only:
-        photos = {} if asked.no_engine else posed_capture(PHOTOS, WIDTH, HEIGHT)
         found = soak(
             s3=asked.storage == "s3",
             count=asked.faults,
             seed=asked.seed,
             seconds=asked.seconds,
             only=asked.only,
-            photos=photos,
+            patience=asked.patience,
             keep=asked.keep,
         )
         complaints = found[-1]["complaints"]
@@ -106,26 +115,27 @@ def soak(
     seed: int,
     seconds: float | None = None,
     only: Sequence[str] | None = None,
-    photos: dict[str, bytes] | None = None,
+    patience: float = 1.0,
     keep: Path | None = None,
 ) -> list[Row]:
     """Run one soak and return a row for each fault, and a last one for the whole.
 
     count, seconds: the soak ends with the earlier of the two. Without a count there are `faults.KILLS` kills.
     only: names of faults; each comes once if this soak can have it, and `count` says nothing.
-    photos: what a capture for the engine consists of; without it, no job is trained by the engine.
+    patience: what time limits are multiplied by, for a machine that has other work.
     """
     rng = random.Random(seed)
     rows: list[Row] = []
     begun = time.monotonic()
     folder = Path(tempfile.mkdtemp(prefix="soak-"))
-    service = Service(folder, s3=s3)
+    service = Service(folder, s3=s3, patience=patience)
     try:
         service.start()
         possible, left_out = faults.possible(service)
-        clients = Clients(service, seed, photos or {})
+        clients = Clients(service, seed, work.captures())
         clients.start()
-        target = faults.Target(service, rng)
+        target = Target(service, rng)
+        whole = count is None and only is None and seconds is None
         count = faults.enough(possible) if count is None else count
         same = {"bench": "soak", "storage": "s3" if s3 else "folder", "seed": seed}
         for number, fault in enumerate(faults.schedule(possible, count, rng, only)):
@@ -144,9 +154,13 @@ def soak(
         settled = time.monotonic() - over
         clients.stop()
         complaints += verdict.check(service, clients)
+        if whole:
+            complaints += verdict.met(service, target)
         service.stop()
         complaints += verdict.check_stopped(service)
-        rows.append(same | _summary(rows, clients, time.monotonic() - begun, settled, left_out, complaints))
+        end = _summary(rows, clients, time.monotonic() - begun, settled, left_out, complaints)
+        resumed = attempts.resumptions(service.records())
+        rows.append(same | end | {"resumed": resumed, "roles": dict(target.killed), "patience": patience})
     finally:
         if keep is not None:
             keep.mkdir(parents=True, exist_ok=True)
@@ -159,22 +173,27 @@ def soak(
 def _one(
     service: Service,
     clients: Clients,
-    target: faults.Target,
+    target: Target,
     fault: faults.Fault,
     at_once: bool,
     begun: float,
 ) -> Row:
     """Do a fault, and measure until all works again."""
-    service.family()
     target.strike()
-    row: Row = {"at": round(target.struck - begun, 2), "complaint": None, **dict.fromkeys(MEASURED)}
+    target.victim = None
+    row: Row = {"complaint": None, **dict.fromkeys(MEASURED)}
     clients.faults.append((fault.name, math.inf))
     try:
+        if fault.loses:
+            target.lose_worker()
         fault.act(target)
     except AssertionError as error:
         row["complaint"] = str(error)
         target.healed = time.monotonic()
     clients.faults[-1] = fault.name, target.healed
+    if target.victim is not None:
+        row["fault"] = faults.kill_of(target.victim).name
+    row["at"] = round(target.struck - begun, 2)
     row["lasted"] = round(target.healed - target.struck, 2)
     if not at_once and row["complaint"] is None:
         measured, row["complaint"] = recover(service, clients, target.struck, target.healed)
@@ -202,10 +221,12 @@ def _summary(
         "faults": len(rows),
         "killed": sum(row["kills"] for row in rows),
         "jobs": len(states),
+        "kinds": dict(Counter(work.KINDS[promise.kind] for promise in clients.promises.values())),
         "succeeded": states.count("succeeded"),
         "cancelled": states.count("cancelled"),
         "restarts": sum(promise.restarts for promise in clients.promises.values()),
         "views": clients.views,
+        "conversions": clients.conversions,
         "retries": clients.retries,
         "left_out": left_out,
         "complaints": complaints,
@@ -215,7 +236,9 @@ def _summary(
 def document(rows: list[Row]) -> str:
     """Return the page with the table by kind of fault."""
     storages = list(dict.fromkeys(row["storage"] for row in rows))
-    names = [f.name for f in faults.FAULTS if any(row["fault"] == f.name for row in rows)]
+    done = {row["fault"]: row["kills"] for row in rows if row["fault"] is not None}
+    others = [fault.name for fault in faults.FAULTS]
+    names = sorted(name for name in done if name not in others) + [name for name in others if name in done]
     text = ["# What the service survives", ""]
     text += [
         "Made by `splatmill bench soak`; the head of `soak.py` says what is done and what must hold.",
@@ -229,22 +252,25 @@ def document(rows: list[Row]) -> str:
 
 def _storage_part(storage: str, rows: list[Row], names: list[str]) -> list[str]:
     end = next(row for row in rows if row["fault"] is None)
-    words = "a folder" if storage == "folder" else "S3"
-    text = [f"## Storage in {words}", ""]
+    text = [f"## Storage in {'a folder' if storage == 'folder' else 'S3'}", ""]
     text += [
-        f"{end['faults']} faults in {end['seconds']} s, {end['killed']} of them kills (seed {end['seed']}); "
-        f"{end['jobs']} jobs: {end['succeeded']} succeeded, {end['cancelled']} cancelled by a client, "
-        f"{end['restarts']} restarts by a client after a failure that advises one; {end['views']} views.",
+        f"{end['faults']} faults in {end['seconds']} s, {end['killed']} of them kills (seed {end['seed']}): "
+        f"{words.kills(rows)}. "
+        f"{end['jobs']} jobs of the engine: {words.jobs(end)}. {end['succeeded']} succeeded, {end['cancelled']} were "
+        f"cancelled by a client; clients restarted {end['restarts']} after a failure that advises it, got "
+        f"{end['views']} views and {end['conversions']} conversions. {end['resumed']} attempts trained on from a "
+        "checkpoint.",
         "",
     ]
     if end["complaints"]:
         text += ["**What did not hold:**", "", *(f"- {complaint}" for complaint in end["complaints"]), ""]
     else:
         text += [
-            f"Within {RESUME_SECONDS:g} s of every fault that no other followed at once, the service answered, took a "
-            "capture and showed a model, and every job that had begun had got on or ended. Nothing was lost, no two "
-            "attempts at a job ran at once, no step with a stored checkpoint was taken again, no process was left, "
-            "every file was whole, and Redis, storage and the API's lists agreed on every record.",
+            f"Within {RESUME_SECONDS * end['patience']:g} s of every fault that no other followed at once, the service "
+            "answered, took a capture and showed a model, and every job that had begun had got on or ended. Nothing "
+            "was lost, no job failed of a fault, every model came of all its photos, no two attempts at a job ran at "
+            "once, no step with a stored checkpoint was taken again, no process was left, every file was whole, and "
+            "Redis, storage and the API's lists agreed on every record.",
             "",
         ]
     text += [f"Not run: {name}, because {why}." for name, why in end["left_out"].items()]
@@ -272,7 +298,9 @@ def _seconds(values: list[float]) -> str:
 
 def _say(row: Row) -> None:
     times = ", ".join(f"{what} {row[what]} s" for what in MEASURED if row[what] is not None)
-    print(f"{row['number'] + 1} {row['fault']}: {row['complaint'] or times or 'at once'}", flush=True)
+    print(
+        f"{row['number'] + 1} {row['fault']}: {row['complaint'] or times or 'the next at once'}", flush=True
+    )
 
 
 if __name__ == "__main__":

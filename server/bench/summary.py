@@ -13,6 +13,7 @@ from pathlib import Path
 
 import abuse
 from _rows import Row, footer, lines
+from _soak.words import jobs, kills
 
 HERE = Path(__file__).resolve().parent
 README = HERE.parents[1] / "README.md"
@@ -62,13 +63,14 @@ def _soak(rows: list[Row]) -> Told:
         if not ends:
             continue
         end = ends[-1]
-        held = "nothing lost, run twice or left over"
+        held = "nothing lost, run twice or left over, and no job failed of a fault"
         if end["complaints"]:
             held = f"**{len(end['complaints'])} things did not hold**"
         waits = [row["resumes"] for row in found if row.get("resumes") is not None]
         back = f"; jobs went on within {max(waits):.0f} s" if waits else ""
         yield (
-            f"{end['faults']} faults, {end['killed']} of them kills, while {end['jobs']} jobs ran; storage in {words}",
+            f"{end['faults']} faults, {end['killed']} of them kills ({kills(found)}), while {end['jobs']} jobs of the "
+            f"engine ran: {jobs(end)}; storage in {words}",
             held + back,
             [end],
         )
@@ -132,7 +134,7 @@ def _fleet(rows: list[Row]) -> Told:
         most = rates[max(rates)]
         yield (
             f"{most['workers']} simulated workers on one Redis",
-            f"{most['per_second']:.0f} jobs a second with all of them on these cores, "
+            f"{most['per_second']:.0f} simulated jobs a second, which train nothing, with all of them on these cores; "
             f"{1000 * most['cpu']['redis']:.1f} ms of Redis a job",
             [most],
         )

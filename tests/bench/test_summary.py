@@ -8,8 +8,16 @@ import summary
 
 ORIGIN = {"machine": "one", "versions": {"python": "3"}, "commit": "abc"}
 SOAK: list[dict[str, Any]] = [
-    {"storage": "s3", "fault": "kill redis", "resumes": 7.4, "kills": True},
-    {"storage": "s3", "fault": None, "faults": 1, "killed": 1, "jobs": 3, "complaints": []},
+    {"storage": "s3", "fault": "Redis killed", "resumes": 7.4, "kills": True},
+    {
+        "storage": "s3",
+        "fault": None,
+        "faults": 1,
+        "killed": 1,
+        "jobs": 3,
+        "complaints": [],
+        "kinds": {"SfM and training of 11 photos": 2, "training of 11 photos with given cameras": 1},
+    },
 ]
 
 
@@ -29,7 +37,9 @@ def test_benches_without_rows_have_no_line(tmp_path: Path) -> None:
 def test_what_did_not_hold_is_told(tmp_path: Path) -> None:
     write(tmp_path, "soak", *SOAK)
     held = (
-        "| 1 faults, 1 of them kills, while 3 jobs ran; storage in S3 | nothing lost, run twice or left over"
+        "| 1 faults, 1 of them kills (Redis 1), while 3 jobs of the engine ran: 2 with SfM and training of 11 photos, "
+        "1 with training of 11 photos with given cameras; storage in S3 | nothing lost, run twice or left over, and no "
+        "job failed of a fault; jobs went on within 7 s"
     )
     assert held in summary.table(tmp_path)
     write(tmp_path, "soak", SOAK[0], SOAK[1] | {"complaints": ["job 1 is lost", "a file is half written"]})

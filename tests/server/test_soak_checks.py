@@ -22,7 +22,8 @@ from typing import Any, cast
 import httpx
 import pytest
 import redis
-from _soak import agreement, attempts, faults, files, recovery, verdict
+from _soak import agreement, attempts, faults, files, recovery, target, verdict
+from _soak import service as soaked
 from _soak.clients import Clients, Promise
 from _soak.orphans import Adoption
 from _soak.proxy import Proxy
@@ -38,12 +39,20 @@ OTHER = "f" * 16
 
 
 def line(what: str, job: str = "a", at: float = 0.0, **more: Any) -> dict[str, Any]:
-    begun = {"overlap": False, "published": False, "step": 0} if what == "begin" else {}
+    begun = {"overlap": False, "published": False} if what == "begin" else {}
     return {"what": what, "job": job, "at": at, "pid": 7, **begun, **more}
 
 
 def step(number: int, at: float = 0.0, job: str = "a") -> dict[str, Any]:
-    return line("step", job, at, step=number, stored=True)
+    return line("step", job, at, stage="training", step=number)
+
+
+def stored(number: int) -> dict[str, Any]:
+    return line("stored", step=number)
+
+
+def resumed(number: int) -> dict[str, Any]:
+    return line("resume", step=number)
 
 
 # What ran
@@ -73,13 +82,24 @@ def test_attempts_beside_each_other_are_found() -> None:
 
 
 def test_steps_that_are_taken_again_are_found() -> None:
-    resumed = [line("begin"), step(1), step(2), line("begin", step=2), step(3)]
-    assert attempts.repeated(resumed) == []
-    assert attempts.repeated([line("begin"), step(1), step(2), line("begin", step=1), step(2)]) == [
-        "a was resumed from step 1 though step 2 was stored"
+    whole = [line("begin"), resumed(0), stored(10), stored(20), line("begin"), resumed(20), stored(30)]
+    assert attempts.repeated(whole) == []
+    assert attempts.resumptions(whole) == 1
+    assert attempts.repeated([*whole, stored(30)]) == []  # a worker that is stopped stores its step once more
+    assert attempts.repeated([*whole, line("begin"), resumed(20)]) == [
+        "a was resumed from step 20 though step 30 was stored"
     ]
-    assert attempts.repeated([*resumed, step(3)]) == ["a took step 3 twice"]
-    assert attempts.repeated([line("begin", step=None), line("step", step=5), line("step", step=4)]) == []
+    assert attempts.repeated([*whole, stored(25)]) == ["a stored step 25 after step 30"]
+
+
+def test_cameras_that_are_recovered_again_are_found() -> None:
+    posed = [line("step", stage="mapping", step=None), line("step", stage="training", step=None)]
+    again = line("step", stage="mapping", step=None)
+    assert attempts.repeated([*posed, *posed]) == []
+    assert attempts.repeated([*posed, again | {"pid": 8, "job": "b"}]) == []
+    assert attempts.repeated([*posed, again | {"pid": 8}, again | {"pid": 8}]) == [
+        "process 8 recovered the cameras of a again, which were stored"
+    ]
 
 
 def test_a_pipeline_that_runs_for_a_stored_model_is_found() -> None:
@@ -283,6 +303,10 @@ SPOILED: dict[str, tuple[Callable[[Ended], Any], str]] = {
         lambda e: e.storage.delete(layout.job_record(e.job)),
         "a file of a model without a record",
     ),
+    "a preview has no job": (
+        lambda e: e.storage.put(layout.model_file(OTHER, "preview.jpg"), b"x"),
+        "a file of a model without a record",
+    ),
     "a file is not listed": (
         lambda e: (cast(Any, e.storage.root) / "models" / ".model.ply.1234.part").write_bytes(b"half"),
         "",
@@ -299,14 +323,28 @@ def test_a_file_that_is_not_whole_or_not_explained_is_found(ended: Ended, spoile
     assert any(named in sentence for sentence in found), found
 
 
+def test_the_preview_of_a_job_that_has_no_model_is_explained(ended: Ended) -> None:
+    ended.storage.put(layout.model_file(ended.cancelled, "preview.jpg"), b"x")
+    assert files.strays(ended.storage) == []
+
+
 def test_a_file_that_differs_from_what_was_uploaded_or_recorded_is_found(ended: Ended) -> None:
     photo = layout.capture_file(ended.capture, cast(Any, "images"), "a.jpg")
     promise = Promise(
-        ended.job, ended.capture, {"images/a.jpg": ended.storage.get(photo)}, state=JobState.succeeded.value
+        ended.job,
+        ended.capture,
+        {"images/a.jpg": ended.storage.get(photo)},
+        photos=3,
+        state=JobState.succeeded.value,
     )
+    cameras: dict[str, Any] = {"cameras": [{}, {}, {}]}
+    ended.storage.put(layout.model_file(ended.job, "cameras.json"), json.dumps(cameras).encode())
     ply = layout.model_file(ended.job, "model.ply")
     ended.change(layout.job_record(ended.job), sha256={"model.ply": _sha256(ended.storage.get(ply))})
     assert files.halves([promise], ended.storage) == []
+    promise.photos = 4
+    assert files.halves([promise], ended.storage) == [f"{ended.job} was made of 3 photos, not of 4"]
+    promise.photos = 3
     ended.storage.put(ply, ended.storage.get(ply)[:-1])
     assert files.halves([promise], ended.storage) == [f"{ply} is not whole"]
     ended.storage.put(photo, b"other")
@@ -331,6 +369,7 @@ def served(broken: str) -> tuple[Any, Any]:
     records = [line("begin", at=1.0), *([] if broken == "resumes" else [step(1, time.monotonic())])]
     service = SimpleNamespace(
         ready=lambda: broken != "answers",
+        patience=1.0,
         http=httpx.Client(transport=httpx.MockTransport(answer), base_url="http://service"),
         records=lambda: records,
         orphans=lambda: [os.getpid()] if broken == "orphans" else [],
@@ -429,6 +468,7 @@ def test_a_job_that_does_not_end_is_told(
     ended: Ended, clients: Clients, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(verdict, "SETTLE_SECONDS", 0.1)
+    clients.service = cast(Any, SimpleNamespace(patience=1.0))
     assert verdict.settle(clients) == []
     clients.promises["a"] = Promise("a", ended.capture, {}, state="training")
     assert verdict.settle(clients) == ["a is still training 0.1 s after the last fault"]
@@ -443,10 +483,18 @@ def test_a_whole_soak_has_its_kills_and_every_kind_of_fault() -> None:
     assert all(chosen.count(fault) >= 5 for fault in faults.FAULTS)
 
 
+def test_the_kill_of_any_role_can_be_asked_for_and_of_nothing_else() -> None:
+    chosen = faults.schedule(list(faults.FAULTS), 0, random.Random(0), ["decoder of the trainer killed"])
+    assert [fault.name for fault in chosen] == ["decoder of the trainer killed"]
+    with pytest.raises(ValueError, match="no faults"):
+        faults.schedule(list(faults.FAULTS), 0, random.Random(0), ["decoder"])
+
+
 def test_a_fault_that_meets_nothing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(faults, "_MET_SECONDS", 0.1)
-    monkeypatch.setattr(faults, "_HOLD", (0.0, 0.0))
-    target, ended = faults.Target(cast(Any, None), random.Random(0)), threading.Event()
+    monkeypatch.setattr(target, "_MET_SECONDS", 0.1)
+    monkeypatch.setattr(target, "HOLD", (0.0, 0.0))
+    service = cast(Any, SimpleNamespace(wait_for=soaked.wait_for))
+    reached, ended = target.Target(service, random.Random(0)), threading.Event()
 
     def ask() -> None:
         while not ended.wait(0.01):
@@ -459,12 +507,12 @@ def test_a_fault_that_meets_nothing_is_told(monkeypatch: pytest.MonkeyPatch) -> 
         try:
             for what in ("cut", "stall", "fail"):
                 with pytest.raises(AssertionError, match="the fault has met a request"):
-                    faults.spoil(target, proxy, what)
-            monkeypatch.setattr(faults, "_MET_SECONDS", 20.0)
+                    faults.spoil(reached, proxy, what)
+            monkeypatch.setattr(target, "_MET_SECONDS", 20.0)
             asking = threading.Thread(target=ask, daemon=True)
             asking.start()
             for what in ("cut", "stall", "fail"):
-                faults.spoil(target, proxy, what)
+                faults.spoil(reached, proxy, what)
                 assert proxy.met
         finally:
             ended.set()

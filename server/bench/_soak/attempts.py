@@ -3,6 +3,8 @@
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
+from splatmill.schema import JobState
+
 Line = Mapping[str, Any]
 """A line of the record, in the order in which they were written."""
 
@@ -16,13 +18,13 @@ def interrupted(lines: Iterable[Line], moment: float, ended: Collection[str]) ->
 
 
 def got_on(lines: Iterable[Line], moment: float) -> dict[str, float]:
-    """Return, by job, when it first took a step or came to its end after a moment.
+    """Return, by job, when the engine first emitted an event or came to its end after a moment.
 
     To begin is not to get on: an attempt may begin again and again.
     """
     found: dict[str, float] = {}
     for line in lines:
-        if line["what"] in ("step", "end") and line["at"] > moment:
+        if line["what"] in ("step", "stored", "end") and line["at"] > moment:
             found.setdefault(line["job"], line["at"])
     return found
 
@@ -37,23 +39,34 @@ def overlapping(lines: Iterable[Line]) -> list[str]:
 
 
 def repeated(lines: Iterable[Line]) -> list[str]:
-    """Return a sentence for each attempt that took steps again whose checkpoint was on its disk.
+    """Return a sentence for each attempt that did work again whose result was on its disk.
 
-    A step is recorded once its checkpoint is stored, so a later attempt at the job on this machine must begin behind
-    it. Attempts of the engine are left out: they store a checkpoint now and then.
+    A checkpoint is recorded once it is stored, so a later attempt at the job on this machine must train on behind it.
+    Cameras are stored when the training begins, so no later attempt may recover them again.
     """
     found: list[str] = []
-    taken: dict[str, int] = {}
+    stored: dict[str, int] = {}
+    posed: dict[str, int] = {}
     for line in lines:
-        job, step = line["job"], line.get("step")
-        if line["what"] == "begin" and step is not None and step < taken.get(job, 0):
-            found.append(f"{job} was resumed from step {step} though step {taken[job]} was stored")
-            taken[job] = step
-        elif line["what"] == "step" and step is not None and line.get("stored", False):
-            if step <= taken.get(job, 0):
-                found.append(f"{job} took step {step} twice")
-            taken[job] = max(step, taken.get(job, 0))
-    return found
+        job, pid = line["job"], line["pid"]
+        step: Any = line.get("step")
+        if line["what"] == "resume":
+            if step < stored.get(job, 0):
+                found.append(f"{job} was resumed from step {step} though step {stored[job]} was stored")
+        elif line["what"] == "stored":
+            if step < stored.get(job, 0):
+                found.append(f"{job} stored step {step} after step {stored[job]}")
+            stored[job] = max(step, stored.get(job, 0))
+        elif line["what"] == "step" and line["stage"] == JobState.training and step is None:
+            posed.setdefault(job, pid)
+        elif line["what"] == "step" and line["stage"] == "mapping" and posed.get(job, pid) != pid:
+            found.append(f"process {pid} recovered the cameras of {job} again, which were stored")
+    return list(dict.fromkeys(found))
+
+
+def resumptions(lines: Iterable[Line]) -> int:
+    """Return how many attempts trained on from a checkpoint."""
+    return sum(line["what"] == "resume" and line["step"] > 0 for line in lines)
 
 
 def run_again(lines: Iterable[Line]) -> list[str]:

@@ -1,6 +1,5 @@
 """The clients of a soak: they upload, start jobs, follow, cancel, look at models, and note what was broken to them."""
 
-import json
 import random
 import threading
 import time
@@ -9,13 +8,19 @@ from typing import Any
 
 import httpx
 
-from _soak.pipeline import SCRIPT
+from _soak import work
 from _soak.service import Service
 
 FINAL = {"succeeded", "failed", "cancelled"}
 
-UNFINISHED = 3
-"""Jobs that are unfinished at each moment, so that a fault always meets work."""
+UNFINISHED = 2
+"""Jobs that are unfinished at each moment: a fault always meets one, and one waits no longer than for another."""
+
+_CANCELLED = 9
+"""One job in so many is cancelled by a client."""
+
+_FORMATS = ("spz", "sog", "glb")
+"""File formats in which models are downloaded, in turn; the renderer converts them."""
 
 FORGOTTEN_SECONDS = 30.0
 """Seconds after which a job that the service does not know counts as lost."""
@@ -46,6 +51,7 @@ class Promise:
     """A job that the service has accepted.
 
     capture: the capture, and `files` the bytes that were uploaded to it.
+    kind, photos: as `work.Work` says.
     state: the last that was seen.
     cancel: whether a client cancels it.
     restarts: how often a client restarted it after a failure whose advice that is.
@@ -56,6 +62,8 @@ class Promise:
     job: str
     capture: str
     files: dict[str, bytes]
+    kind: str = "photos"
+    photos: int = work.PHOTOS
     cancel: bool = False
     state: str = "queued"
     restarts: int = 0
@@ -69,7 +77,7 @@ class Promise:
 class Clients:
     """Clients with a seed, in a thread.
 
-    photos: files of captures that are trained by the engine; every `photo_share`-th job is one of these.
+    files: those of a capture of each kind.
     complaints: what no client should have met.
     captures: those that the service has accepted.
     faults: names of the faults so far, and the monotonic time at which each was over; infinity: it goes on.
@@ -77,13 +85,13 @@ class Clients:
 
     service: Service
     seed: int
-    photos: dict[str, bytes] = field(default_factory=dict)
-    photo_share: int = 16
+    files: dict[str, dict[str, bytes]] = field(default_factory=dict)
     promises: dict[str, Promise] = field(default_factory=dict)
     complaints: list[str] = field(default_factory=list)
     captures: list[str] = field(default_factory=list)
     faults: list[tuple[str, float]] = field(default_factory=list)
     views: int = 0
+    conversions: int = 0
     retries: int = 0
     number: int = 0
 
@@ -127,34 +135,23 @@ class Clients:
 
     def _submit(self) -> None:
         self.number += 1
-        engine = bool(self.photos) and self.number % self.photo_share == 0
         made = self._ask("POST", "/v1/captures", json={})
         if made is None:
             return
         capture = str(made.json()["id"])
         self.captures.append(capture)
-        if engine:
-            files, options = self.photos, {"steps": 150}
-        else:
-            script = {
-                "steps": self._random.randint(8, 24),
-                "seconds": 0.1,
-                "bytes": self._random.choice((1_000, 300_000)),
-                "gaussians": self._random.choice((1, 3000)),
-            }
-            files = {f"images/{SCRIPT}": json.dumps(script).encode(), "images/other.jpg": bytes(50_000)}
-            options = {}
-        for name, content in files.items():
+        one = work.nth(self.number, self.files)
+        for name, content in one.files.items():
             if self._ask("PUT", f"/v1/captures/{capture}/{name}", content=content) is None:
                 return
-        body = {"capture": capture, "options": options}
+        body = {"capture": capture, "options": one.options}
         headers = {"Idempotency-Key": f"soak-{self.seed}-{self.number}"}
         answer = self._ask("POST", "/v1/jobs", json=body, headers=headers)
         if answer is None:
             return
-        cancel = not engine and self.number % 11 == 5
         job = str(answer.json()["id"])
-        self.promises[job] = Promise(job, capture, files, cancel)
+        cancel = self.number % _CANCELLED == 5
+        self.promises[job] = Promise(job, capture, one.files, one.kind, one.photos, cancel)
 
     def _ask(self, method: str, path: str, **request: Any) -> httpx.Response | None:
         """Send a request until it is answered; None if the soak ends first."""
@@ -195,8 +192,8 @@ class Clients:
             promise.state = job["state"]
         if promise.cancel and not promise.asked_to_cancel and job["state"] == "training":
             self._cancel(promise)
-        if promise.state == "succeeded" and self._random.random() < 0.25:
-            self._view(promise)
+        if promise.state == "succeeded":
+            (self._view if self._random.random() < 0.5 else self._convert)(promise)
 
     def _failed(self, promise: Promise, problem: Any) -> None:
         cause = CAUSES.get(problem["code"])
@@ -229,6 +226,17 @@ class Clients:
             self.views += answer.content.startswith(b"\x89PNG")
         elif not _may_repeat(answer):
             self.complaints.append(f"a view: {answer.status_code} {answer.text[:300]}")
+
+    def _convert(self, promise: Promise) -> None:
+        form = _FORMATS[self.conversions % len(_FORMATS)]
+        try:
+            answer = self._http.get(f"/v1/models/{promise.job}/download/{form}")
+        except httpx.HTTPError:
+            return
+        if answer.status_code == 200:
+            self.conversions += 1
+        elif not _may_repeat(answer):
+            self.complaints.append(f"a download as {form}: {answer.status_code} {answer.text[:300]}")
 
 
 def _may_repeat(answer: httpx.Response) -> bool:

@@ -10,25 +10,23 @@ from dataclasses import dataclass
 
 import psutil
 
+from _soak.processes import TRAINER, WORKER
 from _soak.proxy import Proxy
-from _soak.service import Service, wait_for
+from _soak.service import Service
+from _soak.target import HOLD, Target
 
 KILLS = 200
 """Kills in a whole soak."""
 
-MAX_TRAINER_KILLS = 2
-"""Kills of the trainer of one job. A job whose process ends unexpectedly in four attempts is given up by design."""
-
-_HOLD = (0.3, 4.0)
-"""Seconds that a stop, a cut or a stall lasts: below and above the timeout of Redis with its retries."""
+_KILLED = " killed"
+_ANY = "process killed"
+"""Name of the kill of any process that the service starts again. Its row has the role of the process."""
 
 _FROZEN = (18.0, 26.0)
 """Seconds that a worker is stopped, until its lease has expired and its job is in the queue, while its trainer runs on.
 A lease lasts 15 s, and the reaper looks every 10."""
 
 _AWAY = (0.0, 1.0)  # seconds before what was killed is started again
-_TARGET_SECONDS = 20.0
-_MET_SECONDS = 10.0
 
 
 @dataclass(frozen=True)
@@ -38,6 +36,7 @@ class Fault:
     name: what the table calls it.
     weight: how often it comes in a round, beside others.
     kills: whether it ends processes.
+    loses: whether the job that runs may lose its worker.
     act: does it to the service and heals it.
     needs: "s3", "folder", "disk" or "clock"; "" where every soak can have it.
     """
@@ -45,73 +44,14 @@ class Fault:
     name: str
     weight: int
     kills: bool
-    act: Callable[["Target"], None]
+    act: Callable[[Target], None]
     needs: str = ""
+    loses: bool = False
 
 
-class Target:
-    """The service as the faults reach it.
-
-    killed: kills of trainers by job.
-    struck: monotonic time at which the newest fault began.
-    healed: monotonic time at which the newest fault was over: its kill, or the beginning of what takes it back.
-    """
-
-    def __init__(self, service: Service, rng: random.Random) -> None:
-        self.service = service
-        self.rng = rng
-        self.killed: dict[str, int] = {}
-        self.struck = self.healed = 0.0
-
-    def strike(self) -> None:
-        """Note that the fault begins now."""
-        self.struck = time.monotonic()
-
-    def trainer(self, *, spare: bool = False) -> int:
-        """Return the process of the attempt that runs. With `spare`, not of a job whose trainers were killed often."""
-
-        def find() -> int | None:
-            ended = set()
-            for line in reversed(self.service.records()):
-                if line["what"] == "end":
-                    ended.add(line["pid"])
-                elif line["what"] == "begin" and line["pid"] not in ended:
-                    if not psutil.pid_exists(line["pid"]):
-                        return None
-                    if spare and self.killed.get(line["job"], 0) >= MAX_TRAINER_KILLS:
-                        return None
-                    self.killed[line["job"]] = self.killed.get(line["job"], 0) + spare
-                    return int(line["pid"])
-                elif line["what"] == "begin":
-                    return None
-            return None
-
-        return int(wait_for(find, _TARGET_SECONDS, "an attempt runs"))
-
-    def last(self, bounds: tuple[float, float]) -> None:
-        """Let the fault last for some seconds, after which it is taken back."""
-        time.sleep(self.rng.uniform(*bounds))
-        self.healed = time.monotonic()
-
-    def met(self, proxy: Proxy) -> None:
-        """Let the fault of a proxy last for some seconds, and until it has met something."""
-        self.last(_HOLD)
-        wait_for(lambda: proxy.met, _MET_SECONDS, "the fault has met a request")
-        self.healed = time.monotonic()
-
-    def kill(self, pid: int) -> None:
-        """Kill a process that the service starts again by itself."""
-        self.struck = self.healed = time.monotonic()
-        self.service.kill(pid)
-
-
-def _kill_trainer(target: Target) -> None:
-    target.kill(target.trainer(spare=True))
-
-
-def _kill_part(name: str) -> Callable[[Target], None]:
+def _kill_role(role: str | None) -> Callable[[Target], None]:
     def act(target: Target) -> None:
-        target.kill(target.service.part(name))
+        target.kill_one(role)
 
     return act
 
@@ -145,9 +85,9 @@ def _empty_redis(target: Target) -> None:
     target.service.start_redis()
 
 
-def _stop(find: Callable[[Target], int], bounds: tuple[float, float] = _HOLD) -> Callable[[Target], None]:
+def _stop(role: str, bounds: tuple[float, float] = HOLD) -> Callable[[Target], None]:
     def act(target: Target) -> None:
-        pid = find(target)
+        pid = target.service.redis_pid if role == "Redis" else target.service.part(role)
         target.strike()
         os.kill(pid, signal.SIGSTOP)
         target.last(bounds)
@@ -186,7 +126,7 @@ def _full_disk(target: Target) -> None:
     target.strike()
     try:
         target.service.fill_disk()
-        target.last(_HOLD)
+        target.last(HOLD)
     finally:
         target.service.empty_disk()
 
@@ -200,29 +140,32 @@ def _jump(target: Target) -> None:
 
 
 FAULTS = (
-    Fault("trainer killed", 4, True, _kill_trainer),
-    Fault("worker killed", 4, True, _kill_part("worker")),
-    Fault("API killed", 3, True, _kill_part("api")),
-    Fault("renderer killed", 2, True, _kill_part("renderer")),
-    Fault("Redis killed", 3, True, _kill_redis),
-    Fault("supervisor killed", 1, True, _kill_up),
-    Fault("everything killed", 2, True, _kill_all),
+    Fault(_ANY, 19, True, _kill_role(None)),
+    Fault("Redis killed", 2, True, _kill_redis),
     Fault("Redis emptied", 1, True, _empty_redis),
-    Fault("trainer stopped", 1, False, _stop(Target.trainer)),
-    Fault("worker stopped", 1, False, _stop(lambda target: target.service.part("worker"))),
-    Fault("worker frozen", 1, False, _stop(lambda target: target.service.part("worker"), _FROZEN)),
-    Fault("API stopped", 1, False, _stop(lambda target: target.service.part("api"))),
-    Fault("renderer stopped", 1, False, _stop(lambda target: target.service.part("renderer"))),
-    Fault("Redis stopped", 1, False, _stop(lambda target: target.service.redis_pid)),
+    Fault("supervisor killed", 1, True, _kill_up, loses=True),
+    Fault("everything killed", 2, True, _kill_all, loses=True),
+    Fault("trainer stopped", 1, False, _stop(TRAINER)),
+    Fault("worker stopped", 1, False, _stop(WORKER)),
+    Fault("worker frozen", 1, False, _stop(WORKER, _FROZEN), loses=True),
+    Fault("API stopped", 1, False, _stop("API")),
+    Fault("renderer stopped", 1, False, _stop("renderer")),
+    Fault("Redis stopped", 1, False, _stop("Redis")),
     Fault("Redis cut off", 1, False, _redis("cut")),
     Fault("Redis stalled", 1, False, _redis("stall")),
     Fault("disk full", 1, False, _full_disk, "disk"),
-    Fault("clock set", 1, False, _jump, "clock"),
+    Fault("clock set", 1, False, _jump, "clock", loses=True),
     Fault("S3 cut off", 1, False, _s3("cut"), "s3"),
     Fault("S3 stalled", 1, False, _s3("stall"), "s3"),
     Fault("S3 answers 503", 1, False, _s3("fail"), "s3"),
 )
-"""All kinds. A round holds each as often as its weight, in an order of its own."""
+"""All kinds but the kills of one role, which _ANY stands for. A round holds each as often as its weight, in an order of
+its own."""
+
+
+def kill_of(role: str) -> Fault:
+    """Return the kill of a process of a role."""
+    return Fault(f"{role}{_KILLED}", 1, True, _kill_role(role))
 
 
 def possible(service: Service) -> tuple[list[Fault], dict[str, str]]:
@@ -249,14 +192,19 @@ def schedule(
 ) -> list[Fault]:
     """Return so many faults, round after round; with `only`, one of each of these names.
 
+    `only` may name the kill of any role.
+
     Raises ValueError for a name that no fault has.
     """
     if only is not None:
-        if unknown := set(only) - {fault.name for fault in FAULTS}:
+        names = {fault.name for fault in FAULTS}
+        if unknown := {name for name in only if name not in names and not name.endswith(_KILLED)}:
             raise ValueError(
-                f"There are no faults {sorted(unknown)}; the names are {[f.name for f in FAULTS]}."
+                f"There are no faults {sorted(unknown)}; the names are {sorted(names)}, and ROLE{_KILLED} for any role "
+                "of a process."
             )
         chosen = [fault for fault in faults if fault.name in only]
+        chosen += [kill_of(name.removesuffix(_KILLED)) for name in only if name not in names]
         rng.shuffle(chosen)
         return chosen
     found: list[Fault] = []

@@ -29,7 +29,10 @@ _STAGED = re.compile(r"#\d+\Z")
 
 
 def halves(promises: Iterable[Promise], storage: Storage) -> list[str]:
-    """Return a sentence for each file that is not what was uploaded, or not what the model's record says."""
+    """Return a sentence for each file that is not what was uploaded, or not what the model's record says.
+
+    A model that was made without some of its photos is not whole.
+    """
     found = []
     for promise in promises:
         for name, content in promise.files.items():
@@ -44,9 +47,12 @@ def halves(promises: Iterable[Promise], storage: Storage) -> list[str]:
             continue
         try:
             record = json.loads(storage.get(layout.job_record(promise.job)))
+            cameras = json.loads(storage.get(layout.model_file(promise.job, "cameras.json")))["cameras"]
         except (FileNotFoundError, ValueError) as error:
             found.append(f"the record of the model {promise.job} cannot be read: {error}")
             continue
+        if len(cameras) != promise.photos:
+            found.append(f"{promise.job} was made of {len(cameras)} photos, not of {promise.photos}")
         found += _not_whole(promise.job, record, storage)
     return found
 
@@ -105,6 +111,9 @@ def _fault(entry: Entry, entries: Mapping[str, Entry], storage: Storage) -> str 
             return f"is no JSON: {error}"
     elif path.startswith("models/"):
         model = path.split("/")[1]
-        if layout.job_record(model) not in entries:
+        preview = path == layout.model_file(model, "preview.jpg") and layout.job_log(model) in entries
+        if (
+            layout.job_record(model) not in entries and not preview
+        ):  # a job keeps its preview, however it ends
             return "is a file of a model without a record"
     return None

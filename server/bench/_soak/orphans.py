@@ -17,12 +17,13 @@ _PR_SET_CHILD_SUBREAPER = 36
 class Adoption:
     """This process as the one to which the kernel gives the orphans among all processes below it, until `end`.
 
+    own: the children that this process had before.
     missing: why this system has nothing of the kind, or None.
     """
 
     def __init__(self) -> None:
         self.missing = None if sys.platform == "linux" else "only Linux gives orphans to a process of our own"
-        self._own = {child.pid for child in psutil.Process().children()}
+        self.own = {child.pid for child in psutil.Process().children()}
         self._set(1)
 
     def end(self) -> None:
@@ -36,7 +37,7 @@ class Adoption:
         """
         if self.missing is not None:
             return []
-        given = {child.pid for child in psutil.Process().children()} - self._own - set(own)
+        given = {child.pid for child in psutil.Process().children()} - self.own - set(own)
         for pid in given:
             with suppress(ChildProcessError):
                 os.waitpid(pid, os.WNOHANG)  # one that has ended waits for this

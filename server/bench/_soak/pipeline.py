@@ -1,11 +1,13 @@
-"""The pipeline of the jobs of a soak: the engine's or steps without photos, with every begin, step and end on record.
+"""The engine's pipeline in the jobs of a soak, with every begin, event, checkpoint and end on record.
 
-It runs in the attempt's process (SPLATMILL_PIPELINE). The record is one file of all attempts, SOAK_TRACE, with a JSON
-line for each of
+It runs in the attempt's process (SPLATMILL_PIPELINE) and changes nothing of what the pipeline does. The record is one
+file of all attempts, SOAK_TRACE, with a JSON line for each of
 
-    begin: the process, the job, the step that it resumes from, whether another attempt at the job runs beside it
-        (`overlap`), and whether its model is in storage already (`published`);
-    step: a step whose checkpoint is stored (`stored`), or any event of the engine;
+    begin: the process, the job, whether another attempt at the job runs beside it (`overlap`), and whether its model is
+        in storage already (`published`);
+    step: an event of the engine, with its `stage` and its `step` of the training where it has them;
+    stored: the checkpoint of a step is stored;
+    resume: training begins, behind the `step` of the checkpoint that was read, or 0;
     end: the pipeline has returned with a whole model.
 
 Times are those of the machine's monotonic clock, which all processes share and no fault of a soak sets.
@@ -17,19 +19,16 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
-
-from _one_gaussian import ply
+from unittest.mock import patch
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage, StorageError
-from splatmill.files import atomic_write
-from splatmill.schema import Event, JobState, MetricEvent, PlanEvent, ProgressEvent, StateEvent, TrainOptions
+from splatmill.schema import Event, ProgressEvent, StateEvent, TrainOptions
+from splatmill_worker import pipeline
 from splatmill_worker.settings import storage_url
-
-SCRIPT = "soak.json"
-"""Name of the image of a capture that is no photo: a job on it takes the steps that it lists, without the engine."""
+from splatmill_worker.splat.train import checkpoint
+from splatmill_worker.splat.train.snapshot import Snapshot
 
 
 def run(
@@ -41,8 +40,7 @@ def run(
     *,
     onlookers: Any = None,
 ) -> Any:
-    """Run the job that the capture asks for, and record what becomes of it."""
-    workdir.mkdir(parents=True, exist_ok=True)
+    """Run the pipeline, and record what becomes of it."""
     job = workdir.parent.name
     # The kernel releases this lock when the process ends, not before: if it is held, two attempts run at once.
     alone = open(Path(os.environ["SOAK_TRACE"]).parent / f"{job}.lock", "w")  # noqa: SIM115
@@ -51,20 +49,24 @@ def run(
         overlap = False
     except BlockingIOError:
         overlap = True
-    script = capture / "images" / SCRIPT
-    if script.is_file():
-        record(job, "begin", overlap=overlap, published=_published(job), step=_step(workdir))
-        result: Any = _steps(json.loads(script.read_text()), job, workdir, emit, cancelled)
-    else:
-        record(job, "begin", overlap=overlap, published=_published(job), step=None)
+    record(job, "begin", overlap=overlap, published=_published(job))
+    save, load = checkpoint.save, checkpoint.load
 
-        def noted(event: Event) -> None:
-            record(job, "step", step=event.step if isinstance(event, ProgressEvent) else None)
-            emit(event)
+    def recorded_emit(event: Event) -> None:
+        record(job, "step", **_place(event))
+        emit(event)
 
-        from splatmill_worker import pipeline
+    def recorded_save(directory: Path, snapshot: Snapshot) -> None:
+        save(directory, snapshot)
+        record(job, "stored", step=snapshot.step)
 
-        result = pipeline.run(capture, workdir, options, noted, cancelled, onlookers=onlookers)
+    def recorded_load(directory: Path) -> Snapshot | None:
+        snapshot = load(directory)
+        record(job, "resume", step=0 if snapshot is None else snapshot.step)
+        return snapshot
+
+    with patch.multiple(checkpoint, save=recorded_save, load=recorded_load):
+        result = pipeline.run(capture, workdir, options, recorded_emit, cancelled, onlookers=onlookers)
     if result.ended == "succeeded":
         record(job, "end")
     return result
@@ -80,35 +82,12 @@ def record(job: str, what: str, **more: Any) -> None:
         os.close(handle)
 
 
-def _steps(
-    script: dict[str, Any],
-    job: str,
-    workdir: Path,
-    emit: Callable[[Event], None],
-    cancelled: Callable[[], bool],
-) -> SimpleNamespace:
-    """Take the script's `steps`, of `seconds` each, with a checkpoint of `bytes` after every one."""
-    total = int(script["steps"])
-    emit(StateEvent(state=JobState.sfm))
-    emit(StateEvent(state=JobState.training))
-    emit(PlanEvent(plan={"steps": {"value": total, "because": "the script says so"}}))
-    for step in range(_step(workdir) + 1, total + 1):
-        time.sleep(script["seconds"])
-        text = json.dumps({"step": step, "padding": "x" * int(script["bytes"])})
-        atomic_write(_checkpoint(workdir), text)
-        record(job, "step", step=step, stored=True)
-        emit(ProgressEvent(stage="training", done=step, total=total, step=step, loss=1 / step))
-        if cancelled():
-            return SimpleNamespace(ended="cancelled")
-    emit(MetricEvent(seconds=1.0, step=total, psnr=30.0, ssim=0.9, gaussians=script["gaussians"]))
-    emit(StateEvent(state=JobState.exporting))
-    out = workdir / "out"
-    out.mkdir(exist_ok=True)
-    (out / "model.ply").write_bytes(ply(int(script["gaussians"])))
-    curve = [{"seconds": 1.0, "step": total, "psnr": 30.0, "gaussians": script["gaussians"]}]
-    (out / "report.json").write_text(json.dumps({"curve": curve, "seconds": {}}))
-    (out / "cameras.json").write_text(json.dumps({"cameras": []}))
-    return SimpleNamespace(ended="succeeded")
+def _place(event: Event) -> dict[str, Any]:
+    if isinstance(event, ProgressEvent):
+        return {"stage": event.stage, "step": event.step}
+    if isinstance(event, StateEvent):
+        return {"stage": event.state.value, "step": None}
+    return {"stage": None, "step": None}
 
 
 def _published(job: str) -> bool:
@@ -117,12 +96,3 @@ def _published(job: str) -> bool:
         return Storage(storage_url()).exists(layout.job_record(job))
     except StorageError:
         return False
-
-
-def _checkpoint(workdir: Path) -> Path:
-    return workdir / "checkpoints" / "state.json"
-
-
-def _step(workdir: Path) -> int:
-    path = _checkpoint(workdir)
-    return int(json.loads(path.read_text())["step"]) if path.is_file() else 0

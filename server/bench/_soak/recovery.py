@@ -11,7 +11,7 @@ from _soak.orphans import command
 from _soak.service import Service
 
 RESUME_SECONDS = 30.0
-"""Seconds after a fault within which all of it works again."""
+"""Seconds after a fault within which all of it works again, times the patience of the soak."""
 
 _PAUSE = 0.02  # seconds between two looks
 
@@ -21,7 +21,7 @@ MEASURED = ("answers", "accepts", "shows", "resumes")
 answers: `/readyz` finds Redis, storage and the renderer;
 accepts: a capture is made;
 shows: the renderer has made a picture of the newest model, if there is one;
-resumes: every job that had begun before the fault has taken another step or has ended. Where none had, any job has.
+resumes: every job that had begun before the fault has got on or has ended. Where none had, any job has.
 """
 
 
@@ -32,6 +32,7 @@ def recover(
 
     struck, healed: monotonic times of the fault's beginning and end.
     """
+    within = RESUME_SECONDS * service.patience
     found: dict[str, float] = {}
     waited: dict[str, Callable[[], bool | float]] = {
         "answers": service.ready,
@@ -39,19 +40,19 @@ def recover(
         "shows": lambda: shows(service, clients),
         "resumes": lambda: resumed(service, clients, struck, healed),
     }
-    while len(found) < len(waited) and time.monotonic() < healed + RESUME_SECONDS:
+    while len(found) < len(waited) and time.monotonic() < healed + within:
         for what in [what for what in waited if what not in found]:
             if (when := waited[what]()) is not False:
                 found[what] = (time.monotonic() if when is True else when) - healed
         time.sleep(_PAUSE)
     orphans = service.orphans()
-    while orphans and time.monotonic() < healed + RESUME_SECONDS:
+    while orphans and time.monotonic() < healed + within:
         time.sleep(_PAUSE)
         orphans = service.orphans()
-    late = [what for what in waited if found.get(what, RESUME_SECONDS) >= RESUME_SECONDS]
+    late = [what for what in waited if found.get(what, within) >= within]
     complaint = None
     if late:
-        complaint = f"After {RESUME_SECONDS:g} s the service does not do this: {', '.join(late)}."
+        complaint = f"After {within:g} s the service does not do this: {', '.join(late)}."
         if "resumes" in late:
             waiting = missing(service, clients, struck, healed)
             complaint += f" It has not resumed {sorted(waiting) or 'any job'}."

@@ -20,14 +20,16 @@ import redis
 
 from _soak.clock import Clock
 from _soak.orphans import Adoption
+from _soak.processes import Member, Processes
 from _soak.proxy import Proxy
+from splatmill.backplane import entries, leases
 from splatmill.backplane.connection import connect
 from splatmill.backplane.process import die_with_parent, start_time
 from splatmill.backplane.redis_program import find
 from splatmill.backplane.storage import Storage
 
-DISK_BYTES = 256 << 20
-"""Size of the disk of the data folder, so that it can be filled."""
+DISK_BYTES = 640 << 20
+"""Size of the disk of the data folder, so that it can be filled: some 300 jobs leave a megabyte each."""
 
 RESERVE_BYTES = 16 << 20
 """Bytes of that disk that uploads and workers leave free."""
@@ -37,34 +39,30 @@ _CLOCK_SECONDS = 5.0
 
 _GONE_SECONDS = 10.0  # for the children of a killed process to end
 
-PARTS = {
-    "api": "splatmill_server.up.api",
-    "worker": "splatmill_worker train",
-    "renderer": "splatmill_worker renderer",
-}
-"""The processes of `up`, by a part of their command line."""
-
 
 class Service:
     """The processes on a folder of their own, which is deleted with them.
 
     folder: for all that is written.
     s3: whether storage is S3; otherwise a folder.
+    patience: what all time limits are multiplied by, for a machine that has other work.
+    processes: those of the service.
     disk: whether the data lies on a small disk of its own; None without the right to mount one.
     """
 
-    def __init__(self, folder: Path, *, s3: bool) -> None:
+    def __init__(self, folder: Path, *, s3: bool, patience: float = 1.0) -> None:
         self.folder = folder
+        self.patience = patience
         self.data = folder / "data"
         self.trace = folder / "trace.jsonl"
         self.trace.touch()
         self.data.mkdir(parents=True)
         self.clock = Clock(folder)
         self.disk = _mount(self.data)
-        self.seen: dict[int, str | None] = {}
         self._records: list[Any] = []
         self._read = 0
         self._adoption = Adoption()
+        self.processes = Processes(self._own)
         self._ports = [_free_port() for _ in range(3)]
         self._redis: subprocess.Popen[bytes] | None = None
         self._up: subprocess.Popen[str] | None = None
@@ -82,6 +80,7 @@ class Service:
             "SPLATMILL_DISK_RESERVE": str(RESERVE_BYTES),
             "SPLATMILL_MIN_FREE_BYTES": str(RESERVE_BYTES),
             "SOAK_TRACE": str(self.trace),
+            "OMP_NUM_THREADS": "1",  # photos this small gain nothing by more, and threads wait for each other
             "PYTHONPATH": str(Path(__file__).resolve().parent.parent),
             **self.clock.environment,
         }
@@ -89,6 +88,7 @@ class Service:
         if s3:
             self._start_s3()
         self.http = httpx.Client(base_url=f"http://127.0.0.1:{self._ports[2]}", timeout=20, trust_env=False)
+        self.processes.start()
 
     # Processes
 
@@ -109,7 +109,7 @@ class Service:
         options = [part for name, value in settings.items() for part in (f"--{name}", value)]
         self._redis = self._popen([str(find().path), *options], "redis", os.environ | self.clock.environment)
         with self.redis() as connection:
-            wait_for(lambda: _answers(connection.ping), 30, "Redis answers")
+            self.wait_for(lambda: _answers(connection.ping), 30, "Redis answers")
 
     def start(self) -> None:
         """Start `splatmill up`, and wait until it is ready."""
@@ -133,10 +133,9 @@ class Service:
     def stop(self) -> None:
         """Stop `up` as Ctrl-C does."""
         assert self._up is not None
-        self.family()
         assert self._up.stdin is not None
         self._up.stdin.close()
-        self._up.wait(60)
+        self._up.wait(60 * self.patience)
         assert self._up.stdout is not None
         self._up.stdout.close()
         self._up = None
@@ -146,6 +145,7 @@ class Service:
         self.http.close()
         if self._up is not None:
             self.kill_up()
+        self.processes.stop()
         for process in (self._redis, self._s3):
             if process is not None and process.poll() is None:
                 process.kill()
@@ -158,29 +158,18 @@ class Service:
             subprocess.run(["umount", "--lazy", str(self.data)], check=False)
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def family(self) -> list[psutil.Process]:
-        """Return `up` and every process below it, and remember them for `left`."""
-        assert self._up is not None
-        found: list[psutil.Process] = []
-        with suppress(psutil.Error):
-            top = psutil.Process(self._up.pid)
-            found = [top, *top.children(recursive=True)]
-        self.seen |= {process.pid: start_time(process.pid) for process in found}
-        return found
+    def running(self, role: str) -> list[Member]:
+        """Return the processes of a role that run now."""
+        return [member for member in self.processes.look() if member.role == role]
 
-    def part(self, name: str) -> int:
-        """Return the process id of the API, the worker or the renderer, once it runs."""
-        assert self._up is not None
-        up = psutil.Process(self._up.pid)
+    def part(self, role: str) -> int:
+        """Return the process id of a part of the service, such as the API, once it runs."""
+        return int(self.wait_for(lambda: self.running(role), 20, f"there is a {role}")[0].pid)
 
-        def find() -> int | None:
-            for child in up.children():
-                with suppress(psutil.Error):
-                    if PARTS[name] in " ".join(child.cmdline()):
-                        return int(child.pid)
-            return None
-
-        return int(wait_for(find, 20, f"the {name} runs"))
+    def jobs_held(self) -> set[str]:
+        """Return the jobs that a worker holds: those that an attempt runs, or has run until its worker ended."""
+        with self.redis() as connection:
+            return {entries.split_rq_id(lease.entry)[0] for lease in leases.held(connection)}
 
     @property
     def redis_pid(self) -> int:
@@ -188,13 +177,19 @@ class Service:
         return self._redis.pid
 
     def left(self) -> list[int]:
-        """Return the processes that were seen below `up` and still run."""
-        return [pid for pid, began in self.seen.items() if began is not None and start_time(pid) == began]
+        """Return the processes of the service that still run."""
+        self.processes.look()
+        return [member.pid for member in self.processes.members if member.runs]
 
     def orphans(self) -> list[int]:
         """Return the processes below this one that have lost their parent and run on."""
-        own = [process.pid for process in (self._redis, self._up, self._s3) if process is not None]
+        own = [*self._own(), *([self._up.pid] if self._up is not None else [])]
         return self._adoption.orphans(own)
+
+    def _own(self) -> list[int]:
+        """Return the children of this process that are no part of the service: those from before, Redis and S3."""
+        servers = [process.pid for process in (self._redis, self._s3) if process is not None]
+        return [*self._adoption.own, *servers]
 
     def kill(self, *pids: int) -> None:
         """Kill processes, and wait until those below them are gone too. Raises AssertionError for one that stays."""
@@ -206,7 +201,7 @@ class Service:
         for pid in pids:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        wait_for(
+        self.wait_for(
             lambda: all(start_time(pid) != began for pid, began in below.items() if began is not None),
             _GONE_SECONDS,
             f"the processes below {pids} are gone",
@@ -220,7 +215,8 @@ class Service:
 
     def kill_all(self) -> None:
         """Kill `up`, all below it, and Redis at once."""
-        family = [process.pid for process in self.family()]
+        self.processes.look()
+        family = [member.pid for member in self.processes.members if member.runs]
         self.kill(*family, self.redis_pid)
         assert self._redis is not None
         self._redis.wait(10)
@@ -267,6 +263,10 @@ class Service:
         self._records += [json.loads(line) for line in whole.splitlines()]
         return self._records
 
+    def wait_for(self, condition: Callable[[], Any], seconds: float, what: str) -> Any:
+        """Return the first true value of `condition`. Raises AssertionError after `seconds`, with its patience."""
+        return wait_for(condition, seconds * self.patience, what)
+
     def sees_clock(self) -> bool:
         """Return whether the clock of Redis is off by as much as the injected one."""
         with self.redis() as connection:
@@ -297,7 +297,7 @@ class Service:
         port = self._ports[1]
         self._s3 = self._popen(_s3_server.command(port), "s3", dict(os.environ))
         url = f"http://127.0.0.1:{port}/soak"
-        wait_for(lambda: _answers(lambda: httpx.put(url, trust_env=False)), 60, "the S3 server answers")
+        self.wait_for(lambda: _answers(lambda: httpx.put(url, trust_env=False)), 60, "the S3 server answers")
         self.s3_proxy = Proxy(("127.0.0.1", port))
         self.storage_url = "s3://soak/data"
         self.environment |= _s3_server.environment(self.s3_proxy.port) | {

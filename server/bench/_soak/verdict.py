@@ -12,13 +12,14 @@ from _soak import agreement, attempts, files
 from _soak.clients import CAMERA, FINAL, Clients
 from _soak.orphans import command
 from _soak.service import Service, wait_for
+from _soak.target import STARTED_BY_THE_SOAK, Target
 from splatmill.backplane import events
 from splatmill.backplane.records import UnreadableRecord
 from splatmill.backplane.storage import Storage
 from splatmill.schema import StateEvent
 
 SETTLE_SECONDS = 90.0
-"""Seconds for the last jobs to end once no fault comes any more: at most one of the engine and two of a few seconds."""
+"""Seconds for the last jobs to end once no fault comes any more, times the patience of the soak."""
 
 _AGREE_SECONDS = 30.0
 """Seconds for Redis, storage and the API's lists to agree once all jobs have ended."""
@@ -29,10 +30,11 @@ _ANSWER_SECONDS = 120.0  # for a page of models of which each is read from stora
 def settle(clients: Clients) -> list[str]:
     """Wait for every job to end; return a sentence for each that does not."""
     clients.submit_no_more()
+    seconds = SETTLE_SECONDS * clients.service.patience
     with suppress(AssertionError):
-        wait_for(lambda: not clients.unfinished(), SETTLE_SECONDS, "every job has ended")
+        wait_for(lambda: not clients.unfinished(), seconds, "every job has ended")
     return [
-        f"{promise.job} is still {promise.state} {SETTLE_SECONDS:g} s after the last fault"
+        f"{promise.job} is still {promise.state} {seconds:g} s after the last fault"
         for promise in clients.unfinished()
     ]
 
@@ -65,6 +67,17 @@ def check_stopped(service: Service) -> list[str]:
     """Return a sentence for each process that the stopped service has left behind."""
     left = {*service.left(), *_marked(service.trace), *service.orphans()}
     return [f"process {pid} still runs: {command(pid)}" for pid in sorted(left)]
+
+
+def met(service: Service, target: Target) -> list[str]:
+    """Return a sentence for each thing that a whole soak should have met, and has not."""
+    found = [
+        f"a process was met and never killed: the {role}"
+        for role in sorted(service.processes.roles - target.killed.keys() - STARTED_BY_THE_SOAK)
+    ]
+    if not attempts.resumptions(service.records()):
+        found.append("no attempt trained on from a checkpoint")
+    return found
 
 
 def lost(clients: Clients, jobs: list[str], models: list[str]) -> list[str]:
@@ -136,7 +149,7 @@ def _agreed(
     service: Service, connection: redis.Redis, storage: Storage, clients: Clients
 ) -> tuple[dict[str, list[str]], list[str]]:
     """Return what the API lists, and where Redis, storage and that differ once the service has had time to repair."""
-    end = time.monotonic() + _AGREE_SECONDS
+    end = time.monotonic() + _AGREE_SECONDS * service.patience
     while True:
         listed = {kind: _listed(service, kind) for kind in ("captures", "jobs", "models")}
         try:
