@@ -72,7 +72,7 @@ class Cost:
 
     def described(self) -> list[str]:
         """Return the lines of the table of what one of each costs."""
-        fleet, records = f"{self.workers} workers", f"{self.records} records"
+        fleet, records = f"{self.workers} simulated workers", f"{self.records} records"
         found = [
             ("worker that waits", f"{100 * self.idle:.4f} % of a core of Redis", fleet),
             ("worker that trains", f"{100 * self.training:.3f} % of a core of Redis", fleet),

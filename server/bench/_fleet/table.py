@@ -5,7 +5,7 @@ from pathlib import Path
 
 from _rows import Row, footer, lines
 
-HEAD = """# A fleet of workers
+HEAD = """# A fleet of simulated workers
 
 What 10 to 1,000 workers ask of one Redis and of the API. `splatmill bench fleet` writes the rows
 (`results/fleet.jsonl`) and this page. Workers are simulated, and train nothing; all they do with Redis and with
@@ -27,7 +27,7 @@ stores its log and its end, and a minute later shrinks its streams. The worker's
 forks no process.
 """
 
-_TRAINING = """## Workers that train
+_TRAINING = """## Simulated trainings
 
 Up to 300 workers run a job, each with a progress event every quarter of a second, which is the most that a worker
 sends; the others wait. "Of one" is an average over all of them.
