@@ -4,7 +4,7 @@ import ipaddress
 from pathlib import Path
 from typing import Self
 
-from pydantic import Field, SecretStr, model_validator
+from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from splatmill.backplane import rendering
@@ -165,12 +165,24 @@ class Settings(BaseSettings):
         "the places. Each holds a connection.",
     )
 
+    # Validators of one field, because their messages name the variable.
+
+    @field_validator("umask")
+    @classmethod
+    def _mask(cls, text: str) -> str:
+        parse_mask(text)
+        return text
+
+    @field_validator("outgoing_allow")
+    @classmethod
+    def _hosts(cls, text: str) -> str:
+        outgoing.allowed_hosts(text)
+        return text
+
     @model_validator(mode="after")
     def _complete(self) -> Self:
         if not self.storage:
             self.storage = (self.data.expanduser().absolute() / "storage").as_uri()
-        parse_mask(self.umask)
-        outgoing.allowed_hosts(self.outgoing_allow)
         if self.renderer_url is not None:
             rendering.address(self.renderer_url)
         if self.api_key is not None and not self.api_key.get_secret_value():

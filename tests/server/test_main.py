@@ -76,13 +76,14 @@ def test_reasons_not_to_start_are_sentences(tmp_path: Path, redis_url: str) -> N
     (tmp_path / "file").write_text("x")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        key, log, file, nowhere, no_port, renderer, in_use = refusals(
+        key, log, file, nowhere, no_port, renderer, allowed, in_use = refusals(
             (["--host", "0.0.0.0"], data),
             ([], data | {"SPLATMILL_LOG_FORMAT": "xml"}),
             ([], {"SPLATMILL_DATA": str(tmp_path / "file")}),
             ([], {"SPLATMILL_DATA": "/proc/splatmill"}),  # nobody, not even root, can make a folder there
             ([], data | {"SPLATMILL_PORT": "99999999"}),
             ([], data | {"SPLATMILL_RENDERER_URL": "ftp://x"}),
+            ([], data | {"SPLATMILL_OUTGOING_ALLOW": "nas/share"}),
             (["--port", port], data | {"SPLATMILL_PORT": "0"}),
         )
     assert "SPLATMILL_API_KEY" in key
@@ -90,7 +91,8 @@ def test_reasons_not_to_start_are_sentences(tmp_path: Path, redis_url: str) -> N
     assert "cannot be created" in file
     assert "cannot be created" in nowhere
     assert "SPLATMILL_PORT" in no_port
-    assert "renderer" in renderer.lower()
+    assert "SPLATMILL_RENDERER_URL" in renderer
+    assert "SPLATMILL_OUTGOING_ALLOW: 'nas/share' is not a host" in allowed
     assert port in in_use
     assert "SPLATMILL_PORT" in in_use
 
@@ -235,4 +237,4 @@ def test_a_folder_that_is_open_to_others_is_named_at_the_start_and_its_secrets_a
     )
     assert (storage / "webhooks").stat().st_mode & 0o777 == 0o700
     wrong = refusals(([], env | {"SPLATMILL_UMASK": "777"}), ([], env | {"SPLATMILL_UMASK": "rubbish"}))
-    assert all("is no mask; write 077" in said for said in wrong)
+    assert all("SPLATMILL_UMASK: " in said and "is not a mask; write 077" in said for said in wrong)

@@ -5,10 +5,12 @@ Photos, models, and the secrets of webhooks lie in the data folder. A process of
 write to the same folder) lets the group in.
 """
 
+import errno
 import os
 import re
 import shlex
 import socket
+import stat
 from pathlib import Path
 
 PRIVATE = 0o077
@@ -21,7 +23,7 @@ def parse_mask(text: str) -> int:
     """Return the mask in a text such as `027`. Raises ValueError for any other, or one against the user itself."""
     if not _MASK.fullmatch(text):
         raise ValueError(
-            f"{text[:20]!r} is no mask; write 077 (nobody else), 027 (the group may read), 007 (and write) or 022 "
+            f"{text[:20]!r} is not a mask; write 077 (nobody else), 027 (the group may read), 007 (and write) or 022 "
             "(everybody may read)"
         )
     return int(text, 8)
@@ -45,35 +47,45 @@ def exposure(folder: Path, mask: int) -> str | None:
 
 def close(folder: Path | None, mask: int) -> None:
     """Take away the rights to a folder with secrets that an earlier version gave, and that `mask` does not."""
-    if folder is not None and folder.is_dir() and folder.stat().st_uid == os.geteuid():
-        folder.chmod(folder.stat().st_mode & 0o777 & ~mask)
+    if folder is None or not folder.is_dir():
+        return
+    found = folder.stat()
+    if found.st_uid == os.geteuid() and found.st_mode & mask:
+        folder.chmod(stat.S_IMODE(found.st_mode) & ~mask)
 
 
 def listen(path: Path, advice: str) -> socket.socket:
     """Return a socket at `path` that only this user can connect to, in place of one that a killed process left.
 
-    Raises OSError, with a sentence that ends in `advice`, if another process listens there or it cannot be made.
+    Raises OSError, with a sentence that ends in `advice`, if another process listens there, or if the socket cannot be
+    created. A file that is not a socket is kept.
     """
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    probe = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        probe.connect(str(path))
-    except OSError:
-        path.unlink(missing_ok=True)
-    else:
-        listener.close()
+    if _is_answered(path):
         raise OSError(f"Another server listens on {path}; stop it, or {advice}")
-    finally:
-        probe.close()
-    before = os.umask(0o177)  # the mode counts from the first moment, before a chmod could
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        listener.bind(str(path))
+        if path.is_socket():
+            path.unlink()
+        before = os.umask(0o177)  # a chmod after `bind` would leave the socket open to others for a moment
+        try:
+            listener.bind(str(path))
+        finally:
+            os.umask(before)
     except OSError as error:
         listener.close()
+        reason = "there is a file" if error.errno == errno.EADDRINUSE else error.strerror or error
         raise OSError(
-            f"The socket {path} cannot be created: {error.strerror or error}. Or {advice}"
+            f"The socket {path} cannot be created: {reason}; free that path, or {advice}"
         ) from error
-    finally:
-        os.umask(before)
     return listener
+
+
+def _is_answered(path: Path) -> bool:
+    """Return whether a process listens on the socket at `path`."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        try:
+            probe.connect(str(path))
+        except OSError:
+            return False
+    return True
