@@ -70,7 +70,7 @@ _VERSION = "1"
 
 
 class _Delayed(Exception):
-    """The renderer did not deliver a part. It may do so later: `problem` says why, `counts` whether it tried."""
+    """A part was not made or stored. It may be later: `problem` says why, `counts` whether the renderer tried."""
 
     def __init__(self, problem: Problem, *, counts: bool) -> None:
         super().__init__(problem.detail)
@@ -115,7 +115,7 @@ class Orbits:
     async def create(self, model_id: str, request: OrbitRequest, who: Caller) -> Orbit:
         """Return the orbit video of a request, which is rendered in the background if it is not there.
 
-        who: the caller, whose room in storage is looked at for a new video. Each of its parts is reserved on its own.
+        who: the caller. Its quota must have room for the record; each part of the video is reserved on its own.
 
         Raises 404 and 409 problems of the model, a 503 problem without a renderer, a 409 problem for too many orbit
         videos, and a 507 problem where the quota is used up.
@@ -129,12 +129,13 @@ class Orbits:
         if self._renderer is None:
             raise no_renderer()
         orbit_id = _id_of(ply.etag, request)
-        mark = layout.unfinished_orbit(self._line(model_id), model_id, orbit_id)
         found = self._read(model_id, orbit_id)
         if found is not None and found.state is OrbitState.succeeded:
             return found
+        owner = self._owner(model_id)
+        mark = layout.unfinished_orbit(_line_of(owner), model_id, orbit_id)
         if found is None or found.state is OrbitState.failed:
-            self._check_number(model_id, new=found is None)
+            self._check_number(model_id, _line_of(owner), new=found is None)
             found = Orbit(
                 id=orbit_id,
                 model=model_id,
@@ -143,15 +144,14 @@ class Orbits:
                 frames=request.frames,
                 created_at=datetime.now(UTC),
             )
-            with self._quota.room(who, self._owner(model_id), model_id, RECORD_BYTES) as room:
+            with self._quota.room(who, owner, model_id, RECORD_BYTES) as room:
                 self._put(found)
                 room.stored = RECORD_BYTES
         # After the record, without which a mark is removed; also for a record whose mark was never written.
         self._storage.put_new(mark, b"{}")
         return _with_links(found)
 
-    def _check_number(self, model_id: str, *, new: bool) -> None:
-        line = self._line(model_id)
+    def _check_number(self, model_id: str, line: str, *, new: bool) -> None:
         marks = [entry.path.rsplit("/", 1)[-1] for entry in self._storage.entries(layout.unfinished_orbits())]
         if sum(mark.partition(".")[0] == line for mark in marks) >= MAX_UNFINISHED:
             raise ProblemError(
@@ -209,7 +209,7 @@ class Orbits:
 
     def _forget(self, model_id: str, orbit_id: str) -> str:
         self.get(model_id, orbit_id)
-        mark = layout.unfinished_orbit(self._line(model_id), model_id, orbit_id)
+        mark = layout.unfinished_orbit(_line_of(self._owner(model_id)), model_id, orbit_id)
         # The mark first: what a process that works on the video stores after this, it deletes again.
         self._storage.delete(mark)
         self._storage.delete_prefix(layout.orbit(model_id, orbit_id))
@@ -279,7 +279,7 @@ class Orbits:
 
     async def _ask(self, name: str, address: str, body: BaseModel, path: str) -> None:
         """Store what the renderer answers at `path`."""
-        # The videos of an owner take turns with the views that its people look at.
+        # The videos of an owner take turns with the views that its people render.
         model_id = name.split(".")[1]
         owner = await run_in_threadpool(self._owner, model_id)
         headers = {rendering.CLIENT_HEADER: rendering.client_of(owner, "orbits")}
@@ -297,15 +297,17 @@ class Orbits:
         except httpx.TransportError as error:
             detail = f"The renderer ended before its answer did ({type(error).__name__})."
             raise _Delayed(_orbit_problem("render_failed", detail), counts=True) from error
+        except ProblemError as error:
+            if (
+                error.problem.status == 503
+            ):  # storage has not been listed yet, so that no room can be reserved
+                raise _Delayed(error.problem, counts=False) from error
+            raise
         finally:
             await answer.aclose()
 
     def _owner(self, model_id: str) -> str:
         return self._models.owner(model_id) or DEFAULT_OWNER
-
-    def _line(self, model_id: str) -> str:
-        """Return what the marks of all videos of a model's owner begin with."""
-        return hashlib.sha256(self._owner(model_id).encode()).hexdigest()[:16]
 
     def _read(self, model_id: str, orbit_id: str) -> Orbit | None:
         path = layout.orbit_record(model_id, orbit_id)
@@ -327,6 +329,11 @@ class Orbits:
         marked = self._storage.exists(f"{layout.unfinished_orbits()}/{name}")
         if not (marked and self._storage.exists(layout.job_record(record.model))):
             self._storage.delete_prefix(layout.orbit(record.model, record.id))
+
+
+def _line_of(owner: str) -> str:
+    """Return what the marks of all videos of an owner's models begin with."""
+    return hashlib.sha256(owner.encode()).hexdigest()[:16]
 
 
 def _id_of(etag: str, request: OrbitRequest) -> str:

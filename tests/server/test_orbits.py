@@ -23,6 +23,7 @@ from splatmill.client import Client
 from splatmill.errors import InvalidRequest, NotFound, ServerError, WaitTimeout
 from splatmill.schema import Progress
 from splatmill_server import orbits
+from splatmill_server.space import usage
 from tests.support.ball import write_ply
 from tests.support.command_line import invoke, spawn
 from tests.support.rendering import renderer_in
@@ -97,6 +98,22 @@ def files(app: ServedApp) -> list[str]:
 def frames(video: bytes) -> list[Any]:
     with av.open(io.BytesIO(video), "r") as container:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def test_a_video_waits_while_storage_is_listed_for_the_first_time(
+    serve: Serve, folder: Path, renderer: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(orbits, "_PAUSE_SECONDS", 0.3)
+    monkeypatch.setattr(usage, "_FIRST_SCAN_SECONDS", 0.1)
+    app = serve(renderer_url=f"unix:{folder}/r.sock", storage=str(folder / "storage"), quota=10**9)
+    store_ball_as(app, MODEL, folder)
+    found = begun(app, width=640, height=480, seconds=4)
+    # Redis loses the last scan while another process makes a new one.
+    app.service.redis.set(keys.SCAN_LOCK, "another process", ex=60)
+    app.service.redis.delete(keys.SCAN)
+    wait_for(lambda: app.service.orbits._failures, 20)
+    app.service.redis.delete(keys.SCAN_LOCK)
+    assert ended(app, found["id"])["state"] == "succeeded"
 
 
 def test_a_video_is_rendered_in_the_background_kept_and_found_again(app: ServedApp) -> None:

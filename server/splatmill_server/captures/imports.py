@@ -208,23 +208,20 @@ class Imports:
             return _failed(found, "import_failed", str(error))
         except AddressRefused as error:
             return _failed(found, "url_refused", str(error))
-        except ProblemError as error:
-            return found.model_copy(update={"state": ImportState.failed, "problem": error.problem})
-        except StorageError as error:
-            problem = problem_of_storage(error)
+        except (ProblemError, StorageError) as error:
+            problem = error.problem if isinstance(error, ProblemError) else problem_of_storage(error)
+            # A 503 problem may pass, such as that of a storage that has not been listed yet.
+            if problem.status == 503 and found.attempts < MAX_ATTEMPTS:
+                return _tried(found, problem.detail)
             return found.model_copy(update={"state": ImportState.failed, "problem": problem})
         except redis.RedisError:
             raise  # the import waits until Redis answers, without which no lease is given
         except Exception as error:
             # Counted, whatever it is: what others send must not be fetched for ever.
-            if not isinstance(error, NoAnswer):
-                log.exception("an attempt ended unexpectedly", id=found.id)
-                error = NoAnswer(f"The attempt ended in an unexpected error ({type(error).__name__}).")
-            if found.attempts >= MAX_ATTEMPTS:
-                tried = f"It was tried {found.attempts} times."
-                return _failed(found, "import_failed", f"{error} {tried}")
-            log.info("an import is tried again", id=found.id, attempt=found.attempts, reason=str(error))
-            return found.model_copy(update={"state": ImportState.queued})
+            if isinstance(error, NoAnswer):
+                return _tried(found, str(error))
+            log.exception("an attempt ended unexpectedly", id=found.id)
+            return _tried(found, f"The attempt ended in an unexpected error ({type(error).__name__}).")
 
     async def _fetch(self, found: Import) -> Import:
         async with AsyncExitStack() as stack:
@@ -296,6 +293,14 @@ def _check(answer: Answer) -> None:
         raise ProblemError(
             "import_failed", "The other server sent the file compressed, which was not asked for."
         )
+
+
+def _tried(found: Import, reason: str) -> Import:
+    """Return the import after an attempt that failed: waiting for the next one, or failed after the last."""
+    if found.attempts >= MAX_ATTEMPTS:
+        return _failed(found, "import_failed", f"{reason} It was tried {found.attempts} times.")
+    log.info("an import is tried again", id=found.id, attempt=found.attempts, reason=reason)
+    return found.model_copy(update={"state": ImportState.queued})
 
 
 def _failed(found: Import, code: str, detail: str) -> Import:

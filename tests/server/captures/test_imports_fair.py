@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import layout
+from splatmill.backplane import keys, layout
 from splatmill_server import least_rate, unfinished
 from splatmill_server.captures import imports
+from splatmill_server.space import usage
 from tests.support.scripted_server import Reply, ScriptedServer, Seen, scripted_server
 from tests.support.served_app import Serve, ServedApp, problem, stored
 from tests.support.waiting import wait_for
@@ -157,3 +158,29 @@ def test_an_owner_has_a_bounded_number_of_unfinished_imports(
     )
     assert refused["detail"] == "The owner has 3 imports that have not ended."
     begin(app, capture(app, "bob"), f"{peer.url}/fast")
+
+
+def test_an_import_waits_while_storage_is_listed_for_the_first_time(
+    serve: Serve, peer: ScriptedServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(imports, "_LOOK_SECONDS", 0.05)
+    monkeypatch.setattr(imports, "_PAUSE_SECONDS", 0.05)
+    monkeypatch.setattr(usage, "_FIRST_SCAN_SECONDS", 0.1)
+    app = serve(outgoing_allow=peer.url.removeprefix("http://"), quota=10**9)
+
+    def lose_figures(seen: Seen) -> Reply:
+        """Let Redis lose the last scan while another process makes a new one, until the third attempt."""
+        connection = app.service.redis
+        if len(peer.seen) == 1:
+            connection.set(keys.SCAN_LOCK, "another process", ex=30)
+            connection.delete(keys.SCAN)
+            return Reply(status=503)
+        if len(peer.seen) == 3:
+            connection.delete(keys.SCAN_LOCK)
+        return Reply(body=b"photo")
+
+    peer.answer = lose_figures
+    address = begin(app, capture(app), f"{peer.url}/a.jpg")
+    wait_for(lambda: state(app, address) in ("succeeded", "failed"))
+    found = app.http.get(address).json()
+    assert (found["state"], found["attempts"]) == ("succeeded", 3), found
