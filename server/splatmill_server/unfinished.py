@@ -87,10 +87,11 @@ class Unfinished:
         self.wake()
 
     def line_of(self, name: str) -> str:
-        """Return the line of a piece. Raises StorageError."""
-        if name not in self._lines:
-            self._lines[name] = self._line(name)
-        return self._lines[name]
+        """Return the line of a piece. Any thread may call. Raises StorageError."""
+        line = self._lines.get(name)
+        if line is None:
+            line = self._lines[name] = self._line(name)
+        return line
 
     async def run(self) -> None:
         """Take up what has not ended until this task is cancelled."""
@@ -134,7 +135,8 @@ class Unfinished:
         found = {
             name: self.line_of(name) for name in names if all(layout.is_id(part) for part in name.split("."))
         }
-        self._lines = found | {name: self._lines[name] for name in self.running if name in self._lines}
+        running = [*self.running]  # copied at once: the event loop changes it meanwhile
+        self._lines = found | {name: self._lines[name] for name in running if name in self._lines}
         return found
 
     async def _run(self, name: str) -> None:
