@@ -20,6 +20,7 @@ from splatmill.backplane import layout
 from splatmill.backplane.parts import EndMoved, open_part
 from splatmill.schema import SHA256_HEADER, Role
 from splatmill_server.captures import unfinished_uploads
+from splatmill_server.problems import ProblemError
 from tests.support.bucket import bucket
 from tests.support.served_app import Serve, ServedApp, problem
 from tests.support.waiting import wait_for
@@ -404,6 +405,37 @@ def test_uploads_that_nobody_goes_on_with_are_swept_as_a_whole(serve: Serve) -> 
     assert app.service.captures.delete_abandoned_uploads() == 2
     assert app.http.head(old).status_code == 404
     assert offset(app, slow) == 2000
+
+
+def test_counting_the_uploads_of_one_capture_holds_up_no_other(
+    app: ServedApp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(unfinished_uploads, "MAX_UNFINISHED", 2)
+    full, other = capture(app), capture(app)
+    unsized = {"Upload-Complete": "?0"}
+    assert [begin(app, full, **unsized).status_code for _ in range(2)] == [201, 201]
+    counting, proceed = threading.Event(), threading.Event()
+
+    def is_complete(capture_id: str, upload_id: str) -> bool:
+        counting.set()
+        return not proceed.wait(30)
+
+    counted = unfinished_uploads.UnfinishedUploads(app.service.storage, is_complete)
+
+    def one_more(capture_id: str) -> None:
+        with counted.one_more(capture_id, "a" * 16):
+            pass
+
+    with ThreadPoolExecutor(2) as pool:
+        slow = pool.submit(one_more, full)
+        try:
+            assert counting.wait(10)
+            pool.submit(one_more, other).result(timeout=10)
+            assert not slow.done()
+        finally:
+            proceed.set()
+        with pytest.raises(ProblemError, match="2 uploads that are not complete"):
+            slow.result(timeout=10)
 
 
 def test_a_capture_has_a_limited_number_of_unfinished_uploads(
