@@ -97,8 +97,9 @@ class _Part:
     def begin(self, etag: str | None) -> None:
         self.discard()
         # Files with equal weak ETags may differ in their bytes.
-        if read_token(etag) and etag and not etag.startswith("W/"):
-            self.etag_path.write_text(etag)
+        token = read_token(etag)
+        if token is not None and not token.startswith("W/"):
+            self.etag_path.write_text(token)
         self.path.touch()
 
     def digest(self) -> str:

@@ -149,7 +149,7 @@ class Conversions:
             if answer.status_code != 200:
                 raise _refused(await answer.aread())
             record = Conversion.model_validate_json(answer.headers.get(CONVERSION_HEADER, ""))
-            room.take(len(record.model_dump_json()))
+            await run_in_threadpool(room.take, len(record.model_dump_json().encode()))
             await run_in_threadpool(room.announce, answer.headers.get("content-length"))
             await self._storage.stream_put(
                 layout.conversion(model_id, form.key), room.counted(answer.aiter_raw())

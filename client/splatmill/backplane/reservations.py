@@ -27,7 +27,7 @@ UPLOAD_SECONDS = 3600.0
 ARRIVING, JOB, WORK, STORED = "arriving", "job", "work", "stored"
 
 EVERYBODY = ""
-"""In the hash of limits, the owner whose limit holds for those that have none of their own. No owner has no name."""
+"""Field of the hash of limits whose limit holds for owners that have none of their own. No owner has an empty name."""
 
 NOTED: Final = "noted"
 """In place of a limit: the one that was last noted for the owner, or else that of EVERYBODY."""
@@ -52,11 +52,11 @@ local function size_of(field, value)
   local job = string.match(field, '^job/(.+)$')
   return job and math.max(0, size - held(job)) or size
 end
-local function sum(but)
+local function sum(except)
   local total = tonumber(redis.call('hget', KEYS[2], ARGV[1]) or '0')
   local entries = redis.call('hgetall', KEYS[1])
   for i = 1, #entries, 2 do
-    if entries[i] ~= but then total = total + size_of(entries[i], entries[i + 1]) end
+    if entries[i] ~= except then total = total + size_of(entries[i], entries[i + 1]) end
   end
   return total
 end

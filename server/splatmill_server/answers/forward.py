@@ -67,9 +67,9 @@ async def forward(
 
 
 def client_of(request: Request, visited: str | None = None) -> str:
-    """Return a text for the caller and the machine of a request, without telling who they are.
+    """Return a text that stands for the caller and the machine of a request, and names neither.
 
-    Visitors of the models of one owner are one owner of requests, apart from the owner itself.
+    Visitors of all models of one owner take turns as one owner, apart from that owner itself.
     """
     caller = getattr(request.state, "caller", None)
     owner = caller.owner if isinstance(caller, Caller) else ""

@@ -52,7 +52,7 @@ async def create_capture(
     )
     if new:
         try:
-            size = len(capture.model_dump_json()) + CAPTURE_BYTES
+            size = len(capture.model_dump_json().encode()) + CAPTURE_BYTES
             async with service.quota.storing(who, who.owner, capture.id, size) as room:
                 room.stored = size
         except Exception:

@@ -1,5 +1,6 @@
 """The endpoints of imports: files of a capture that the server fetches from an address."""
 
+import json
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Path
@@ -42,7 +43,7 @@ async def import_file(
 ) -> Import:
     """Fetch a file of the capture from an address. It is fetched in the background; `Location` tells how far it is."""
     owner = (await run_in_threadpool(service.captures.recent, capture_id)).owner
-    size = RECORD_BYTES + 6 * len(request.url)  # as JSON, a character has up to six bytes
+    size = RECORD_BYTES + len(json.dumps(request.url))
     async with service.quota.storing(who, owner, capture_id, size) as room:
         made = await service.imports.create(capture_id, request)
         room.stored = size

@@ -70,7 +70,7 @@ async def begin(
         owner = (await run_in_threadpool(service.captures.recent, capture_id)).owner
         async with service.quota.storing(who, owner, capture_id, RECORD_BYTES) as room:
             found = await service.partial_uploads.create(capture_id, role, name, read_integer(length), digest)
-            room.stored = len(found.record.model_dump_json()) if isinstance(found, Standing) else 0
+            room.stored = len(found.record.model_dump_json().encode()) if isinstance(found, Standing) else 0
         if isinstance(found, CaptureFile):
             return _stored(found, 200)
         try:

@@ -222,10 +222,9 @@ class Ledger:
 
         def apply(pipe: Any) -> None:
             before = _holding(pipe.hget(stored, key) or b"")
-            gone = []
             if kind is StoredKind.job:
                 gone = [reservations.job(record_id), reservations.work(record_id)]
-            if kind is not StoredKind.job:  # what is stored of a job and of its model is entered under one id
+            else:  # what is stored of a job and of its model is entered under one id
                 gone = [
                     field
                     for field in pipe.hkeys(uploads)

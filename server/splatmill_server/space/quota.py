@@ -5,6 +5,7 @@ only those are admitted that fit together. An upload is refused before it begins
 while it arrives otherwise. A job reserves JOB_ROOM, and its worker what it stores beyond that.
 """
 
+import json
 import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -16,7 +17,8 @@ from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane import reservations
 from splatmill.backplane.reservations import NoRoom
-from splatmill.schema import DEFAULT_OWNER, Job, StoredKind, format_bytes
+from splatmill.schema import DEFAULT_OWNER, Job, Scope, StoredKind, format_bytes
+from splatmill.schema.headers import read_integer
 from splatmill_server.access.caller import Caller
 from splatmill_server.captures.records import Captures
 from splatmill_server.problems import ProblemError
@@ -45,7 +47,7 @@ RECORD_BYTES = 4096
 
 def bytes_beside(name: str) -> int:
     """Return the most bytes that a file of a capture takes beside its own: its digest, and its row in the manifest."""
-    return 160 + 6 * len(name)
+    return 160 + len(json.dumps(name))
 
 
 class Quota:
@@ -99,8 +101,12 @@ class Quota:
             )
 
     def note(self, who: Caller) -> None:
-        """Note the limit of a caller, for what is stored for its records without it."""
-        self.usage.ledger.note_limits(who.owner, who.limits.bytes_stored, self.default)
+        """Note the limit of a caller, for what is stored for its records without it.
+
+        That of a key which only reads is not noted: it need not have one, and would lift that of the owner's jobs.
+        """
+        if who.has(Scope.train):
+            self.usage.ledger.note_limits(who.owner, who.limits.bytes_stored, self.default)
 
     @contextmanager
     def room(self, who: Caller | None, owner: str, record_id: str, size: int = 1) -> Iterator["Arrival"]:
@@ -271,9 +277,9 @@ class Arrival:
             yield chunk
 
     def announce(self, length: str | None) -> None:
-        """Reserve what is to arrive beyond what has, as a header says. Raises a 507 problem if it does not fit."""
-        if length is not None and length.isdigit():
-            self.claim(max(self._claimed, self.received + int(length)))
+        """Reserve what a Content-Length says is still to arrive. Raises a 507 problem if it does not fit."""
+        if (size := read_integer(length)) is not None:
+            self.claim(max(self._claimed, self.received + size))
 
     def take(self, size: int) -> None:
         """Count bytes that are about to be stored at once. Raises a 507 problem where they exceed the quota."""

@@ -4,6 +4,7 @@ Not proved here: how the limits get into a key (tests/server/test_keys), and two
 """
 
 import asyncio
+import json
 import threading
 from collections.abc import Iterator
 
@@ -11,6 +12,8 @@ import httpx
 import pytest
 
 from splatmill.backplane import keys, layout
+from splatmill.schema import KeyLimits, Scope
+from splatmill_server.access.caller import Caller
 from splatmill_server.problems import ProblemError
 from splatmill_server.space import quota as quota_module
 from splatmill_server.space import usage as usage_module
@@ -31,6 +34,21 @@ def ann(people: ServedApp) -> Person:
 
 def bytes_of(app: ServedApp, owner: str = "ann") -> int:
     return app.service.usage.ledger.bytes_of(owner)
+
+
+def test_a_key_that_only_reads_does_not_lift_the_limit_of_its_owner(people: ServedApp) -> None:
+    writer = Caller("ann", scopes=frozenset({Scope.train}), limits=KeyLimits(bytes_stored=1000))
+    reader = Caller("ann", scopes=frozenset({Scope.read}))
+    for caller in (writer, reader):
+        people.service.quota.note(caller)  # as a download does in a format that is not stored yet
+    assert people.service.quota.known_limit("ann") == 1000
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "\u65e5\u672c.jpg", "\U0001f34e" * 60 + ".jpg"])
+def test_what_lies_beside_a_file_is_counted_for_any_name(name: str) -> None:
+    digest = "f" * 64
+    row = json.dumps({f"images/{name}": [digest, 1 << 40]}, separators=(",", ":"))
+    assert len(digest) + len(row) <= quota_module.bytes_beside(name)
 
 
 def test_a_file_that_does_not_fit_is_refused_before_its_body_is_sent(people: ServedApp, ann: Person) -> None:
