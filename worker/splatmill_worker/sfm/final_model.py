@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.sfm import checks, features
+from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.effort import registered_photos
 from splatmill_worker.sfm.mapping import adjust, mapper
 from splatmill_worker.sfm.run import EffortResult, SfmRun
@@ -24,12 +24,14 @@ class FinalModel:
     facts: figures about the photos, the pairs and the model.
     left_out: why a photo is not registered, by its index.
     notes: sentences for the user.
+    warnings: sentences for the user about what may be wrong.
     """
 
     model: pycolmap.Reconstruction
     facts: dict[str, Any]
     left_out: dict[int, str]
     notes: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
 def final_model(run: SfmRun, result: EffortResult) -> FinalModel:
@@ -42,7 +44,7 @@ def final_model(run: SfmRun, result: EffortResult) -> FinalModel:
     mapped, model, fixed = _with_plausible_intrinsics(run, result, result.mapped, result.mapped.largest)
     deregistered = checks.deregister_outliers(model)
     with run.clock("polish"):
-        model = _adjusted(run, model, fixed)
+        model, warnings = _adjusted(run, model, fixed)
     facts |= checks.model_facts(model, run.count)
     checks.require_usable(facts)
     outliers = {
@@ -51,7 +53,7 @@ def final_model(run: SfmRun, result: EffortResult) -> FinalModel:
     facts["features_per_photo"] = float(np.median([len(found.scales) for found in result.features]))
     facts |= _mapper_facts(run, mapped, model)
     left_out = _reasons(run, result, mapped, model) | outliers
-    return FinalModel(model, facts, left_out, (*run.notes, *mapped.notes))
+    return FinalModel(model, facts, left_out, (*run.notes, *mapped.notes), warnings)
 
 
 def _with_plausible_intrinsics(
@@ -93,16 +95,39 @@ def _with_plausible_intrinsics(
     return again, again.largest, True
 
 
-def _adjusted(run: SfmRun, model: pycolmap.Reconstruction, fixed: bool) -> pycolmap.Reconstruction:
-    """The model after the last bundle adjustment, with OPENCV cameras where that gives plausible intrinsics."""
-    if not fixed and run.options.camera_model == "auto":
-        detailed = copy.deepcopy(model)
-        if adjust.use_opencv_cameras(detailed):
-            adjust.bundle_adjust(detailed, run.threads, fixed_intrinsics=False, cancelled=run.cancelled)
-            if checks.implausible_intrinsics(detailed) is None:
-                return detailed
-    adjust.bundle_adjust(model, run.threads, fixed_intrinsics=fixed, cancelled=run.cancelled)
-    return model
+def _adjusted(
+    run: SfmRun, model: pycolmap.Reconstruction, fixed: bool
+) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
+    """The model after the last bundle adjustment, and warnings about its lenses."""
+    if fixed or run.options.camera_model != "auto":
+        adjust.bundle_adjust(model, run.threads, fixed_intrinsics=fixed, cancelled=run.cancelled)
+        return model, ()
+    group_of = {index: group for group in run.groups for index in group.photos}
+    groups = {
+        model.images[image_id].camera_id: group_of[features.photo_index(model.images[image_id].name)]
+        for image_id in model.reg_image_ids()
+    }
+    initial = {
+        camera_id: group.focal * max(model.cameras[camera_id].width, model.cameras[camera_id].height)
+        for camera_id, group in groups.items()
+    }
+    adjusted = adjust.adjust_with_lenses(model, initial, run.threads, run.cancelled)
+    if adjusted.tied:
+        run.notes.append(
+            "The photos do not determine whether the lens stretches them, since the camera moved along a line, around "
+            "one axis or over a flat scene. Its pixels are assumed to be square, and its distortion radial."
+        )
+    return adjusted.model, tuple(_assumption(groups[camera]) for camera in sorted(adjusted.assumed))
+
+
+def _assumption(group: CameraGroup) -> str:
+    photos = f"{len(group.photos)} photo{'s' if len(group.photos) > 1 else ''}"
+    source = "is that of EXIF" if group.known else "is assumed, because EXIF has none"
+    return (
+        f"The focal length of {photos}, {group.focal:.2f} times the longest side, {source}: the motion of the camera "
+        "does not determine it. If it is wrong, depths are wrong by the same factor. Photos from different distances "
+        "and directions determine it."
+    )
 
 
 def _mapper_facts(run: SfmRun, mapped: mapper.Mapped, model: pycolmap.Reconstruction) -> dict[str, Any]:

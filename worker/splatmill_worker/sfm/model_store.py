@@ -57,6 +57,7 @@ def store_model(run: SfmRun, final: FinalModel, folder: Path) -> None:
         | {"seconds": {stage: round(seconds, 3) for stage, seconds in run.seconds.items()}},
         "left_out": {run.prepared.photos[index].name: reason for index, reason in final.left_out.items()},
         "notes": list(final.notes),
+        "warnings": list(final.warnings),
     }
     (partial / FACTS).write_text(json.dumps(document, indent=1), "utf-8")
     shutil.rmtree(folder, ignore_errors=True)
@@ -79,7 +80,7 @@ def load_model(prepared: Prepared, folder: Path, known: KnownDistance | None = N
         left_out=(*prepared.skipped, *document["left_out"].items()),
         notes=(*prepared.notes, *document["notes"]),
     )
-    scene = replace(scene, facts=document["facts"])
+    scene = replace(scene, facts=document["facts"], warnings=tuple(document["warnings"]))
     if (folder / STEREO).is_file():
         scene = stereo.add(scene, stereo.StereoPoints.load(folder / STEREO))
     if (folder / FRAME).is_file():

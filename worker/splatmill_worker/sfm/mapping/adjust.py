@@ -1,17 +1,31 @@
-"""The last bundle adjustment of a model, with a full lens model for cameras that the photos determine well."""
+"""The last bundle adjustment of a model, with the lens parameters that its photos determine."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.callbacks import stop_if
+from splatmill_worker.sfm.checks import implausible_intrinsics
 
 OPENCV_MIN_PHOTOS = 8
 """Registered photos of a camera from which its four OPENCV distortion coefficients are estimated."""
 
 OPENCV_MIN_OBSERVATIONS = 2000
 """Observations of points by a camera from which its four OPENCV distortion coefficients are estimated."""
+
+STRETCH_PIXELS = 1.0
+"""Standard deviation of fx / fy, as a displacement of the longer edge of the photo in pixels, up to which the two focal
+lengths are estimated apart: a larger stretch would be visible, and no lens has one (decisions: STRETCH_PIXELS)."""
+
+FOCAL_DEVIATION = 0.05
+"""Relative standard deviation up to which an estimated focal length is used. Beyond it noise biases the estimate too:
+along a line it falls to half of the true one (decisions: FOCAL_DEVIATION)."""
 
 MAX_ITERATIONS = 50
 """Iterations of the last bundle adjustment, at most."""
@@ -20,42 +34,143 @@ FUNCTION_TOLERANCE = 1e-6
 """Relative decrease of the cost below which the last bundle adjustment has converged."""
 
 
-def use_opencv_cameras(model: pycolmap.Reconstruction) -> bool:
-    """Turn well-determined SIMPLE_RADIAL cameras into OPENCV ones (k1, k2, p1, p2), in place.
+@dataclass(frozen=True)
+class Adjusted:
+    """A model after its last bundle adjustment.
 
-    Returns whether any camera was changed. Mapping estimates a single radial coefficient, which a few photos
-    determine; the last bundle adjustment then estimates the whole lens (decisions: OPENCV_CAMERAS).
+    model: poses, points and lenses.
+    tied: cameras whose fx and fy are one value because their photos do not determine the ratio.
+    assumed: cameras with their initial focal length because their photos do not determine it.
     """
+
+    model: pycolmap.Reconstruction
+    tied: frozenset[int] = frozenset()
+    assumed: frozenset[int] = frozenset()
+
+
+def adjust_with_lenses(
+    model: pycolmap.Reconstruction,
+    initial: Mapping[int, float],
+    threads: int,
+    cancelled: Callable[[], bool],
+) -> Adjusted:
+    """Adjust all poses and points, and of each SIMPLE_RADIAL camera the parameters that its photos determine.
+
+    Parameters are judged by their standard deviations in the adjustment. A camera gets OPENCV distortion (k1, k2, p1,
+    p2) and separate fx and fy where the ratio fx / fy is determined: motion around one axis leaves a stretch of the
+    scene along that axis nearly free. Where not even the single focal length of SIMPLE_RADIAL is determined, as by
+    parallel views of a plane or along a straight line, the initial one is kept.
+
+    model: is left in an unspecified state.
+    initial: focal length that a camera had before any photo was matched, in pixels, by its id.
+    """
+    rich = _well_observed(model)
+    tied: set[int] = set()
+    while rich:
+        trial = copy.deepcopy(model)
+        _use_opencv(trial, rich)
+        deviations = Deviations.of(trial, bundle_adjust(trial, threads, cancelled=cancelled))
+        loose = {camera for camera in rich if not deviations.stretch_is_determined(trial.cameras[camera])}
+        if not loose:
+            if implausible_intrinsics(trial) is None:
+                return Adjusted(trial, frozenset(tied))
+            break
+        tied |= loose
+        rich -= loose
+    deviations = Deviations.of(model, bundle_adjust(model, threads, cancelled=cancelled))
+    assumed = {camera for camera in initial if not deviations.focal_is_determined(model.cameras[camera])}
+    if assumed:
+        for camera in assumed:
+            params = np.array(model.cameras[camera].params)
+            params[model.cameras[camera].focal_length_idxs()] = initial[camera]
+            model.cameras[camera].params = params.tolist()
+        bundle_adjust(model, threads, fixed_focal=True, cancelled=cancelled)
+    return Adjusted(model, frozenset(tied), frozenset(assumed))
+
+
+def _well_observed(model: pycolmap.Reconstruction) -> set[int]:
+    """SIMPLE_RADIAL cameras with enough photos and observations for OPENCV's distortion (decisions: OPENCV_CAMERAS)."""
     photos: dict[int, int] = {}
     observations: dict[int, int] = {}
     for image_id in model.reg_image_ids():
         image = model.images[image_id]
         photos[image.camera_id] = photos.get(image.camera_id, 0) + 1
         observations[image.camera_id] = observations.get(image.camera_id, 0) + image.num_points3D
-    changed = False
-    for camera_id, camera in model.cameras.items():
-        determined = (
-            photos.get(camera_id, 0) >= OPENCV_MIN_PHOTOS
-            and observations[camera_id] >= OPENCV_MIN_OBSERVATIONS
-        )
-        if determined and camera.model == pycolmap.CameraModelId.SIMPLE_RADIAL:
-            focal, cx, cy, k1 = camera.params
-            camera.model = pycolmap.CameraModelId.OPENCV
-            camera.params = [focal, focal, cx, cy, k1, 0.0, 0.0, 0.0]
-            changed = True
-    return changed
+    return {
+        camera_id
+        for camera_id, camera in model.cameras.items()
+        if camera.model == pycolmap.CameraModelId.SIMPLE_RADIAL
+        and photos.get(camera_id, 0) >= OPENCV_MIN_PHOTOS
+        and observations[camera_id] >= OPENCV_MIN_OBSERVATIONS
+    }
+
+
+def _use_opencv(model: pycolmap.Reconstruction, cameras: Collection[int]) -> None:
+    for camera_id in cameras:
+        camera = model.cameras[camera_id]
+        focal, cx, cy, k1 = camera.params
+        camera.model = pycolmap.CameraModelId.OPENCV
+        camera.params = [focal, focal, cx, cy, k1, 0.0, 0.0, 0.0]
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """Standard deviations of the lens parameters in a bundle adjustment.
+
+    covariance: of residuals of one pixel; None where it is singular.
+    error: mean reprojection error in pixels.
+    """
+
+    covariance: pycolmap.BACovariance | None
+    error: float
+
+    @staticmethod
+    def of(model: pycolmap.Reconstruction, adjuster: pycolmap.CeresBundleAdjuster) -> Deviations:
+        """The standard deviations at the solution that `adjuster` has found for `model`."""
+        covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
+        return Deviations(covariance, model.compute_mean_reprojection_error())
+
+    def stretch_is_determined(self, camera: pycolmap.Camera) -> bool:
+        """Whether the ratio fx / fy of an OPENCV camera is known to STRETCH_PIXELS."""
+        both = self._of(camera)
+        if both is None:
+            return False
+        gradient = np.array([1.0, -1.0]) / camera.params[:2]
+        deviation = self.error * math.sqrt(gradient @ both[:2, :2] @ gradient)
+        return deviation * max(camera.width, camera.height) / 2 <= STRETCH_PIXELS
+
+    def focal_is_determined(self, camera: pycolmap.Camera) -> bool:
+        """Whether the focal length, the camera's first parameter, is known to FOCAL_DEVIATION."""
+        covariance = self._of(camera)
+        if covariance is None:
+            return False
+        deviation = self.error * math.sqrt(covariance[0, 0]) / camera.params[0]
+        return deviation <= FOCAL_DEVIATION
+
+    def _of(self, camera: pycolmap.Camera) -> np.ndarray | None:
+        # COLMAP finds the parameters of a camera by their address, which the view `params` keeps.
+        return None if self.covariance is None else self.covariance.get_other_params_cov(camera.params)
 
 
 def bundle_adjust(
-    model: pycolmap.Reconstruction, threads: int, *, fixed_intrinsics: bool, cancelled: Callable[[], bool]
-) -> None:
+    model: pycolmap.Reconstruction,
+    threads: int,
+    *,
+    fixed_intrinsics: bool = False,
+    fixed_focal: bool = False,
+    cancelled: Callable[[], bool],
+) -> pycolmap.CeresBundleAdjuster:
     """Adjust all poses, points and (unless fixed) lenses to convergence, with a robust loss, in place.
 
-    Raises Cancelled at the end, when the caller has asked to stop.
+    fixed_intrinsics: keep focal lengths and distortion.
+    fixed_focal: keep focal lengths.
+
+    Returns the solved problem. Raises Cancelled at the end, when the caller has asked to stop.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = False
-    options.refine_focal_length = options.refine_extra_params = not fixed_intrinsics
+    options.refine_extra_params = not fixed_intrinsics
+    options.refine_focal_length = not fixed_intrinsics and not fixed_focal
     options.ceres.use_gpu = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = threads
@@ -67,6 +182,8 @@ def bundle_adjust(
         config.add_image(image_id)
     # Fixes the seven degrees of gauge freedom, as `pycolmap.bundle_adjustment` does; that function also logs.
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    adjuster.solve()
     model.update_point_3d_errors()
     stop_if(cancelled)
+    return adjuster
