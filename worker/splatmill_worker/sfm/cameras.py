@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.prepare import UsablePhoto
 
 DEFAULT_FOCAL = 1.2
 """Focal length over the longest side where EXIF gives none; COLMAP's default, about a phone's main camera."""
+
+LEAST_OF_A_FOLDER = 3
+"""Photos without EXIF from which a folder has a camera of its own; fewer hardly determine its focal length."""
 
 FOCAL_BOUNDS = 0.2, 9.0
 """Focal lengths over the longest side that lenses have: from an 8 mm fisheye to 300 mm on full frame."""
@@ -36,23 +41,25 @@ class CameraGroup:
 def group(photos: Sequence[UsablePhoto]) -> list[CameraGroup]:
     """One camera for all photos that agree in size, make, model, lens and focal length.
 
-    Photos without EXIF share a camera when their sizes agree. If the zoom changed among them, the shared focal length
-    is a compromise; one per photo would be worse, because a single photo does not determine its focal length.
+    Photos without any of these tags also agree in their video or folder, since each may be of another camera; those of
+    videos and folders with fewer than LEAST_OF_A_FOLDER share a camera. If the zoom changed among them, `lenses`
+    divides them once they are placed; one camera per photo would be worse, because a single photo does not determine
+    its lens.
     """
+    keys = [_key(photo) for photo in photos]
+    counts = Counter(keys)
     groups: dict[tuple[object, ...], list[int]] = {}
-    for index, photo in enumerate(photos):
-        tags = photo.exif
-        key = (
-            photo.width,
-            photo.height,
-            tags.make,
-            tags.model,
-            tags.lens,
-            tags.focal_length,
-            tags.focal_in_diagonals,
-        )
-        groups.setdefault(key, []).append(index)
+    for index, key in enumerate(keys):
+        groups.setdefault(key if counts[key] >= LEAST_OF_A_FOLDER else key[:-1], []).append(index)
     return [_group(tuple(members), photos[members[0]]) for members in groups.values()]
+
+
+def _key(photo: UsablePhoto) -> tuple[object, ...]:
+    """What photos of one camera agree in; last, the video or folder of a photo without EXIF of its camera."""
+    tags = photo.exif
+    camera = (tags.make, tags.model, tags.lens, tags.focal_length, tags.focal_in_diagonals)
+    source = photo.sequence or PurePosixPath(photo.name).parent if camera == (None,) * len(camera) else None
+    return photo.width, photo.height, *camera, source
 
 
 def _group(members: tuple[int, ...], photo: UsablePhoto) -> CameraGroup:

@@ -43,13 +43,13 @@ def final_model(run: SfmRun, result: EffortResult) -> FinalModel:
         raise AssertionError("a result without a model is never usable")
     mapped, model, fixed = _with_plausible_intrinsics(run, result, result.mapped, result.mapped.largest)
     deregistered = checks.deregister_outliers(model)
+    outliers = {
+        features.photo_index(model.images[image_id].name): reason for image_id, reason in deregistered.items()
+    }
     with run.clock("polish"):
         model, warnings = _adjusted(run, model, fixed)
     facts |= checks.model_facts(model, run.count)
     checks.require_usable(facts)
-    outliers = {
-        features.photo_index(model.images[image_id].name): reason for image_id, reason in deregistered.items()
-    }
     facts["features_per_photo"] = float(np.median([len(found.scales) for found in result.features]))
     facts |= _mapper_facts(run, mapped, model)
     left_out = _reasons(run, result, mapped, model) | outliers

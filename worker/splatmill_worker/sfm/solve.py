@@ -17,7 +17,7 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.scene import Scene
-from splatmill_worker.sfm import cameras, checks, stereo
+from splatmill_worker.sfm import cameras, checks, lenses, stereo
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if
 from splatmill_worker.sfm.effort import solve_at
 from splatmill_worker.sfm.final_model import final_model
@@ -150,4 +150,25 @@ def _solve(run: SfmRun) -> EffortResult:
             break  # the standard effort has about three times the lean one's features; even more would not match
     assert best is not None  # _efforts returns at least one
     unfold(run, best)
-    return best
+    return _with_divided_cameras(run, best)
+
+
+def _with_divided_cameras(run: SfmRun, result: EffortResult) -> EffortResult:
+    """`result`, or the photos mapped again with two cameras for each one whose photos have two focal lengths."""
+    model = result.mapped.largest if result.mapped is not None else None
+    if model is None or run.options.camera_model != "auto":
+        return result
+    whole = run.groups
+    run.groups = lenses.divided(whole, model, run.threads, run.cancelled)
+    if len(run.groups) == len(whole):
+        return result
+    again = solve_at(run, result.effort, None)
+    unfold(run, again)
+    if registered_counts(again.mapped) < registered_counts(result.mapped):
+        run.groups = whole
+        return result
+    run.notes.append(
+        f"{len(run.groups) - len(whole)} of the cameras had photos of two focal lengths, though of one size and "
+        "without EXIF. They are taken to be of two cameras."
+    )
+    return again

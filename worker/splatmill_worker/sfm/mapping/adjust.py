@@ -12,6 +12,7 @@ import numpy as np
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.callbacks import stop_if
 from splatmill_worker.sfm.checks import implausible_intrinsics
+from splatmill_worker.sfm.mapping.registered import registered
 
 OPENCV_MIN_PHOTOS = 8
 """Registered photos of a camera from which its four OPENCV distortion coefficients are estimated."""
@@ -61,9 +62,10 @@ def adjust_with_lenses(
     scene along that axis nearly free. Where not even the single focal length of SIMPLE_RADIAL is determined, as by
     parallel views of a plane or along a straight line, the initial one is kept.
 
-    model: is left in an unspecified state.
+    model: is not changed.
     initial: focal length that a camera had before any photo was matched, in pixels, by its id.
     """
+    model = registered(model)  # the covariance needs the pose of every photo
     rich = _well_observed(model)
     tied: set[int] = set()
     while rich:
@@ -78,7 +80,7 @@ def adjust_with_lenses(
         tied |= loose
         rich -= loose
     deviations = Deviations.of(model, bundle_adjust(model, threads, cancelled=cancelled))
-    assumed = {camera for camera in initial if not deviations.focal_is_determined(model.cameras[camera])}
+    assumed = {camera for camera in initial if not deviations.focal(model.cameras[camera]) <= FOCAL_DEVIATION}
     if assumed:
         for camera in assumed:
             params = np.array(model.cameras[camera].params)
@@ -118,7 +120,7 @@ class Deviations:
     """Standard deviations of the lens parameters in a bundle adjustment.
 
     covariance: of residuals of one pixel; None where it is singular.
-    error: mean reprojection error in pixels.
+    error: median over the points of the mean reprojection error, in pixels.
     """
 
     covariance: pycolmap.BACovariance | None
@@ -128,7 +130,7 @@ class Deviations:
     def of(model: pycolmap.Reconstruction, adjuster: pycolmap.CeresBundleAdjuster) -> Deviations:
         """The standard deviations at the solution that `adjuster` has found for `model`."""
         covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
-        return Deviations(covariance, model.compute_mean_reprojection_error())
+        return Deviations(covariance, float(np.median([point.error for point in model.points3D.values()])))
 
     def stretch_is_determined(self, camera: pycolmap.Camera) -> bool:
         """Whether the ratio fx / fy of an OPENCV camera is known to STRETCH_PIXELS."""
@@ -139,13 +141,12 @@ class Deviations:
         deviation = self.error * math.sqrt(gradient @ both[:2, :2] @ gradient)
         return deviation * max(camera.width, camera.height) / 2 <= STRETCH_PIXELS
 
-    def focal_is_determined(self, camera: pycolmap.Camera) -> bool:
-        """Whether the focal length, the camera's first parameter, is known to FOCAL_DEVIATION."""
+    def focal(self, camera: pycolmap.Camera) -> float:
+        """The relative standard deviation of the focal length, a camera's first parameter; infinite if it is free."""
         covariance = self._of(camera)
         if covariance is None:
-            return False
-        deviation = self.error * math.sqrt(covariance[0, 0]) / camera.params[0]
-        return deviation <= FOCAL_DEVIATION
+            return math.inf
+        return float(self.error * math.sqrt(covariance[0, 0]) / camera.params[0])
 
     def _of(self, camera: pycolmap.Camera) -> np.ndarray | None:
         # COLMAP finds the parameters of a camera by their address, which the view `params` keeps.
