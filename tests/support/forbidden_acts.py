@@ -17,6 +17,7 @@ import socket
 import stat
 import subprocess
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -255,11 +256,24 @@ def call_of_32_bits(target: Path) -> str:
 
 def answer(target: Path, written: bytes | str) -> None:
     """Write bytes where answers are written, in place of an answer."""
-    content = bytes.fromhex(str(written))
+    _write_answer(bytes.fromhex(str(written)))
+    os._exit(0)
+
+
+def endless(target: Path, first: str, again: str) -> None:
+    """Write bytes where answers are written, and others after them again and again, for twenty seconds."""
+    _write_answer(bytes.fromhex(first))
+    end = time.monotonic() + 20.0
+    while time.monotonic() < end:
+        _write_answer(bytes.fromhex(again))
+        time.sleep(0.02)
+    os._exit(0)
+
+
+def _write_answer(content: bytes) -> None:
     for descriptor in range(3, 32):
         try:
             if fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE == os.O_WRONLY:
                 os.write(descriptor, content)
         except OSError:
             continue
-    os._exit(0)

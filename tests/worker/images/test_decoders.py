@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from PIL import Image
 
@@ -18,6 +20,7 @@ from splatmill_worker.images import examine as examine_here
 from splatmill_worker.images.decoders import Decoders, confined
 from splatmill_worker.images.prepare import prepare
 from tests.support.hostile.videos import video
+from tests.support.waiting import wait_for
 
 
 @pytest.fixture
@@ -83,6 +86,24 @@ def test_a_decoder_has_no_secret_and_only_the_files_of_its_job(
         other.write_bytes((photos / "deep.png").read_bytes())
         with pytest.raises(PermissionError):
             decoders.decode(other)
+
+
+def test_photos_that_have_been_read_take_no_memory(photos: Path, confinement: Decoders) -> None:
+    """Neither in the process that decoded them, whose memory is limited, nor in this one."""
+    Image.new("L", (10_000, 10_000)).save(photos / "big.png")
+    decoders.decode(photos / "deep.png")
+    (child,) = map(psutil.Process, children())
+    gc.collect()
+    gc.disable()
+    try:
+        before = [process.memory_info().rss for process in (psutil.Process(), child)]
+        for _ in range(3):
+            assert decoders.decode(photos / "big.png").size == (10_000, 10_000)
+        assert psutil.Process().memory_info().rss < before[0] + 50_000_000
+        # It writes an answer shortly before its memory is free.
+        wait_for(lambda: child.memory_info().rss < before[1] + 50_000_000)
+    finally:
+        gc.enable()
 
 
 def test_a_picture_that_takes_too_long_is_given_up(photos: Path, confinement: Decoders) -> None:

@@ -21,7 +21,7 @@ from PIL import Image
 
 from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline, synthetic
-from splatmill_worker.errors import DecoderNotStarted, UnusablePicture, UnusableVideo
+from splatmill_worker.errors import Cancelled, DecoderNotStarted, UnusablePicture, UnusableVideo
 from splatmill_worker.images import decode as here
 from splatmill_worker.images import decoders
 from splatmill_worker.images import video as video_here
@@ -29,6 +29,7 @@ from splatmill_worker.images.decoder import LENGTHS
 from splatmill_worker.images.decoder_process import Call, DecoderProcess
 from splatmill_worker.images.decoders import STARTS, Decoders, confined
 from splatmill_worker.images.prepare import prepare
+from splatmill_worker.images.turns import Turns
 from splatmill_worker.service.problems import is_transient, keeps_progress, problem_of
 from splatmill_worker.sfm import posed
 from tests.support.acting import acts
@@ -156,7 +157,8 @@ def test_the_next_attempt_does_not_open_it_again(photos: Path, tmp_path: Path) -
         assert [name for name, _ in prepared.skipped] == ["b.png"]
         assert decoders.forget_ended()
         assert len(prepare(photos, None, tmp_path / "work").photos) == 4
-    assert not kept.exists()
+    # The list is written anew and not removed: its copy in storage is replaced by this one.
+    assert json.loads(kept.read_text()) == {}
 
 
 def test_a_damaged_list_of_ended_files_is_none(photos: Path, tmp_path: Path) -> None:
@@ -335,6 +337,28 @@ def test_why_it_does_not_start_is_its_last_line(photos: Path, monkeypatch: pytes
         decoders.decode(photos / "a.png")
 
 
+def test_a_process_that_is_not_ready_in_time_is_started_once(
+    photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten such waits would take most of an hour."""
+    starts: list[DecoderProcess] = []
+    original = DecoderProcess.ready
+
+    def ready(process: DecoderProcess) -> tuple[str, ...]:
+        starts.append(process)
+        return original(process)
+
+    program = "import sys; sys.stdin.read()  # images.decoder"
+    monkeypatch.setattr("splatmill_worker.images.decoder_process._COMMAND", (sys.executable, "-c", program))
+    monkeypatch.setattr("splatmill_worker.images.decoder_process.PICTURE_SECONDS", 0.5)
+    monkeypatch.setattr(DecoderProcess, "ready", ready)
+    with confined([photos]):
+        with pytest.raises(DecoderNotStarted, match="it was not ready after"):
+            decoders.decode(photos / "a.png")
+        assert children() == []
+    assert len(starts) == 1
+
+
 def test_processes_that_have_ended_do_not_disturb_the_end(photos: Path) -> None:
     with confined([photos]):
         assert same(photos / "a.png")
@@ -345,7 +369,7 @@ def test_processes_that_have_ended_do_not_disturb_the_end(photos: Path) -> None:
 
 def test_the_second_try_runs_alone() -> None:
     """It may have been ended for want of memory, which other photos took."""
-    turns = decoders._Turns()
+    turns = Turns()
     order: list[str] = []
     entered = threading.Event()
 
@@ -397,6 +421,8 @@ def told(value: Any, arrays: bytes = b"") -> bytes:
         told({"error": {"name": "picture", "given": []}}),
         told({"error": {"name": "picture", "given": ["no_such_code", "a", "b"]}}),
         told({"error": {"name": "system", "given": ["x"]}}),
+        told({"error": {"name": "system", "given": [float("inf"), "a", "b"]}}),
+        told({"value": {"": ["|u1", [0, 10**30]]}}),
         told({"part": 1}) * 2 + told({"value": 1}),
         LENGTHS.pack(2**40, 0),
         LENGTHS.pack(2, 2**40),
@@ -412,6 +438,63 @@ def test_an_answer_that_is_none_costs_the_file(
         with pytest.raises(UnusablePicture, match=r"a.png: its decoder gave an answer that is not valid"):
             decoders.call(known.answer, photos / "a.png", answer.hex(), check=here.picture_of)
         assert same(photos / "b.png")
+
+
+@pytest.mark.parametrize(
+    ("first", "again"),
+    [(LENGTHS.pack(10, 10**6), b"x"), (b"", told({"part": 1}))],
+    ids=["an answer, byte by byte", "parts"],
+)
+def test_answers_that_never_end_are_given_up(
+    first: bytes, again: bytes, photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = acts(monkeypatch)
+    with confined([photos]) as started:
+        with pytest.raises(UnusablePicture, match="decoding it took longer than 1 seconds"):
+            decoders.call(
+                known.endless, photos / "a.png", first.hex(), again.hex(), check=here.picture_of, seconds=1.0
+            )
+        cancelled = iter((False, False, True))
+        asked = Call(
+            known.endless, photos / "a.png", (first.hex(), again.hex()), cancelled=lambda: next(cancelled)
+        )
+        with pytest.raises(Cancelled):
+            started.call(asked, here.picture_of, UnusablePicture)
+
+
+@pytest.mark.parametrize("check", [here.picture_of, lambda value: value.shape, lambda value: value[7]])
+def test_a_process_whose_answer_is_not_valid_reads_no_other_file(
+    check: Callable[[Any], Any], photos: Path, confinement: Decoders
+) -> None:
+    """A file may have taken it over, and would answer for the others, too."""
+    assert same(photos / "a.png")
+    (before,) = children()
+    with pytest.raises(UnusablePicture, match=r"b.png: its decoder gave an answer that is not valid"):
+        decoders.call(here.sizes, photos / "b.png", "b.png", check=check)
+    assert before not in children()
+    assert same(photos / "c.png")
+
+
+def test_what_a_function_raises_costs_no_process(photos: Path, confinement: Decoders) -> None:
+    assert same(photos / "a.png")
+    before = children()
+    (photos / "b.png").write_bytes(b"no picture")
+    with pytest.raises(UnusablePicture, match="not an image"):
+        decoders.decode(photos / "b.png")
+    with pytest.raises(FileNotFoundError):
+        decoders.decode(photos / "none.png")
+    assert children() == before
+
+
+def test_a_first_answer_that_is_not_valid_is_no_fault_of_the_file(
+    photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = "import os, sys; os.write(1, b'x' * 64); sys.stdin.read()  # images.decoder"
+    monkeypatch.setattr("splatmill_worker.images.decoder_process._COMMAND", (sys.executable, "-c", program))
+    with confined([photos]):
+        with pytest.raises(DecoderNotStarted, match="its first answer is not valid"):
+            decoders.decode(photos / "a.png")
+        assert children() == []
 
 
 def test_what_a_decoder_says_of_a_file_is_cut(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:

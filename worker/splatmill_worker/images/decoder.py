@@ -48,6 +48,7 @@ def main() -> None:
     if first is None:
         return
     held = confine([*map(Path, first["read"]), *program_files()], int(first["memory"]))
+    # Imported after that: their libraries start threads, and confinement must come before these.
     from splatmill_worker import reader_memory
     from splatmill_worker.images import guarded, messages
 
@@ -56,12 +57,9 @@ def main() -> None:
     write_message(answers, *messages.packed({"held": held}))
     while (call := _read_call(calls)) is not None:
         try:
-            for answer in _answered(call):
-                write_message(answers, *messages.packed(answer))
+            _answer(call, answers)
         except BrokenPipeError:
             return  # the caller has ended
-        except Exception as error:  # the caller raises it again
-            write_message(answers, *messages.packed({"error": messages.described(error)}))
 
 
 def program_files() -> list[Path]:
@@ -81,6 +79,19 @@ def _read_call(stream: IO[bytes]) -> dict[str, Any] | None:
         return None
     text: dict[str, Any] = json.loads(stream.read(LENGTHS.unpack(head)[0]))
     return text
+
+
+def _answer(call: dict[str, Any], answers: IO[bytes]) -> None:
+    """Write the answers to a call. None of their arrays is left in memory while the next call is waited for."""
+    from splatmill_worker.images import messages
+
+    try:
+        for answer in _answered(call):
+            write_message(answers, *messages.packed(answer))
+    except BrokenPipeError:
+        raise
+    except Exception as error:  # the caller raises it again
+        write_message(answers, *messages.packed({"error": messages.described(error)}))
 
 
 def _answered(call: dict[str, Any]) -> Iterator[dict[str, Any]]:

@@ -36,6 +36,9 @@ PIPE_BYTES = 2**20
 """Size of the pipe for answers: with Linux's default of 64 KiB, the two processes would take turns a thousand times a
 photo."""
 
+POLL_MILLISECONDS = 200
+"""Longest wait for bytes of an answer between two looks at the deadline and at `Call.cancelled`."""
+
 _KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "LD_LIBRARY_PATH")
 """Environment variables that a decoding process is given."""
 
@@ -86,9 +89,9 @@ class DecoderProcess:
     """
 
     def __init__(self, start: dict[str, Any], lock: int) -> None:
-        self._said, said = os.pipe()
+        self._stderr, stderr = os.pipe()
         # What it prints beyond the size of the pipe is lost: nobody reads before it has ended.
-        os.set_blocking(said, False)
+        os.set_blocking(stderr, False)
         try:
             self._process = subprocess.Popen(
                 _COMMAND,
@@ -96,17 +99,19 @@ class DecoderProcess:
                 | {"OMP_NUM_THREADS": "1"},
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=said,
+                stderr=stderr,
                 bufsize=0,
                 pass_fds=(lock,),
             )
         except BaseException:
-            os.close(self._said)
+            os.close(self._stderr)
             raise
         finally:
-            os.close(said)
+            os.close(stderr)
         assert self._process.stdout is not None
         self._answers = self._process.stdout.fileno()
+        self._poll = select.poll()  # `select.select` refuses descriptors from 1024 on
+        self._poll.register(self._answers, select.POLLIN)
         if hasattr(fcntl, "F_SETPIPE_SZ"):
             with suppress(OSError):  # the user has too many large pipes
                 fcntl.fcntl(self._answers, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
@@ -120,14 +125,17 @@ class DecoderProcess:
     def ready(self) -> tuple[str, ...]:
         """Wait until it is confined, and return what holds, as `sandbox.confine` does. Raises Ended and TimeIsUp."""
         if self._held is None:
-            answer = self._answer(time.monotonic() + PICTURE_SECONDS, MAX_TEXT, lambda: False)
-            self._held = tuple(answer["held"])
+            try:
+                answer = self._answer(time.monotonic() + PICTURE_SECONDS, 0, lambda: False)
+                self._held = tuple(answer["held"])
+            except (ValueError, TypeError, KeyError) as error:
+                raise Ended(f"its first answer is not valid, {self.end()}") from error
         return self._held
 
     def ask(self, call: Call) -> dict[str, Any]:
         """Return the last answer to a call, of which `value` or `error` is an item.
 
-        Raises Ended, TimeIsUp, Cancelled, ValueError for an answer that is none, and what `call.part` raises; the
+        Raises Ended, TimeIsUp, Cancelled, ValueError for an answer that is not valid, and what `call.part` raises; the
         process can then not be asked again.
         """
         deadline = time.monotonic() + call.seconds
@@ -180,11 +188,12 @@ class DecoderProcess:
         content = bytearray(length)
         view = memoryview(content)
         while view:
-            if not select.select([self._answers], [], [], 0.2)[0]:
-                if cancelled():
-                    raise Cancelled("Reading a file was cancelled.")
-                if time.monotonic() > deadline:
-                    raise TimeoutError
+            # Also while bytes arrive: a process that a file has taken over could send some for ever.
+            if cancelled():
+                raise Cancelled("Reading a file was cancelled.")
+            if time.monotonic() > deadline:
+                raise TimeoutError
+            if not self._poll.poll(POLL_MILLISECONDS):
                 continue
             count = os.readv(self._answers, [view])
             if count == 0:
@@ -194,14 +203,14 @@ class DecoderProcess:
 
     def _last_line(self) -> str:
         """The last line that it printed, and nothing more; the pipe is closed."""
-        if self._said < 0:
+        if self._stderr < 0:
             return ""
-        os.set_blocking(self._said, False)
+        os.set_blocking(self._stderr, False)
         printed = b""
         with suppress(BlockingIOError):
-            while more := os.read(self._said, 65536):
+            while more := os.read(self._stderr, 65536):
                 printed += more
-        os.close(self._said)
-        self._said = -1
+        os.close(self._stderr)
+        self._stderr = -1
         lines = printed.decode("utf-8", "replace").strip().splitlines()
         return lines[-1][: messages.MAX_REASON] if lines else ""

@@ -1,21 +1,19 @@
 """Reads strangers' files in processes of their own while an attempt runs, and in this process otherwise.
 
-What reads strangers' files is the part that such a file may take over. Within `confined`, that part runs in processes
-without secrets, network, files to write, or files to read but those of the job (see `decoder` and `sandbox`). One that
-ends costs a second try, and one that ends twice the file. Programs on a user's own files (`fit-image`, the engine as a
-library) read in their own process.
+A damaged file may crash the library that reads it, and a hostile one may run code there. Within `confined`, files are
+therefore read in processes without secrets, network, files to write, or files to read but those of the job (see
+`decoder` and `sandbox`). If a process ends, another one reads the file again; a file that ends two is not read.
+Programs on a user's own files (`fit-image`, the engine as a library) read in their own process.
 
 `call` runs any function of this package there: what `decode` and the others below do for pictures.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import queue
 import tempfile
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -24,7 +22,7 @@ from typing import Any, TypeVar
 from PIL import Image
 from pydantic import TypeAdapter
 
-from splatmill.files import atomic_write
+from splatmill.schema import format_bytes
 from splatmill.schema.photos import MAX_PHOTO_PIXELS
 from splatmill_worker import memory, reader_memory, settings
 from splatmill_worker.errors import DecoderNotStarted, UnusablePicture, UnusableVideo
@@ -39,7 +37,9 @@ from splatmill_worker.images.decoder_process import (
     Ended,
     TimeIsUp,
 )
+from splatmill_worker.images.ended_files import EndedFiles
 from splatmill_worker.images.examine import Picture
+from splatmill_worker.images.turns import Turns
 
 PROCESSES = min(os.cpu_count() or 1, 8)
 """Decoding processes of an attempt."""
@@ -70,13 +70,15 @@ lets the job be tried again."""
 
 T = TypeVar("T")
 
+INVALID = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError)
+"""What the check of an answer may raise."""
+
 # What a process answers is checked, since a file may have taken the process over.
 _SIZES: TypeAdapter[tuple[tuple[int, int], tuple[int, int]]] = TypeAdapter(
     tuple[tuple[int, int], tuple[int, int]]
 )
 _PICTURE: TypeAdapter[Picture | str] = TypeAdapter(Picture | str)
 _FAULT: TypeAdapter[str | None] = TypeAdapter(str | None)
-_ENDED: TypeAdapter[dict[str, str]] = TypeAdapter(dict[str, str])
 
 log = logging.getLogger("splatmill.decoders")
 
@@ -88,8 +90,7 @@ def confined(read: list[Path], ended: Path | None = None) -> Iterator[Decoders]:
     """Let decoding processes open the files of strangers within the block.
 
     read: the files and folders that they may open.
-    ended: a file that keeps which files have ended their process twice, for the next attempt: these are not opened
-        again.
+    ended: a file with the list of files that have ended their process twice, which the next attempt does not open.
     """
     global _active
     decoders = Decoders(read, ended)
@@ -115,10 +116,9 @@ def call(
     function: of a module of this package, not nested. It returns dicts, lists, tuples, dataclasses, str, numbers, None,
         bytes and NumPy arrays; tuples arrive as lists, and dataclasses as dicts.
     arguments: None, str, numbers, and tuples of these.
-    check: makes the value to return of what arrives, and raises ValueError, TypeError or KeyError for what the function
-        never returns.
+    check: makes the value to return of what arrives, and raises one of INVALID for what the function never returns.
     fault: makes the error that is raised where the process ended twice or took longer than `seconds`, and where
-        its answer is none.
+        its answer is not valid.
     max_bytes: of the arrays of an answer.
 
     Raises what the function raises: the errors of `messages`, OSError and ValueError. Others become a `fault`.
@@ -228,7 +228,7 @@ class Decoders:
         self.held: tuple[str, ...] | None = None
         self._room = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `close`
         self._root = read[0] if read else Path("/")
-        self._ended = _EndedFiles(ended)
+        self._ended = EndedFiles(ended)
         limit = memory_limit() if limit is None else limit
         self._memory = limit + libraries
         self._start = {
@@ -238,7 +238,7 @@ class Decoders:
             "pixels": guarded.decoding_pixels(settings.max_memory()) // processes,
             "room": self._room.fileno(),
         }
-        self._turns = _Turns()
+        self._turns = Turns()
         self._processes = processes
         self._free: queue.LifoQueue[DecoderProcess | None] = queue.LifoQueue()
         for _ in range(processes - 1):
@@ -260,21 +260,15 @@ class Decoders:
         for alone in (False, True):
             try:
                 with self._turns.taken(alone=alone):
-                    answer = self._answer(call)
-                if "error" in answer:
-                    raise self._error(answer["error"], name, fault)
-                return check(answer["value"])
-            except _Answered as error:
-                raise error.error from None
+                    answer = self._answer(call, check, fault)
+                if isinstance(answer, Exception):
+                    raise answer
+                return answer
             except Ended as error:
                 how = str(error)
             except TimeIsUp:
                 reason = f"decoding it took longer than {call.seconds:.0f} seconds"
                 raise fault("image_truncated", name, reason) from None
-            except (ValueError, TypeError, KeyError) as error:
-                raise fault(
-                    "image_truncated", name, "its decoder gave an answer that is not valid"
-                ) from error
         reason = f"it could not be decoded: its decoder was ended twice ({how})"
         self._ended.add(self._key(call.path), reason)
         raise fault("decoder_ended", name, reason)
@@ -332,18 +326,28 @@ class Decoders:
     def _key(self, path: Path) -> str:
         return os.path.relpath(path, self._root)
 
-    def _answer(self, call: Call) -> dict[str, Any]:
-        """The last answer of a process, which is kept if it can answer another call."""
+    def _answer(self, call: Call, check: Callable[[Any], T], fault: Fault) -> T | Exception:
+        """What `check` makes of the answer of a process, or the error that it describes.
+
+        The process is kept for other calls, unless it ended, or its answer is not valid: a file may have taken it over.
+        """
         slot, kept = self._free.get(), None
         try:
             process = self._started(slot)
             try:
                 answer = process.ask(call)
-            except BaseException:
+                if "error" in answer:
+                    result: T | Exception = self._error(answer["error"], call.path.name, fault)
+                else:
+                    result = check(answer["value"])
+            except BaseException as error:
                 process.end()
+                if isinstance(error, INVALID):
+                    reason = "its decoder gave an answer that is not valid"
+                    raise fault("image_truncated", call.path.name, reason) from error
                 raise
             kept = process
-            return answer
+            return result
         finally:
             self._free.put(kept)
 
@@ -361,22 +365,21 @@ class Decoders:
                     log.warning("Photos are decoded in processes without secrets, but %s.", lacking)
                 self.held = held
                 return process
-            except Ended as error:
+            except (Ended, OSError) as error:
                 how = str(error)
             except TimeIsUp:
                 how = f"it was not ready after {PICTURE_SECONDS:.0f} seconds"
-            except OSError as error:
-                how = str(error)
+                break
             process = None
         raise DecoderNotStarted(how)
 
     def _error(self, description: Any, name: str, fault: Fault) -> Exception:
-        """The error that a process described, to be raised as it is."""
+        """The error that a process described. Raises ValueError for anything but a description."""
         error = messages.error_of(description, lambda reason: fault("image_truncated", name, reason))
         if isinstance(error, MemoryError):
-            limit = f"{self._memory / 2**30:.0f} GiB"
+            limit = format_bytes(self._memory)
             error = fault("image_too_large", name, f"decoding it takes more than {limit} of memory")
-        return _Answered(error)
+        return error
 
 
 def _lacking(held: tuple[str, ...]) -> str:
@@ -388,65 +391,3 @@ def memory_limit() -> int:
     what the machine or the attempt has if that is less."""
     machine = guarded.machine_bytes()
     return min(16 * MAX_PHOTO_PIXELS, machine, settings.max_memory() or machine)
-
-
-class _Answered(Exception):
-    """Carries the error of a function, so that it is not taken for one of the answer."""
-
-    def __init__(self, error: Exception) -> None:
-        super().__init__()
-        self.error = error
-
-
-class _Turns:
-    """Lets calls run together, or one of them alone: a photo whose process has ended, perhaps for want of memory."""
-
-    def __init__(self) -> None:
-        self._running = 0
-        self._alone = False
-        self._changed = threading.Condition()
-
-    @contextmanager
-    def taken(self, *, alone: bool) -> Iterator[None]:
-        with self._changed:
-            self._changed.wait_for(lambda: not self._alone)
-            if alone:
-                self._alone = True
-                self._changed.wait_for(lambda: self._running == 0)
-            self._running += 1
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._running -= 1
-                self._alone = self._alone and not alone
-                self._changed.notify_all()
-
-
-class _EndedFiles:
-    """Why files are not opened again, by their path below the job's folder; kept in a file if there is one."""
-
-    def __init__(self, kept: Path | None) -> None:
-        self._kept = kept
-        self._lock = threading.Lock()
-        self._reasons: dict[str, str] = {}
-        if kept is not None:
-            with suppress(OSError, ValueError):
-                self._reasons = _ENDED.validate_json(kept.read_bytes())
-
-    def reason(self, key: str) -> str | None:
-        return self._reasons.get(key)
-
-    def add(self, key: str, reason: str) -> None:
-        with self._lock:
-            self._reasons[key] = reason
-            if self._kept is not None:
-                atomic_write(self._kept, json.dumps(self._reasons))
-
-    def forget(self) -> bool:
-        with self._lock:
-            had = bool(self._reasons)
-            self._reasons = {}
-            if self._kept is not None:
-                self._kept.unlink(missing_ok=True)
-            return had

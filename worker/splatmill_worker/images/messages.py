@@ -30,7 +30,13 @@ _TYPE = re.compile(r"[<|][biuf][1248]")
 MAX_REASON = 1000
 """Characters of what a decoding process says of a file."""
 
+Bytes = npt.NDArray[np.uint8]
+
 _PICTURE_CODES = ("file_empty", "not_an_image", "image_truncated", "image_too_small", "image_too_large")
+
+
+# No function below is nested and calls itself: such a one is a reference cycle, and would hold the arrays of photos in
+# memory until the garbage collector runs.
 
 
 def packed(value: Any) -> tuple[bytes, list[memoryview]]:
@@ -40,59 +46,60 @@ def packed(value: Any) -> tuple[bytes, list[memoryview]]:
         and tuples become lists.
     """
     parts: list[memoryview] = []
-
-    def plain(item: Any) -> Any:
-        if isinstance(item, np.ndarray):
-            array = np.ascontiguousarray(item, item.dtype.newbyteorder("<"))
-            parts.append(array.reshape(-1).view(np.uint8).data)
-            return {_ARRAY: [array.dtype.str, list(item.shape)]}
-        if isinstance(item, bytes):
-            parts.append(memoryview(item))
-            return {_ARRAY: [_BYTES, [len(item)]]}
-        if isinstance(item, np.generic):
-            return item.item()
-        if is_dataclass(item) and not isinstance(item, type):
-            return plain(asdict(item))
-        if isinstance(item, dict):
-            return {str(key): plain(inner) for key, inner in item.items()}
-        if isinstance(item, (list, tuple)):
-            return [plain(inner) for inner in item]
-        return item
-
-    return json.dumps(plain(value)).encode(), parts
+    return json.dumps(_plain(value, parts)).encode(), parts
 
 
-def unpacked(text: bytes | bytearray, payload: npt.NDArray[np.uint8]) -> Any:
-    """The value that `packed` was given; its arrays lie in `payload`, uint8 [n]. Raises ValueError."""
-    start = 0
+def _plain(item: Any, parts: list[memoryview]) -> Any:
+    """`item` in JSON's types; the bytes of its arrays are appended to `parts`."""
+    if isinstance(item, np.ndarray):
+        array = np.ascontiguousarray(item, item.dtype.newbyteorder("<"))
+        parts.append(array.reshape(-1).view(np.uint8).data)
+        return {_ARRAY: [array.dtype.str, list(item.shape)]}
+    if isinstance(item, bytes):
+        parts.append(memoryview(item))
+        return {_ARRAY: [_BYTES, [len(item)]]}
+    if isinstance(item, np.generic):
+        return item.item()
+    if is_dataclass(item) and not isinstance(item, type):
+        return _plain(asdict(item), parts)
+    if isinstance(item, dict):
+        return {str(key): _plain(inner, parts) for key, inner in item.items()}
+    if isinstance(item, (list, tuple)):
+        return [_plain(inner, parts) for inner in item]
+    return item
 
-    def whole(item: Any) -> Any:
-        nonlocal start
-        if isinstance(item, list):
-            return [whole(inner) for inner in item]
-        if not isinstance(item, dict):
-            return item
-        if _ARRAY not in item:
-            return {key: whole(inner) for key, inner in item.items()}
-        name, shape = item[_ARRAY]
-        if not all(type(side) is int and side >= 0 for side in shape):
-            raise ValueError("the shape of an array is not valid")
-        if name != _BYTES and not _TYPE.fullmatch(name):
-            raise ValueError("the type of an array is not valid")
-        kind = np.dtype(np.uint8 if name == _BYTES else name)
-        end = start + math.prod(shape) * kind.itemsize
-        if end > len(payload):
-            raise ValueError("an array is longer than what was sent")
-        content, start = payload[start:end], end
-        return content.tobytes() if name == _BYTES else content.view(kind).reshape(shape)
 
+def unpacked(text: bytes | bytearray, payload: Bytes) -> Any:
+    """The value that `packed` was given; its arrays lie in `payload`. Raises ValueError for any other text."""
+    rest = [payload]
     try:
-        value = whole(json.loads(text))
-    except (TypeError, AttributeError, RecursionError) as error:
+        value = _whole(json.loads(text), rest)
+    except (TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError("the answer is no value") from error
-    if start != len(payload):
+    if len(rest[0]):
         raise ValueError("the answer is longer than its arrays")
     return value
+
+
+def _whole(item: Any, rest: list[Bytes]) -> Any:
+    """The value that `_plain` was given; its arrays are taken from the beginning of `rest`, a list of one array."""
+    if isinstance(item, list):
+        return [_whole(inner, rest) for inner in item]
+    if not isinstance(item, dict):
+        return item
+    if _ARRAY not in item:
+        return {key: _whole(inner, rest) for key, inner in item.items()}
+    name, shape = item[_ARRAY]
+    if not all(type(side) is int and side >= 0 for side in shape):
+        raise ValueError("the shape of an array is not valid")
+    if name != _BYTES and not _TYPE.fullmatch(name):
+        raise ValueError("the type of an array is not valid")
+    kind = np.dtype(np.uint8 if name == _BYTES else name)
+    size = math.prod(shape) * kind.itemsize
+    if size > len(rest[0]):
+        raise ValueError("an array is longer than what was sent")
+    content, rest[0] = rest[0][:size], rest[0][size:]
+    return content.tobytes() if name == _BYTES else content.view(kind).reshape(shape)
 
 
 _CLASSES: dict[str, tuple[type[Exception], Callable[[Any], list[Any]]]] = {
@@ -120,7 +127,7 @@ def described(error: Exception) -> dict[str, Any]:
 def error_of(description: Any, fault: Callable[[str], Exception]) -> Exception:
     """The error of a description; `fault` makes one of a reason where its class is not known.
 
-    Raises ValueError for what is no description.
+    Raises ValueError for anything but a description.
     """
     try:
         name, given = description["name"], description["given"]
@@ -135,5 +142,5 @@ def error_of(description: Any, fault: Callable[[str], Exception]) -> Exception:
         if name in _CLASSES:
             return _CLASSES[name][0](*given)
         return fault(f"it does not decode: {given[0]}")
-    except (TypeError, KeyError, IndexError) as error:
+    except (TypeError, KeyError, IndexError, OverflowError) as error:
         raise ValueError("the description of an error is not valid") from error
