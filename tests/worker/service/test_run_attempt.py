@@ -1,14 +1,17 @@
 """Proves how an attempt that storage refuses ends: queued again while it can be retried, failed by name when not. That
 it waits for a job that Redis has lost. That photos reach structure from motion from a storage on another file system.
 That garbage is collected while a pipeline runs, and not while it is imported.
+That a list of files that end decoding processes reaches another machine.
 
 Does not prove what happens to the processes: tests/service does.
 """
 
 import gc
 import importlib
+import json
 import logging
 import os
+import shutil
 import sys
 import threading
 from pathlib import Path
@@ -20,9 +23,15 @@ from PIL import Image
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import Role
+from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.service import run_attempt as module
 from splatmill_worker.service.attempt import Attempt, start_attempt
+from splatmill_worker.service.disk_reserve import DiskWatch
+from splatmill_worker.service.job_folder import ENDED, JobFolder
+from splatmill_worker.service.lock import JobLock
+from splatmill_worker.service.outbox import Outbox
 from splatmill_worker.service.process_exit import HANDED_BACK_STATUS
+from splatmill_worker.service.room import Room
 from splatmill_worker.service.run_attempt import run_attempt
 from tests.support.jobs import CAPTURE, messages, read_job, write_row
 
@@ -130,3 +139,32 @@ def test_no_garbage_is_collected_while_the_pipeline_is_imported(
     with pytest.raises(ModuleNotFoundError):
         module._pipeline()
     assert gc.isenabled()
+
+
+def test_the_files_that_end_decoders_are_known_to_an_attempt_on_another_machine(
+    remote: Storage, room: Room, connection: redis.Redis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also when they are to be tried again: the list that an earlier attempt stored is replaced."""
+    (tmp_path / "ended_pipeline.py").write_text(
+        "from splatmill_worker.errors import UnusablePicture\n"
+        "from splatmill_worker.images import decoders\n"
+        "def run(capture, *arguments, **others):\n"
+        "    if not decoders.forget_ended():\n"
+        "        decoders._active._ended.add('capture/images/a.jpg', 'it was ended twice')\n"
+        "    raise UnusablePicture('decoder_ended', 'a.jpg', 'it was ended twice')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(module, "PIPELINE", "ended_pipeline")
+    row = write_row(connection, JOB)
+    attempt = Attempt(connection, JOB, 1, 1, JobLock(connection, JOB, "token"))
+    for stored in ({"capture/images/a.jpg": "it was ended twice"}, {}):
+        folder, disk, outbox = JobFolder(remote, JOB, CAPTURE), DiskWatch(), Outbox(attempt)
+        try:
+            with pytest.raises(UnusablePicture):
+                module._train(attempt, row, folder, room, disk, outbox)
+        finally:
+            outbox.close()
+            disk.close()
+            folder.close()
+        assert json.loads(remote.get(f"{layout.job_work(JOB)}/{ENDED}")) == stored
+        shutil.rmtree(folder.path)  # the next attempt runs on another machine

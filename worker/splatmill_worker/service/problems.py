@@ -26,18 +26,21 @@ def is_transient(error: BaseException) -> bool:
     """Return whether the same attempt may succeed a little later: the cause lies outside of the job."""
     if isinstance(error, StorageError):
         return not isinstance(error, StorageFullError)
-    if isinstance(error, WorkerError) and error.code == "decoder_ended":
-        return True  # the next attempt leaves the file out, or finds the machine with more memory
-    return isinstance(error, RedisError | FolderInUse) or _helper_ended(error)
+    return isinstance(error, RedisError | FolderInUse) or is_decoder_end(error) or _is_program_end(error)
 
 
-def _helper_ended(error: BaseException) -> bool:
+def is_decoder_end(error: BaseException) -> bool:
+    """Return whether a decoding process was ended: the next attempt leaves the file out, or finds more memory free."""
+    return isinstance(error, WorkerError) and error.code == "decoder_ended"
+
+
+def _is_program_end(error: BaseException) -> bool:
     """Return whether a program that a library had started, such as a compiler of kernels, was ended by a signal."""
-    seen: BaseException | None = error
-    while seen is not None:
-        if isinstance(seen, subprocess.CalledProcessError) and seen.returncode < 0:
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, subprocess.CalledProcessError) and cause.returncode < 0:
             return True
-        seen = seen.__cause__ or seen.__context__
+        cause = cause.__cause__ or cause.__context__
     return False
 
 

@@ -42,7 +42,7 @@ from splatmill_worker.service.live_view import LiveView
 from splatmill_worker.service.lock import LockState
 from splatmill_worker.service.mirror import Mirror
 from splatmill_worker.service.outbox import Outbox
-from splatmill_worker.service.problems import is_transient, keeps_progress, problem_of
+from splatmill_worker.service.problems import is_decoder_end, is_transient, keeps_progress, problem_of
 from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, UNREPORTED_STATUS, WITHDRAWN_STATUS
 from splatmill_worker.service.redis_patience import PATIENCE, patiently
 from splatmill_worker.service.room import Room
@@ -238,7 +238,8 @@ def _train(
                 onlookers=live,
             )
     except BaseException as error:
-        mirror.close(copy=hand_back.requested())
+        # The next attempt, perhaps on another machine, needs the list of files that it must not open.
+        mirror.close(copy=hand_back.requested() or is_decoder_end(error))
         stopped = hand_back.requested() or disk.error is not None
         if isinstance(error, Exception) and not stopped and not keeps_progress(error):
             folder.reset()
