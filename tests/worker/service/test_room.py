@@ -108,6 +108,20 @@ def test_a_checkpoint_without_room_is_reported_and_not_copied(
     assert list(remote.entries(layout.job_work(JOB))) == []
 
 
+def test_files_that_are_stored_at_once_all_count(connection: redis.Redis, limited: int, room: Room) -> None:
+    """Previews are stored while the files for other machines are."""
+    start = threading.Barrier(8)
+
+    def store(thread: int) -> None:
+        start.wait()
+        for number in range(20):
+            room.store(f"{thread}/{number}", 100)
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(store, range(8)))
+    assert reservations.used(connection, "default") == 8 * 20 * 100
+
+
 def test_an_archive_is_unpacked_within_the_quota_of_the_owner(
     connection: redis.Redis, limited: int, room: Room, tmp_path: Path
 ) -> None:

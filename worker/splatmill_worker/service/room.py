@@ -1,5 +1,6 @@
 """Room in the owner's quota for what one job stores and unpacks, reserved before it is written (`reservations`)."""
 
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 
@@ -21,6 +22,7 @@ class Room:
         self._connection = connection
         self._owner = owner
         self._job_id = job_id
+        self._lock = threading.Lock()  # previews and copies for other machines are stored by two threads
         self._stored: dict[str, int] = {}
         self._unpacked: dict[str, int] = {}
 
@@ -30,29 +32,32 @@ class Room:
         While Redis cannot be reached nothing is reserved: the state of a job is worth more than a limit, and a later
         scan of storage counts it.
         """
-        sizes = self._stored | {name: size}
-        with suppress(redis.RedisError):
-            self._reserve(reservations.job(self._job_id), sum(sizes.values()))
-        self._stored = sizes
+        with self._lock:
+            sizes = self._stored | {name: size}
+            with suppress(redis.RedisError):
+                self._reserve(reservations.job(self._job_id), sum(sizes.values()))
+            self._stored = sizes
 
     def store_all(self, sizes: Mapping[str, int]) -> None:
         """Reserve the bytes of all files of a model, once Redis can be reached.
 
         Raises redis.RedisError if that takes longer than PATIENCE.
         """
-        together = {**self._stored, **sizes}
-        patiently(lambda: self._reserve(reservations.job(self._job_id), sum(together.values())))
-        self._stored = together
+        with self._lock:
+            together = {**self._stored, **sizes}
+            patiently(lambda: self._reserve(reservations.job(self._job_id), sum(together.values())))
+            self._stored = together
 
     def unpack(self, name: str, size: int, may_refuse: bool = True) -> None:
         """Reserve the bytes that a folder takes on this machine's disk; without `may_refuse`, only count them.
 
         Raises redis.RedisError if Redis cannot be reached for longer than PATIENCE.
         """
-        sizes = self._unpacked | {name: size}
-        field, total = reservations.work(self._job_id), sum(sizes.values())
-        patiently(lambda: self._reserve(field, total, limited=may_refuse))
-        self._unpacked = sizes
+        with self._lock:
+            sizes = self._unpacked | {name: size}
+            field, total = reservations.work(self._job_id), sum(sizes.values())
+            patiently(lambda: self._reserve(field, total, limited=may_refuse))
+            self._unpacked = sizes
 
     def release_unpacked(self) -> None:
         """Enter that nothing that was unpacked is left."""
