@@ -10,7 +10,7 @@
     ├── CaptureIncomplete    files of the capture did not reach the training
     ├── SfmFailed            structure from motion ended without a usable scene
     ├── TrainingFailed       training ended with a numerical failure
-    ├── DecoderNotStarted  no process that decodes files can be started
+    ├── DecoderNotStarted    no process that decodes files can be started
     ├── ModelNotFound        there is no finished model with the requested id
     ├── ModelUnreadable      a model file cannot be read as 3D Gaussians, or is of an unknown format
     ├── QuotaReached         the owner has no room left for what the job stores or unpacks

@@ -151,7 +151,7 @@ def prepare(
             if result.several:
                 found.notes.append(f"{name} holds several pictures; the first one is used.")
     if not photos and found.skipped and decoders.forget_ended():
-        # Whoever ends every process, as the kernel does for want of memory, ends them for healthy photos too.
+        # The cause may lie outside of the photos, such as a lack of memory, which ends processes for any photo.
         name, reason = found.skipped[0]
         raise UnusablePicture("decoder_ended", name, f"no photo is left; of this one: {reason}")
     ordered = tuple(sorted(photos.values(), key=lambda photo: photo.name))

@@ -1,6 +1,6 @@
-"""Room on the worker's disk for what is unpacked, which the service counts for the owner of a job.
+"""Room on the worker's disk for unpacked files, which the service counts within the quota of a job's owner.
 
-Who only trains a folder has no service, and no room to ask for.
+Without the service, as where a local folder is trained, nothing is counted.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 Claim = Callable[[str, int, bool], None]
-"""Told the name of a folder, the bytes of the files in it, and whether it may refuse them, by an error."""
+"""Called with the name of a folder, the bytes of the files in it, and whether it may refuse them by an error."""
 
 _claim: Claim | None = None
 

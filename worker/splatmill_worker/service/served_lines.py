@@ -11,9 +11,9 @@ _DEVICES = ("nvidia[0-9]*", "nvidiactl", "dxg", "kfd")
 
 _ASK = "from splatmill_worker.kernels.gpu.device import absence; print(absence() or '')"
 _ASK_SECONDS = 120.0
-_ASKS = (
-    3  # processes that ask, if a signal ends them: a worker would leave its GPU unused for as long as it runs
-)
+_ASKS = 3
+"""Processes that ask, one after the other, where a signal ends them: without an answer, the worker would leave its GPU
+unused for as long as it runs."""
 
 
 class UnservedLines(ValueError):
