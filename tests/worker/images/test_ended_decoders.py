@@ -20,7 +20,7 @@ import pytest
 from PIL import Image
 
 from splatmill.schema import TrainOptions
-from splatmill_worker import pipeline, synthetic
+from splatmill_worker import pipeline, reader_memory, synthetic
 from splatmill_worker.errors import Cancelled, DecoderNotStarted, UnusablePicture, UnusableVideo
 from splatmill_worker.images import decode as here
 from splatmill_worker.images import decoders
@@ -473,6 +473,18 @@ def test_a_process_whose_answer_is_not_valid_reads_no_other_file(
         decoders.call(here.sizes, photos / "b.png", "b.png", check=check)
     assert before not in children()
     assert same(photos / "c.png")
+
+
+def test_a_reader_cannot_make_the_attempt_take_all_memory(
+    photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = acts(monkeypatch)
+    monkeypatch.setattr(reader_memory, "_limit", 2**30)
+    announced = LENGTHS.pack(2, 2**29) + b"{}"
+    with confined([photos]), pytest.raises(UnusablePicture, match="an answer that is not valid"):
+        decoders.call_once(
+            known.answer, photos / "a.png", announced.hex(), check=here.picture_of, fault=UnusablePicture
+        )
 
 
 def test_what_a_function_raises_costs_no_process(photos: Path, confinement: Decoders) -> None:

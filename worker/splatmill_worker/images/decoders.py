@@ -53,6 +53,10 @@ LIBRARIES = 2 * 2**30
 READING_SECONDS = 300.0
 """Time after which reading a model, or a file of cameras or points, is given up."""
 
+ANSWER_SHARE = 4
+"""The memory that reading a model may take, over that of its answer, at least. Readers take more than five times the
+memory of the arrays that they return."""
+
 OWN_MEMORY = 2**30
 """Bytes of address space that a process needs to read models, besides the files of its libraries."""
 
@@ -137,14 +141,15 @@ def call_once(
 ) -> T:
     """Like `call`, in a process that ends with the call, since the libraries that read models are large.
 
-    It may take all the memory that is free (`reader_memory.limit`), and so may its answer.
+    It may take all the memory that is free (`reader_memory.limit`). Its answer may take a part of that, which this
+    process allocates as soon as the length is announced.
     """
     if _active is None:
         return check(function(path, *arguments))
     limit = reader_memory.limit()
     own = Decoders(_active.read, processes=1, limit=limit, libraries=OWN_MEMORY + memory.mapped_files())
     try:
-        return own.call(Call(function, path, arguments, READING_SECONDS, limit), check, fault)
+        return own.call(Call(function, path, arguments, READING_SECONDS, limit // ANSWER_SHARE), check, fault)
     finally:
         own.close()
 
