@@ -21,7 +21,7 @@ from PIL import Image
 
 from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline, reader_memory, synthetic
-from splatmill_worker.errors import Cancelled, DecoderNotStarted, UnusablePicture, UnusableVideo
+from splatmill_worker.errors import Cancelled, DecoderNotStarted, Refusal, UnusablePicture, UnusableVideo
 from splatmill_worker.images import decode as here
 from splatmill_worker.images import decoders
 from splatmill_worker.images import video as video_here
@@ -310,6 +310,34 @@ def test_a_video_that_ends_its_process_twice_is_left_out(
             decoders.keyframes(photos / "walk.mp4", tmp_path / "out", 3)
     prepared = prepare(photos, None, tmp_path / "work")
     assert [name for name, _ in prepared.skipped] == ["walk.mp4"]
+
+
+def test_points_whose_reader_is_ended_twice_end_the_attempt_and_not_the_points(
+    photos: Path, confinement: Decoders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (photos / "images").mkdir()
+    (photos / "a.png").rename(photos / "images" / "a.png")
+    (photos / "poses").mkdir()
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    document = {"camera_angle_x": 1.0, "ply_file_path": "points.ply", "frames": [frame]}
+    (photos / "poses" / "transforms.json").write_text(json.dumps(document))
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    header = f"ply\nformat ascii 1.0\nelement vertex 1\n{axes}end_header\n"
+    (photos / "poses" / "points.ply").write_text(header + "1 2 3\n")
+    found = posed.find(photos)
+    assert found is not None
+    assert len(found.load().points) == 1
+    original = decoders.call_once
+
+    def killed(*arguments: Any, **options: Any) -> Any:
+        with monkeypatch.context() as patch:
+            Killer(patch, "ask", 1000)
+            return original(*arguments, **options)
+
+    monkeypatch.setattr(decoders, "call_once", killed)
+    with pytest.raises(Refusal, match="ended twice") as caught:
+        found.load()
+    assert is_transient(caught.value)
 
 
 def test_a_process_that_never_starts_says_why_and_the_job_is_tried_again(

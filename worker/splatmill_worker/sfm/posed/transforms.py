@@ -17,7 +17,7 @@ import numpy.typing as npt
 from splatmill.schema.quantities import format_bytes
 from splatmill_worker import point_file
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.errors import UnusablePicture
+from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.images import decoders
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
@@ -268,8 +268,13 @@ def _points_of(answer: Any) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uin
     points, colors = answer
     if not (points.shape == colors.shape == (len(points), 3) and colors.dtype == np.uint8):
         raise ValueError("they are no points with colours")
-    return points.astype(np.float64), colors
+    if not (points.dtype == np.float64 and np.isfinite(points).all()):
+        raise ValueError("a position is no finite float64")
+    return points, colors
 
 
 def _points_fault(code: str, name: str, reason: str) -> Exception:
-    return ValueError(reason)
+    if code != "decoder_ended":
+        return ValueError(reason)
+    message = f"The points in {name} could not be read: {reason}."
+    return Refusal(code, message, advice="Restart the job, or remove ply_file_path from the data set.")
