@@ -6,7 +6,9 @@ photos, which nothing here uses. https://colmap.github.io/format.html describes 
 
 from __future__ import annotations
 
+import codecs
 import mmap
+import re
 import struct
 from array import array
 from collections.abc import Callable, Iterator, Sequence
@@ -63,6 +65,8 @@ MOST_PARAMETERS = max(count for _, count in MODELS.values())
 Arrays = dict[str, npt.NDArray[Any]]
 
 _NUMBERS = {name: number for number, (name, _) in MODELS.items()}
+_INTEGER = re.compile(r"\d+\Z", re.ASCII)
+_NUMBERS_ALONE = re.compile(r"[\s\d.+\-eEnaif]*", re.ASCII)
 _MOST = 2**62  # of a size in pixels, which has 64 bits in a file
 _ROWS = 2**16  # points that are gathered at a time
 
@@ -84,10 +88,10 @@ def read(folder: Path) -> Arrays:
 
     Raises ValueError, naming the file and the entry, when a file is missing, too large or damaged.
     """
-    suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+    suffix = ".bin" if _file(folder, "cameras.bin").is_file() else ".txt"
     arrays: Arrays = {}
     for stem in STEMS:
-        file = folder / f"{stem}{suffix}"
+        file = _file(folder, f"{stem}{suffix}")
         size = file.stat().st_size if file.is_file() else 0
         if size > MAX_FILE_BYTES:
             raise ValueError(f"{file.name} has {size} bytes; at most {MAX_FILE_BYTES} are read.")
@@ -104,6 +108,14 @@ def read(folder: Path) -> Arrays:
         except (struct.error, ValueError, OverflowError) as error:
             raise ValueError(f"{file.name} could not be read: {error}.") from error
     return arrays
+
+
+def _file(folder: Path, name: str) -> Path:
+    """The file of this name, or else the one whose name has another case."""
+    path = folder / name
+    if path.is_file():
+        return path
+    return next((other for other in sorted(folder.iterdir()) if other.name.lower() == name.lower()), path)
 
 
 def _walk(path: Path, least: int, entry: Callable[[mmap.mmap, int], int]) -> mmap.mmap:
@@ -215,11 +227,11 @@ def _cameras_txt(path: Path) -> Arrays:
 
 
 def _images_txt(path: Path) -> Arrays:
-    """A line is id, pose, camera and name, and a line of features follows it."""
+    """A line is id, pose, camera and name, which may hold spaces; a line of features follows it, or is left out."""
     images = _Images()
     for line, number, *words in _lines(path, 9, skipping=True):
         pose, camera = [float(word) for word in words[:7]], words[7]
-        name = line.split(None, 9)[9].strip() if len(words) > 8 else ""
+        name = line.split(None, 9)[9].strip(" \t\r\n") if len(words) > 8 else ""
         images.add(int(number), pose, int(camera), name.encode())
     return images.arrays()
 
@@ -243,26 +255,41 @@ def _points_txt(path: Path) -> Arrays:
 def _lines(path: Path, least: int, *, skipping: bool = False) -> Iterator[list[str]]:
     """Each line of a text file, and its words, of which there are `least` or more; comments are left out.
 
-    skipping: leave out the line behind each. Raises ValueError for a line with fewer words, and for a longer one than
-    MAX_LINE_BYTES.
+    The text is UTF-8, or has a byte-order mark; lines end as on any system. A byte that is no UTF-8 becomes U+FFFD.
+
+    skipping: leave out the line of features behind each. Raises ValueError for a line with fewer words, and for a
+    longer one than MAX_LINE_BYTES.
     """
-    number = 0
     with path.open("rb") as file:
-        while line := file.readline(MAX_LINE_BYTES):
+        encoding = "utf-16" if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
+    number, due = 0, False
+    with path.open(encoding=encoding, errors="replace") as lines:
+        while text := lines.readline(MAX_LINE_BYTES):
             number += 1
-            if len(line) == MAX_LINE_BYTES:
+            if due and not _names_image(text):
+                due = False
+                while not text.endswith("\n") and (text := lines.readline(MAX_LINE_BYTES)):
+                    pass
+                continue
+            if len(text) == MAX_LINE_BYTES:
                 raise ValueError(f"line {number} has {MAX_LINE_BYTES} bytes or more")
-            text = line.decode()
             words = text.split()
             if not words or words[0].startswith("#"):
                 continue
             if len(words) < least:
                 raise ValueError(f"line {number} has {len(words)} words, and {least} or more are needed")
             yield [text, *words]
-            if skipping:
-                number += 1
-                while (rest := file.readline(MAX_LINE_BYTES)) and not rest.endswith(b"\n"):
-                    pass
+            due = skipping
+
+
+def _names_image(line: str) -> bool:
+    """Whether a line is one of an image, and not of features, which are numbers alone, three for each feature."""
+    words = line.split(None, 9)
+    if len(words) < 10 or words[0].startswith("#"):
+        return False
+    return bool(
+        _INTEGER.match(words[0]) and _INTEGER.match(words[8]) and not _NUMBERS_ALONE.fullmatch(words[9])
+    )
 
 
 class _Cameras:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +15,13 @@ from splatmill_worker.images import decoders
 from splatmill_worker.images.lens import lens_of, pinhole, without_distortion
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
 from splatmill_worker.sfm.posed import model_files
-from splatmill_worker.sfm.posed.files import ImageFiles
-from splatmill_worker.sfm.posed.model_files import ModelPoints
+from splatmill_worker.sfm.posed.files import ImageFiles, missing
+from splatmill_worker.sfm.posed.model_files import GivenModel, ModelPoints
 
 Integers = npt.NDArray[np.int64]
+
+MOST_MODELS = 50
+"""Models of one capture that are read; COLMAP writes as many at most."""
 
 MAX_ASPECT_ERROR = 0.02
 """Relative difference of aspect ratios up to which a camera fits a photo: sizes are rounded to whole pixels."""
@@ -29,16 +33,61 @@ def load(folder: Path, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
     Cameras are scaled to the size of the files. Raises ValueError when the model cannot be read, and when none of its
     photos is among the files.
     """
-    model = model_files.read(folder)
+    return scene_of_given(model_files.read(folder), files, notes)
+
+
+def load_largest(folders: Sequence[Path], files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
+    """The scene of the model with the most photos among `files`, of several models of one capture.
+
+    COLMAP writes a model for each set of photos that it could not join with the others; their worlds differ, so that
+    one is used, and a warning says which. Raises ValueError as `load` does, for the first model where none can be read.
+    """
+    if len(folders) == 1:
+        return load(folders[0], files, notes)
+    if len(folders) > MOST_MODELS:
+        raise ValueError(
+            f"The capture has {len(folders)} COLMAP models; at most {MOST_MODELS} are read. Give one of them."
+        )
+    best: tuple[int, Path, GivenModel] | None = None
+    said: list[str] = []
+    faults: list[ValueError] = []
+    for folder in folders:
+        try:
+            model = model_files.read(folder)
+        except ValueError as error:
+            faults.append(error)
+            said.append(f"{_shown(folder)} is not used: {error}")
+            continue
+        count = len({path for image in model.images.values() if (path := _path(files, image.name))})
+        said.append(f"{_shown(folder)} has {count} of the photos.")
+        if best is None or count > best[0]:
+            best = count, folder, model
+    if best is None:
+        raise faults[0]
+    count, folder, model = best
+    scene = scene_of_given(model, files, notes)
+    which = f"Of {len(folders)} COLMAP models, {_shown(folder)} is used, with {count} photos, because it has the most."
+    return replace(scene, warnings=(*scene.warnings, " ".join((which, *said))))
+
+
+def _path(files: ImageFiles, name: str) -> Path | None:
+    found = files.photo(name)
+    return None if found is None else found[1]
+
+
+def _shown(folder: Path) -> str:
+    return f"{folder.parent.name}/{folder.name}"
+
+
+def scene_of_given(model: GivenModel, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
+    """The scene of a model that was read; see `load`."""
     views: dict[int, View] = {}
-    missing: list[tuple[str, str]] = []
+    lacking: list[tuple[str, str]] = []
     unusable: dict[Path, tuple[str, str]] = {}
     for image_id, image in sorted(model.images.items(), key=lambda item: item[1].name):
         found = files.photo(image.name)
         if found is None:
-            missing.append(
-                (image.name, "the COLMAP model has a camera for it, but the capture has no such photo")
-            )
+            lacking.append((image.name, missing(image.name, files, "the COLMAP model has a camera for it")))
             continue
         name, path = found
         try:
@@ -55,19 +104,22 @@ def load(folder: Path, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
         )
     if not views:
         raise ValueError(
-            f"The COLMAP model names {len(missing)} photos (such as {missing[0][0]!r}), and the capture has none of "
-            "them. Give the photos the names that the model uses."
-            if missing
+            f"The COLMAP model names {len(lacking)} photos (such as {lacking[0][0]!r}), and the capture has none of "
+            f"them ({lacking[0][1]}). Give the photos the names that the model uses."
+            if lacking
             else "The COLMAP model has no registered photo. Give one that has, or leave it out."
         )
     used = {view.image for view in views.values()}
+    copies, copy_warnings = files.copies(used)
+    faulty = {found[1]: fault for name, fault in model.faulty if (found := files.photo(name)) is not None}
     without = [
-        (name, "the COLMAP model has no camera for it")
+        (name, faulty.get(path, "the COLMAP model has no camera for it"))
         for name, path in files.photos.items()
-        if path not in used and path not in unusable
+        if path not in used and path not in copies and path not in unusable
     ]
-    left_out = (*missing, *unusable.values(), *without)
-    return scene_of(model.points, views, source="colmap", left_out=left_out, notes=notes)
+    left_out = (*lacking, *unusable.values(), *without)
+    scene = scene_of(model.points, views, source="colmap", left_out=left_out, notes=notes)
+    return replace(scene, warnings=copy_warnings)
 
 
 def posed_view(

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+import unicodedata
+from collections.abc import Callable, Set
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
+from typing import Literal
 
 from splatmill.schema.photos import MASK_FOLDERS, PHOTO_SUFFIXES
+from splatmill_worker.errors import UnusablePicture
+from splatmill_worker.images import decoders
 from splatmill_worker.images.masks import mask_of, masks_under
+
+SIZED = re.compile(r"(images|input|rgb)(_\d+)?", re.ASCII | re.IGNORECASE)
+"""Folders in which tools put the photos of a data set, and those reduced so many times."""
+
+MAX_ASPECT_RATIO = 1.02
+"""Ratio of the aspect ratios of one photo in two sizes: sizes are rounded to whole pixels."""
 
 
 @dataclass(frozen=True)
@@ -43,15 +54,52 @@ class ImageFiles:
         """Relative name and path of the photo that `name` refers to; None when there is none, or no single one.
 
         It is the photo with the most trailing path components in common, the file name at least. When no file name
-        agrees, the suffix may be missing or differ.
+        agrees, the suffix may be missing or differ. Names in another case, or in another form of Unicode, count where
+        none agrees exactly. Of one photo in several sizes (images_2/, images_4/), it is the largest.
         """
-        wanted = [
+        best = self.candidates(name)
+        found = best[0] if len(best) == 1 else self._largest(best)
+        return (found, self.photos[found]) if found is not None else None
+
+    def copies(self, used: Set[Path]) -> tuple[frozenset[Path], tuple[str, ...]]:
+        """The photos that are smaller copies of those of `used`, and a sentence for each of their folders."""
+        copies: list[Path] = []
+        notes = []
+        for folders, chosen in self._sizes.items():
+            if chosen is None:
+                continue
+            count = sum(self._in_folder(chosen, path) for path in used)
+            others = ", ".join(f"{folder}/" for folder in sorted(folders) if folder != chosen)
+            notes.append(f"{count} photos are those of {chosen}/; {others} hold them at a smaller size.")
+            copies += [
+                path
+                for name, path in self.photos.items()
+                if PurePosixPath(name).parts[0] in folders - {chosen}
+            ]
+        return frozenset(copies) - used, tuple(notes)
+
+    def mask(self, name: str) -> Path | None:
+        """The mask of the photo with this relative name; None when it has none."""
+        return mask_of(name, self.masks)
+
+    def candidates(self, name: str) -> list[str]:
+        """The photos that `name` fits equally well."""
+        parts = [
             part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in (".", "..", "/")
         ]
         best: list[str] = []
+        for key in (str, folded):
+            best = self._best([key(part) for part in parts], key)
+            if len(best) == 1:
+                break
+        return best
+
+    def _best(self, wanted: list[str], key: Callable[[str], str]) -> list[str]:
+        """Names of the photos with the most trailing parts as `wanted`, by the `key` of each part."""
+        best: list[str] = []
         best_length = 0
-        for candidate in self._by_last_part(wanted[-1] if wanted else ""):
-            parts = PurePosixPath(candidate).parts
+        for candidate in self._by_last_part(wanted[-1] if wanted else "", key):
+            parts = [key(part) for part in PurePosixPath(candidate).parts]
             length = 1
             while length < min(len(parts), len(wanted)) and parts[-1 - length] == wanted[-1 - length]:
                 length += 1
@@ -59,31 +107,67 @@ class ImageFiles:
                 best, best_length = [candidate], length
             elif length == best_length:
                 best.append(candidate)
-        exact = "/".join(wanted)
-        if exact in best:
-            best = [exact]
-        return (best[0], self.photos[best[0]]) if len(best) == 1 else None
+        exact = [name for name in best if [key(part) for part in PurePosixPath(name).parts] == wanted]
+        return exact if len(exact) == 1 else best
 
-    def mask(self, name: str) -> Path | None:
-        """The mask of the photo with this relative name; None when it has none."""
-        return mask_of(name, self.masks)
+    def _largest(self, names: list[str]) -> str | None:
+        """The name of the largest, where all are one photo in folders for several sizes; else None."""
+        parts = [PurePosixPath(name).parts for name in names]
+        if len({part[1:] for part in parts}) != 1 or not all(SIZED.fullmatch(part[0]) for part in parts):
+            return None
+        folders = frozenset(part[0] for part in parts)
+        if folders not in self._sizes:
+            self._sizes[folders] = self._largest_folder(names)
+        chosen = self._sizes[folders]
+        return next((name for name in names if PurePosixPath(name).parts[0] == chosen), None)
 
-    def _by_last_part(self, last: str) -> list[str]:
+    def _largest_folder(self, names: list[str]) -> str | None:
+        """The folder of the largest of these photos; None where two are as large, or a shape differs."""
+        try:
+            sizes = {name: decoders.sizes(self.photos[name], name)[0] for name in names}
+        except UnusablePicture:
+            return None
+        first, second, *_ = ordered = sorted(names, key=lambda name: -sizes[name][0])
+        aspects = [sizes[name][0] / sizes[name][1] for name in ordered]
+        if sizes[first][0] == sizes[second][0] or max(aspects) > min(aspects) * MAX_ASPECT_RATIO:
+            return None
+        return PurePosixPath(first).parts[0]
+
+    def _in_folder(self, folder: str, path: Path) -> bool:
+        return path.is_relative_to(self.root / folder)
+
+    def _by_last_part(self, last: str, key: Callable[[str], str]) -> list[str]:
         """Names of the photos whose file name is `last`; when there are none, of those with the same stem."""
         path = PurePosixPath(last)
         stem = path.stem if path.suffix.lower() in PHOTO_SUFFIXES else last
-        return self._by_name.get(last) or self._by_stem.get(stem, [])
+        by_name, by_stem = self._indices[key]
+        return by_name.get(last) or by_stem.get(stem, [])
 
     @cached_property
-    def _by_name(self) -> dict[str, list[str]]:
-        return self._indexed(lambda path: path.name)
+    def _sizes(self) -> dict[frozenset[str], str | None]:
+        """The folder with the largest photos, of folders that hold the same in several sizes."""
+        return {}
 
     @cached_property
-    def _by_stem(self) -> dict[str, list[str]]:
-        return self._indexed(lambda path: path.stem)
+    def _indices(self) -> dict[Callable[[str], str], tuple[dict[str, list[str]], dict[str, list[str]]]]:
+        """Names of the photos by their file name and by its stem, for each key of names."""
+        return {key: (self._indexed(key, "name"), self._indexed(key, "stem")) for key in (str, folded)}
 
-    def _indexed(self, key: Callable[[PurePosixPath], str]) -> dict[str, list[str]]:
+    def _indexed(self, key: Callable[[str], str], of: Literal["name", "stem"]) -> dict[str, list[str]]:
         index: dict[str, list[str]] = {}
         for name in self.photos:
-            index.setdefault(key(PurePosixPath(name)), []).append(name)
+            index.setdefault(key(getattr(PurePosixPath(name), of)), []).append(name)
         return index
+
+
+def folded(name: str) -> str:
+    """A name without its case and form of Unicode, in which programs and systems differ."""
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+def missing(name: str, files: ImageFiles, given: str) -> str:
+    """Why no photo is used for a name that has a camera. given: what has the camera."""
+    several = files.candidates(name)
+    if len(several) > 1:
+        return f"{given}, and it may be {several[0]} or {several[1]}; leave one of them out"
+    return f"{given}, but the capture has no such photo"

@@ -24,6 +24,9 @@ MAX_PARAMETER = 1e7
 MAX_DISTANCE = 1e12
 """Distance of a camera from the origin, in units of the model: squares of it are exact enough."""
 
+MOST_FAULTY = 0.1
+"""Share of the poses of a file that are left out where no photo can have them; more are a fault of the file."""
+
 Float = npt.NDArray[np.float64]
 
 
@@ -67,10 +70,14 @@ class GivenImage:
 
 @dataclass(frozen=True)
 class GivenModel:
-    """A COLMAP model that came with photos; the images by their ids."""
+    """A COLMAP model that came with photos; the images by their ids.
+
+    faulty: name, and what is wrong, of the images that are left out.
+    """
 
     images: dict[int, GivenImage]
     points: ModelPoints
+    faulty: tuple[tuple[str, str], ...] = ()
 
 
 def read(folder: Path) -> GivenModel:
@@ -80,7 +87,8 @@ def read(folder: Path) -> GivenModel:
     and when a camera or a pose is not valid.
     """
     arrays = decoders.call_once(colmap_files.read, folder, check=_arrays, fault=_fault)
-    return GivenModel(_images(arrays, _cameras(arrays)), _points(arrays))
+    images, faulty = _images(arrays, _cameras(arrays))
+    return GivenModel(images, _points(arrays), faulty)
 
 
 def _fault(code: str, name: str, reason: str) -> Exception:
@@ -151,9 +159,15 @@ def _cameras(arrays: Arrays) -> dict[int, pycolmap.Camera]:
     return cameras
 
 
-def _images(arrays: Arrays, cameras: dict[int, pycolmap.Camera]) -> dict[int, GivenImage]:
-    """The images by their ids. Raises ValueError for a pose that no photo can have."""
+def _images(
+    arrays: Arrays, cameras: dict[int, pycolmap.Camera]
+) -> tuple[dict[int, GivenImage], tuple[tuple[str, str], ...]]:
+    """The images by their ids, and those that are left out because no photo can have their pose.
+
+    Raises ValueError, naming the first, when these are more than MOST_FAULTY of all.
+    """
     images: dict[int, GivenImage] = {}
+    faulty: list[tuple[str, str]] = []
     names = arrays["image_names"].tobytes().decode("utf-8", "replace").split("\0")[:-1]
     for number, of, pose, name in zip(
         arrays["image_ids"].tolist(),
@@ -169,17 +183,23 @@ def _images(arrays: Arrays, cameras: dict[int, pycolmap.Camera]) -> dict[int, Gi
             raise ValueError(
                 f"The COLMAP model could not be read: {name!r} has the camera {of}, which is missing."
             )
+        fault = ""
         if not (abs(float(np.linalg.norm(quat)) - 1.0) < 1e-3):
-            raise ValueError(f"The rotation of {name!r} in the COLMAP model is not valid: {quat}.")
-        if not (np.abs(translation) <= MAX_DISTANCE).all():
-            raise ValueError(
+            fault = f"The rotation of {name!r} in the COLMAP model is not valid: {quat}."
+        elif not (np.abs(translation) <= MAX_DISTANCE).all():
+            fault = (
                 f"The translation of {name!r} in the COLMAP model is not valid, or too large: {translation}."
             )
+        if fault:
+            faulty.append((name, fault))
+            if len(faulty) > MOST_FAULTY * len(names):
+                raise ValueError(faulty[0][1])
+            continue
         viewmat = np.eye(4)
         viewmat[:3, :3] = pycolmap.Rotation3d(np.roll(quat / np.linalg.norm(quat), -1)).matrix()
         viewmat[:3, 3] = translation
         images[number] = GivenImage(name, cameras[of], viewmat)
-    return images
+    return images, tuple(faulty)
 
 
 def _points(arrays: Arrays) -> ModelPoints:

@@ -15,6 +15,13 @@ def main(folder: Path) -> int:
         said = (str(error).strip().splitlines() or [type(error).__name__])[-1][:200]
         print(f"Error: The COLMAP model in {folder} could not be read: {said}", file=sys.stderr)
         return 1
+    spaced = sum(" " in image.name for image in model.images.values())
+    if spaced:
+        print(
+            f"Warning: {spaced} names have spaces. Splatmill reads them from text, and COLMAP and many other programs "
+            "only up to the first space: use the binary model (--format colmap), or rename the photos.",
+            file=sys.stderr,
+        )
     for path in sorted(folder.iterdir()):
         if path.suffix == ".bin":
             path.unlink()

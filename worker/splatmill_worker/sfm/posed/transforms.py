@@ -21,8 +21,8 @@ from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.images import decoders
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
-from splatmill_worker.sfm.posed.files import ImageFiles
-from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_PARAMETER, MAX_SIDE
+from splatmill_worker.sfm.posed.files import ImageFiles, missing
+from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_PARAMETER, MAX_SIDE, MOST_FAULTY
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns the axes of a camera-to-world matrix from OpenGL's to OpenCV's."""
@@ -53,6 +53,7 @@ def load(
     left_out: list[tuple[str, str]] = []
     unusable: dict[str, str] = {}
     messages = list(notes)
+    warnings: list[str] = []
     points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     for path in paths:
         document = _read(path)
@@ -61,19 +62,37 @@ def load(
             messages.append(f"{path.name} is not used: it is a validation set.")
             continue
         tests = _test_names(path, document)
+        without, faulty = 0, 0
         for index, frame in enumerate(document["frames"]):
+            if _has_no_pose(frame):
+                without += 1
+                left_out.append((_called(index, frame), f"{path.name} has no transform_matrix for it"))
+                continue
             try:
                 name, view = _view(path, index, document, frame, files, capture)
             except UnusablePicture as error:
                 unusable[error.facts["file"]] = error.reason
                 continue
+            except ValueError as error:
+                faulty += 1
+                if faulty > MOST_FAULTY * len(document["frames"]):
+                    raise
+                left_out.append((_called(index, frame), str(error)))
+                continue
             if view is None:
-                left_out.append((name, f"{path.name} has a camera for it, but the capture has no such photo"))
+                left_out.append((name, missing(name, files, f"{path.name} has a camera for it")))
                 continue
             own = split or (("test" if frame["file_path"] in tests else "train") if tests else None)
             views[view.name] = replace(view, split=own)
+        if without == len(document["frames"]) > 0:
+            raise ValueError(f"No frame of {path.name} has a transform_matrix: it places no photo.")
+        if without:
+            warnings.append(
+                f"{without} of {len(document['frames'])} frames of {path.name} have no transform_matrix, and are left "
+                "out."
+            )
         if document.get("ply_file_path"):
-            points, note = _sparse_points(path.parent / str(document["ply_file_path"]), capture)
+            points, note = _sparse_points(path.parent / _local(str(document["ply_file_path"])), capture)
             messages += [note] if note else []
     if not views and unusable:
         name, reason = next(iter(unusable.items()))
@@ -83,17 +102,18 @@ def load(
             f"None of the {len(unusable)} photos with a camera can be used, such as {name!r}: {reason}."
         )
     if not views:
-        first = f" (such as {left_out[0][0]!r})" if left_out else ""
+        first = f" (such as {left_out[0][0]!r}: {left_out[0][1]})" if left_out else ""
         raise ValueError(
             f"{', '.join(path.name for path in paths)} has {len(left_out)} cameras{first}, and the capture has none "
             "of their photos. Give the photos the names in file_path."
         )
     used = {view.image for view in views.values()}
     left_out += unusable.items()
+    copies, copy_warnings = files.copies(used)
     left_out += [
         (name, "no camera is given for it")
         for name, path in files.photos.items()
-        if path not in used and name not in unusable
+        if path not in used and path not in copies and name not in unusable
     ]
     return Scene(
         views=tuple(sorted(views.values(), key=lambda view: view.name)),
@@ -102,6 +122,7 @@ def load(
         source=source,
         left_out=tuple(left_out),
         notes=tuple(messages),
+        warnings=(*warnings, *copy_warnings),
     )
 
 
@@ -167,9 +188,25 @@ def _view(
         raise ValueError(f"Frame {index} of {path.name} ({name}): {fault}") from error
     mask = files.mask(relative)
     if mask is None and isinstance(frame.get("mask_path"), str):
-        beside = path.parent / frame["mask_path"]
+        beside = path.parent / _local(frame["mask_path"])
         mask = beside if _within(beside, capture) and beside.is_file() else None
     return name, fit_to_file(camera_and_lens(camera, viewmat), relative, photo, mask)
+
+
+def _has_no_pose(frame: Any) -> bool:
+    """Whether a frame places no photo: it is null, or its matrix is missing, null or empty."""
+    return frame is None or (isinstance(frame, dict) and frame.get("transform_matrix") in (None, []))
+
+
+def _called(index: int, frame: Any) -> str:
+    """The file_path of a frame, or its number where it has none."""
+    name = frame.get("file_path") if isinstance(frame, dict) else None
+    return name if isinstance(name, str) else f"frame {index}"
+
+
+def _local(path: str) -> str:
+    """A path of a transforms file with the slashes of this system."""
+    return path.replace("\\", "/")
 
 
 def world_to_camera(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -1,0 +1,238 @@
+"""Posed data sets as programs and people write them have the cameras that the plain one has, for the same photos.
+
+Names with spaces, text of other programs and systems, photos in several sizes, and frames without a pose.
+"""
+
+import shutil
+import unicodedata
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatmill_worker.sfm.posed import text as model_text
+from splatmill_worker.sfm.posed.model_files import read
+from splatmill_worker.sfm.posed.written import model_of
+from tests.support.posed_sets import ALL, NAMES, check, frames, image_lines, loaded, model, photos, transforms
+
+# Names with spaces in text.
+
+SPACED = [
+    "my photo (1).jpg",
+    "two  spaces.jpg",
+    "1 2 3.jpg",
+    "at 9.41\u202fAM.png",
+    "#1 first.jpg",
+    "a b/c d.jpg",
+]
+
+
+def test_names_with_spaces_survive_the_text_that_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos(tmp_path / "images", SPACED)
+    model(tmp_path / "sparse/0", dict(enumerate(SPACED)))
+    scene = loaded(tmp_path)
+    shutil.rmtree(tmp_path / "sparse/0")
+    (tmp_path / "sparse/0").mkdir()
+    model_of(list(scene.views), scene.points, scene).write_binary(tmp_path / "sparse/0")
+    before = read(tmp_path / "sparse/0").images
+    assert model_text.main(tmp_path / "sparse/0") == 0
+    assert f"{len(SPACED)} names have spaces" in capsys.readouterr().err
+    after = read(tmp_path / "sparse/0").images
+    assert {image.name for image in after.values()} == set(SPACED)
+    assert {k: image.name for k, image in after.items()} == {k: image.name for k, image in before.items()}
+    check(loaded(tmp_path), {name: k for k, name in enumerate(SPACED)})
+
+
+# Text as other programs write it.
+
+WRITERS: dict[str, Callable[[str], bytes]] = {
+    "a byte-order mark": lambda text: text.encode("utf-8-sig"),
+    "CRLF": lambda text: text.replace("\n", "\r\n").encode(),
+    "both": lambda text: text.replace("\n", "\r\n").encode("utf-8-sig"),
+    "CR": lambda text: text.replace("\n", "\r").encode(),
+    "UTF-16 of PowerShell": lambda text: text.replace("\n", "\r\n").encode("utf-16"),
+    "tabs": lambda text: text.replace(" 1 view", "\t1\tview").encode(),
+    "no comments": lambda text: "".join(
+        line for line in text.splitlines(keepends=True) if not line.startswith("#")
+    ).encode("utf-8-sig"),
+    "no lines of features": lambda text: text.replace("\n\n", "\n").encode(),
+    "spaces at the ends": lambda text: text.replace("\n", "  \n").encode(),
+}
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_text_of_other_programs_is_read(tmp_path: Path, writer: str) -> None:
+    photos(tmp_path / "colmap/images")
+    model(tmp_path / "colmap/sparse/0", change=WRITERS[writer])
+    scene = loaded(tmp_path / "colmap")
+    check(scene, ALL)
+    np.testing.assert_array_equal(scene.points, [[1, 2, 3]])
+    photos(tmp_path / "nerf/images")
+    transforms(tmp_path / "nerf/transforms.json", change=WRITERS[writer])
+    check(loaded(tmp_path / "nerf"), ALL)
+
+
+def test_features_are_not_taken_for_photos(tmp_path: Path) -> None:
+    photos(tmp_path / "images")
+    rows = [f"{line}\n1 2 -1 30 4.5 7 1e1 2 3 4 5 6\n" for line in image_lines(dict(enumerate(NAMES)))]
+    model(tmp_path / "sparse/0")
+    (tmp_path / "sparse/0/images.txt").write_text("".join(rows))
+    check(loaded(tmp_path), ALL)
+
+
+RENAMED: dict[str, Callable[[str], str]] = {
+    "upper case": str.upper,
+    "another case of the suffix": lambda name: name.replace(".jpg", ".JPG"),
+    "title case": str.title,
+    "a folder of Windows": lambda name: f"C:\\scene\\images\\{name}",
+    "a relative folder of Windows": lambda name: f".\\images\\{name}",
+    "no suffix": lambda name: name.removesuffix(".jpg"),
+    "another suffix in another case": lambda name: name.upper().replace(".JPG", ".PNG"),
+}
+
+
+@pytest.mark.parametrize("kind", RENAMED)
+def test_names_of_other_systems_are_matched(tmp_path: Path, kind: str) -> None:
+    rename = RENAMED[kind]
+    photos(tmp_path / "colmap/images")
+    model(tmp_path / "colmap/sparse/0", {k: rename(name) for k, name in enumerate(NAMES)})
+    check(loaded(tmp_path / "colmap"), ALL)
+    photos(tmp_path / "nerf/images")
+    given = [frame | {"file_path": rename(name)} for name, frame in zip(NAMES, frames(), strict=True)]
+    transforms(tmp_path / "nerf/transforms.json", given)
+    check(loaded(tmp_path / "nerf"), ALL)
+
+
+def test_accents_match_in_both_forms_of_unicode(tmp_path: Path) -> None:
+    names = [unicodedata.normalize("NFC", f"Gebäude {k}.jpg") for k in range(4)]
+    photos(tmp_path / "images", names)
+    model(tmp_path / "sparse/0", {k: unicodedata.normalize("NFD", name) for k, name in enumerate(names)})
+    check(loaded(tmp_path), {name: k for k, name in enumerate(names)})
+
+
+def test_names_that_differ_in_case_alone_stay_apart(tmp_path: Path) -> None:
+    names = ["a.jpg", "A.jpg"]
+    photos(tmp_path / "images", names)
+    model(tmp_path / "sparse/0", dict(enumerate(names)))
+    check(loaded(tmp_path), {"a.jpg": 0, "A.jpg": 1})
+
+
+def test_files_of_a_model_may_have_another_case(tmp_path: Path) -> None:
+    photos(tmp_path / "images")
+    model(tmp_path / "Sparse/0")
+    for path in list((tmp_path / "Sparse/0").iterdir()):
+        path.rename(path.with_name(path.name.upper().replace("TXT", "txt")))
+    check(loaded(tmp_path), ALL)
+
+
+def test_masks_and_points_with_backslashes_are_found(tmp_path: Path) -> None:
+    photos(tmp_path / "images")
+    photos(tmp_path / "cut", ["m.png"])
+    given = frames()
+    given[0]["mask_path"] = ".\\cut\\m.png"
+    transforms(tmp_path / "transforms.json", given)
+    views = {view.name: view for view in loaded(tmp_path).views}
+    assert views[NAMES[0]].mask == tmp_path / "cut/m.png"
+
+
+@pytest.mark.parametrize("folders", [("images_2", "images_4"), ("images", "images_2", "images_8")])
+@pytest.mark.parametrize("root", ["", "images/"])
+def test_of_photos_in_several_sizes_the_largest_are_used(
+    tmp_path: Path, folders: tuple[str, ...], root: str
+) -> None:
+    for power, folder in enumerate(folders):
+        photos(tmp_path / root / folder, size=(128 >> power, 96 >> power))
+    model(tmp_path / "sparse/0")
+    scene = loaded(tmp_path)
+    inside = folders[0] == "images" and not root
+    check(scene, {name if inside else f"{folders[0]}/{name}": k for name, k in ALL.items()})
+    assert {view.camera.width for view in scene.views} == {128}
+    assert scene.left_out == ()
+    if not inside:
+        (warning,) = scene.warnings
+        assert f"12 photos are those of {folders[0]}/" in warning
+        assert all(f"{folder}/" in warning for folder in folders)
+
+
+def test_the_folder_that_the_cameras_name_is_used(tmp_path: Path) -> None:
+    for folder, size in (("images_2", (128, 96)), ("images_4", (64, 48))):
+        photos(tmp_path / folder, size=size)
+    transforms(
+        tmp_path / "transforms.json",
+        [frame | {"file_path": f"images_4/{n}"} for n, frame in zip(NAMES, frames(), strict=True)],
+    )
+    assert {view.camera.width for view in loaded(tmp_path).views} == {64}
+
+
+@pytest.mark.parametrize(
+    ("folders", "sizes"), [(("left", "right"), (64, 32)), (("images_1", "images_2"), (64, 64))]
+)
+def test_photos_of_one_name_that_are_no_copies_are_refused_with_both_named(
+    tmp_path: Path, folders: tuple[str, str], sizes: tuple[int, int]
+) -> None:
+    for folder, width in zip(folders, sizes, strict=True):
+        photos(tmp_path / folder, size=(width, width * 3 // 4))
+    model(tmp_path / "sparse/0")
+    with pytest.raises(ValueError, match=f"it may be {folders[0]}/view 00.jpg or {folders[1]}/view 00.jpg"):
+        loaded(tmp_path)
+
+
+# Frames without a pose.
+
+
+@pytest.mark.parametrize("matrix", [None, [], "missing", "frame"])
+def test_a_frame_without_a_pose_is_left_out(tmp_path: Path, matrix: object) -> None:
+    photos(tmp_path / "images")
+    given: list[Any] = frames()
+    if matrix == "frame":
+        given[7] = None
+    elif matrix == "missing":
+        del given[7]["transform_matrix"]
+    else:
+        given[7]["transform_matrix"] = matrix
+    transforms(tmp_path / "transforms.json", given)
+    scene = loaded(tmp_path)
+    check(scene, {name: k for name, k in ALL.items() if k != 7})
+    assert "1 of 12 frames of transforms.json have no transform_matrix" in scene.warnings[0]
+    assert any("view 07" in name or name == "frame 7" for name, _ in scene.left_out)
+
+
+@pytest.mark.parametrize("value", [float("nan"), 1e300, 0.0])
+def test_one_frame_that_no_camera_can_be_is_left_out_and_several_are_refused(
+    tmp_path: Path, value: float
+) -> None:
+    photos(tmp_path / "images")
+    given = frames()
+    given[7]["transform_matrix"] = [[value] * 4] * 4
+    transforms(tmp_path / "transforms.json", given)
+    scene = loaded(tmp_path)
+    check(scene, {name: k for name, k in ALL.items() if k != 7})
+    assert any("Frame 7" in reason for _, reason in scene.left_out)
+    given[3]["transform_matrix"] = given[7]["transform_matrix"]
+    transforms(tmp_path / "transforms.json", given)
+    with pytest.raises(ValueError, match="Frame 7"):
+        loaded(tmp_path)
+
+
+def test_no_frame_with_a_pose_is_refused(tmp_path: Path) -> None:
+    photos(tmp_path / "images")
+    transforms(tmp_path / "transforms.json", [frame | {"transform_matrix": None} for frame in frames()])
+    with pytest.raises(ValueError, match=r"No frame of transforms.json has a transform_matrix"):
+        loaded(tmp_path)
+
+
+@pytest.mark.parametrize("pose", ["0 0 0 0 1 2 3", "nan nan nan nan nan nan nan", "1 0 0 0 1e300 0 0"])
+def test_one_pose_of_a_model_that_no_photo_can_have_is_left_out(tmp_path: Path, pose: str) -> None:
+    photos(tmp_path / "images")
+    lines = image_lines(dict(enumerate(NAMES)))
+    lines[7] = f"8 {pose} 1 {NAMES[7]}"
+    model(tmp_path / "sparse/0")
+    (tmp_path / "sparse/0/images.txt").write_text("".join(f"{line}\n\n" for line in lines))
+    scene = loaded(tmp_path)
+    check(scene, {name: k for name, k in ALL.items() if k != 7})
+    assert [name for name, _ in scene.left_out] == [NAMES[7]]
+    assert "not valid" in scene.left_out[0][1]
