@@ -5,14 +5,13 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatmill.data_sets import Cameras, TwoDataSets, find_cameras, walk
 from splatmill.errors import NothingToUpload
 from splatmill.schema.captures import Role, UnsafeName, safe_name
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, MASK_FOLDERS, PHOTO_SUFFIXES, VIDEO_SUFFIXES
 
 MODEL_SUFFIXES = frozenset({".bin", ".txt"})
-MODEL_STEMS = frozenset({"cameras", "images", "points3D", "rigs", "frames"})
-# Where tools put a COLMAP model; the first folder that holds one is used.
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
+MODEL_STEMS = frozenset({"cameras", "images", "points3d", "rigs", "frames"})  # in lower case
 
 
 @dataclass(frozen=True)
@@ -33,10 +32,15 @@ class LocalFile:
 
 @dataclass(frozen=True)
 class Found:
-    """The files of a capture, and the relative names of the files that were ignored."""
+    """The files of a capture.
+
+    ignored: relative names of the files that are not used.
+    top: the folder of the data set, with a slash at its end, where it is not the given one.
+    """
 
     files: tuple[LocalFile, ...]
     ignored: tuple[str, ...] = ()
+    top: str = ""
 
     def count(self, role: Role) -> int:
         """Return the number of files with this role."""
@@ -53,8 +57,9 @@ def find_files(path: str | os.PathLike[str]) -> Found:
 
     In a folder, the photos are those under `images/`, named relative to it. Without `images/`, they are all photos in
     the folder, named relative to the folder, so that `train/r_0.png` keeps its name in `transforms_train.json`. Masks
-    lie under `masks/` or `mask/`; poses are `transforms*.json`, the `.ply` files of points that they name, and a COLMAP
-    model. Hidden files and folders are ignored. Videos and zip archives are used only where there are no photos.
+    lie under `masks/` or `mask/`; poses are `transforms*.json`, the `.ply` files of points that they name, and COLMAP
+    models. All of this may lie some folders down: see `data_sets.find_cameras`. Hidden files and folders are ignored.
+    Videos and zip archives are used only where there are no photos.
 
     Raises NothingToUpload where the path does not exist, cannot be read or holds none of these, and where the service
     does not accept the name of a file.
@@ -65,16 +70,28 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     if root.is_file():
         return _single(root)
     try:
-        names = _walk(root)
+        names = walk(root)
+        cameras = find_cameras(names) or Cameras("")
     except OSError as error:
         raise NothingToUpload(f"{error.filename} cannot be read: {error.strerror}.") from error
+    except TwoDataSets as error:
+        raise NothingToUpload(f"{root} cannot be read as one capture. {error}") from error
 
-    photo_root = "images/" if any(name.startswith("images/") and _is_image(name) for name in names) else ""
+    # Cameras in a folder without photos are those of the photos around it.
+    top = cameras.top if any(name.startswith(cameras.top) and _is_image(name) for name in names) else ""
+    photo_root = f"{top}images/"
+    if not any(name.startswith(photo_root) and _is_image(name) for name in names):
+        photo_root = top
     mask_root = next(
-        (f"{top}/" for top in MASK_FOLDERS if any(name.startswith(f"{top}/") for name in names)), None
+        (
+            f"{top}{folder}/"
+            for folder in MASK_FOLDERS
+            if any(name.startswith(f"{top}{folder}/") for name in names)
+        ),
+        None,
     )
-    poses = _poses(names)
-    poses |= _points_of([root / name for name in poses if name.endswith(".json")], names)
+    poses = _poses(cameras, names)
+    poses |= _points_of(root, cameras, names)
     files: list[LocalFile] = []
     ignored: list[str] = []
     for name in names:
@@ -97,7 +114,7 @@ def find_files(path: str | os.PathLike[str]) -> Found:
                 f"{root} contains no photos, no video and no zip archive.",
                 f"Photos are {kinds} files.",
             )
-    return Found(tuple(files), tuple(ignored))
+    return Found(tuple(files), tuple(ignored), cameras.top)
 
 
 def start_model(path: Path) -> LocalFile:
@@ -122,58 +139,36 @@ def _single(path: Path) -> Found:
     return Found((_local(Role.images, path.name, path),))
 
 
-def _walk(root: Path) -> list[str]:
-    """Return the relative names of all files under `root` except hidden ones, sorted."""
-
-    def fail(error: OSError) -> None:
-        raise error
-
-    names: list[str] = []
-    visited: set[tuple[int, int]] = set()
-    # Links are followed, because data sets share photos through them; a folder seen before ends a cycle.
-    for folder, subfolders, files in os.walk(root, onerror=fail, followlinks=True):
-        here = os.stat(folder)
-        if (here.st_dev, here.st_ino) in visited:
-            subfolders.clear()
-            continue
-        visited.add((here.st_dev, here.st_ino))
-        subfolders[:] = [name for name in subfolders if not name.startswith((".", "__MACOSX"))]
-        inside = Path(folder).relative_to(root)
-        names += [(inside / name).as_posix() for name in files if not name.startswith(".")]
-    return sorted(names)
-
-
-def _poses(names: list[str]) -> dict[str, str]:
+def _poses(cameras: Cameras, names: list[str]) -> dict[str, str]:
     """Return the local name of each pose file, with its name in the capture."""
-    found = {
-        name: name
-        for name in names
-        if "/" not in name and name.startswith("transforms") and name.endswith(".json")
-    }
-    for folder in MODEL_FOLDERS:
-        prefix = "" if folder == "." else f"{folder}/"
-        inside = [name for name in names if name.startswith(prefix) and "/" not in name.removeprefix(prefix)]
-        if any(name.removeprefix(prefix) in ("cameras.bin", "cameras.txt") for name in inside):
-            model = [
-                name for name in inside if Path(name).stem in MODEL_STEMS and _suffix(name) in MODEL_SUFFIXES
-            ]
-            # In a capture, a COLMAP model always lies in the same folder.
-            return found | {name: f"sparse/0/{name.removeprefix(prefix)}" for name in model}
+    found = {name: name.removeprefix(cameras.top) for name in cameras.transforms}
+    places: list[str] = []
+    for folder in cameras.models:
+        # In a capture, COLMAP models always lie in the folders sparse/N.
+        number = folder.rstrip("/").rpartition("/")[2]
+        if not number.isdecimal() or number in places:
+            number = next(str(free) for free in range(len(places) + 1) if str(free) not in places)
+        places.append(number)
+        for name in names:
+            base = name.removeprefix(folder)
+            stem, suffix = os.path.splitext(base.lower())
+            if name.startswith(folder) and stem in MODEL_STEMS and suffix in MODEL_SUFFIXES:
+                found[name] = f"sparse/{number}/{base}"
     return found
 
 
-def _points_of(transforms: list[Path], names: list[str]) -> dict[str, str]:
-    """Return the .ply files with points that transforms files name, each with its name in the capture, which is the
-    same. A transforms file that cannot be read names none here; the worker says what is wrong with it."""
+def _points_of(root: Path, cameras: Cameras, names: list[str]) -> dict[str, str]:
+    """Return the .ply files with points that transforms files name, each with its name in the capture. A transforms
+    file that cannot be read names none here; the worker says what is wrong with it."""
     found = {}
-    for path in transforms:
+    for path in (root / name for name in cameras.transforms):
         try:
             named = json.loads(path.read_bytes()).get("ply_file_path")
         except (OSError, ValueError, AttributeError, RecursionError):
             continue
-        name = str(named).removeprefix("./")
-        if name in names and _suffix(name) == ".ply":
-            found[name] = name
+        name = str(named).replace("\\", "/").removeprefix("./")
+        if cameras.top + name in names and _suffix(name) == ".ply":
+            found[cameras.top + name] = name
     return found
 
 

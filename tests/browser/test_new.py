@@ -158,6 +158,14 @@ TREES = {
     "colmap in its root": "images/a.jpg cameras.txt images.txt points3D.txt frames.txt",
     "colmap of nerfstudio": "images/a.jpg colmap/sparse/0/cameras.bin colmap/sparse/0/points3D.bin transforms.json",
     "blender": "train/r_0.png test/r_0.png transforms_train.json transforms_test.json deep/transforms.json",
+    "a data set one folder down": "scene/images/a.jpg scene/sparse/0/cameras.bin scene/sparse/0/images.bin "
+    "scene/masks/a.png note.txt",
+    "models of a mapper": "images/a.jpg sparse/10/cameras.txt sparse/2/cameras.txt "
+    "sparse/cameras.txt colmap/sparse/0/cameras.txt",
+    "cameras beside the photos": "photos/a.jpg out/sparse/0/cameras.bin out/sparse/0/images.bin extra/cameras.txt",
+    "other cases": "Scene/images/A.JPG Scene/Transforms.JSON",
+    "numbered models": "a.jpg 0/cameras.bin 1/cameras.bin 1/images.bin",
+    "too deep": "a.jpg 1a/2a/3a/4a/5a/transforms.json",
     "videos": "a.mov b.webm",
     "a zip": "photos.zip",
     "code points": "é.jpg Z.jpg a.jpg \U0001f600.jpg ﬁ.jpg",

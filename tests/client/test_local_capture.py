@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from splatmill.data_sets import find_cameras, walk
 from splatmill.errors import NothingToUpload
 from splatmill.local_capture import find_files
 from splatmill.schema import Role
@@ -71,10 +72,65 @@ def test_a_colmap_model_is_found_where_tools_put_it(tmp_path: Path):
         assert roles(root)[Role.poses] == [f"sparse/0/{name}" for name in model]
 
 
-def test_a_smaller_model_beside_the_first_is_left(tmp_path: Path):
-    tree(tmp_path, "images/a.jpg", "sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/1/cameras.bin")
-    assert roles(tmp_path)[Role.poses] == ["sparse/0/cameras.bin", "sparse/0/images.bin"]
-    assert "sparse/1/cameras.bin" in find_files(tmp_path).ignored
+def test_all_models_of_a_mapper_are_sent_because_the_largest_is_chosen_by_its_photos(tmp_path: Path):
+    model = ("cameras.bin", "images.bin")
+    tree(tmp_path, "images/a.jpg", *(f"sparse/{k}/{name}" for k in (0, 2, 10) for name in model))
+    assert roles(tmp_path)[Role.poses] == [f"sparse/{k}/{name}" for k in (0, 10, 2) for name in model]
+    found = find_cameras(walk(tmp_path))
+    assert found is not None
+    assert found.models == ("sparse/0/", "sparse/2/", "sparse/10/")
+
+
+MODEL = ("sparse/0/cameras.bin", "sparse/0/images.bin")
+NESTED = {
+    "one folder down": ("scene/", "scene/images/", [f"scene/{name}" for name in MODEL]),
+    "beside a readme": ("scene/", "scene/images/", ["readme.txt", *(f"scene/{name}" for name in MODEL)]),
+    "four down": ("a/b/c/d/", "a/b/c/d/images/", [f"a/b/c/d/{name}" for name in MODEL]),
+    "transforms of another program": ("export/", "export/frames/", ["export/transforms.json"]),
+    "the photos beside it": ("export/", "photos/", [f"export/{name}" for name in MODEL]),
+    "undistorted by COLMAP": (
+        "dense/0/",
+        "dense/0/images/",
+        ["dense/0/sparse/cameras.bin", "dense/0/sparse/images.bin"],
+    ),
+    "in other cases": (
+        "Scene/",
+        "Scene/images/",
+        ["Scene/Sparse/0/Cameras.bin", "Scene/Sparse/0/Images.bin"],
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", NESTED)
+def test_a_data_set_some_folders_down_is_found(tmp_path: Path, kind: str):
+    top, photos, poses = NESTED[kind]
+    tree(tmp_path, f"{photos}a.jpg", f"{photos}b.jpg", *poses)
+    found = find_files(tmp_path)
+    assert found.top == top
+    assert [Path(file.name).name for file in found.files if file.role is Role.images] == ["a.jpg", "b.jpg"]
+    sent = [file.name for file in found.files if file.role is Role.poses]
+    assert len(sent) == len([name for name in poses if name != "readme.txt"])
+    assert all(name.startswith(("sparse/0/", "transforms.json")) for name in sent)
+
+
+def test_two_data_sets_side_by_side_are_refused_with_both_named(tmp_path: Path):
+    for scene in ("chair", "table"):
+        tree(tmp_path, f"{scene}/images/a.jpg", *(f"{scene}/{name}" for name in MODEL))
+    with pytest.raises(NothingToUpload, match="chair/ and in table/"):
+        find_files(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("names", "top"),
+    [
+        (["a/transforms.json", "transforms.json"], ""),  # the outermost
+        (["a/cameras.txt"], None),  # no model without its images
+        (["a/b/c/d/e/transforms.json"], None),  # too deep
+    ],
+)
+def test_files_that_are_no_second_data_set(names: list[str], top: str | None):
+    found = find_cameras(names)
+    assert (found.top if found is not None else None) == top
 
 
 @pytest.mark.parametrize("name", ["walk.MOV", "photos.zip", "one.jpg"])
@@ -100,7 +156,12 @@ def test_links_are_followed_but_not_in_circles(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "content", ['{"ply_file_path": "points3D.ply"}', '{"ply_file_path": "./points3D.ply"}']
+    "content",
+    [
+        '{"ply_file_path": "points3D.ply"}',
+        '{"ply_file_path": "./points3D.ply"}',
+        '\ufeff{"ply_file_path": ".\\\\points3D.ply"}',
+    ],
 )
 def test_the_points_that_transforms_name_are_poses_and_other_files_are_not(tmp_path: Path, content: str):
     tree(tmp_path, "images/a.jpg", "points3D.ply", "other.ply")

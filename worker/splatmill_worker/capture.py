@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from splatmill.data_sets import TwoDataSets
 from splatmill.schema import Backend, TrainOptions, known_distance
 from splatmill_worker import sfm
 from splatmill_worker.errors import Refusal
@@ -41,7 +42,12 @@ def posed_scene(
     Raises Refusal for poses that cannot be used and for a scale that cannot be followed, and SfmFailed.
     """
     capture = zipped.data_set(capture, workdir, cancelled)
-    given = posed.find(capture)
+    try:
+        given = posed.find(capture)
+    except TwoDataSets as error:
+        raise Refusal(
+            "poses_invalid", str(error), advice="Give one data set, or photos without cameras."
+        ) from error
     if given is not None:
         if options.scale is not None:
             raise Refusal(

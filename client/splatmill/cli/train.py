@@ -151,6 +151,8 @@ def _announce(found: Found) -> None:
     photos, poses, masks = (found.count(role) for role in (Role.images, Role.poses, Role.masks))
     extra = "".join(f", {count} {kind}" for count, kind in ((masks, "masks"), (poses, "pose files")) if count)
     typer.echo(f"{photos} photos{extra}, {format_bytes(found.bytes)}")
+    if found.top:
+        typer.echo(f"cameras: those in {found.top}")
     if found.ignored:
         shown = ", ".join(found.ignored[:5]) + (", ..." if len(found.ignored) > 5 else "")
         typer.echo(f"ignored: {shown}")

@@ -103,6 +103,8 @@ def unpack(
     try:
         with _BoundedReads(io.FileIO(path)) as file, zipfile.ZipFile(cast(IO[bytes], file)) as archive:
             _check_places(archive)
+            for entry in archive.infolist():
+                entry.filename = entry.filename.replace("\\", "/")  # as some programs of Windows write them
             entries = [entry for entry in archive.infolist() if not entry.filename.endswith("/")]
             _check_declared(entries)
             _check_folders(entries)

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from splatmill.backplane.records import reason
+from splatmill.data_sets import TwoDataSets
 from splatmill.schema import EditModel, ModelCameras
 from splatmill_worker.errors import ModelUnreadable, Refusal, StartUnusable
 from splatmill_worker.images.archive import UnsafeArchive, unpack
@@ -237,7 +238,10 @@ def _views(model: Path, wanted: Wanted, offset: tuple[float, float, float]) -> _
 
 def _scene(capture: Path, model: Path, stack: ExitStack) -> tuple[Scene, bool]:
     """The posed scene of a capture, and whether its cameras are those of the model, in the world of its file."""
-    given, own = posed.find(capture), False
+    try:
+        given, own = posed.find(capture), False
+    except TwoDataSets as error:
+        raise Refusal("poses_invalid", str(error)) from error
     beside = model.with_name("cameras.zip")
     if given is None and beside.is_file():
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="splatmill-clean-")))

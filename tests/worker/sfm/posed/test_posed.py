@@ -268,7 +268,7 @@ def test_both_sources_of_fox_agree() -> None:
     model = posed.find(folder)
     assert model is not None
     scene = model.load()
-    other = posed.PosedInput(folder, "transforms", None, (folder / "transforms.json",)).load()
+    other = posed.PosedInput(folder, "transforms", (), (folder / "transforms.json",)).load()
     poses = {view.name: view.camera for view in other.views}
     pairs = [(view.camera, poses[view.name]) for view in scene.views if view.name in poses]
     assert len(pairs) == 50

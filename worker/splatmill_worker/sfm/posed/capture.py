@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from splatmill.data_sets import find_cameras, walk
+from splatmill.schema.photos import PHOTO_SUFFIXES
 from splatmill_worker.images.decoders import mask_fault
 from splatmill_worker.scene import Scene, Source
 from splatmill_worker.sfm.posed import colmap_model, transforms
 from splatmill_worker.sfm.posed.files import ImageFiles
-
-MODEL_FILES = ("cameras.bin", "cameras.txt")
-"""Files of which a folder with a COLMAP model has one."""
-
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "0", "")
-"""Folders in which tools put COLMAP models; the first that has one is used."""
 
 POSE_FOLDERS = ("poses", "")
 """Folders of a capture in which cameras are looked for, in order."""
@@ -24,18 +20,20 @@ POSE_FOLDERS = ("poses", "")
 class PosedInput:
     """Cameras found beside the photos.
 
-    directory: the capture.
+    directory: the capture, or the folder of the data set in it.
     source: the kind of cameras.
-    model: folder of the COLMAP model; None for the other kinds.
+    models: folders with a COLMAP model, of which the one with most photos is used; empty for the other kinds.
     transforms: the transforms*.json files; empty for a COLMAP model.
     notes: sentences for the user about files that are not used.
+    warnings: sentences for the user about photos that are not used.
     """
 
     directory: Path
     source: Source
-    model: Path | None
+    models: tuple[Path, ...]
     transforms: tuple[Path, ...]
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def load(self) -> Scene:
         """The scene with the cameras as they were given.
@@ -44,30 +42,48 @@ class PosedInput:
         naming the file and the fault, when no usable view is left, and UnusablePicture for a mask that is too large.
         """
         files = ImageFiles.under(self.directory)
-        if self.model is not None:
-            scene = colmap_model.load(self.model, files, self.notes)
+        if self.models:
+            scene = colmap_model.load_largest(self.models, files, self.notes)
         else:
             scene = transforms.load(self.transforms, self.source, files, self.directory, self.notes)
-        return _without_unfit_masks(scene)
+        return _without_unfit_masks(replace(scene, warnings=(*self.warnings, *scene.warnings)))
 
 
 def find(directory: Path) -> PosedInput | None:
     """The cameras in `directory`, in poses/ first; None when there are none.
 
-    A COLMAP model is preferred to transforms.json, because it has sparse points as well.
+    A COLMAP model is preferred to transforms.json, because it has sparse points as well. The cameras may lie some
+    folders down: see `splatmill.data_sets.find_cameras`. Raises TwoDataSets.
     """
     for base in (directory / folder for folder in POSE_FOLDERS):
-        json_files = tuple(sorted(base.glob("transforms*.json"))) if base.is_dir() else ()
-        model = _model_under(base)
-        if model is not None:
-            unused = [path.name for path in json_files]
-            notes = (f"The COLMAP model in {model.relative_to(directory)} is used, not {', '.join(unused)}.",)
-            return PosedInput(directory, "colmap", model, (), notes if unused else ())
-        if json_files:
-            plain = tuple(path for path in json_files if path.name == "transforms.json")
-            if plain:
-                return PosedInput(directory, "transforms", None, plain)
-            return PosedInput(directory, "blender", None, json_files)
+        names = walk(base) if base.is_dir() else []
+        cameras = find_cameras(names)
+        if cameras is None:
+            continue
+        place, notes = directory, []
+        warnings: tuple[str, ...] = ()
+        if base == directory and cameras.top:
+            notes = [f"The cameras are those in {cameras.top}."]
+            photos = [name for name in names if Path(name).suffix.lower() in PHOTO_SUFFIXES]
+            outside = [name for name in photos if not name.startswith(cameras.top)]
+            if len(outside) < len(photos):
+                place = directory / cameras.top
+                if outside:
+                    warnings = (
+                        f"{len(outside)} photos outside {cameras.top} are not used, such as {outside[0]}: the cameras "
+                        f"are those of the data set in {cameras.top}.",
+                    )
+        json_files = tuple(base / name for name in cameras.transforms)
+        if cameras.models:
+            models = tuple(base / folder for folder in cameras.models)
+            if json_files:
+                of = f"The COLMAP model in {models[0].relative_to(directory)} is used"
+                notes.append(f"{of}, not {', '.join(path.name for path in json_files)}.")
+            return PosedInput(place, "colmap", models, (), tuple(notes), warnings)
+        plain = tuple(path for path in json_files if path.name.lower() == "transforms.json")
+        if plain:
+            return PosedInput(place, "transforms", (), plain, tuple(notes), warnings)
+        return PosedInput(place, "blender", (), json_files, tuple(notes), warnings)
     return None
 
 
@@ -82,12 +98,3 @@ def _without_unfit_masks(scene: Scene) -> Scene:
                 view = replace(view, mask=None)
         views.append(view)
     return replace(scene, views=tuple(views), notes=(*scene.notes, *notes))
-
-
-def _model_under(base: Path) -> Path | None:
-    """The first of MODEL_FOLDERS under `base` with a COLMAP model."""
-    for folder in MODEL_FOLDERS:
-        place = base / folder
-        if any((place / name).is_file() for name in MODEL_FILES):
-            return place
-    return None

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from splatmill.data_sets import MAX_DEPTH, TwoDataSets
 from splatmill.schema.formats import is_model_file
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, MASK_FOLDERS
 from splatmill_worker.images import prepare
 from splatmill_worker.images.archive import Allowance
 from splatmill_worker.sfm.posed.capture import find
-
-MAX_DEPTH = 4
-"""Folders around a data set that are looked into: zips often hold a folder that has all the rest."""
 
 
 def data_set(capture: Path, workdir: Path, cancelled: Callable[[], bool] = lambda: False) -> Path:
@@ -46,4 +44,7 @@ def data_set(capture: Path, workdir: Path, cancelled: Callable[[], bool] = lambd
 
 def _is_data_set(folder: Path) -> bool:
     masked = (folder / "images").is_dir() and any((folder / name).is_dir() for name in MASK_FOLDERS)
-    return masked or find(folder) is not None
+    try:
+        return masked or find(folder) is not None
+    except TwoDataSets:
+        return True  # whoever reads it says so

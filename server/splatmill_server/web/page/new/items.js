@@ -39,6 +39,8 @@ export class Items {
     /** @type {Map<string, Item>} */
     this.byPath = new Map();
     this.count = 0;
+    /** @type {string | null} why the files cannot be one capture */
+    this.problem = null;
   }
 
   /** All items in order of their paths. */
@@ -98,6 +100,7 @@ export class Items {
   /** Decide again what each file is; more files may change that. */
   sort() {
     const sorted = sort(this.byPath.keys(), this.accepted);
+    this.problem = sorted.problem;
     const order = new Map(sorted.files.map(({ path, role, name }) => [path, { role, name }]));
     const before = this.byPath;
     this.byPath = new Map();

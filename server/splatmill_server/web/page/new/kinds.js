@@ -1,5 +1,5 @@
 // Which of the given files are photos, masks, poses, videos or archives, and the names they get in the capture. The rules
-// are those of the command line (client/splatmill/local_capture.py); a test compares the two.
+// are those of the command line (client/splatmill/local_capture.py and data_sets.py); a test compares the two.
 
 /** @typedef {"images" | "masks" | "poses"} Role */
 
@@ -18,11 +18,19 @@
  * @typedef {object} Sorted
  * @property {{role: Role, name: string, path: string}[]} files
  * @property {string[]} ignored paths
+ * @property {string | null} problem why the files cannot be read as one capture
  */
 
 const MODEL_SUFFIXES = [".bin", ".txt"];
-const MODEL_STEMS = ["cameras", "images", "points3D", "rigs", "frames"];
-const MODEL_FOLDERS = ["sparse/0/", "sparse/", "colmap/sparse/0/", "colmap/sparse/", ""];
+const MODEL_STEMS = ["cameras", "images", "points3d", "rigs", "frames"];
+
+/** Folders of a data set in which tools put COLMAP models, with their rank; the longest is tried first. */
+const MODEL_PLACES = /** @type {[number, RegExp][]} */ ([
+  [1, /(?:^|(?<=\/))colmap\/sparse\/(?:\d+\/)?$/i], [0, /(?:^|(?<=\/))sparse\/(?:\d+\/)?$/i], [2, /(?:^|(?<=\/))\d+\/$/],
+]);
+
+/** Folders around a data set that are looked into. */
+const MAX_DEPTH = 4;
 
 /** Folders that say what lies in them, so their name is kept where everything lies in one folder. */
 const TELLING = ["images", "masks", "mask", "sparse", "colmap"];
@@ -44,11 +52,14 @@ export function sort(paths, accepted) {
   const seen = [...paths].filter((path) => !isHidden(path)).sort(byCodePoint);
   const isPhoto = (/** @type {string} */ path) => accepted.photos.includes(suffix(path));
   const isWhole = (/** @type {string} */ path) => [...accepted.videos, ...accepted.archives].includes(suffix(path));
-  const photoRoot = seen.some((path) => path.startsWith("images/") && isPhoto(path)) ? "images/" : "";
-  const maskRoot = accepted.mask_folders.map((folder) => `${folder}/`).find((root) => seen.some((path) => path.startsWith(root)));
-  const poses = posesIn(seen);
+  const cameras = camerasIn(seen);
+  // Cameras in a folder without photos are those of the photos around it.
+  const top = seen.some((path) => path.startsWith(cameras.top) && isPhoto(path)) ? cameras.top : "";
+  const photoRoot = seen.some((path) => path.startsWith(`${top}images/`) && isPhoto(path)) ? `${top}images/` : top;
+  const maskRoot = accepted.mask_folders.map((folder) => `${top}${folder}/`).find((root) => seen.some((path) => path.startsWith(root)));
+  const poses = namesOf(cameras, seen);
   /** @type {Sorted} */
-  const found = { files: [], ignored: [] };
+  const found = { files: [], ignored: [], problem: cameras.problem };
   for (const path of seen) {
     const pose = poses.get(path);
     if (pose !== undefined) found.files.push({ role: "poses", name: pose, path });
@@ -83,23 +94,72 @@ function isHidden(path) {
   return parts.some((part) => part.startsWith(".")) || parts.slice(0, -1).some((part) => part.startsWith("__MACOSX"));
 }
 
-/** The name in the capture of each path that is a pose file. @param {string[]} paths */
-function posesIn(paths) {
-  /** @type {Map<string, string>} */
-  const found = new Map();
+/** @typedef {{top: string, transforms: string[], models: string[], problem: string | null}} Cameras */
+
+/**
+ * The cameras of the outermost data set: its folder, its transforms*.json files and its folders with a COLMAP model.
+ * @param {string[]} paths
+ * @returns {Cameras}
+ */
+function camerasIn(paths) {
+  /** @type {Map<string, {transforms: string[], models: Map<string, number>}>} */
+  const sets = new Map();
+  const lower = new Set(paths.map((path) => path.toLowerCase()));
+  const of = (/** @type {string} */ top) => sets.get(top) ?? sets.set(top, { transforms: [], models: new Map() }).get(top);
   for (const path of paths) {
-    if (!path.includes("/") && path.startsWith("transforms") && path.endsWith(".json")) found.set(path, path);
+    const folder = path.slice(0, path.lastIndexOf("/") + 1);
+    const base = path.slice(folder.length).toLowerCase();
+    if (base.startsWith("transforms") && base.endsWith(".json")) of(folder)?.transforms.push(path);
+    else if (base === "cameras.bin" || base === "cameras.txt") {
+      const { top, rank } = placeOf(folder);
+      if (top === "" || lower.has(`${folder.toLowerCase()}images${base.slice(-4)}`)) of(top)?.models.set(folder, rank);
+    }
   }
-  for (const folder of MODEL_FOLDERS) {
-    const inside = paths.filter((path) => path.startsWith(folder) && !path.slice(folder.length).includes("/"));
-    if (!inside.some((path) => ["cameras.bin", "cameras.txt"].includes(path.slice(folder.length)))) continue;
-    for (const path of inside) {
+  const depth = (/** @type {string} */ top) => top.split("/").length - 1;
+  const tops = [...sets.keys()].sort((one, other) => depth(one) - depth(other) || byCodePoint(one, other));
+  const none = { top: "", transforms: [], models: [], problem: null };
+  if (!tops.length || depth(tops[0]) > MAX_DEPTH) return none;
+  if (tops.length > 1 && depth(tops[1]) === depth(tops[0])) {
+    return { ...none, problem: `There are cameras of several data sets, in ${tops[0]} and in ${tops[1]}. Give the folder of one of them.` };
+  }
+  const { transforms, models } = /** @type {{transforms: string[], models: Map<string, number>}} */ (sets.get(tops[0]));
+  const best = Math.min(...models.values());
+  const folders = [...models.keys()].filter((folder) => models.get(folder) === best);
+  const last = (/** @type {string} */ folder) => Number(numberOf(folder) ?? Infinity);
+  folders.sort((one, other) => (last(one) === last(other) ? byCodePoint(one, other) : last(one) - last(other)));
+  return { top: tops[0], transforms, models: folders, problem: null };
+}
+
+/** The data set that a folder with a COLMAP model belongs to, and the rank of its place there. @param {string} folder */
+function placeOf(folder) {
+  for (const [rank, place] of MODEL_PLACES) {
+    const found = place.exec(folder);
+    if (found) return { top: folder.slice(0, found.index), rank };
+  }
+  return { top: folder, rank: MODEL_PLACES.length };
+}
+
+/** The last part of a folder if it is a number. @param {string} folder */
+function numberOf(folder) {
+  return /(?:^|\/)(\d+)\/$/.exec(folder)?.[1] ?? null;
+}
+
+/** The name in the capture of each path that is a pose file. @param {Cameras} cameras @param {string[]} paths */
+function namesOf(cameras, paths) {
+  /** @type {Map<string, string>} */
+  const found = new Map(cameras.transforms.map((path) => [path, path.slice(cameras.top.length)]));
+  /** @type {string[]} */
+  const places = [];
+  for (const folder of cameras.models) {
+    let number = numberOf(folder);
+    for (let free = 0; number === null || places.includes(number); free++) number = String(free);
+    places.push(number);
+    for (const path of paths.filter((one) => one.startsWith(folder))) {
       const base = path.slice(folder.length);
       const ending = suffix(path);
-      const stem = base.slice(0, base.length - ending.length);
-      if (MODEL_STEMS.includes(stem) && MODEL_SUFFIXES.includes(ending)) found.set(path, `sparse/0/${base}`);
+      const stem = base.slice(0, base.length - ending.length).toLowerCase();
+      if (MODEL_STEMS.includes(stem) && MODEL_SUFFIXES.includes(ending)) found.set(path, `sparse/${number}/${base}`);
     }
-    break;
   }
   return found;
 }

@@ -118,6 +118,7 @@ export class Start {
     this.on.redraw();
     let last = "";
     try {
+      if (this.items.problem) throw new Error(this.items.problem);
       await this.check();
       await this.looked();
       await this.makeCapture();

@@ -32,7 +32,7 @@ function names(list) {
     if (list.getUint32(at, true) !== ENTRY) return null;
     const length = list.getUint16(at + 28, true);
     if (at + 46 + length > list.byteLength) return null;
-    const name = text.decode(new Uint8Array(list.buffer, list.byteOffset + at + 46, length));
+    const name = text.decode(new Uint8Array(list.buffer, list.byteOffset + at + 46, length)).replaceAll("\\", "/");
     if (!name.endsWith("/")) found.push(name);
     at += 46 + length + list.getUint16(at + 30, true) + list.getUint16(at + 32, true);
   }

@@ -1,0 +1,104 @@
+"""A data set some folders down, in a zip, or with several COLMAP models has the cameras that the plain one has.
+
+Does not prove that the names and the text of other programs are read (test_variants.py does).
+"""
+
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from splatmill.data_sets import TwoDataSets
+from splatmill.schema import TrainOptions
+from splatmill_worker.capture import posed_scene
+from splatmill_worker.errors import Refusal
+from splatmill_worker.images.archive import UnsafeArchive, unpack
+from splatmill_worker.sfm import posed
+from splatmill_worker.sfm.posed import zipped
+from tests.support.posed_sets import ALL, COUNT, NAMES, check, loaded, model, photos, transforms, zip_of
+
+
+@pytest.mark.parametrize("top", ["scene", "my scene/export", "a/b/c/d", "dense/0"])
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_a_data_set_some_folders_down_is_read(tmp_path: Path, top: str, kind: str) -> None:
+    photos(tmp_path / top / "images")
+    if kind == "colmap":
+        model(tmp_path / top / "sparse/0")
+    else:
+        transforms(tmp_path / top / "transforms.json")
+    (tmp_path / "readme.txt").write_text("by another program")
+    check(loaded(tmp_path), ALL)
+
+
+@pytest.mark.parametrize("slash", ["/", "\\"])
+def test_a_zip_with_more_than_the_data_set_is_read(tmp_path: Path, slash: str) -> None:
+    photos(tmp_path / "set/scene/images")
+    model(tmp_path / "set/scene/sparse/0")
+    (tmp_path / "set/license.txt").write_text("free")
+    photos(tmp_path / "set", ["cover.jpg"])
+    zip_of(tmp_path / "set", tmp_path / "capture/images/set.zip", slash)
+    scene = loaded(zipped.data_set(tmp_path / "capture", tmp_path / "work"))
+    check(scene, ALL)
+    assert "1 photos outside scene/ are not used" in " ".join(scene.warnings)
+
+
+def test_backslashes_lead_out_of_no_zip(tmp_path: Path) -> None:
+    (tmp_path / "a.zip").parent.mkdir(exist_ok=True)
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        entry = zipfile.ZipInfo("x")
+        entry.filename = "..\\out.jpg"
+        archive.writestr(entry, b"x")
+    with pytest.raises(UnsafeArchive, match="outside"):
+        unpack(tmp_path / "a.zip", tmp_path / "there")
+
+
+def test_cameras_beside_the_folder_of_their_photos_are_read(tmp_path: Path) -> None:
+    photos(tmp_path / "photos")
+    model(tmp_path / "export/sparse/0")
+    check(loaded(tmp_path), {f"photos/{name}": k for name, k in ALL.items()})
+
+
+def test_two_data_sets_are_refused_with_both_named(tmp_path: Path) -> None:
+    for scene in ("chair", "table"):
+        photos(tmp_path / "set" / scene / "images")
+        model(tmp_path / "set" / scene / "sparse/0")
+    with pytest.raises(TwoDataSets, match="chair/ and in table/"):
+        posed.find(tmp_path / "set")
+    zip_of(tmp_path / "set", tmp_path / "capture/images/set.zip")
+    with pytest.raises(Refusal, match="chair/ and in table/"):
+        posed_scene(tmp_path / "capture", tmp_path / "work", TrainOptions(), lambda *_: None, lambda: False)
+
+
+@pytest.mark.parametrize(
+    "place", ["sparse/{}", "colmap/sparse/{}", "{}", "poses/sparse/{}", "scene/sparse/{}"]
+)
+@pytest.mark.parametrize("larger", [0, 1])
+def test_the_model_with_most_photos_is_used_and_the_others_named(
+    tmp_path: Path, place: str, larger: int
+) -> None:
+    photos(tmp_path / ("scene/images" if place.startswith("scene") else "images"))
+    model(tmp_path / place.format(1 - larger), dict(enumerate(NAMES[:3])))
+    model(tmp_path / place.format(larger), {k: NAMES[k] for k in range(3, COUNT)})
+    scene = loaded(tmp_path)
+    check(scene, {NAMES[k]: k for k in range(3, COUNT)})
+    (warning,) = scene.warnings
+    assert f"/{larger} is used, with 9 photos" in warning
+    assert f"/{1 - larger} has 3 of the photos" in warning
+
+
+def test_photos_that_the_capture_lacks_do_not_count(tmp_path: Path) -> None:
+    photos(tmp_path / "images", NAMES[:3])
+    model(tmp_path / "sparse/0", {k: NAMES[k] for k in range(2, COUNT)})
+    model(tmp_path / "sparse/1", dict(enumerate(NAMES[:3])))
+    check(loaded(tmp_path), {NAMES[k]: k for k in range(3)})
+
+
+def test_a_broken_model_among_several_is_named(tmp_path: Path) -> None:
+    photos(tmp_path / "images")
+    model(tmp_path / "sparse/0", change=lambda _: b"\x01\x02")
+    model(tmp_path / "sparse/1")
+    scene = loaded(tmp_path)
+    check(scene, ALL)
+    assert "sparse/0 is not used: cameras.txt could not be read" in scene.warnings[0].replace(
+        "The COLMAP model in 0/ could not be read: ", ""
+    )
