@@ -39,7 +39,8 @@ def test_a_zip_with_more_than_the_data_set_is_read(tmp_path: Path, slash: str) -
     zip_of(tmp_path / "set", tmp_path / "capture/images/set.zip", slash)
     scene = loaded(zipped.data_set(tmp_path / "capture", tmp_path / "work"))
     check(scene, ALL)
-    assert "1 photos outside scene/ are not used" in " ".join(scene.warnings)
+    (warning,) = scene.warnings
+    assert "not used: 1, such as cover.jpg" in warning
 
 
 def test_backslashes_lead_out_of_no_zip(tmp_path: Path) -> None:

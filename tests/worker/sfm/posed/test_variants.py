@@ -40,7 +40,7 @@ def test_names_with_spaces_survive_the_text_that_is_written(
     model_of(list(scene.views), scene.points, scene).write_binary(tmp_path / "sparse/0")
     before = read(tmp_path / "sparse/0").images
     assert model_text.main(tmp_path / "sparse/0") == 0
-    assert f"{len(SPACED)} names have spaces" in capsys.readouterr().err
+    assert f"names with spaces ({len(SPACED)})" in capsys.readouterr().err
     after = read(tmp_path / "sparse/0").images
     assert {image.name for image in after.values()} == set(SPACED)
     assert {k: image.name for k, image in after.items()} == {k: image.name for k, image in before.items()}
@@ -129,6 +129,15 @@ def test_files_of_a_model_may_have_another_case(tmp_path: Path) -> None:
     check(loaded(tmp_path), ALL)
 
 
+def test_a_blender_set_in_another_case_keeps_its_split(tmp_path: Path) -> None:
+    photos(tmp_path / "images")
+    transforms(tmp_path / "Transforms_Train.JSON", frames()[:9])
+    transforms(tmp_path / "Transforms_Test.JSON", frames()[9:])
+    scene = loaded(tmp_path)
+    check(scene, ALL)
+    assert [view.split for view in scene.views] == ["train"] * 9 + ["test"] * 3
+
+
 def test_masks_and_points_with_backslashes_are_found(tmp_path: Path) -> None:
     photos(tmp_path / "images")
     photos(tmp_path / "cut", ["m.png"])
@@ -158,6 +167,16 @@ def test_of_photos_in_several_sizes_the_largest_are_used(
         assert all(f"{folder}/" in warning for folder in folders)
 
 
+def test_photos_that_are_there_twice_are_used_once(tmp_path: Path) -> None:
+    photos(tmp_path / "images_2")
+    photos(tmp_path / "images_4")
+    transforms(tmp_path / "transforms.json")
+    scene = loaded(tmp_path)
+    check(scene, {f"images_2/{name}": k for name, k in ALL.items()})
+    assert "12 photos are those of images_2/; images_4/ hold them again" in scene.warnings[0]
+    assert scene.left_out == ()
+
+
 def test_the_folder_that_the_cameras_name_is_used(tmp_path: Path) -> None:
     for folder, size in (("images_2", (128, 96)), ("images_4", (64, 48))):
         photos(tmp_path / folder, size=size)
@@ -175,7 +194,7 @@ def test_photos_of_one_name_that_are_no_copies_are_refused_with_both_named(
     tmp_path: Path, folders: tuple[str, str], sizes: tuple[int, int]
 ) -> None:
     for folder, width in zip(folders, sizes, strict=True):
-        photos(tmp_path / folder, size=(width, width * 3 // 4))
+        photos(tmp_path / folder, NAMES if folder == folders[0] else NAMES[::-1], (width, width * 3 // 4))
     model(tmp_path / "sparse/0")
     with pytest.raises(ValueError, match=f"it may be {folders[0]}/view 00.jpg or {folders[1]}/view 00.jpg"):
         loaded(tmp_path)
@@ -197,8 +216,9 @@ def test_a_frame_without_a_pose_is_left_out(tmp_path: Path, matrix: object) -> N
     transforms(tmp_path / "transforms.json", given)
     scene = loaded(tmp_path)
     check(scene, {name: k for name, k in ALL.items() if k != 7})
-    assert "1 of 12 frames of transforms.json have no transform_matrix" in scene.warnings[0]
-    assert any("view 07" in name or name == "frame 7" for name, _ in scene.left_out)
+    assert "left out: 1 of 12 in transforms.json" in scene.warnings[0]
+    expected = ["frame 7", NAMES[7]] if matrix == "frame" else [NAMES[7]]
+    assert [name for name, _ in scene.left_out] == expected
 
 
 @pytest.mark.parametrize("value", [float("nan"), 1e300, 0.0])
@@ -211,7 +231,9 @@ def test_one_frame_that_no_camera_can_be_is_left_out_and_several_are_refused(
     transforms(tmp_path / "transforms.json", given)
     scene = loaded(tmp_path)
     check(scene, {name: k for name, k in ALL.items() if k != 7})
-    assert any("Frame 7" in reason for _, reason in scene.left_out)
+    ((name, reason),) = scene.left_out
+    assert name == NAMES[7]
+    assert "Frame 7" in reason
     given[3]["transform_matrix"] = given[7]["transform_matrix"]
     transforms(tmp_path / "transforms.json", given)
     with pytest.raises(ValueError, match="Frame 7"):

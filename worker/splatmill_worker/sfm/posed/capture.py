@@ -70,8 +70,8 @@ def find(directory: Path) -> PosedInput | None:
                 place = directory / cameras.top
                 if outside:
                     warnings = (
-                        f"{len(outside)} photos outside {cameras.top} are not used, such as {outside[0]}: the cameras "
-                        f"are those of the data set in {cameras.top}.",
+                        f"Photos outside {cameras.top}, where the cameras are, are not used: {len(outside)}, such as "
+                        f"{outside[0]}.",
                     )
         json_files = tuple(base / name for name in cameras.transforms)
         if cameras.models:

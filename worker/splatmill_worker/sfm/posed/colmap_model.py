@@ -15,7 +15,7 @@ from splatmill_worker.images import decoders
 from splatmill_worker.images.lens import lens_of, pinhole, without_distortion
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
 from splatmill_worker.sfm.posed import model_files
-from splatmill_worker.sfm.posed.files import ImageFiles, missing
+from splatmill_worker.sfm.posed.files import ImageFiles, missing, readings
 from splatmill_worker.sfm.posed.model_files import GivenModel, ModelPoints
 
 Integers = npt.NDArray[np.int64]
@@ -49,25 +49,26 @@ def load_largest(folders: Sequence[Path], files: ImageFiles, notes: tuple[str, .
             f"The capture has {len(folders)} COLMAP models; at most {MOST_MODELS} are read. Give one of them."
         )
     best: tuple[int, Path, GivenModel] | None = None
-    said: list[str] = []
+    said: dict[Path, str] = {}
     faults: list[ValueError] = []
     for folder in folders:
         try:
             model = model_files.read(folder)
         except ValueError as error:
             faults.append(error)
-            said.append(f"{_shown(folder)} is not used: {error}")
+            said[folder] = f"{_shown(folder)} is not used: {error}"
             continue
         count = len({path for image in model.images.values() if (path := _path(files, image.name))})
-        said.append(f"{_shown(folder)} has {count} of the photos.")
+        said[folder] = f"{_shown(folder)} has {count} of the photos."
         if best is None or count > best[0]:
             best = count, folder, model
     if best is None:
         raise faults[0]
     count, folder, model = best
     scene = scene_of_given(model, files, notes)
+    others = (sentence for other, sentence in said.items() if other != folder)
     which = f"Of {len(folders)} COLMAP models, {_shown(folder)} is used, with {count} photos, because it has the most."
-    return replace(scene, warnings=(*scene.warnings, " ".join((which, *said))))
+    return replace(scene, warnings=(*scene.warnings, " ".join((which, *others))))
 
 
 def _path(files: ImageFiles, name: str) -> Path | None:
@@ -103,11 +104,13 @@ def scene_of_given(model: GivenModel, files: ImageFiles, notes: tuple[str, ...] 
             f"None of the {len(unusable)} photos with a camera can be used, such as {name!r}: {reason}."
         )
     if not views:
+        if not lacking:
+            raise ValueError("The COLMAP model has no registered photo. Give one that has, or leave it out.")
+        several = readings(first := lacking[0][0], files)
         raise ValueError(
-            f"The COLMAP model names {len(lacking)} photos (such as {lacking[0][0]!r}), and the capture has none of "
-            f"them ({lacking[0][1]}). Give the photos the names that the model uses."
-            if lacking
-            else "The COLMAP model has no registered photo. Give one that has, or leave it out."
+            f"The COLMAP model names {len(lacking)} photos (such as {first!r}), and the capture has "
+            + (f"several of this name: {several}." if several else "none of them.")
+            + " Give the photos the names that the model uses."
         )
     used = {view.image for view in views.values()}
     copies, copy_warnings = files.copies(used)

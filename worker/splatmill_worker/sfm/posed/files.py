@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import re
 import unicodedata
 from collections.abc import Callable, Set
@@ -70,7 +71,7 @@ class ImageFiles:
                 continue
             count = sum(self._in_folder(chosen, path) for path in used)
             others = ", ".join(f"{folder}/" for folder in sorted(folders) if folder != chosen)
-            notes.append(f"{count} photos are those of {chosen}/; {others} hold them at a smaller size.")
+            notes.append(f"{count} photos are those of {chosen}/; {others} hold them again, no larger.")
             copies += [
                 path
                 for name, path in self.photos.items()
@@ -122,14 +123,17 @@ class ImageFiles:
         return next((name for name in names if PurePosixPath(name).parts[0] == chosen), None)
 
     def _largest_folder(self, names: list[str]) -> str | None:
-        """The folder of the largest of these photos; None where two are as large, or a shape differs."""
+        """The folder of the largest of these photos; None where two as large differ, or a shape does."""
         try:
             sizes = {name: decoders.sizes(self.photos[name], name)[0] for name in names}
         except UnusablePicture:
             return None
-        first, second, *_ = ordered = sorted(names, key=lambda name: -sizes[name][0])
+        first, *_ = ordered = sorted(names, key=lambda name: (-sizes[name][0], name))
         aspects = [sizes[name][0] / sizes[name][1] for name in ordered]
-        if sizes[first][0] == sizes[second][0] or max(aspects) > min(aspects) * MAX_ASPECT_RATIO:
+        if max(aspects) > min(aspects) * MAX_ASPECT_RATIO:
+            return None
+        alike = [name for name in ordered[1:] if sizes[name] == sizes[first]]
+        if not all(filecmp.cmp(self.photos[first], self.photos[name], shallow=False) for name in alike):
             return None
         return PurePosixPath(first).parts[0]
 
@@ -165,9 +169,13 @@ def folded(name: str) -> str:
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
 
 
+def readings(name: str, files: ImageFiles) -> str:
+    """The photos that a name may refer to, as a part of a sentence, where they are several; else empty."""
+    several = files.candidates(name)
+    return f"it may be {several[0]} or {several[1]}; leave one of them out" if len(several) > 1 else ""
+
+
 def missing(name: str, files: ImageFiles, given: str) -> str:
     """Why no photo is used for a name that has a camera. given: what has the camera."""
-    several = files.candidates(name)
-    if len(several) > 1:
-        return f"{given}, and it may be {several[0]} or {several[1]}; leave one of them out"
-    return f"{given}, but the capture has no such photo"
+    several = readings(name, files)
+    return f"{given}, and {several}" if several else f"{given}, but the capture has no such photo"

@@ -18,8 +18,9 @@ def main(folder: Path) -> int:
     spaced = sum(" " in image.name for image in model.images.values())
     if spaced:
         print(
-            f"Warning: {spaced} names have spaces. Splatmill reads them from text, and COLMAP and many other programs "
-            "only up to the first space: use the binary model (--format colmap), or rename the photos.",
+            f"Warning: The model has names with spaces ({spaced}). Splatmill reads them from text, and COLMAP "
+            "and many other programs only up to the first space: use the binary model (--format colmap), or rename "
+            "the photos.",
             file=sys.stderr,
         )
     for path in sorted(folder.iterdir()):

@@ -21,7 +21,7 @@ from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.images import decoders
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
-from splatmill_worker.sfm.posed.files import ImageFiles, missing
+from splatmill_worker.sfm.posed.files import ImageFiles, missing, readings
 from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_PARAMETER, MAX_SIDE, MOST_FAULTY
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -66,7 +66,7 @@ def load(
         for index, frame in enumerate(document["frames"]):
             if _has_no_pose(frame):
                 without += 1
-                left_out.append((_called(index, frame), f"{path.name} has no transform_matrix for it"))
+                left_out.append((_called(index, frame, files), f"{path.name} has no transform_matrix for it"))
                 continue
             try:
                 name, view = _view(path, index, document, frame, files, capture)
@@ -77,7 +77,7 @@ def load(
                 faulty += 1
                 if faulty > MOST_FAULTY * len(document["frames"]):
                     raise
-                left_out.append((_called(index, frame), str(error)))
+                left_out.append((_called(index, frame, files), str(error)))
                 continue
             if view is None:
                 left_out.append((name, missing(name, files, f"{path.name} has a camera for it")))
@@ -88,8 +88,8 @@ def load(
             raise ValueError(f"No frame of {path.name} has a transform_matrix: it places no photo.")
         if without:
             warnings.append(
-                f"{without} of {len(document['frames'])} frames of {path.name} have no transform_matrix, and are left "
-                "out."
+                f"Frames without a transform_matrix are left out: {without} of {len(document['frames'])} in "
+                f"{path.name}."
             )
         if document.get("ply_file_path"):
             points, note = _sparse_points(path.parent / _local(str(document["ply_file_path"])), capture)
@@ -102,18 +102,21 @@ def load(
             f"None of the {len(unusable)} photos with a camera can be used, such as {name!r}: {reason}."
         )
     if not views:
-        first = f" (such as {left_out[0][0]!r}: {left_out[0][1]})" if left_out else ""
+        first = f" (such as {left_out[0][0]!r})" if left_out else ""
+        several = readings(left_out[0][0], files) if left_out else ""
         raise ValueError(
-            f"{', '.join(path.name for path in paths)} has {len(left_out)} cameras{first}, and the capture has none "
-            "of their photos. Give the photos the names in file_path."
+            f"{', '.join(path.name for path in paths)} has {len(left_out)} cameras{first}, and the capture has "
+            + (f"several photos of this name: {several}." if several else "none of their photos.")
+            + " Give the photos the names in file_path."
         )
     used = {view.image for view in views.values()}
     left_out += unusable.items()
+    named = {name for name, _ in left_out}
     copies, copy_warnings = files.copies(used)
     left_out += [
         (name, "no camera is given for it")
         for name, path in files.photos.items()
-        if path not in used and path not in copies and name not in unusable
+        if path not in used and path not in copies and name not in named
     ]
     return Scene(
         views=tuple(sorted(views.values(), key=lambda view: view.name)),
@@ -160,7 +163,7 @@ def _test_names(path: Path, document: dict[str, Any]) -> set[str]:
 
 def _split_of(path: Path) -> Literal["train", "test", "val"] | None:
     """The split that a Blender data set names in the file name."""
-    match path.stem.removeprefix("transforms").lstrip("_"):
+    match path.stem.lower().removeprefix("transforms").lstrip("_"):
         case "train" | "test" | "val" as split:
             return split
     return None
@@ -198,10 +201,13 @@ def _has_no_pose(frame: Any) -> bool:
     return frame is None or (isinstance(frame, dict) and frame.get("transform_matrix") in (None, []))
 
 
-def _called(index: int, frame: Any) -> str:
-    """The file_path of a frame, or its number where it has none."""
+def _called(index: int, frame: Any, files: ImageFiles) -> str:
+    """The name of the photo of a frame, or else its file_path, or its number where it has none."""
     name = frame.get("file_path") if isinstance(frame, dict) else None
-    return name if isinstance(name, str) else f"frame {index}"
+    if not isinstance(name, str):
+        return f"frame {index}"
+    found = files.photo(name)
+    return name if found is None else found[0]
 
 
 def _local(path: str) -> str:
