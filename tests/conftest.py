@@ -1,11 +1,13 @@
 """What all tests share.
 
 Threads of the kernels sleep soon at barriers, as they do in the worker's own processes. Test processes that run side by
-side divide the cores between them. No garbage is looked for while tests are collected.
+side divide the cores between them. No garbage is looked for while tests are collected. A umask that a command sets in
+the process of its test is taken back.
 """
 
 import gc
 import os
+from collections.abc import Iterator
 
 import pytest
 
@@ -31,3 +33,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with slow tests first, so that no process is left alone with one of them at the end."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
+
+
+@pytest.fixture(autouse=True)
+def _umask() -> Iterator[None]:
+    before = os.umask(0o022)
+    os.umask(before)
+    yield
+    os.umask(before)
