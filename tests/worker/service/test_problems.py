@@ -74,3 +74,9 @@ def test_a_helper_of_a_library_that_a_signal_ends_is_no_fault_of_the_job(end: st
     with pytest.raises(RuntimeError) as caught:
         compiled()
     assert is_transient(caught.value) is again
+
+
+def test_an_error_that_is_its_own_cause_is_judged_in_bounded_time() -> None:
+    first, second = RuntimeError("first"), RuntimeError("second")
+    first.__context__, second.__context__ = second, first
+    assert not is_transient(first)

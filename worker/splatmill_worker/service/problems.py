@@ -37,9 +37,11 @@ def is_decoder_end(error: BaseException) -> bool:
 def _is_program_end(error: BaseException) -> bool:
     """Return whether a program that a library had started, such as a compiler of kernels, was ended by a signal."""
     cause: BaseException | None = error
-    while cause is not None:
+    visited: set[int] = set()  # an error that is raised anew from one of its consequences is its own cause
+    while cause is not None and id(cause) not in visited:
         if isinstance(cause, subprocess.CalledProcessError) and cause.returncode < 0:
             return True
+        visited.add(id(cause))
         cause = cause.__cause__ or cause.__context__
     return False
 
