@@ -109,10 +109,11 @@ class LiveScene:
     """Observes training, and shows the scene as a compressed .ply without spherical harmonics.
 
     world: the coordinates of the snapshots, those of the exported model.
+    antialiased: whether the scene is trained antialiased.
     """
 
-    def __init__(self, looks: Looks, world: ExportWorld) -> None:
-        self._looks = looks
+    def __init__(self, looks: Looks, world: ExportWorld, antialiased: bool) -> None:
+        self._looks, self._antialiased = looks, antialiased
         self._scale = 1.0 / world.normalization.scale
         self._shift = torch.from_numpy(-self._scale * world.normalization.translation - world.offset)
         self._step = 0
@@ -126,7 +127,7 @@ class LiveScene:
         with self._looks.one():
             scene = gaussians_of(engine)
             shown = most_covering(scene.padded(0), MOST_GAUSSIANS).moved(self._scale, self._shift)
-            ply = compressed_ply.encode(shown)
+            ply = compressed_ply.encode(shown, antialiased=self._antialiased)
             event = SnapshotEvent(
                 step=step, seconds=seconds, gaussians=scene.count, shown=shown.count, bytes=len(ply)
             )

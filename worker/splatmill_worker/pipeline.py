@@ -256,13 +256,15 @@ def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaus
     """The Gaussians to start from, and the assessment of the given model; None where no model was given."""
     path = start_model_path(task.capture, task.workdir, task.options)
     if path is not None:
-        given, count = read_given_model(path, cameras.normalization, _most_given(task.options))
-        if count > given.count:
-            task.emit(LogEvent(level="warning", message=_reduced_message(path, count, given.count)))
-        start = assess(given, photos.training)
+        given = read_given_model(path, cameras.normalization, _most_given(task.options))
+        gaussians = given.gaussians
+        if given.count > gaussians.count:
+            message = _reduced_message(path, given.count, gaussians.count)
+            task.emit(LogEvent(level="warning", message=message))
+        start = assess(gaussians, photos.training, antialiased=given.antialiased)
         if start.doubtful:
             task.emit(LogEvent(level="warning", message=_doubt_message(start)))
-        return given, start
+        return gaussians, start
     world = cameras.world
     if len(world.points) >= ENOUGH_POINTS:
         return from_points(torch.from_numpy(world.points), torch.from_numpy(world.colors)), None
@@ -349,8 +351,10 @@ def _train(task: Task, cameras: Cameras, engine: Engine, photos: Photos, plan: P
         film = ProgressFilm(task.workdir / "film", photos.shown, plan, anew=earlier is None)
     lapse = None
     if task.keeps_time_lapse:
-        lapse = TimeLapse(task.workdir / TIME_LAPSE, cameras.exported, anew=earlier is None)
-    live = None if task.looks is None else LiveScene(task.looks, cameras.exported)
+        lapse = TimeLapse(
+            task.workdir / TIME_LAPSE, cameras.exported, anew=earlier is None, antialiased=plan.antialias
+        )
+    live = None if task.looks is None else LiveScene(task.looks, cameras.exported, plan.antialias)
     events = TrainingEvents(task.emit, task.workdir, plan, photos.shown)
     trained = train(
         engine,

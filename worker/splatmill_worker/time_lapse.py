@@ -42,14 +42,21 @@ class TimeLapse:
     folder: of the snapshots, `000.ply` and so on, each with a `000.json` that says when it was taken.
     world: the coordinates of the snapshots, those of the exported model.
     anew: drop the snapshots of earlier attempts.
+    antialiased: whether the scene is trained antialiased.
     clock: seconds; the time between two looks at it is the time of the training.
     seconds: wall time of the snapshots in this attempt.
     """
 
     def __init__(
-        self, folder: Path, world: ExportWorld, *, anew: bool, clock: Callable[[], float] = time.perf_counter
+        self,
+        folder: Path,
+        world: ExportWorld,
+        *,
+        anew: bool,
+        antialiased: bool = False,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self._folder, self._clock = folder, clock
+        self._folder, self._clock, self._antialiased = folder, clock, antialiased
         if anew:
             shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True, exist_ok=True)
@@ -86,7 +93,7 @@ class TimeLapse:
         scene = gaussians_of(engine)
         shown = most_covering(scene.padded(0), MOST_GAUSSIANS).moved(self._scale, self._shift)
         path = self._folder / f"{self._taken:03d}.ply"
-        atomic_write(path, compressed_ply.encode(shown))
+        atomic_write(path, compressed_ply.encode(shown, antialiased=self._antialiased))
         facts = {"step": step, "seconds": seconds, "gaussians": scene.count, "shown": shown.count}
         # Written after the snapshot, so that one without it is not counted and is written again.
         atomic_write(path.with_suffix(".json"), json.dumps(facts))

@@ -143,7 +143,7 @@ class Bench:
         """What the worker makes of a file to start from, whose suffix tells its format."""
         path = write(self._fresh() / f"start{suffix}", data)
         try:
-            gaussians, _ = read_given_model(path, Normalization(1.0, np.zeros(3)), 1000)
+            gaussians = read_given_model(path, Normalization(1.0, np.zeros(3)), 1000).gaussians
         except WorkerError as error:
             return Answer(f"the job fails: `{error.code}`", error.message)
         return Answer("used", f"{gaussians.count} Gaussians")

@@ -173,7 +173,7 @@ def _by_photos(
     targets = [view.full for view in views.training]
     background = benchmark_background(views.training)
     if views.photos:
-        _check_world(gaussians.select(keep), views.training)
+        _check_world(gaussians.select(keep), views.training, antialias)
     before = [_mean(gaussians, each, background, antialias) for each in (views.training, views.held_out)]
     if wanted.min_weight is not None:
         rows = keep.nonzero()[:, 0]
@@ -202,10 +202,10 @@ def _mean(gaussians: Gaussians, views: Sequence[TrainingView], background: Tenso
     return sum(scores) / max(1, len(scores))
 
 
-def _check_world(gaussians: Gaussians, views: Sequence[TrainingView]) -> None:
+def _check_world(gaussians: Gaussians, views: Sequence[TrainingView], antialias: bool) -> None:
     """Raise Refusal for a model that lies in another world than the cameras: all of it would be unsupported."""
     try:
-        assess(gaussians, views)
+        assess(gaussians, views, antialiased=antialias)
     except StartUnusable as error:
         raise Refusal(
             "poses_invalid",

@@ -63,10 +63,12 @@ def edit(storage: Storage, model_id: str, request: EditModel, backend: str | Non
     if left.count == 0:
         raise NothingLeft
     photos = _held_out(storage, model_id)
-    try:
-        antialias = antialias_of(storage.get(layout.model_file(model_id, "report.json")))
-    except FileNotFoundError:
-        antialias = False
+    antialias = contents.antialiased
+    if antialias is None:
+        try:
+            antialias = antialias_of(storage.get(layout.model_file(model_id, "report.json")))
+        except FileNotFoundError:
+            antialias = False
     grey = background_of(storage, model_id)
     background = (grey, grey, grey)
     before = _score(whole, photos, background, antialias, backend)
@@ -79,7 +81,8 @@ def edit(storage: Storage, model_id: str, request: EditModel, backend: str | Non
         views=[EditedView(name=v.name, psnr=v.psnr, ssim=v.ssim) for v in (after.views if after else ())],
     )
     if not request.preview:
-        ply.write(path, left, offset=contents.offset, comments=("Made by Splatmill",))
+        comments = ("Made by Splatmill",)
+        ply.write(path, left, offset=contents.offset, antialiased=antialias, comments=comments)
     return edited
 
 

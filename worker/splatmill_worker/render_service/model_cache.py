@@ -108,7 +108,8 @@ class ModelCache:
         if self._backend == "gpu":
             gaussians = gaussians.map(lambda tensor: tensor.cuda())
         size = sum(t.numel() * t.element_size() for t in gaussians)
-        antialias = self._antialias(model_id)
+        said = contents.antialiased
+        antialias = self._antialias(model_id) if said is None else said
         return LoadedModel(model_id, etag, gaussians, antialias, size, self._backend, contents.offset)
 
     def _antialias(self, model_id: str) -> bool:

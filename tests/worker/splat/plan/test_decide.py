@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -37,6 +38,7 @@ VARIANTS: list[dict[str, Any]] = [
     {"tint_spread": 0.2, "halving_loss": 0.5, "points": 900_000},
     {"width": 60, "height": 80, "native_longest": 80},
     {"start": GivenModel(700, 3, 27.0, 12.0, 11.0)},
+    {"start": GivenModel(700, 3, 27.0, 12.0, 11.0, antialiased=True)},
 ]
 WITHOUT_NUMBER = {
     "No photo is transparent.",
@@ -44,6 +46,7 @@ WITHOUT_NUMBER = {
     "No photo has lens distortion.",
     "No photo is transparent; a random background keeps training from hiding holes in the surface.",
     "The given model is kept as it is.",
+    "The file of the given model says how the model is drawn.",
     "The given model is trained already; reduced photos would blur it.",
     "The distances from which points are seen are not known.",
     "The angles between the views of a point are not known.",
@@ -177,6 +180,13 @@ def test_a_given_model_is_trained_at_full_size_with_the_papers_rates() -> None:
     assert not plan.gaps
 
 
+def test_a_given_model_is_trained_as_its_file_says_it_is_drawn() -> None:
+    for said, near_and_far, antialias in ((True, 1.0, True), (False, 9.0, False), (None, 9.0, True)):
+        model = GivenModel(700, 2, 27.0, 12.0, 11.0, antialiased=said)
+        assert planned(changed(start=model, distance_ratio=near_and_far)).antialias is antialias
+    assert not planned(changed(start=replace(model, antialiased=True)), antialias="off").antialias
+
+
 def test_a_given_model_keeps_its_degree_unless_another_is_asked_for() -> None:
     model = GivenModel(700, 2, psnr=27.0, one_color=12.0, another=11.0)
     narrow = changed(start=model, view_angle=2.0)
@@ -215,4 +225,5 @@ def test_facts_as_plain_values_hold_the_speed_and_the_model() -> None:
     model = GivenModel(700, 2, psnr=27.0, one_color=12.0, another=None)
     told = changed(FACTS, start=model).as_dict()
     assert told["speed"] == {"per_pixel": 2.6e-8, "per_gaussian": 9e-8}
-    assert told["start"] == {"gaussians": 700, "degree": 2, "psnr": 27.0, "one_color": 12.0, "another": None}
+    psnr = {"psnr": 27.0, "one_color": 12.0, "another": None}
+    assert told["start"] == {"gaussians": 700, "degree": 2, **psnr, "antialiased": None}

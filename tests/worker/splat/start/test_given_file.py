@@ -33,7 +33,8 @@ pytestmark = [
 
 
 def given(path: Path, most: int = 10**6) -> tuple[Gaussians, int]:
-    return read_given_model(path, Normalization(1.0, np.zeros(3)), most)
+    start = read_given_model(path, Normalization(1.0, np.zeros(3)), most)
+    return start.gaussians, start.count
 
 
 def children() -> list[int]:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from splatmill.files import atomic_write
 from splatmill_worker.errors import ModelUnreadable
-from splatmill_worker.splat.formats import ply
+from splatmill_worker.splat.formats import ply, ply_comments
 from splatmill_worker.splat.formats.contents import (
     MIN_OPACITY,
     NO_OFFSET,
@@ -52,22 +52,23 @@ _OTHERS = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 _RESTS = (9, 24, 45)
 
 
-def encode(gaussians: Gaussians, *, offset: Offset = NO_OFFSET) -> bytes:
+def encode(gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antialiased: bool = False) -> bytes:
     """The file as bytes, with the harmonics that `gaussians` have: pad them to degree 0 for 16 bytes a Gaussian.
 
     Rows with a non-finite parameter and rows with an opacity under MIN_OPACITY are left out, and the others are put
     into the order of a space-filling curve, so that the Gaussians of a chunk lie near each other.
     """
-    return _encoded(_ordered(gaussians), offset)
+    return _encoded(_ordered(gaussians), offset, antialiased)
 
 
 def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antialiased: bool = False) -> int:
-    """Write what `encode` gives; returns how many Gaussians were written. `antialiased` is not stored.
+    """Write what `encode` gives; returns how many Gaussians were written.
 
-    The file is replaced atomically. Raises OSError.
+    offset, antialiased: of `Contents`, stored as comments of the header. The file is replaced atomically.
+    Raises OSError.
     """
     ordered = _ordered(gaussians)
-    atomic_write(path, _encoded(ordered, offset))
+    atomic_write(path, _encoded(ordered, offset, antialiased))
     return ordered.count
 
 
@@ -121,7 +122,9 @@ def decode(path: Path, document: PlyData) -> Contents:
         logit_opacities=logits(rgba[:, 3]),
         sh=torch.cat(coefficients, dim=1),
     )
-    return Contents(finite(gaussians), ply.offset_of(path, document))
+    return Contents(
+        finite(gaussians), ply_comments.offset_of(path, document), ply_comments.antialiased_of(document)
+    )
 
 
 def _ordered(gaussians: Gaussians) -> Gaussians:
@@ -132,7 +135,7 @@ def _ordered(gaussians: Gaussians) -> Gaussians:
     return gaussians.select(rows)
 
 
-def _encoded(gaussians: Gaussians, offset: Offset) -> bytes:
+def _encoded(gaussians: Gaussians, offset: Offset, antialiased: bool) -> bytes:
     """The file that holds the rows of `gaussians` in their order."""
     ranges = []
     fractions = []
@@ -162,7 +165,7 @@ def _encoded(gaussians: Gaussians, offset: Offset) -> bytes:
         steps = gaussians.sh[:, 1:].transpose(1, 2).flatten(1) * (128.0 / HARMONICS_RANGE)
         levels = (steps.floor() + 128).clamp(0, 255).to(torch.uint8).numpy()
         elements.append(("sh", "uchar", [f"f_rest_{i}" for i in range(3 * rest)], levels))
-    comments = ["Made by Splatmill", *ply.offset_comment(offset)]
+    comments = ["Made by Splatmill", *ply_comments.comments_of(offset, antialiased)]
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
     for name, kind, properties, rows in elements:
         header += [f"element {name} {len(rows)}", *(f"property {kind} {label}" for label in properties)]

@@ -27,7 +27,7 @@ class Contents:
     gaussians: float32, rows with a non-finite value left out.
     offset: world = file + offset. Export subtracts it where float32 could not hold the coordinates of the world.
     antialiased: whether the model was trained with the low-pass filter of Mip-Splatting (Yu et al. 2024); None where
-        the format does not say.
+        the file does not say.
     """
 
     gaussians: Gaussians

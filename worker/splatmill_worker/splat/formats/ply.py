@@ -12,6 +12,7 @@ from splatmill.files import replacing
 from splatmill_worker import ply_header
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.reader_memory import check_gaussians
+from splatmill_worker.splat.formats import ply_comments
 from splatmill_worker.splat.formats.contents import NO_OFFSET, OPAQUE, Contents, Offset, finite, unit, visible
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -43,7 +44,7 @@ def write(
     """Write `gaussians` as binary little-endian float32; returns how many were written.
 
     Rows with a non-finite parameter and rows with an opacity under MIN_OPACITY are left out. Quaternions are
-    normalised. offset: of `Contents`. antialiased: not stored, the format has no place for it. degree: SH degree of the
+    normalised. offset, antialiased: of `Contents`, stored as comments of the header. degree: SH degree of the
     file (some viewers read degree 3 only); that of the Gaussians where None. comments: lines of the header.
     The file is replaced atomically and synced.
     """
@@ -68,17 +69,14 @@ def write(
         np.ascontiguousarray(columns.numpy(), dtype="<f4").view([(name, "<f4") for name in names]).reshape(n)
     )
     document = PlyData(
-        [PlyElement.describe(table, "vertex")], byte_order="<", comments=[*comments, *offset_comment(offset)]
+        [PlyElement.describe(table, "vertex")],
+        byte_order="<",
+        comments=[*comments, *ply_comments.comments_of(offset, antialiased)],
     )
 
     with replacing(path, sync=True) as part, part.open("wb") as stream:
         document.write(stream)
     return n
-
-
-def offset_comment(offset: Offset) -> list[str]:
-    """The comment of the header that holds the offset of `Contents`; none where it is zero."""
-    return ["offset " + " ".join(f"{value:.0f}" for value in offset)] if any(offset) else []
 
 
 def read(path: Path) -> Contents:
@@ -130,7 +128,9 @@ def decode(path: Path, document: PlyData) -> Contents:
         logit_opacities=columns("opacity")[:, 0].contiguous().clamp(-OPAQUE, OPAQUE),
         sh=torch.cat([columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest_columns.transpose(1, 2)], dim=1),
     )
-    return Contents(finite(gaussians), offset_of(path, document))
+    return Contents(
+        finite(gaussians), ply_comments.offset_of(path, document), ply_comments.antialiased_of(document)
+    )
 
 
 def check_count(path: Path, count: int, degree: int) -> None:
@@ -151,18 +151,3 @@ def parsed(path: Path) -> PlyData:
     except (PlyParseError, ValueError, OSError, IndexError, KeyError) as error:
         raise ModelUnreadable(f"{path.name} could not be read as a .ply file: {error}.") from error
     return document
-
-
-def offset_of(path: Path, document: PlyData) -> Offset:
-    """The offset in the comments of a header. Raises ModelUnreadable where one does not hold three numbers."""
-    for comment in document.comments:
-        words = comment.split()
-        if words[:1] == ["offset"]:
-            try:
-                x, y, z = (float(word) for word in words[1:])
-            except ValueError as error:
-                raise ModelUnreadable(
-                    f"{path.name} has an offset without three numbers in its header: {comment!r}."
-                ) from error
-            return x, y, z
-    return NO_OFFSET

@@ -65,6 +65,9 @@ FORMATS = ("WEBP", "PNG")
 """Pillow's names of the formats that are read. The specification has WebP as its default, and allows any with RGBA
 values of 8 bits."""
 
+_MODELS = {"default": False, "antialiased": True, "2dgs": False}
+"""Whether Gaussians are drawn antialiased, by the field `model` of the `meta.json`."""
+
 Plane = npt.NDArray[np.uint8]
 
 _ROWS = 2**16
@@ -117,6 +120,7 @@ def write(
         "asset": {"generator": "Splatmill"},
         "count": count,
         "antialias": antialiased,
+        "model": "antialiased" if antialiased else "default",
         "means": {
             "mins": low.tolist(),
             "maxs": high.tolist(),
@@ -298,12 +302,15 @@ def _contents(files: sog_files.Files) -> Contents:
     if isinstance(meta.get("splatmill"), dict):
         x, y, z = _numbers(meta["splatmill"]["offset"], 3).tolist()
         offset = (x, y, z)
+    return Contents(finite(gaussians), offset, _antialiased(meta))
+
+
+def _antialiased(meta: dict[str, Any]) -> bool | None:
+    """What `model` says, or `antialias` of earlier writers where it says nothing known."""
+    if isinstance(meta.get("model"), str) and meta["model"] in _MODELS:
+        return _MODELS[meta["model"]]
     antialiased = meta.get("antialias")
-    return Contents(
-        finite(gaussians),
-        offset,
-        antialiased if isinstance(antialiased, bool) else None,
-    )
+    return antialiased if isinstance(antialiased, bool) else None
 
 
 def _names(meta: dict[str, Any]) -> dict[str, list[str]]:

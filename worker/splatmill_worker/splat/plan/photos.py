@@ -147,6 +147,8 @@ def decide_antialias(facts: Facts, options: TrainOptions, reasons: Reasons) -> b
 
 
 def _antialias(facts: Facts) -> tuple[bool, str]:
+    if facts.start is not None and facts.start.antialiased is not None:
+        return facts.start.antialiased, "The file of the given model says how the model is drawn."
     ratio = facts.distance_ratio
     if ratio is None:
         return False, "The distances from which points are seen are not known."

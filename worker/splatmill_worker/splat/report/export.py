@@ -81,6 +81,7 @@ def export(
         out / "model.ply",
         gaussians,
         offset=(float(x), float(y), float(z)),
+        antialiased=plan.antialias,
         degree=plan.schedule.degree,
         comments=("Made by Splatmill",),
     )

@@ -10,8 +10,9 @@ import numpy.typing as npt
 from splatmill_worker.splat.formats import registry
 
 
-def read(path: Path, most: int) -> dict[str, npt.NDArray[np.float32] | tuple[float, ...] | int]:
-    """The five parameters of the `most` most opaque Gaussians of a file, its `offset`, and the `count` of all of them.
+def read(path: Path, most: int) -> dict[str, npt.NDArray[np.float32] | tuple[float, ...] | int | None]:
+    """The five parameters of the `most` most opaque Gaussians of a file, its `offset`, the `count` of all
+    of them, and whether it is drawn `antialiased` (None where the file does not say so).
 
     Raises ModelUnreadable and OSError.
     """
@@ -21,4 +22,5 @@ def read(path: Path, most: int) -> dict[str, npt.NDArray[np.float32] | tuple[flo
         **{name: value.numpy() for name, value in gaussians.most_opaque(most).parameters().items()},
         "offset": contents.offset,
         "count": gaussians.count,
+        "antialiased": contents.antialiased,
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ class GivenModel:
     psnr: PSNR of the model's views, dB.
     one_color: PSNR of the baseline, a constant colour per photo, dB.
     another: PSNR of the model's views against photos of other views, dB; None where no two photos have the same size.
+    antialiased: whether its file says that it is drawn antialiased; None where the file does not say so.
     """
 
     gaussians: int
@@ -51,6 +52,7 @@ class GivenModel:
     psnr: float
     one_color: float
     another: float | None
+    antialiased: bool | None = None
 
     @property
     def doubtful(self) -> bool:
@@ -63,8 +65,22 @@ class GivenModel:
         return self.doubtful and self.another is not None and not self.psnr > self.another + OWN_PHOTO_MARGIN
 
 
-def read_given_model(path: Path, normalization: Normalization, most: int) -> tuple[Gaussians, int]:
-    """The `most` most opaque Gaussians of the file `path` in the training world, and how many it has.
+@dataclass(frozen=True)
+class Start:
+    """What is read of the file of a given model.
+
+    gaussians: the most opaque ones, in the training world.
+    count: number of Gaussians of the file.
+    antialiased: as in `splat.formats.contents.Contents`.
+    """
+
+    gaussians: Gaussians
+    count: int
+    antialiased: bool | None
+
+
+def read_given_model(path: Path, normalization: Normalization, most: int) -> Start:
+    """The model in the file `path`, of which the `most` most opaque Gaussians are kept.
 
     The file may be of any readable format; it is moved by `normalization`.
 
@@ -72,25 +88,31 @@ def read_given_model(path: Path, normalization: Normalization, most: int) -> tup
     Raises StartUnusable where the file cannot be read or holds no Gaussian.
     """
     try:
-        gaussians, offset, count = decoders.call_once(given_file.read, path, most, check=_given, fault=_fault)
+        start, offset = decoders.call_once(given_file.read, path, most, check=_given, fault=_fault)
     except ModelUnreadable as error:
         raise StartUnusable(error.message) from error
     except OSError as error:
         raise StartUnusable(f"{path.name} cannot be opened: {error.strerror or error}.") from error
-    if gaussians.count == 0:
+    if start.gaussians.count == 0:
         raise StartUnusable(f"{path.name} holds no Gaussian with finite values.")
     shift = normalization.scale * np.array(offset) + normalization.translation
-    return gaussians.moved(normalization.scale, torch.from_numpy(shift)), count
+    return replace(start, gaussians=start.gaussians.moved(normalization.scale, torch.from_numpy(shift)))
 
 
-def _given(answer: Any) -> tuple[Gaussians, list[float], int]:
-    """The Gaussians of what `given_file.read` returns, offset, and number. Raises ValueError and KeyError."""
+def _given(answer: Any) -> tuple[Start, list[float]]:
+    """What `given_file.read` returns as a `Start`, in the coordinates of the file, and its offset.
+
+    Raises ValueError and KeyError.
+    """
     values = {field.name: torch.from_numpy(answer[field.name]) for field in fields(Gaussians)}
     gaussians = Gaussians(**values)
     x, y, z = (float(value) for value in answer["offset"])
     if not all(value.dtype == torch.float32 for value in gaussians) or not bool(gaussians.finite().all()):
         raise ValueError("a parameter is no finite float32")
-    return gaussians, [x, y, z], int(answer["count"])
+    antialiased = answer["antialiased"]
+    if not isinstance(antialiased, bool | None):
+        raise ValueError("it is not said whether the model is drawn antialiased")
+    return Start(gaussians, int(answer["count"]), antialiased), [x, y, z]
 
 
 def _fault(code: str, name: str, reason: str) -> Exception:
@@ -100,9 +122,12 @@ def _fault(code: str, name: str, reason: str) -> Exception:
     return Refusal(code, message, advice="Restart the job, or leave out the option start.")
 
 
-def assess(gaussians: Gaussians, views: Sequence[TrainingView]) -> GivenModel:
+def assess(
+    gaussians: Gaussians, views: Sequence[TrainingView], *, antialiased: bool | None = None
+) -> GivenModel:
     """Compare renderings of `gaussians` with the photos of some of `views`.
 
+    antialiased: of the file of the model; they are rendered so where it says so.
     Raises StartUnusable where the Gaussians lie in another world.
     """
     some = views[:: max(1, len(views) // ASSESSED_VIEWS)]
@@ -115,7 +140,7 @@ def assess(gaussians: Gaussians, views: Sequence[TrainingView]) -> GivenModel:
         for view, other in zip(some, [*some[half:], *some[:half]], strict=True):
             target, wrong = view.full, other.full
             photo = target.over(background)
-            color = render(gaussians, target.camera, background=background).color
+            color = render(gaussians, target.camera, background=background, antialias=bool(antialiased)).color
             own.append(compare(view.name, color, photo, target.mask).psnr)
             baseline.append(compare(view.name, _one_color(photo, target.mask), photo, target.mask).psnr)
             if wrong.rgb.shape == target.rgb.shape and len(some) > 1:
@@ -126,6 +151,7 @@ def assess(gaussians: Gaussians, views: Sequence[TrainingView]) -> GivenModel:
         float(np.median(own)),
         float(np.median(baseline)),
         float(np.median(others)) if others else None,
+        antialiased,
     )
     if model.misaligned:
         raise StartUnusable(
