@@ -111,13 +111,13 @@ def test_an_image_from_a_camera_of_ones_own_at_another_width(ball: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_file_of_another_trainer_is_seen_whole(ball: Path, tmp_path: Path, run_here):
+def test_a_file_of_another_trainer_is_seen_from_the_side(ball: Path, tmp_path: Path, run_here):
     ball.with_name("cameras.json").write_text('[{"id": 0, "img_name": "a"}]')
-    status, _, stderr = run_here("render", ball, "-o", tmp_path / "view.png", "--width", "200", "--up=-y")
+    status, _, stderr = run_here("render", ball, "-o", tmp_path / "view.png", "--width", "200")
     assert status == 0
     assert stderr.splitlines() == [
         f"{ball.with_name('cameras.json')} is not used: it was not written by Splatmill.",
-        "The image shows the whole scene from the side, with -y up.",
+        "The image shows the dense middle of the scene from the side, with -y up.",
     ]
     with Image.open(tmp_path / "view.png") as image:
         assert image.size == (200, 150)
@@ -138,7 +138,7 @@ def test_a_video_around_the_scene(ball: Path, tmp_path: Path, run_here, cameras:
     size = ("--seconds", "0.5", "--fps", "8", "--width", "64", "--height", "48")
     status, stdout, stderr = run_here("orbit", ball, "-o", tmp_path / "o.mp4", *size)
     assert (status, stdout) == (0, f"{tmp_path / 'o.mp4'}\n")
-    assert ("The camera circles the middle of the Gaussians, with z up." in stderr) is not cameras
+    assert ("The camera circles the dense middle of the scene, with -y up." in stderr) is not cameras
     with av.open(str(tmp_path / "o.mp4")) as video:
         frames = [frame.to_ndarray(format="rgb24")[24, 32].astype(int) for frame in video.decode(video=0)]
     assert len(frames) == 4

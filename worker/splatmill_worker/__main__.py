@@ -47,7 +47,7 @@ def main(argv: list[str] | None = None) -> int:
         file.add_argument("--request", default="{}", help="the request of the REST API as JSON")
         file.add_argument("--cameras", type=Path, help="cameras.json of the model")
         file.add_argument("--width", type=int, help="width in pixels of an image without a camera")
-        file.add_argument("--up", default="z", help="axis that points up, for a model without cameras")
+        file.add_argument("--up", default="-y", help="axis that points up, for a model without cameras")
     convert = programs.add_parser("convert-file", help="convert a model file to other formats")
     convert.add_argument("model", type=Path)
     convert.add_argument("outs", type=Path, nargs="+")

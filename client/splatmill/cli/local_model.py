@@ -47,7 +47,7 @@ def render_local(
     width: int | None,
     up: str,
 ) -> NoReturn:
-    """Render an image of a model file and end. Without a camera, it shows the whole scene from the side.
+    """Render an image of a model file and end. Without a camera, it shows the dense middle of the scene from the side.
 
     options: output, format and background of `RenderRequest`.
     """
@@ -62,7 +62,7 @@ def render_local(
     except ValidationError as error:
         raise invalid_request(error, "camera_invalid") from error
     if camera is None:
-        typer.echo(f"The image shows the whole scene from the side, with {up} up.", err=True)
+        typer.echo(f"The image shows the dense middle of the scene from the side, with {up} up.", err=True)
     body = request.model_dump_json(exclude_none=True, exclude={"camera"} if camera is None else None)
     size = ("--width", str(width)) if width is not None else ()
     _run("render-file", model, out, body, up, *size)
@@ -82,7 +82,7 @@ def orbit_local(
     except ValidationError as error:
         raise invalid_request(error) from error
     if not with_cameras:
-        typer.echo(f"The camera circles the middle of the Gaussians, with {up} up.", err=True)
+        typer.echo(f"The camera circles the dense middle of the scene, with {up} up.", err=True)
     cameras = ("--cameras", str(_cameras_path(model))) if with_cameras else ()
     _run("orbit-file", model, out, request.model_dump_json(exclude_none=True), up, *cameras)
 

@@ -24,7 +24,7 @@ Up = Annotated[
     Literal["x", "y", "z", "-x", "-y", "-z"] | None,
     typer.Option(
         "--up",
-        help="Axis that points up in a file without a cameras.json beside it. Left out, z.",
+        help="Axis that points up in a file without a cameras.json beside it. Left out, -y.",
         show_default=False,
     ),
 ]
@@ -90,7 +90,7 @@ def render(
         whole = not cameras and view is None and camera is None
         _check_up(up, used=whole)
         chosen = None if whole else _camera(cameras, view, camera, width)
-        render_local(path, out, options, chosen, width, up or "z")
+        render_local(path, out, options, chosen, width, up or "-y")
     _check_up(up, used=False)
     with open_client(server) as client:
         model = client.model(model_id)
@@ -125,7 +125,7 @@ def orbit(
     if is_local(model_id):
         cameras = local_cameras(Path(model_id))
         _check_up(up, used=not cameras)
-        orbit_local(Path(model_id), out, options, with_cameras=bool(cameras), up=up or "z")
+        orbit_local(Path(model_id), out, options, with_cameras=bool(cameras), up=up or "-y")
     _check_up(up, used=False)
     with open_client(server) as client:
         model = client.model(model_id)

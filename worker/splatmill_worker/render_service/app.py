@@ -327,7 +327,7 @@ class RenderApp:
             stored = ModelCameras.model_validate_json(text)
         except (FileNotFoundError, ValidationError):
             stored = None
-        return list(orbit_cameras(stored, model.gaussians.means.double().cpu().numpy(), body))
+        return list(orbit_cameras(stored, model.gaussians, body))
 
 
 def _client(request: Request) -> str:

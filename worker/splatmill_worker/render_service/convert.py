@@ -130,7 +130,7 @@ def _viewpoints(model: Path, gaussians: Gaussians, photos: Path | None) -> tuple
     held_out = [entry for entry in stored if entry.split == "test"]
     chosen = held_out or stored
     if not chosen:
-        around = list(orbit_cameras(None, gaussians.means.double().cpu().numpy(), ORBIT))
+        around = list(orbit_cameras(None, gaussians, ORBIT))
         where = f"{len(around)} synthetic cameras around the scene"
         text = f"views: from {where}, against those of {model.name}; {path} {why}."
         return [Viewpoint(camera) for camera in around], text

@@ -19,7 +19,7 @@ from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.film import Film
 from splatmill_worker.render_service.encoding import render_frame, render_image
 from splatmill_worker.render_service.model_cache import LoadedModel, antialias_of
-from splatmill_worker.render_service.orbit import DEFAULT_FOV, Float, orbit_cameras, path_around
+from splatmill_worker.render_service.orbit import DEFAULT_FOV, Float, orbit_cameras, path_of
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.formats.contents import Contents
 
@@ -63,7 +63,7 @@ def main(chosen: argparse.Namespace) -> int:
 def render_file(model: Path, out: Path, request: dict[str, Any], width: int | None, up: str) -> None:
     """Render an image of the model file `model` and write it to `out`.
 
-    request: the fields of RenderRequest. Without a camera, the image shows the whole model from the side.
+    request: the fields of RenderRequest. Without a camera, the image shows the dense middle of the model from the side.
     width: width in pixels of an image without a camera.
     up: the axis that points up in an image without a camera, a key of AXES.
 
@@ -84,7 +84,7 @@ def orbit_file(model: Path, out: Path, request: OrbitRequest, cameras: Path | No
     """
     loaded = load(model)
     stored = ModelCameras.model_validate_json(cameras.read_bytes()) if cameras is not None else None
-    path = orbit_cameras(stored, _means(loaded), request, AXES[up])
+    path = orbit_cameras(stored, loaded.gaussians, request, AXES[up])
     said = time.monotonic()
     with replacing(out) as part, Film(part, request.width, request.height, request.fps) as film:
         for index, camera in enumerate(path):
@@ -115,8 +115,8 @@ def read(model: Path) -> Contents:
 
 
 def overview(model: LoadedModel, width: int, up: Float) -> CameraSpec:
-    """Return a camera that shows the whole model from the side, where an orbit around it begins."""
-    path = path_around(_means(model), up)
+    """Return a camera that shows the dense middle of the model from the side, where an orbit around it begins."""
+    path = path_of(model.gaussians, up)
     return CameraSpec.looking_at(
         tuple(path.eye(0.0)),
         tuple(path.target),
@@ -125,8 +125,3 @@ def overview(model: LoadedModel, width: int, up: Float) -> CameraSpec:
         fov_y_deg=DEFAULT_FOV,
         up=tuple(path.up),
     )
-
-
-def _means(model: LoadedModel) -> Float:
-    means: Float = model.gaussians.means.double().cpu().numpy()
-    return means

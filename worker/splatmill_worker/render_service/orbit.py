@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from splatmill.schema import ModelCameras, OrbitRequest
 from splatmill_worker.scene import Camera, looked_at, viewmat_of
+from splatmill_worker.splat.gaussians import Gaussians
 
 Float = npt.NDArray[np.float64]
 
@@ -18,8 +19,12 @@ FULL_CIRCLE = math.radians(220)
 """Radians of azimuth that photos must cover for a full circle. If they cover less, the camera swings back and forth
 within the arc of the photos, because no photo shows the model from outside of it."""
 
-Z: Float = np.array([0.0, 0.0, 1.0])
-"""The axis that points up in a model without cameras, if nothing else is said."""
+UP: Float = np.array([0.0, -1.0, 0.0])
+"""The axis that points up in a model without cameras, if nothing else is said: y points down in a `.ply`, and every
+other format is turned into its frame when it is read."""
+
+MIDDLE = 4.0
+"""Radius of the dense middle of a model, in median distances from its centre; far shells lie outside of it."""
 
 DEFAULT_FOV = 50.0
 """Vertical field of view in degrees where neither the request nor the photos give one."""
@@ -81,15 +86,26 @@ def fit_path(centers: Float, forwards: Float, ups: Float) -> OrbitPath:
     return OrbitPath(target, right, front, up, radius, float(np.median(heights)), middle, half)
 
 
-def path_around(points: Float, up: Float = Z) -> OrbitPath:
-    """Return a full circle around points [N,3] with a coordinate axis `up`, [3], for a model without cameras.
+def path_around(points: Float, opacities: Float, up: Float = UP) -> OrbitPath:
+    """Return a full circle around the dense middle of a model without cameras.
 
-    Its radius is 2.5 times the distance from the median point within which 80 % of the points lie.
+    points, opacities: of its Gaussians, [N,3] and [N]. up: a coordinate axis, [3].
+
+    The target is the median point by opacity. The radius is 2.5 times the distance from there within which 95 % of the
+    opacity of the dense middle lies.
     """
-    target = np.median(points, axis=0)
-    reach = float(np.quantile(np.linalg.norm(points - target, axis=1), 0.8)) or 1.0
+    target = np.array([_quantile(axis, opacities, 0.5) for axis in points.T])
+    distances = np.linalg.norm(points - target, axis=1)
+    dense = distances <= MIDDLE * _quantile(distances, opacities, 0.5)
+    reach = _quantile(distances[dense], opacities[dense], 0.95) or 1.0
     right = np.eye(3)[1 if up[0] else 0]
     return OrbitPath(target, right, np.cross(up, right), up, 2.5 * reach, 0.5 * reach, 0.0, math.pi)
+
+
+def path_of(gaussians: Gaussians, up: Float = UP) -> OrbitPath:
+    """Return `path_around` of Gaussians on any device."""
+    opacities = gaussians.logit_opacities.sigmoid()
+    return path_around(gaussians.means.double().cpu().numpy(), opacities.double().cpu().numpy(), up)
 
 
 def cameras_along(path: OrbitPath, request: OrbitRequest, fov_y_deg: float) -> Iterable[Camera]:
@@ -107,20 +123,27 @@ def cameras_along(path: OrbitPath, request: OrbitRequest, fov_y_deg: float) -> I
 
 
 def orbit_cameras(
-    stored: ModelCameras | None, points: Float, request: OrbitRequest, up: Float = Z
+    stored: ModelCameras | None, gaussians: Gaussians, request: OrbitRequest, up: Float = UP
 ) -> Iterable[Camera]:
     """Return the cameras of an orbit video of a model.
 
-    stored: the cameras of its photos; None, or fewer than two, gives a circle around the points.
-    points: the means of its Gaussians, [N,3], in world units.
+    stored: the cameras of its photos; None, or fewer than two, gives a circle around the dense middle.
+    gaussians: the model.
     request: number and size of the frames, and the field of view if given.
     up: the coordinate axis that points up where there are no cameras, [3].
     """
     if stored is None or len(stored.cameras) < 2:
-        return cameras_along(path_around(points, up), request, request.fov_y_deg or DEFAULT_FOV)
+        return cameras_along(path_of(gaussians, up), request, request.fov_y_deg or DEFAULT_FOV)
     poses = np.array([camera.camera.opencv_to_world() for camera in stored.cameras])
     path = fit_path(poses[:, :3, 3], poses[:, :3, 2], -poses[:, :3, 1])
     return cameras_along(path, request, request.fov_y_deg or _field_of_view(stored, request))
+
+
+def _quantile(values: Float, weights: Float, share: float) -> float:
+    """Return the least of `values` [N] up to which the share of the sum of `weights` [N] lies; N is not 0."""
+    order = np.argsort(values)
+    sums = np.cumsum(weights[order])
+    return float(values[order[min(np.searchsorted(sums, share * sums[-1]), len(order) - 1)]])
 
 
 def _nearest_to_axes(centers: Float, forwards: Float) -> Float:
