@@ -258,6 +258,8 @@ def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaus
     if path is not None:
         given = read_given_model(path, cameras.normalization, _most_given(task.options))
         gaussians = given.gaussians
+        for note in given.notes:
+            task.emit(LogEvent(level="warning", message=f"{path.name}: {note}"))
         if given.count > gaussians.count:
             message = _reduced_message(path, given.count, gaussians.count)
             task.emit(LogEvent(level="warning", message=message))

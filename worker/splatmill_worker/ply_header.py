@@ -23,7 +23,8 @@ _TEXT_BYTES = 2
 def check(path: Path) -> None:
     """Raise ValueError, with what is wrong, when the file is no .ply or too short for what its header announces.
 
-    Files with list properties, such as the faces of a mesh, are refused: neither point clouds nor splats have them.
+    Rows with list properties, such as the faces of a mesh, are refused: neither point clouds nor splats have them. An
+    element of no rows may have such properties, as that of the faces in files of programs for meshes.
     Raises OSError when the file cannot be opened.
     """
     with path.open("rb") as file:
@@ -57,7 +58,8 @@ def _parsed(header: str) -> tuple[str, list[tuple[str, int, list[int]]]]:
             case ["element", name, count]:
                 elements.append((name, int(count), []))
             case ["property", "list", *_]:
-                raise ValueError(f"it has a list property ({line.strip()[:80]!r})")
+                if not elements or elements[-1][1] != 0:
+                    raise ValueError(f"it has a list property ({line.strip()[:80]!r})")
             case ["property", kind, _] if kind in _BYTES and elements:
                 elements[-1][2].append(_BYTES[kind])
             case ["property" | "element", *_]:

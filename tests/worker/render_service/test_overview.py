@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import torch
 
@@ -20,15 +21,20 @@ CENTRE = np.array([30.0, 10.0, -20.0])
 SIZE = OrbitRequest.model_validate({"seconds": 0.5, "fps": 8, "width": 64, "height": 48})
 
 
-def ball(count: int) -> np.ndarray:
+Points = npt.NDArray[np.float64]
+
+
+def ball(count: int) -> Points:
     """Points in a ball of radius 1 around CENTRE."""
     points = np.random.default_rng(0).uniform(-1, 1, (8 * count, 3))
-    return CENTRE + points[np.linalg.norm(points, axis=1) <= 1][:count]
+    inside: Points = CENTRE + points[np.linalg.norm(points, axis=1) <= 1][:count]
+    return inside
 
 
-def around(count: int, distance: float, middle: np.ndarray) -> np.ndarray:
+def around(count: int, distance: float, middle: Points) -> Points:
     directions = np.random.default_rng(1).normal(size=(count, 3))
-    return middle + distance * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    points: Points = middle + distance * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return points
 
 
 @pytest.mark.parametrize(
@@ -41,7 +47,7 @@ def around(count: int, distance: float, middle: np.ndarray) -> np.ndarray:
     ],
     ids=["nothing", "shell", "floaters", "stray"],
 )
-def test_the_dense_middle_fills_the_picture(others: np.ndarray, opacity: float) -> None:
+def test_the_dense_middle_fills_the_picture(others: Points, opacity: float) -> None:
     points = np.concatenate([ball(1000), others])
     opacities = np.concatenate([np.full(1000, 0.9), np.full(len(others), opacity)])
     path = orbit.path_around(points, opacities)

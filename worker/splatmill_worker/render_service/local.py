@@ -103,11 +103,14 @@ def load(model: Path) -> LoadedModel:
 def read(model: Path) -> Contents:
     """Return what a file of any readable format holds, at least one Gaussian, and whether it was antialiased.
 
-    Where its format does not say so, a report.json beside it does. Raises ModelUnreadable, and FileNotFoundError.
+    Where the file does not say so, a report.json beside it does. Its notes are printed. Raises ModelUnreadable, and
+    FileNotFoundError.
     """
     contents = registry.read(model)
     if not contents.gaussians.count:
         raise ModelUnreadable(f"{model.name} has no Gaussians with finite values.")
+    for note in contents.notes:
+        print(f"{model.name}: {note}", file=sys.stderr)
     if contents.antialiased is not None:
         return contents
     report = model.with_name("report.json")

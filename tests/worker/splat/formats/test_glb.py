@@ -89,6 +89,21 @@ def test_a_scene_is_read_back_as_it_was(tmp_path: Path) -> None:
     assert max(differences(contents.gaussians, scene).values()) < 1e-5
 
 
+def test_harmonics_of_degree_4_are_left_out_and_said(tmp_path: Path) -> None:
+    scene = some_gaussians(30, 3)
+    glb.write(tmp_path / "m.glb", scene)
+    assert glb.read(tmp_path / "m.glb").notes == ()
+
+    def add(document: dict[str, Any]) -> None:
+        attributes = _primitive(document)["attributes"]
+        attributes |= {f"{EXTENSION}:SH_DEGREE_4_COEF_{n}": attributes["POSITION"] for n in range(9)}
+
+    (tmp_path / "four.glb").write_bytes(_changed((tmp_path / "m.glb").read_bytes(), add))
+    contents = glb.read(tmp_path / "four.glb")
+    assert max(differences(contents.gaussians, scene).values()) < 1e-5
+    assert contents.notes == ("Its harmonics of degree 4 are read to degree 3.",)
+
+
 def test_nothing_is_a_model_too(tmp_path: Path) -> None:
     assert glb.write(tmp_path / "m.glb", some_gaussians(3, 1).select(torch.arange(0))) == 0
     with pytest.raises(ModelUnreadable, match="0 primitives"):

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData, PlyElement
 
 from splatmill_worker import reader_memory
 from splatmill_worker.splat.formats import registry
@@ -88,6 +89,22 @@ def test_a_reader_takes_no_more_than_its_copies(tmp_path: Path, degree: int) -> 
     for path, (size, said) in zip(paths[1:], read(paths), strict=True):
         assert said == "read", (path.name, said)
         assert size < reader_memory.COPIES * parameters, (path.name, size / parameters)
+
+
+def test_a_reader_of_degree_4_takes_no_more_than_its_copies(tmp_path: Path) -> None:
+    registry.write(tmp_path / "small.ply", some_gaussians(3, 1))
+    registry.write(tmp_path / "three.ply", gaussians(3))
+    rows = PlyData.read(str(tmp_path / "three.ply"))["vertex"].data
+    names = [f"f_rest_{i}" for i in range(72)]
+    others = [name for name in rows.dtype.names if not name.startswith("f_rest")]
+    table = np.zeros(COUNT, [(name, "<f4") for name in (*others, *names)])
+    for name in others:
+        table[name] = rows[name]
+    table["x"][0] = np.nan
+    PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(tmp_path / "four.ply"))
+    ((size, said),) = read([tmp_path / "small.ply", tmp_path / "four.ply"])
+    assert said == "read"
+    assert size < reader_memory.COPIES * 4 * COUNT * (11 + 3 * 25)
 
 
 def test_a_model_larger_than_the_memory_is_refused_before_it_is_read(

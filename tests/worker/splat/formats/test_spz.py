@@ -144,6 +144,17 @@ def header(count: int, *, version: int = 3, degree: int = 0, bits: int = 12) -> 
     return b"NGSP" + struct.pack("<IIBBBB", version, count, degree, bits, 0, 0)
 
 
+def test_harmonics_of_degree_4_are_left_out_and_said(tmp_path: Path) -> None:
+    steps = np.full((5, 24, 3), 255, np.uint8)
+    steps[:, :15] = np.arange(5 * 15 * 3, dtype=np.uint8).reshape(5, 15, 3)
+    rows = bytes(9 * 5) + bytes([255] * 5) + bytes(6 * 5) + bytes([0, 0, 0, 192] * 5)
+    (tmp_path / "m.spz").write_bytes(gzip.compress(header(5, degree=4) + rows + steps.tobytes()))
+    contents = spz.read(tmp_path / "m.spz")
+    assert contents.notes == ("Its harmonics of degree 4 are read to degree 3.",)
+    rest = torch.from_numpy(steps[:, :15].astype(np.float32) - 128) / 128
+    assert torch.equal(contents.gaussians.sh[:, 1:].abs(), rest.abs())
+
+
 def fourth(count: int, *frames: bytes, streams: int | None = None, sizes: list[int] | None = None) -> bytes:
     """A file of version 4 without harmonics."""
     expected = [width * count for width in (9, 1, 3, 3, 4)] if sizes is None else sizes

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from splatmill.files import atomic_write
 from splatmill_worker.errors import ModelUnreadable
-from splatmill_worker.splat.formats import ply, ply_comments
+from splatmill_worker.splat.formats import ply, ply_columns, ply_comments
 from splatmill_worker.splat.formats.contents import (
     MIN_OPACITY,
     NO_OFFSET,
@@ -29,7 +29,7 @@ from splatmill_worker.splat.formats.contents import (
     logits,
 )
 from splatmill_worker.splat.formats.morton import morton_order
-from splatmill_worker.splat.gaussians import REST_COEFFICIENTS, SH_C0, Gaussians
+from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 
 CHUNK = 256
 """Gaussians that share their ranges."""
@@ -49,7 +49,6 @@ _RANGES = [
 ]
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _OTHERS = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-_RESTS = (9, 24, 45)
 
 
 def encode(gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antialiased: bool = False) -> bytes:
@@ -98,23 +97,24 @@ def decode(path: Path, document: PlyData) -> Contents:
             f"{path.name} has {n} Gaussians and {chunk.count} chunks of {CHUNK}, which are too few."
         )
     rest = 0 if sh is None else len(sh.properties)
-    if sh is not None and (rest not in _RESTS or sh.count != n):
+    degree = ply_columns.degree_of(rest)
+    if sh is not None and (not degree or sh.count != n):
         raise ModelUnreadable(
-            f"{path.name} has {rest} harmonics of {sh.count} Gaussians, where 9, 24 or 45 of {n} are possible."
+            f"{path.name} has {rest} harmonics of {sh.count} Gaussians, where 9, 24, 45 or 72 of {n} are possible."
         )
-    ply.check_count(path, n, {3 * k: degree for degree, k in REST_COEFFICIENTS.items()}[rest])
+    ply.check_count(path, n, degree or 0)
     position, rotation, scale, color = (np.asarray(vertex[name]).astype(np.uint32) for name in _PACKED)
     rgba = _unpacked(color, 8, 8, 8, 8)
     rgb = _spread(rgba[:, :3], chunk, _RANGES[12:]) if colors_too else rgba[:, :3]
     coefficients = [((rgb - 0.5) / SH_C0)[:, None]]
     if rest:
-        names = [f"f_rest_{i}" for i in range(rest)]
-        sh = _element(path, elements, "sh", names)
+        sh = _element(path, elements, "sh", [f"f_rest_{i}" for i in range(rest)])
+        names = ply_columns.kept_rest(rest)
         levels = np.stack([np.asarray(sh[name], np.float32) for name in names], axis=1)
         # The middle of each step; the two outermost levels stand for the ends of the range.
         values = np.where(levels == 0, -128.0, np.where(levels == 255, 128.0, levels - 127.5))
         table = torch.from_numpy(values.astype(np.float32) * np.float32(HARMONICS_RANGE / 128.0))
-        coefficients.append(table.reshape(n, 3, rest // 3).transpose(1, 2))
+        coefficients.append(table.reshape(n, 3, len(names) // 3).transpose(1, 2))
     gaussians = Gaussians(
         means=_spread(_unpacked(position, 11, 10, 11), chunk, _RANGES[:6]),
         log_scales=_spread(_unpacked(scale, 11, 10, 11), chunk, _RANGES[6:12]),
@@ -123,7 +123,10 @@ def decode(path: Path, document: PlyData) -> Contents:
         sh=torch.cat(coefficients, dim=1),
     )
     return Contents(
-        finite(gaussians), ply_comments.offset_of(path, document), ply_comments.antialiased_of(document)
+        finite(gaussians),
+        ply_comments.offset_of(path, document),
+        ply_comments.antialiased_of(document),
+        (*ply_columns.rest_notes(degree or 0), *ply_comments.unknown_modes(document)),
     )
 
 

@@ -28,11 +28,13 @@ class Contents:
     offset: world = file + offset. Export subtracts it where float32 could not hold the coordinates of the world.
     antialiased: whether the model was trained with the low-pass filter of Mip-Splatting (Yu et al. 2024); None where
         the file does not say.
+    notes: sentences about what is read otherwise than it stands in the file, or not at all.
     """
 
     gaussians: Gaussians
     offset: Offset = NO_OFFSET
     antialiased: bool | None = None
+    notes: tuple[str, ...] = ()
 
 
 def finite(gaussians: Gaussians) -> Gaussians:

@@ -31,6 +31,7 @@ from splatmill_worker.splat.formats.contents import (
     visible,
 )
 from splatmill_worker.splat.formats.frames import turned_about_x
+from splatmill_worker.splat.formats.ply_columns import rest_notes
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -233,7 +234,10 @@ def _contents(path: Path) -> Contents:
     x, y, z = (float(value) for value in extras.get("offset", NO_OFFSET))
     antialiased = extras.get("antialiased")
     return Contents(
-        finite(turned_about_x(gaussians)), (x, y, z), antialiased if isinstance(antialiased, bool) else None
+        finite(turned_about_x(gaussians)),
+        (x, y, z),
+        antialiased if isinstance(antialiased, bool) else None,
+        rest_notes(4 if f"{EXTENSION}:SH_DEGREE_4_COEF_0" in attributes else degree),
     )
 
 

@@ -12,11 +12,9 @@ from splatmill.files import replacing
 from splatmill_worker import ply_header
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.reader_memory import check_gaussians
-from splatmill_worker.splat.formats import ply_comments
-from splatmill_worker.splat.formats.contents import NO_OFFSET, OPAQUE, Contents, Offset, finite, unit, visible
+from splatmill_worker.splat.formats import ply_columns, ply_comments
+from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, finite, unit, visible
 from splatmill_worker.splat.gaussians import Gaussians
-
-_DEGREE_OF_REST = {0: 0, 9: 1, 24: 2, 45: 3}
 
 
 def property_names(degree: int) -> list[str]:
@@ -82,8 +80,11 @@ def write(
 def read(path: Path) -> Contents:
     """Read any tool's 3D Gaussian `.ply` (binary of either byte order, or text) as float32 tensors.
 
-    Properties are found by name; normals and unknown properties are ignored. Rows with a non-finite value are left
-    out. Raises ModelUnreadable for any other file, and FileNotFoundError where there is none.
+    Properties are found by name; normals and unknown properties are ignored. Colours as red, green and blue, Gaussians
+    of two scales, and harmonics above degree 3 are read too, with notes in the contents.
+
+    Rows with a non-finite value are left out. Raises ModelUnreadable for any other file, and FileNotFoundError where
+    there is none.
     """
     return decode(path, parsed(path))
 
@@ -96,40 +97,22 @@ def decode(path: Path, document: PlyData) -> Contents:
             f"{path.name} has no vertex element; its elements are: {', '.join(elements) or 'none'}."
         )
     vertex = elements["vertex"]
-    present = [p.name for p in vertex.properties]
-    rest = sum(name.startswith("f_rest_") for name in present)
-    if rest not in _DEGREE_OF_REST:
+    rest = sum(p.name.startswith("f_rest_") for p in vertex.properties)
+    degree = ply_columns.degree_of(rest)
+    if degree is None:
         raise ModelUnreadable(
-            f"{path.name} has {rest} f_rest properties; SH degrees 0 to 3 have 0, 9, 24 or 45."
+            f"{path.name} has {rest} f_rest properties; SH degrees 0 to 4 have 0, 9, 24, 45 or 72."
         )
-    degree = _DEGREE_OF_REST[rest]
-    wanted = [name for name in property_names(degree) if name not in ("nx", "ny", "nz")]
-    missing = [name for name in wanted if name not in present]
-    if missing:
-        raise ModelUnreadable(
-            f"{path.name} is not a 3D Gaussian .ply: the properties {', '.join(missing)} are missing."
-        )
-
     check_count(path, vertex.count, degree)
-
-    def columns(*names: str) -> torch.Tensor:
-        if not names:
-            return torch.zeros(vertex.count, 0)
-        return torch.from_numpy(
-            np.stack([np.asarray(vertex[name], dtype=np.float32) for name in names], axis=1)
-        )
-
-    rest_columns = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(vertex.count, 3, rest // 3)
-    gaussians = Gaussians(
-        means=columns("x", "y", "z"),
-        log_scales=columns("scale_0", "scale_1", "scale_2"),
-        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        # Some tools write an opacity of exactly 1 or 0 as its infinite logit.
-        logit_opacities=columns("opacity")[:, 0].contiguous().clamp(-OPAQUE, OPAQUE),
-        sh=torch.cat([columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest_columns.transpose(1, 2)], dim=1),
-    )
+    try:
+        gaussians, notes = ply_columns.gaussians_of(vertex)
+    except ValueError as error:
+        raise ModelUnreadable(f"{path.name} is not a 3D Gaussian .ply: {error}.") from error
     return Contents(
-        finite(gaussians), ply_comments.offset_of(path, document), ply_comments.antialiased_of(document)
+        finite(gaussians),
+        ply_comments.offset_of(path, document),
+        ply_comments.antialiased_of(document),
+        (*notes, *ply_comments.unknown_modes(document)),
     )
 
 

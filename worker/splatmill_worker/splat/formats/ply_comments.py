@@ -42,6 +42,16 @@ def offset_of(path: Path, document: PlyData) -> Offset:
     return NO_OFFSET
 
 
+def unknown_modes(document: PlyData) -> tuple[str, ...]:
+    """A sentence for each render mode in the comments that is not known."""
+    found = [match[1] for comment in document.comments if (match := _MODE.match(comment))]
+    return tuple(
+        f"Its SplatRenderMode {mode[:40]!r} is not known, and says nothing of how it is drawn."
+        for mode in found
+        if mode.lower() not in _MODES
+    )
+
+
 def antialiased_of(document: PlyData) -> bool | None:
     """Whether the comments say that the model is drawn antialiased, by the last that does; None where none does."""
     said = None

@@ -25,6 +25,7 @@ from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset,
 from splatmill_worker.splat.formats.expansion import Gunzip, unzstd
 from splatmill_worker.splat.formats.frames import turned_about_x
 from splatmill_worker.splat.formats.morton import morton_order
+from splatmill_worker.splat.formats.ply_columns import rest_notes
 from splatmill_worker.splat.gaussians import Gaussians
 
 MAGIC = b"NGSP"
@@ -127,7 +128,8 @@ def read(path: Path) -> Contents:
     )
     if frame == _RUB:
         gaussians = turned_about_x(gaussians)
-    return Contents(finite(gaussians), antialiased=bool(header.flags & _ANTIALIASED))
+    antialiased = bool(header.flags & _ANTIALIASED)
+    return Contents(finite(gaussians), antialiased=antialiased, notes=rest_notes(header.degree))
 
 
 def _parsed(head: bytes, size: int) -> _Header:

@@ -10,9 +10,11 @@ import numpy.typing as npt
 from splatmill_worker.splat.formats import registry
 
 
-def read(path: Path, most: int) -> dict[str, npt.NDArray[np.float32] | tuple[float, ...] | int | None]:
+def read(
+    path: Path, most: int
+) -> dict[str, npt.NDArray[np.float32] | tuple[float, ...] | list[str] | int | None]:
     """The five parameters of the `most` most opaque Gaussians of a file, its `offset`, the `count` of all
-    of them, and whether it is drawn `antialiased` (None where the file does not say so).
+    of them, whether it is drawn `antialiased` (None where the file does not say so), and `notes`, as in `Contents`.
 
     Raises ModelUnreadable and OSError.
     """
@@ -23,4 +25,5 @@ def read(path: Path, most: int) -> dict[str, npt.NDArray[np.float32] | tuple[flo
         "offset": contents.offset,
         "count": gaussians.count,
         "antialiased": contents.antialiased,
+        "notes": [*contents.notes],
     }

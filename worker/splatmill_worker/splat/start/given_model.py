@@ -35,6 +35,10 @@ OWN_PHOTO_MARGIN = 1.0
 another world (decisions: OWN_PHOTO_MARGIN)."""
 
 
+_MOST_NOTES, _MOST_NOTE = 10, 200
+"""Sentences about a file that are passed on, and characters of one."""
+
+
 @dataclass(frozen=True)
 class GivenModel:
     """What is known of a given model before the first step. Values in dB are medians over some of the training views.
@@ -71,12 +75,13 @@ class Start:
 
     gaussians: the most opaque ones, in the training world.
     count: number of Gaussians of the file.
-    antialiased: as in `splat.formats.contents.Contents`.
+    antialiased, notes: as in `splat.formats.contents.Contents`.
     """
 
     gaussians: Gaussians
     count: int
     antialiased: bool | None
+    notes: tuple[str, ...] = ()
 
 
 def read_given_model(path: Path, normalization: Normalization, most: int) -> Start:
@@ -112,7 +117,8 @@ def _given(answer: Any) -> tuple[Start, list[float]]:
     antialiased = answer["antialiased"]
     if not isinstance(antialiased, bool | None):
         raise ValueError("it is not said whether the model is drawn antialiased")
-    return Start(gaussians, int(answer["count"]), antialiased), [x, y, z]
+    notes = tuple(str(note)[:_MOST_NOTE] for note in answer["notes"][:_MOST_NOTES])
+    return Start(gaussians, int(answer["count"]), antialiased, notes), [x, y, z]
 
 
 def _fault(code: str, name: str, reason: str) -> Exception:
