@@ -306,6 +306,23 @@ def test_a_view_follows_its_size_and_bounds_its_pixels(
     assert page.locator(".view").count() == 0
 
 
+def test_without_cameras_the_dense_middle_is_seen_upright(
+    service: Up, model: SmallModel, visit: Visit
+) -> None:
+    assert mount(visit.page, model, cameras=[]) == "webgl"
+    seen = camera(visit.page)
+    points = np.array(visit.page.evaluate("[...view.surface.points]")).reshape(-1, 3)
+    assert len(points) == visit.page.evaluate("view.gaussians")
+    focus = np.array(visit.page.evaluate("view.focus"))
+    assert focus == pytest.approx(np.median(points, axis=0), abs=0.02)
+    pose = np.array(seen["camera_to_world"])
+    assert pose[1, 1] > 0.9, "y points down"
+    away = np.linalg.norm(pose[:3, 3] - focus)
+    distances = np.linalg.norm(points - focus, axis=1)
+    assert 1.2 * np.median(distances) < away < 11 * np.median(distances)
+    assert psnr(pixels(visit.page), rendered(service.http, model, seen)) > 25
+
+
 def test_cameras_are_drawn_and_can_be_chosen(shown: Page) -> None:
     before = pixels(shown)
     shown.evaluate(

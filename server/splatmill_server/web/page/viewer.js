@@ -16,7 +16,7 @@ import { Pictures } from "./pictures_view.js";
 import { Controls, HELP } from "./viewer/controls.js";
 import { ViewerError } from "./viewer/errors.js";
 import { Overlay } from "./viewer/overlay.js";
-import { dot, length, lookingAt, matrixOf, poseOf, sub, surroundings, tangentsOf } from "./viewer/pose.js";
+import { denseMiddle, dot, length, lookingAt, matrixOf, poseOf, sub, surroundings, tangentsOf } from "./viewer/pose.js";
 import { Splats, hasWebGL } from "./viewer/splats.js";
 
 export { ViewerError };
@@ -37,7 +37,8 @@ const FRUSTUM = 0.07;
  * @property {string} [url]  address of a file of splats: .ply, compressed .ply or .sog
  * @property {ArrayBuffer | Uint8Array} [bytes]  its bytes, in place of an address
  * @property {string} [model]  address of a stored model, as /v1/models/{id}: the server renders it where there is no WebGL
- * @property {Camera[]} [cameras]  of the photos: they tell where up is, where to look, and how far away to be
+ * @property {Camera[]} [cameras]  of the photos: they tell where up is, where to look, and how far away to be. Without
+ *   any, -y is up, and the dense middle of the Gaussians is seen from the side
  * @property {Camera} [camera]  to start from; left out, one of `cameras` whose view is close to the middle of all
  * @property {"webgl" | "pictures" | "depth"} [kind]  the kind of view; left out, webgl where the browser has it
  * @property {"black" | "white"} [background]  colour behind the model; left out, black
@@ -154,6 +155,7 @@ export class View extends EventTarget {
     }
     this.element.dataset.kind = this.kind;
     if (options.url || options.bytes || this.kind !== "webgl") await this.surface.load(options, options.progress);
+    if (!options.camera && !options.cameras?.length && this.surface instanceof Splats) this.frameMiddle(this.surface.points);
     this.again();
   }
 
@@ -202,6 +204,18 @@ export class View extends EventTarget {
     this.distance = Math.max(length(sub(this.focus, this.pose.position)), 1e-3);
     this.tangents = tangentsOf(camera);
     [this.home, this.homeDistance, this.homeTangents] = [this.pose, this.distance, this.tangents];
+    this.moved();
+  }
+
+  /** Look at the dense middle of a scene without cameras from the side. @param {Float32Array | null} points */
+  frameMiddle(points) {
+    if (!points?.length) return;
+    const { focus, reach } = denseMiddle(points);
+    [this.focus, this.middle, this.spread] = [focus, focus, reach];
+    this.overlay.size = FRUSTUM * reach;
+    this.pose = lookingAt([focus[0], focus[1] - 0.5 * reach, focus[2] - 2.5 * reach], focus, this.up);
+    this.distance = length(sub(focus, this.pose.position));
+    [this.home, this.homeDistance] = [this.pose, this.distance];
     this.moved();
   }
 

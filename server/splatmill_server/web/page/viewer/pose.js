@@ -158,6 +158,35 @@ export function surroundings(cameras) {
   return { up: unit(times(mean(poses.map((pose) => pose.down)), -1), [0, -1, 0]), focus, middle, spread };
 }
 
+/** Radius of the dense middle, in median distances from its centre: far shells lie outside of it. */
+const MIDDLE = 4;
+
+/** Points from which the dense middle is found, at most. */
+const MOST_POINTS = 50_000;
+
+/**
+ * The dense middle of a scene without cameras: the median point, and the distance from there within which 95 % of the
+ * points lie that are no more than MIDDLE median distances away.
+ *
+ * @param {ArrayLike<number>} points  x, y and z in turn, of at least one point
+ */
+export function denseMiddle(points) {
+  const count = points.length / 3;
+  const step = Math.ceil(count / MOST_POINTS);
+  /** @type {Vec[]} */
+  const some = [];
+  for (let i = 0; i < count; i += step) some.push([points[3 * i], points[3 * i + 1], points[3 * i + 2]]);
+  /** @param {number[]} values @param {number} share */
+  const quantile = (values, share) => values.sort((a, b) => a - b)[Math.min(values.length - 1, Math.floor(share * values.length))];
+  /** @param {number} axis */
+  const median = (axis) => quantile(some.map((point) => point[axis]), 0.5);
+  /** @type {Vec} */
+  const focus = [median(0), median(1), median(2)];
+  const distances = some.map((point) => length(sub(point, focus)));
+  const most = MIDDLE * quantile(distances, 0.5);
+  return { focus, reach: quantile(distances.filter((distance) => distance <= most), 0.95) || 1 };
+}
+
 /**
  * The point nearest to all optical axes; null where it is not well defined or not in front of most cameras.
  * @param {Pose[]} poses

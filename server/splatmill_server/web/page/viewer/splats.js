@@ -119,6 +119,11 @@ export class Splats {
     this.again();
   }
 
+  /** The positions of the Gaussians, x, y and z in turn; null where they are not known. @returns {Float32Array | null} */
+  get points() {
+    return this.app.assets.get(this.splats?.gsplat.asset)?.resource.centers ?? null;
+  }
+
   /** @param {number} width @param {number} height  of the drawing buffer, in pixels */
   resize(width, height) {
     this.app.graphicsDevice.setResolution(width, height);
