@@ -34,7 +34,7 @@ def watch(event, arguments):
 note("began " + " ".join(sys.orig_argv[1:]))
 sys.addaudithook(watch)
 """
-"""A sitecustomize.py that logs each Python process, and each file of the source tree that it opens."""
+"""A module that logs each Python process that imports it, and each file of the source tree that it opens."""
 
 
 def run(
@@ -125,4 +125,6 @@ def watch(bin_folder: Path, log: Path) -> None:
     """Make every Python process of the environment log the files of the source tree that it opens."""
     (packages,) = bin_folder.parent.glob("lib/python*/site-packages")
     folders = tuple(f"{ROOT / part}/" for part in PARTS.values())
-    (packages / "sitecustomize.py").write_text(WATCH.format(log=str(log), folders=folders))
+    # By a .pth file: Debian's Python has a sitecustomize of its own, which comes before one here.
+    (packages / "_watch_opened.py").write_text(WATCH.format(log=str(log), folders=folders))
+    (packages / "_watch_opened.pth").write_text("import _watch_opened\n")
