@@ -2,6 +2,7 @@
 
 import uuid
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self, TypeVar, Unpack
 
@@ -15,7 +16,7 @@ from splatmill.errors import invalid_request
 from splatmill.imports import AsyncImports
 from splatmill.job import AsyncJobHandle
 from splatmill.keys import AsyncKeys
-from splatmill.local_capture import find_files, start_model
+from splatmill.local_capture import find_files, printable, start_model
 from splatmill.model import AsyncModelHandle, find_model
 from splatmill.schema import (
     IDEMPOTENCY_HEADER,
@@ -30,6 +31,7 @@ from splatmill.schema import (
     ModelPage,
     OptionHelp,
     OptionList,
+    Problem,
     Ready,
     StorageUse,
     TrainOptions,
@@ -119,8 +121,9 @@ class AsyncClient:
 
         `options` are the fields of `TrainOptions`. `start` may also be the path of a model file on this machine, or its
         name in the folder `path`; the file is then uploaded with the poses. The options and the path are checked before
-        anything is sent. The job continues when the connection is closed. `refused` of the returned handle lists the
-        photos that the server refused. The same files are uploaded once: a second training uses the same capture.
+        anything is sent. The job continues when the connection is closed. Of the returned handle, `refused` lists the
+        photos that the server refused, and `renamed` the files that it stores under other names. The same files are
+        uploaded once: a second training uses the same capture.
 
         Raises NothingToUpload, ConnectionFailed, or a subclass of `Refused`.
         """
@@ -130,7 +133,7 @@ class AsyncClient:
             path, name=name, on_progress=on_progress, model=model, resume=True
         )
         handle = await self.submit(capture.id, checked, name=name)
-        handle.refused = uploaded.refused
+        handle.refused, handle.renamed = uploaded.refused, uploaded.renamed
         return handle
 
     async def upload(
@@ -151,16 +154,19 @@ class AsyncClient:
 
         Raises NothingToUpload, ConnectionFailed, or a subclass of `Refused`.
         """
-        files = [*find_files(path).files, *([start_model(model)] if model is not None else [])]
+        found = find_files(path)
+        files = [*found.files, *([start_model(model)] if model is not None else [])]
         if capture is None:
-            body = {"name": name or Path(path).expanduser().resolve().name}
+            body = {"name": name or printable(Path(path).expanduser().resolve().name)}
             if resume:
                 body["key"] = await key_of(files)
             response = await self.connection.request("POST", "/v1/captures", json=body, repeatable=resume)
             target = read_answer(Capture, response)
         else:
             target = await self.capture(capture)
-        return target, await upload(self.connection, target.id, files, on_progress, stored_files=target.files)
+        uploaded = await upload(self.connection, target.id, files, on_progress, stored_files=target.files)
+        unnamed = tuple((name, Problem.of("name_invalid", why)) for name, why in found.left_out)
+        return target, replace(uploaded, refused=(*unnamed, *uploaded.refused), renamed=found.renamed)
 
     async def submit(
         self,

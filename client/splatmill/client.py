@@ -272,6 +272,11 @@ class JobHandle:
         """Names of the photos that the server refused in the upload, each with the reason."""
         return self._async.refused
 
+    @property
+    def renamed(self) -> tuple[tuple[str, str], ...]:
+        """Names of the files that are stored under other names, each with its name in the capture."""
+        return self._async.renamed
+
     def refresh(self) -> Job:
         """Request the current record of the job."""
         return self._loop.run(self._async.refresh())

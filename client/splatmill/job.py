@@ -36,12 +36,14 @@ class AsyncJobHandle:
 
     job: its record, as of the last request.
     refused: names of the photos that the server refused in the upload, each with the reason.
+    renamed: names of the files that are stored under other names, each with its name in the capture.
     """
 
     def __init__(self, connection: Connection, job: Job) -> None:
         self.connection = connection
         self.job = job
         self.refused: tuple[tuple[str, Problem], ...] = ()
+        self.renamed: tuple[tuple[str, str], ...] = ()
 
     @property
     def id(self) -> str:

@@ -2,13 +2,17 @@
 
 import json
 import os
-from dataclasses import dataclass
+import unicodedata
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatmill.data_sets import Cameras, TwoDataSets, find_cameras, walk
 from splatmill.errors import NothingToUpload
-from splatmill.schema.captures import Role, UnsafeName, safe_name
-from splatmill.schema.photos import ARCHIVE_SUFFIXES, MASK_FOLDERS, PHOTO_SUFFIXES, VIDEO_SUFFIXES
+from splatmill.schema.captures import Role, UnsafeName, safe_name, storable_name
+from splatmill.schema.masks import masks_beside, without_mask_folder
+from splatmill.schema.outputs import own_outputs
+from splatmill.schema.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES, VIDEO_SUFFIXES
 
 MODEL_SUFFIXES = frozenset({".bin", ".txt"})
 MODEL_STEMS = frozenset({"cameras", "images", "points3d", "rigs", "frames"})  # in lower case
@@ -36,11 +40,34 @@ class Found:
 
     ignored: relative names of the files that are not used.
     top: the folder of the data set, with a slash at its end, where it is not the given one.
+    renamed: relative names of the files that are stored under other names, each with its name in the capture.
+    left_out: relative names of the files that no name can be made for, each with the reason.
+    outputs: relative names of pictures, videos and zips that are results of Splatmill.
     """
 
     files: tuple[LocalFile, ...]
     ignored: tuple[str, ...] = ()
     top: str = ""
+    renamed: tuple[tuple[str, str], ...] = ()
+    left_out: tuple[tuple[str, str], ...] = ()
+    outputs: tuple[str, ...] = ()
+
+    @staticmethod
+    def of(files: Iterable[LocalFile], ignored: Iterable[str] = ()) -> "Found":
+        """Return the files under names that the service accepts: one bad name keeps no other file from being used."""
+        stored: list[LocalFile] = []
+        renamed: list[tuple[str, str]] = []
+        left_out: list[tuple[str, str]] = []
+        for file in files:
+            try:
+                name = storable_name(file.name)
+            except UnsafeName as error:
+                left_out.append((file.name, str(error)))
+                continue
+            if name != unicodedata.normalize("NFC", file.name):
+                renamed.append((file.name, name))
+            stored.append(replace(file, name=name))
+        return Found(tuple(stored), tuple(ignored), renamed=tuple(renamed), left_out=tuple(left_out))
 
     def count(self, role: Role) -> int:
         """Return the number of files with this role."""
@@ -57,12 +84,14 @@ def find_files(path: str | os.PathLike[str]) -> Found:
 
     In a folder, the photos are those under `images/`, named relative to it. Without `images/`, they are all photos in
     the folder, named relative to the folder, so that `train/r_0.png` keeps its name in `transforms_train.json`. Masks
-    lie under `masks/` or `mask/`; poses are `transforms*.json`, the `.ply` files of points that they name, and COLMAP
-    models. All of this may lie some folders down: see `data_sets.find_cameras`. Hidden files and folders are ignored.
-    Videos and zip archives are used only where there are no photos.
+    lie in a folder such as `masks/`, or beside their photos (`splatmill.schema.masks`); poses are `transforms*.json`,
+    the `.ply` files of points that they name, and COLMAP models. All of this may lie some folders down: see
+    `data_sets.find_cameras`. Hidden files and folders are ignored. Videos and zip archives are used only where there
+    are no photos. Pictures in a folder of results are no photos (`splatmill.schema.outputs`).
 
-    Raises NothingToUpload where the path does not exist, cannot be read or holds none of these, and where the service
-    does not accept the name of a file.
+    A file whose name the service does not accept gets another one, or is left out.
+
+    Raises NothingToUpload where the path does not exist, cannot be read or holds none of these.
     """
     root = Path(path).expanduser()
     if not root.exists():
@@ -77,19 +106,14 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     except TwoDataSets as error:
         raise NothingToUpload(f"{root} cannot be read as one capture. {error}") from error
 
+    outputs = own_outputs(names)
+    names = [name for name in names if name not in outputs]
     # Cameras in a folder without photos are those of the photos around it.
     top = cameras.top if any(name.startswith(cameras.top) and _is_image(name) for name in names) else ""
     photo_root = f"{top}images/"
     if not any(name.startswith(photo_root) and _is_image(name) for name in names):
         photo_root = top
-    mask_root = next(
-        (
-            f"{top}{folder}/"
-            for folder in MASK_FOLDERS
-            if any(name.startswith(f"{top}{folder}/") for name in names)
-        ),
-        None,
-    )
+    masks = _masks([name for name in names if name.startswith(top) and _is_image(name)], top, photo_root)
     poses = _poses(cameras, names)
     poses |= _points_of(root, cameras, names)
     files: list[LocalFile] = []
@@ -97,9 +121,8 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     for name in names:
         if name in poses:
             files.append(_local(Role.poses, poses[name], root / name))
-        elif mask_root and name.startswith(mask_root):
-            if _is_image(name):
-                files.append(_local(Role.masks, name.removeprefix(mask_root), root / name))
+        elif name in masks:
+            files.append(_local(Role.masks, masks[name], root / name))
         elif name.startswith(photo_root) and _is_image(name):
             files.append(_local(Role.images, name.removeprefix(photo_root), root / name))
         else:
@@ -114,7 +137,15 @@ def find_files(path: str | os.PathLike[str]) -> Found:
                 f"{root} contains no photos, no video and no zip archive.",
                 f"Photos are {kinds} files.",
             )
-    return Found(tuple(files), tuple(ignored), cameras.top)
+    found = Found.of(files, ignored)
+    if not found.count(Role.images):
+        raise NothingToUpload(found.left_out[0][1], "Rename the files.")
+    return replace(found, top=cameras.top, outputs=tuple(sorted(outputs)))
+
+
+def printable(name: str) -> str:
+    """Return a file name as text that every terminal and JSON take: bytes that are not UTF-8 become escapes."""
+    return name.encode("utf-8", "backslashreplace").decode()
 
 
 def start_model(path: Path) -> LocalFile:
@@ -127,7 +158,10 @@ def start_model(path: Path) -> LocalFile:
             f"The model {path} to start from does not exist.",
             "Give the path of a model file, or the id of a model.",
         )
-    return _local(Role.poses, path.name, path)
+    try:
+        return _local(Role.poses, safe_name(path.name), path)
+    except UnsafeName as error:
+        raise NothingToUpload(str(error)) from error
 
 
 def _single(path: Path) -> Found:
@@ -136,7 +170,22 @@ def _single(path: Path) -> Found:
             f"{path.name} is neither a photo, nor a video, nor a zip archive.",
             "Give a folder of photos, a zip archive or a video.",
         )
-    return Found((_local(Role.images, path.name, path),))
+    return Found.of([_local(Role.images, path.name, path)])
+
+
+def _masks(pictures: list[str], top: str, photo_root: str) -> dict[str, str]:
+    """Return the local name of each mask, with its name in the capture. All pictures are under `top`."""
+    # A folder around the data set may be called masks too.
+    inner = {name: without_mask_folder(name.removeprefix(top)) for name in pictures}
+    masks = {name: f"{top}{rest}" for name, rest in inner.items() if rest is not None}
+    photos = [name for name in pictures if name.startswith(photo_root) and name not in masks]
+    if not photos:
+        return {}
+    masks |= {name: name for name in masks_beside(photos)}
+    return {
+        name: whole.removeprefix(photo_root if whole.startswith(photo_root) else top)
+        for name, whole in masks.items()
+    }
 
 
 def _poses(cameras: Cameras, names: list[str]) -> dict[str, str]:
@@ -174,9 +223,7 @@ def _points_of(root: Path, cameras: Cameras, names: list[str]) -> dict[str, str]
 
 def _local(role: Role, name: str, path: Path) -> LocalFile:
     try:
-        return LocalFile(role, safe_name(name), path, path.stat().st_size)
-    except UnsafeName as error:
-        raise NothingToUpload(str(error)) from error
+        return LocalFile(role, name, path, path.stat().st_size)
     except OSError as error:
         raise NothingToUpload(f"{path} cannot be read: {error.strerror}.") from error
 

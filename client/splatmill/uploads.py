@@ -36,11 +36,13 @@ class Uploaded:
     """The result of an upload.
 
     files: the files that the capture now holds of those that were sent.
-    refused: names of the photos that the server refused, each with the reason.
+    refused: names of the photos that the server refused, or that have no name it would accept, each with the reason.
+    renamed: names of the files that are stored under other names, each with its name in the capture.
     """
 
     files: tuple[CaptureFile, ...]
     refused: tuple[tuple[str, Problem], ...]
+    renamed: tuple[tuple[str, str], ...] = ()
 
 
 async def upload(

@@ -154,12 +154,20 @@ TREES = {
     "photos in folders": "b.JPG a.heic day/c.png notes.txt .hidden/d.jpg ._a.jpg __MACOSX/e.jpg walk.mp4",
     "masks": "images/a.jpg images/left/b.jpg masks/a.jpg.png masks/left/b.png masks/readme.txt d.jpg",
     "mask": "a.jpg mask/a.png",
+    "masks of other programs": "a.jpg a_mask.png b/c.jpg b/C.mask.PNG Mask_a.png a.jpg.png b/gas_mask.jpg _mask.png",
+    "folders of masks": "images/a.jpg images/Mask/a.PNG Masks/b/a.png segmentation/a.png cam/masks/a.jpg",
+    "results": "a.jpg splat/model.ply splat/report.json splat/preview.jpg splat/report.png splat/own.jpg preview.jpg",
+    "results of a video": "walk.mp4 out/model.ply out/report.json out/orbit.mp4 out/cameras.zip out/cameras.json",
+    "only masks": "mask/a.jpg mask/b.jpg",
     "colmap": "images/a.jpg sparse/0/cameras.bin sparse/0/images.bin sparse/0/project.ini sparse/1/cameras.bin",
     "colmap in its root": "images/a.jpg cameras.txt images.txt points3D.txt frames.txt",
     "colmap of nerfstudio": "images/a.jpg colmap/sparse/0/cameras.bin colmap/sparse/0/points3D.bin transforms.json",
     "blender": "train/r_0.png test/r_0.png transforms_train.json transforms_test.json deep/transforms.json",
     "a data set one folder down": "scene/images/a.jpg scene/sparse/0/cameras.bin scene/sparse/0/images.bin "
     "scene/masks/a.png note.txt",
+    "masks some folders down": "masks/set/images/a.jpg masks/set/images/b.jpg masks/set/images/b_mask.png "
+    "masks/set/segmentation/a.png masks/set/transforms.json masks/other.png",
+    "masks without a folder of photos some folders down": "set/a.jpg set/a_mask.png set/transforms.json b_mask.png",
     "models of a mapper": "images/a.jpg sparse/10/cameras.txt sparse/2/cameras.txt "
     "sparse/cameras.txt colmap/sparse/0/cameras.txt",
     "cameras beside the photos": "photos/a.jpg out/sparse/0/cameras.bin out/sparse/0/images.bin extra/cameras.txt",
@@ -191,6 +199,7 @@ def test_files_are_sorted_as_by_the_command_line(page: Page, tmp_path: Path) -> 
             (file.role.value, file.name, file.path.relative_to(root).as_posix()) for file in found.files
         ], title
         assert here["ignored"] == list(found.ignored), title
+        assert here["outputs"] == list(found.outputs), title
 
 
 def test_a_folder_with_cameras_is_dropped(visit: Visit, service: Up, tmp_path: Path, jobs: None) -> None:

@@ -20,7 +20,7 @@ import pytest
 from splatmill import Client, chunked_uploads, uploads
 from splatmill.errors import ConnectionFailed, InvalidRequest, NothingToUpload
 from splatmill.loop import BackgroundLoop
-from splatmill.schema import Progress
+from splatmill.schema import Progress, storable_name
 from tests.support.waiting import wait_for
 
 SIZE = 3_000_000
@@ -222,3 +222,17 @@ def test_a_command_that_was_killed_goes_on_in_the_same_capture(service, tmp_path
         assert client.job(second.stdout.split()[-1]).job.capture == capture.id
     # What the first command had sent was not sent again, but for what was in flight.
     assert proxy.sent - sent < big - 16_000_000
+
+
+def test_one_bad_name_is_stored_under_another_and_one_is_refused(service, tmp_path):
+    deep = "/".join(["a"] * 17) + ".jpg"
+    for name in ("plain.jpg", " lead.jpg", deep):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(os.urandom(100))
+    with Client(service.url) as client:
+        capture, uploaded = client.upload(tmp_path)
+        held = {file.name for file in client.capture(capture.id).files}
+    assert uploaded.renamed == ((" lead.jpg", storable_name(" lead.jpg")),)
+    assert held == {"plain.jpg", storable_name(" lead.jpg")}
+    [(name, problem)] = uploaded.refused
+    assert (name, problem.code) == (deep, "name_invalid")

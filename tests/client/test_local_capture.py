@@ -3,14 +3,18 @@
 Does not prove that the files hold what their names say; only transforms.json is opened.
 """
 
+import os
+import re
 from pathlib import Path
 
 import pytest
 
+from splatmill.cli.models import FILES, OPTIONAL_FILES
 from splatmill.data_sets import find_cameras, walk
 from splatmill.errors import NothingToUpload
-from splatmill.local_capture import find_files
-from splatmill.schema import Role
+from splatmill.local_capture import find_files, printable
+from splatmill.schema import OUTPUT_MARKS, OUTPUT_MEDIA, Role, safe_name
+from splatmill.schema.masks import paired
 from tests.support.paths import DATA
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the shared data sets are not on this machine")
@@ -48,6 +52,49 @@ def test_a_folder_of_photos(tmp_path: Path):
     found = find_files(tmp_path)
     assert found.ignored == ("notes.txt",)
     assert found.bytes == 30
+
+
+@pytest.mark.parametrize(
+    ("mask", "name"),
+    [
+        ("images/a_mask.png", "a_mask.png"),
+        ("images/a.mask.PNG", "a.mask.PNG"),
+        ("images/left/Mask_B.png", "left/Mask_B.png"),
+        ("Masks/a.PNG", "a.PNG"),
+        ("segmentation/left/b.png", "left/b.png"),
+        ("images/mask/a.png", "a.png"),
+    ],
+)
+def test_masks_of_other_programs(tmp_path: Path, mask: str, name: str) -> None:
+    tree(tmp_path, "images/a.jpg", "images/left/b.jpg", "images/gas_mask.jpg", mask)
+    assert roles(tmp_path) == {
+        Role.images: ["a.jpg", "gas_mask.jpg", "left/b.jpg"],
+        Role.masks: [name],
+        Role.poses: [],
+    }
+
+
+def test_masks_of_a_data_set_some_folders_down(tmp_path: Path) -> None:
+    tree(
+        tmp_path,
+        *(
+            f"masks/set/{name}"
+            for name in ("images/a.jpg", "images/b.jpg", "images/b_mask.png", "transforms.json")
+        ),
+        "masks/set/segmentation/a.png",
+        "masks/other.png",
+    )
+    assert roles(tmp_path) == {
+        Role.images: ["a.jpg", "b.jpg"],
+        Role.masks: ["b_mask.png", "a.png"],
+        Role.poses: ["transforms.json"],
+    }
+    assert find_files(tmp_path).ignored == ("masks/other.png",)
+
+
+def test_pictures_that_all_lie_in_a_folder_of_masks_are_photos(tmp_path: Path) -> None:
+    tree(tmp_path, "mask/a.jpg", "mask/b.jpg")
+    assert roles(tmp_path)[Role.images] == ["mask/a.jpg", "mask/b.jpg"]
 
 
 def test_masks_lie_beside_photos(tmp_path: Path):
@@ -188,9 +235,89 @@ def test_paths_with_nothing_to_train(tmp_path: Path):
         find_files(tmp_path / "notes.txt")
 
 
-def test_a_name_the_service_refuses_is_told_before_anything_is_sent(tmp_path: Path):
-    with pytest.raises(NothingToUpload, match="backslash"):
-        find_files(tree(tmp_path, "a\\b.jpg"))
+@pytest.mark.parametrize(
+    ("bad", "stem"),
+    [
+        (b"x:1.jpg", "x_1"),
+        (b" lead.jpg", "lead"),
+        (b"caf\xe9.jpg", "caf_"),
+        (b"a\\b.jpg", "a_b"),
+        (b"line\nbreak.jpg", "line_break"),
+        ("写".encode() * 80 + b".jpg", "写" * 62),
+        (b" day /1.jpg", "day"),
+    ],
+)
+def test_one_bad_name_is_changed_and_the_others_stay(tmp_path: Path, bad: bytes, stem: str) -> None:
+    tree(tmp_path, *(f"{number}.jpg" for number in range(30)))
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + bad))
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"x")
+    found = find_files(tmp_path)
+    names = {file.path: file.name for file in found.files}
+    assert len(names) == 31
+    stored = names[path]
+    assert re.fullmatch(rf"{stem}-[0-9a-f]{{8}}(/1)?\.jpg", stored)
+    assert safe_name(stored) == stored
+    assert found.renamed == ((os.fsdecode(bad), stored),)
+    assert found.left_out == ()
+    assert set(names.values()) == {f"{number}.jpg" for number in range(30)} | {stored}
+    assert printable(os.fsdecode(bad)).encode()  # no terminal or JSON fails on it
+
+
+def test_a_photo_and_its_mask_are_renamed_alike_and_no_name_is_taken(tmp_path: Path) -> None:
+    tree(tmp_path, "images/x:1.jpg", "images/x_1.jpg", "images/y:1.jpg", "masks/x:1.png")
+    found = find_files(tmp_path)
+    names = {(file.role, file.path.name): file.name for file in found.files}
+    assert len(set(names.values())) == 4
+    photos = [name for (role, _), name in names.items() if role is Role.images]
+    assert paired(photos, [names[Role.masks, "x:1.png"]]) == {
+        names[Role.images, "x:1.jpg"]: names[Role.masks, "x:1.png"]
+    }
+
+
+def test_photos_with_rare_suffixes(tmp_path: Path) -> None:
+    names = ["a.jfif", "b.JPE", "c.avif", "d.JFIF"]
+    tree(tmp_path, *names)
+    assert roles(tmp_path)[Role.images] == names
+
+
+def test_results_among_the_photos_are_no_photos(tmp_path: Path) -> None:
+    results = [f"out/{name}" for name in (*FILES, *OPTIONAL_FILES, "novel_view.png", "orbit.mp4")]
+    tree(tmp_path, "1.jpg", "2.jpg", "preview.jpg", "out/mine.jpg", *results)
+    found = find_files(tmp_path)
+    # Of a picture that somebody put there, and of a preview that was copied, nothing says that it is a result.
+    assert [file.name for file in found.files] == ["1.jpg", "2.jpg", "out/mine.jpg", "preview.jpg"]
+    assert found.outputs == tuple(sorted(f"out/{name}" for name in OUTPUT_MEDIA))
+
+
+def test_results_beside_the_photos_and_after_an_interruption(tmp_path: Path) -> None:
+    # The files are downloaded in the order of FILES: no picture is there before two files that mark the folder.
+    assert set(FILES[:2]) <= set(OUTPUT_MARKS)
+    tree(tmp_path, "1.jpg", "2.jpg", "model.ply", "report.json", "report.png")
+    assert [file.name for file in find_files(tmp_path).files] == ["1.jpg", "2.jpg"]
+
+
+def test_results_beside_a_video_are_no_video_and_no_zip(tmp_path: Path) -> None:
+    tree(tmp_path, "walk.mp4", *(f"splat/{name}" for name in (*FILES, "orbit.mp4")))
+    assert [file.name for file in find_files(tmp_path).files] == ["walk.mp4"]
+
+
+def test_pictures_beside_the_report_of_another_program_are_photos(tmp_path: Path) -> None:
+    tree(tmp_path, "1.jpg", "preview.jpg", "report.json")
+    assert [file.name for file in find_files(tmp_path).files] == ["1.jpg", "preview.jpg"]
+
+
+def test_a_name_that_cannot_be_changed_is_left_out(tmp_path: Path) -> None:
+    deep = "/".join(["a"] * 17)
+    tree(tmp_path, "1.jpg", f"{deep}.jpg")
+    found = find_files(tmp_path)
+    assert [file.name for file in found.files] == ["1.jpg"]
+    [(name, reason)] = found.left_out
+    assert name == f"{deep}.jpg"
+    assert "17 parts" in reason
+    (tmp_path / "1.jpg").unlink()
+    with pytest.raises(NothingToUpload, match="17 parts"):
+        find_files(tmp_path)
 
 
 @needs_data

@@ -24,7 +24,7 @@ TWINS = [
 ]
 ATTRIBUTES = {
     aio.AsyncClient: {"connection"},
-    job.AsyncJobHandle: {"connection", "job", "refused"},
+    job.AsyncJobHandle: {"connection", "job", "refused", "renamed"},
     model.AsyncModelHandle: {"connection", "model"},
 }
 """Names that the asynchronous classes set in `__init__`, where the synchronous ones have properties."""

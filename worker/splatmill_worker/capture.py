@@ -9,6 +9,7 @@ from splatmill.data_sets import TwoDataSets
 from splatmill.schema import Backend, TrainOptions, known_distance
 from splatmill_worker import sfm
 from splatmill_worker.errors import Refusal
+from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.scene import Scene, View, split
 from splatmill_worker.sfm import posed
@@ -67,7 +68,6 @@ def posed_scene(
             scene, workdir, seed=options.seed, on_progress=on_progress, cancelled=cancelled
         )
     images = capture / "images"
-    masks = capture / "masks"
     wanted = sfm.SfmOptions(
         effort=options.sfm_effort.value,
         matcher=options.matcher.value,
@@ -77,7 +77,7 @@ def posed_scene(
     )
     return sfm.reconstruct(
         images if images.is_dir() else capture,
-        masks if masks.is_dir() else None,
+        mask_folder(capture),
         workdir,
         wanted,
         on_progress,

@@ -113,7 +113,7 @@ class UnusablePicture(Refusal):
             code,
             f"{name}: {reason}.",
             facts={"file": name},
-            advice="Leave the file out, or give it as a whole JPEG, PNG, WebP, TIFF or HEIC picture.",
+            advice="Leave the file out, or give it as a whole JPEG, PNG, WebP, TIFF, HEIC or AVIF picture.",
         )
         self.reason = reason
 

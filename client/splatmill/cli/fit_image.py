@@ -15,7 +15,7 @@ def _fit_image(
     photo: Annotated[
         Path,
         typer.Argument(
-            metavar="PHOTO", help="Picture to fit: JPEG, PNG, WebP, TIFF or HEIC.", show_default=False
+            metavar="PHOTO", help="Picture to fit: JPEG, PNG, WebP, TIFF, HEIC or AVIF.", show_default=False
         ),
     ],
     out: Annotated[

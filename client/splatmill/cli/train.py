@@ -22,7 +22,7 @@ from splatmill.cli.servers import open_client
 from splatmill.cli.unfinished import Unfinished, size_text
 from splatmill.client import Client, JobHandle, ModelHandle
 from splatmill.errors import JobCancelled
-from splatmill.local_capture import Found, LocalFile, find_files, start_model
+from splatmill.local_capture import Found, LocalFile, find_files, printable, start_model
 from splatmill.schema import Capture, Role, TrainOptions, format_bytes
 
 DATA = ".splatmill"
@@ -119,7 +119,7 @@ def train(
         )
     out.mkdir(parents=True, exist_ok=True)
     _announce(found)
-    title = name or path.expanduser().resolve().name
+    title = name or printable(path.expanduser().resolve().name)
 
     def outputs(model: ModelHandle) -> None:
         written = download_files(model, out)
@@ -152,10 +152,16 @@ def _announce(found: Found) -> None:
     extra = "".join(f", {count} {kind}" for count, kind in ((masks, "masks"), (poses, "pose files")) if count)
     typer.echo(f"{photos} photos{extra}, {format_bytes(found.bytes)}")
     if found.top:
-        typer.echo(f"cameras: those in {found.top}")
+        typer.echo(f"cameras: those in {printable(found.top)}")
     if found.ignored:
-        shown = ", ".join(found.ignored[:5]) + (", ..." if len(found.ignored) > 5 else "")
+        shown = ", ".join(map(printable, found.ignored[:5])) + (", ..." if len(found.ignored) > 5 else "")
         typer.echo(f"ignored: {shown}")
+    if found.outputs:
+        typer.echo(
+            f"results of an earlier training, not read as photos: {', '.join(map(printable, found.outputs))}"
+        )
+    for name, stored in found.renamed:
+        typer.echo(f"renamed: {name!a} is stored as {stored}", err=True)
 
 
 @contextmanager
@@ -225,7 +231,7 @@ def _upload(
             resume=True,
         )
     for photo, problem in uploaded.refused:
-        typer.echo(f"left out: {photo}: {problem.detail}", err=True)
+        typer.echo(f"left out: {printable(photo)}: {problem.detail}", err=True)
     return capture
 
 

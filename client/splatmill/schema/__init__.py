@@ -1,8 +1,8 @@
 """The wire schema: every request, response, event, option and problem of the service.
 
-All of it is imported when the first name of this package is used. `photos`, `port` and `quantities`, which define no
-messages, can be imported without the others: so `splatmill up`, and the processes that decode photos, start with half
-of the work.
+All of it is imported when the first name of this package is used. `masks`, `outputs`, `photos`, `port` and
+`quantities`, which define no messages, can be imported without the others: so `splatmill up`, and the processes that
+decode photos, start with half of the work.
 """
 
 from importlib import import_module
@@ -62,6 +62,7 @@ if TYPE_CHECKING:
         UnsafeName,
         may_be_empty,
         safe_name,
+        storable_name,
     )
     from splatmill.schema.conversions import (
         CONVERSION_HEADER,
@@ -125,6 +126,11 @@ if TYPE_CHECKING:
         UnusedPhoto,
         Watch,
     )
+    from splatmill.schema.masks import (
+        MASK_BEGINNINGS,
+        MASK_ENDINGS,
+        MASK_FOLDERS,
+    )
     from splatmill.schema.models import (
         HELD_OUT,
         TIME_LAPSE,
@@ -158,9 +164,9 @@ if TYPE_CHECKING:
         OrbitList,
         OrbitState,
     )
+    from splatmill.schema.outputs import OUTPUT_MARKS, OUTPUT_MEDIA
     from splatmill.schema.photos import (
         ARCHIVE_SUFFIXES,
-        MASK_FOLDERS,
         MASK_SUFFIXES,
         MAX_PHOTO_PIXELS,
         MIN_PHOTO_SIDE,
@@ -224,6 +230,8 @@ __all__ = [
     "HELD_OUT",
     "IDEMPOTENCY_HEADER",
     "LONGEST_SHARE",
+    "MASK_BEGINNINGS",
+    "MASK_ENDINGS",
     "MASK_FOLDERS",
     "MASK_SUFFIXES",
     "MAX_NAME_BYTES",
@@ -234,6 +242,8 @@ __all__ = [
     "MAX_RENDER_SIDE",
     "MIN_PHOTO_SIDE",
     "MODEL_FORMATS",
+    "OUTPUT_MARKS",
+    "OUTPUT_MEDIA",
     "PHOTO_SUFFIXES",
     "PRESET_STEPS",
     "PROBLEMS",
@@ -383,6 +393,7 @@ __all__ = [
     "parse_bytes",
     "parse_duration",
     "safe_name",
+    "storable_name",
 ]
 
 

@@ -1,8 +1,10 @@
 """Captures (the photos, masks and poses that belong together) and the rule for their file names."""
 
+import hashlib
 import re
 import unicodedata
 from enum import StrEnum
+from os.path import splitext
 from typing import Annotated
 
 from pydantic import AfterValidator, Field
@@ -64,6 +66,41 @@ def safe_name(name: str) -> str:
     if _STAGED.search(name):
         raise UnsafeName(f"The file name {shown} ends in '#' and digits, which is reserved; rename the file.")
     return name
+
+
+def storable_name(name: str) -> str:
+    """Return a name for the file `name` that `safe_name` accepts: its own, or a changed one that no other file gets.
+
+    Backslashes, control characters, bytes that are not UTF-8 and the colon of a drive become `_`, spaces at an end of a
+    part are removed, and a part that is too long is shortened. Each changed part ends in a digest of what it was, and
+    its suffix. The digest is that of the part without suffix: a photo and its mask keep one stem.
+
+    Raises UnsafeName for what no change of characters mends: an empty part, `.`, `..`, an absolute path, and a path
+    with too many parts or bytes.
+    """
+    try:
+        return safe_name(name)
+    except UnsafeName:
+        parts = unicodedata.normalize("NFC", name).split("/")
+        last = len(parts) - 1
+        return safe_name("/".join(_mended(part, k == 0, k == last) for k, part in enumerate(parts)))
+
+
+def _mended(part: str, first: bool, last: bool) -> str:
+    """A part of a path as `storable_name` changes it; one that is a name already stays as it is."""
+    text = "".join(
+        "_" if c in "\\\ufffd" or unicodedata.category(c) in ("Cc", "Cs") else c for c in part
+    ).strip()
+    if first and _DRIVE.match(text):
+        text = f"{text[0]}_{text[2:]}"
+    if last and _STAGED.search(text):
+        text = text.replace("#", "_")
+    if text in ("", ".", "..") or (text == part and len(part.encode()) <= MAX_PART_BYTES):
+        return text
+    stem, suffix = splitext(text)
+    digest = hashlib.sha256(splitext(part)[0].encode("utf-8", "surrogateescape")).hexdigest()[:8]
+    room = max(0, MAX_PART_BYTES - len(suffix.encode()) - len(digest) - 1)
+    return f"{stem.encode()[:room].decode(errors='ignore').strip()}-{digest}{suffix}"
 
 
 class Role(StrEnum):

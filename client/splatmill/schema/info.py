@@ -43,7 +43,21 @@ class Accepted(Response):
     archives: list[str]
     masks: list[str]
     mask_folders: list[str] = Field(
-        description="Folders of a data set that hold masks; the first that exists is used."
+        description="Folders that hold masks, at any depth. Case does not matter, here and below."
+    )
+    mask_endings: list[str] = Field(
+        default_factory=list,
+        description="What follows the name of a photo, with or without its suffix, in that of a mask.",
+    )
+    mask_beginnings: list[str] = Field(
+        default_factory=list, description="What precedes the name of a photo in that of a mask."
+    )
+    output_marks: list[str] = Field(
+        default_factory=list,
+        description="Names of files of which a folder with results of Splatmill holds two at least.",
+    )
+    output_media: list[str] = Field(
+        default_factory=list, description="Names of files in such a folder that are not read as photos."
     )
     min_photo_side: int = Field(
         description="Pixels; photos with a shorter side are left out of the training."

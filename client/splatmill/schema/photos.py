@@ -4,15 +4,24 @@ Suffixes are in lower case and begin with a dot. The client selects the files to
 whether a capture can be trained. The worker recognises videos and archives by them, and photos by their contents.
 """
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif")
+PHOTO_SUFFIXES = (
+    ".jpg",
+    ".jpeg",
+    ".jpe",
+    ".jfif",
+    ".png",
+    ".webp",
+    ".tif",
+    ".tiff",
+    ".heic",
+    ".heif",
+    ".avif",
+)
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 ARCHIVE_SUFFIXES = (".zip",)
 
-MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
-"""In the order in which the mask of a photo is searched for."""
-
-MASK_FOLDERS = ("masks", "mask")
-"""Folders of a data set that hold masks; the first one that exists is used."""
+MASK_SUFFIXES = tuple(sorted(PHOTO_SUFFIXES, key=lambda suffix: suffix != ".png"))
+"""In the order in which the mask of a photo is searched for. Which pictures are masks: `masks.py`."""
 
 MIN_PHOTO_SIDE = 16
 """Pixels. A smaller photo has hardly any features, and covers one tile of the renderer at most."""

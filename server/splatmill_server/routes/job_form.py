@@ -1,5 +1,6 @@
 """`POST /v1/jobs` with a form: uploads photos and starts a job in one request."""
 
+import unicodedata
 from contextlib import nullcontext
 
 from fastapi.exceptions import RequestValidationError
@@ -8,7 +9,8 @@ from pydantic_core import from_json
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 
-from splatmill.schema import CaptureFile, CreateJob, Job, Role
+from splatmill.backplane import events, row
+from splatmill.schema import CaptureFile, CreateJob, Job, LogEvent, Role, storable_name
 from splatmill_server.access.caller import Caller
 from splatmill_server.captures.records import fingerprints
 from splatmill_server.problems import ProblemError
@@ -26,20 +28,22 @@ async def create_from_form(
     """Store the files of a form in a new capture and start a job on it; return the job, and whether it is new.
 
     The files are the parts `images`, `masks` and `poses`; the field `options` is JSON, `name` is text, and `priority` a
-    number. If any part
-    is refused, the capture is deleted.
+    number. A photo or mask whose name is not accepted is stored under another one, which the log of the job names. If
+    any part is refused, the capture is deleted.
     """
     await run_in_threadpool(service.quota.check_new, who)
     capture, _ = await run_in_threadpool(lambda: service.captures.create(owner=who.owner))
     kept = False
     try:
-        files, fields = await _receive(service, who, request, capture.id)
+        files, fields, renamed = await _receive(service, who, request, capture.id)
         create = _request(capture.id, fields)
         await run_in_threadpool(service.captures.check_trainable, capture.id)
         await run_in_threadpool(check_start_model, service, who, create)
         described = create.described(with_capture=False) + "\n".join(fingerprints(files))
         job, new = await run_in_threadpool(create_job_in_room, service, who, create, key, described)
         kept = job.capture == capture.id
+        if new:
+            await run_in_threadpool(_log_renamed, service, job.id, renamed)
         return job, new
     finally:
         if not kept:
@@ -71,12 +75,17 @@ def check_start_model(service: Service, who: Caller, create: CreateJob) -> None:
 
 async def _receive(
     service: Service, who: Caller, request: Request, capture_id: str
-) -> tuple[list[CaptureFile], dict[str, str]]:
+) -> tuple[list[CaptureFile], dict[str, str], list[tuple[str, str]]]:
+    """The stored files, the fields, and the names of the files that are stored under others, each with the other."""
     files: list[CaptureFile] = []
+    renamed: list[tuple[str, str]] = []
     fields: dict[str, str] = {}
     async for part in read_parts(request):
         if part.filename is not None and part.name in Role.__members__:
-            files.append(await _store(service, who, capture_id, part, part.filename))
+            name = part.filename if part.name == Role.poses else storable_name(part.filename)
+            if name != unicodedata.normalize("NFC", part.filename):
+                renamed.append((part.filename, name))
+            files.append(await _store(service, who, capture_id, part, name))
         elif part.filename is None and part.name in fields:
             raise ProblemError("invalid_request", f"The form contains the field {part.name!r} twice.")
         elif part.filename is None and part.name in _FIELDS:
@@ -89,7 +98,18 @@ async def _receive(
                 advice="Send the files as 'images', 'masks' and 'poses', and the fields 'options' "
                 "(JSON), 'name' and 'priority'.",
             )
-    return files, fields
+    return files, fields, renamed
+
+
+def _log_renamed(service: Service, job_id: str, renamed: list[tuple[str, str]]) -> None:
+    """Append a warning to the log of a new job for each file that is stored under another name."""
+    found = row.read(service.redis, job_id) if renamed else None
+    if found is None:
+        return
+    for name, stored in renamed:
+        message = f"The file name {name[:80]!a} is not accepted; the file is stored as {stored}."
+        warning = LogEvent(level="warning", message=message)
+        events.append(service.redis, job_id, found.generation, 0, warning)
 
 
 async def _store(service: Service, who: Caller, capture_id: str, part: Part, filename: str) -> CaptureFile:

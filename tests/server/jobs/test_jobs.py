@@ -3,6 +3,7 @@
 Not proved here: that a worker trains (tests/service), and cancelling a running process (test_cancel).
 """
 
+import hashlib
 import json
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 
 from splatmill.backplane import keys, layout, queue, row
-from splatmill.schema import JobState, PlanEvent, Problem, ProgressEvent, StateEvent
+from splatmill.schema import JobState, PlanEvent, Problem, ProgressEvent, StateEvent, storable_name
 from splatmill_server import lists
 from tests.support.served_app import ServedApp, problem, raw, stored
 
@@ -274,6 +275,23 @@ def test_one_request_with_a_form_does_it_all(app: ServedApp) -> None:
     again = app.http.post("/v1/jobs", files=files, data=form, headers={"Idempotency-Key": "form"})
     assert again.json()["id"] == made.json()["id"]
     assert len(app.http.get("/v1/captures").json()["captures"]) == 1
+
+
+def test_one_bad_name_in_a_form_is_changed_and_named_in_the_log(app: ServedApp) -> None:
+    names = ["a.jpg", "x:1.jpg", " lead.jpg"]
+    files = [("images", (name, PHOTO + name.encode())) for name in names]
+    job = app.http.post("/v1/jobs", files=files).json()
+    held = {
+        entry["name"]: entry["sha256"]
+        for entry in app.http.get(f"/v1/captures/{job['capture']}").json()["files"]
+    }
+    assert held == {storable_name(name): hashlib.sha256(PHOTO + name.encode()).hexdigest() for name in names}
+    lines = app.http.get(f"/v1/jobs/{job['id']}/logs").json()["lines"]
+    assert [(line["level"], line["message"]) for line in lines] == [
+        ("warning", f"The file name {name!r} is not accepted; the file is stored as {storable_name(name)}.")
+        for name in names[1:]
+    ]
+    assert app.state(job["id"]) == "queued"
 
 
 def test_a_form_that_is_refused_leaves_nothing(app: ServedApp) -> None:

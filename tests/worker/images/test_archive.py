@@ -16,7 +16,7 @@ import pytest
 from splatmill_worker.errors import Refusal, UnusableVideo
 from splatmill_worker.images import archive, decoders, prepare, video
 from splatmill_worker.images.archive import Allowance, UnsafeArchive, unpack
-from tests.support.hostile import archives, videos
+from tests.support.hostile import archives, pictures, videos
 
 
 def written(folder: Path) -> int:
@@ -81,3 +81,22 @@ def test_frames_of_a_video_are_bounded_while_they_are_written_and_with_the_archi
     with pytest.raises(UnusableVideo, match="more than 1000 bytes as JPEGs"):
         decoders.keyframes(images / "a.mp4", tmp_path / "frames", 4)
     assert len(list((tmp_path / "frames").iterdir())) <= 2
+
+
+def test_a_colon_in_a_name_refuses_no_zip(tmp_path: Path) -> None:
+    place = zipped(tmp_path, {"x:1.jpg": b"1", " lead.jpg": b"2", "2.jpg": b"3"}, zipfile.ZIP_STORED)
+    assert [path.name for path in unpack(place, tmp_path / "target")] == ["x:1.jpg", " lead.jpg", "2.jpg"]
+    absolute = zipped(tmp_path, {"C:/1.jpg": b"1"}, zipfile.ZIP_STORED)
+    with pytest.raises(UnsafeArchive, match="outside"):
+        unpack(absolute, tmp_path / "other")
+
+
+def test_results_of_a_training_in_a_zip_are_no_photos(tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    shots = {f"{number}.png": pictures.photo(number) for number in range(2)}
+    results = {"splat/model.ply": b"ply", "splat/report.json": b"{}", "splat/preview.jpg": pictures.photo(2)}
+    zipped(images, shots | results)
+    found = prepare.prepare(images, None, tmp_path / "work")
+    assert [photo.name for photo in found.photos] == ["set/0.png", "set/1.png"]
+    assert ("set/splat/preview.jpg", "it is a result of Splatmill, not a photo") in found.skipped

@@ -25,7 +25,7 @@ from tests.support.waiting import wait_for
 
 @pytest.fixture
 def photos(tmp_path: Path) -> Path:
-    """A folder with a JPEG that EXIF turns, a transparent PNG and a PNG with 16 bits."""
+    """A folder with a JPEG and an AVIF that EXIF turns, a transparent PNG and a PNG with 16 bits."""
     folder = tmp_path / "photos"
     folder.mkdir()
     random = np.random.default_rng(5)
@@ -33,6 +33,7 @@ def photos(tmp_path: Path) -> Path:
     turned[here.ORIENTATION] = 6
     colours = random.integers(0, 256, (96, 160, 4), np.uint8)
     Image.fromarray(colours[..., :3]).save(folder / "turned.jpg", exif=turned)
+    Image.fromarray(colours[..., :3]).save(folder / "turned.avif", exif=turned)
     Image.fromarray(colours).save(folder / "transparent.png")
     Image.fromarray(random.integers(0, 65536, (96, 160)).astype(np.uint16)).save(folder / "deep.png")
     return folder
@@ -44,7 +45,7 @@ def confinement(photos: Path) -> Iterator[Decoders]:
         yield started
 
 
-@pytest.mark.parametrize("name", ["turned.jpg", "transparent.png", "deep.png"])
+@pytest.mark.parametrize("name", ["turned.jpg", "turned.avif", "transparent.png", "deep.png"])
 @pytest.mark.parametrize("at_least", [None, (20, 20)])
 def test_pixels_are_those_of_this_process(
     name: str, at_least: tuple[int, int] | None, photos: Path, confinement: Decoders

@@ -44,14 +44,34 @@ def reasons(result: Prepared) -> dict[str, str]:
     return dict(result.skipped)
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tiff", "heic"])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tiff", "heic", "avif"])
 def test_each_format_is_read(photos: Path, tmp_path: Path, suffix: str) -> None:
     picture().save(photos / f"a.{suffix}", quality=95)
     result = prepared(photos, tmp_path)
     assert [(photo.name, photo.width, photo.height) for photo in result.photos] == [(f"a.{suffix}", 64, 48)]
     pixels = np.asarray(decode.decode(result.photos[0].path).convert("RGB"), float)
-    # HEIC halves the colours' resolution, which this picture has much of.
-    assert np.abs(pixels - np.asarray(picture(), float)).mean() < (8.0 if suffix == "heic" else 4.0)
+    # HEIC and AVIF halve the colours' resolution, which this picture has much of.
+    halved = suffix in ("heic", "avif")
+    assert np.abs(pixels - np.asarray(picture(), float)).mean() < (8.0 if halved else 4.0)
+
+
+@pytest.mark.parametrize("suffix", [".jfif", ".jpe", ".JFIF", ".avif"])
+def test_photos_with_rare_suffixes_are_upright_and_truncated_ones_are_named(
+    photos: Path, tmp_path: Path, suffix: str
+) -> None:
+    turned = Image.Exif()
+    turned[decode.ORIENTATION] = 6
+    form = "AVIF" if suffix == ".avif" else "JPEG"
+    whole = picture(400, 300)
+    whole.save(photos / f"a{suffix}", form, quality=95, exif=turned)
+    data = (photos / f"a{suffix}").read_bytes()
+    (photos / f"cut{suffix}").write_bytes(data[: len(data) // 2])
+    result = prepared(photos, tmp_path)
+    assert [(photo.name, photo.width, photo.height) for photo in result.photos] == [(f"a{suffix}", 300, 400)]
+    assert reasons(result).keys() == {f"cut{suffix}"}
+    assert "it does not decode completely" in reasons(result)[f"cut{suffix}"]
+    pixels = np.asarray(decode.decode(photos / f"a{suffix}"), float)
+    assert np.abs(pixels - np.asarray(whole.rotate(-90, expand=True), float)).mean() < 4.0
 
 
 def test_unusable_files_are_named_with_their_reason(photos: Path, tmp_path: Path) -> None:

@@ -21,8 +21,8 @@ Say = Callable[[str], None]
 
 
 ADVICE = {
-    "not_an_image": "Give a JPEG, PNG, WebP, TIFF or HEIC file.",
-    "file_empty": "Give a JPEG, PNG, WebP, TIFF or HEIC file.",
+    "not_an_image": "Give a JPEG, PNG, WebP, TIFF, HEIC or AVIF file.",
+    "file_empty": "Give a JPEG, PNG, WebP, TIFF, HEIC or AVIF file.",
     "image_truncated": "Save the picture again from the program it came from.",
     "image_too_large": "Scale the picture down first.",
 }

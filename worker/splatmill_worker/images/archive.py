@@ -172,7 +172,8 @@ def _check_declared(entries: list[zipfile.ZipInfo]) -> None:
     for entry in entries:
         name = entry.filename
         windows = PureWindowsPath(name)
-        if PurePosixPath(name).is_absolute() or windows.drive or windows.root or ".." in windows.parts:
+        # A colon after one letter is no drive of Windows unless the path is absolute: `x:1.jpg` is a photo.
+        if PurePosixPath(name).is_absolute() or windows.root or ".." in windows.parts:
             raise UnsafeArchive(f"the name {name!r} points outside the archive")
         if "\x00" in name or not name.strip("/. "):
             raise UnsafeArchive(f"the name {name!r} is not a file name")

@@ -17,10 +17,10 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from PIL import Image
-from pydantic import TypeAdapter
+from pydantic import Field, TypeAdapter
 
 from splatmill.schema import format_bytes
 from splatmill.schema.photos import MAX_PHOTO_PIXELS
@@ -83,6 +83,7 @@ _SIZES: TypeAdapter[tuple[tuple[int, int], tuple[int, int]]] = TypeAdapter(
 )
 _PICTURE: TypeAdapter[Picture | str] = TypeAdapter(Picture | str)
 _FAULT: TypeAdapter[str | None] = TypeAdapter(str | None)
+_SHARE = TypeAdapter(Annotated[float, Field(ge=0.0, le=1.0)])
 
 log = logging.getLogger("splatmill.decoders")
 
@@ -177,6 +178,11 @@ def examine(path: Path, name: str) -> Picture | str:
 def mask_fault(mask: Path, photo: tuple[int, int], *, upright: bool = True) -> str | None:
     """Like `splatmill_worker.images.masks.mask_fault`."""
     return call(masks.mask_fault, mask, photo, upright, check=_FAULT.validate_python)
+
+
+def hidden_share(mask: Path) -> float:
+    """Like `splatmill_worker.images.masks.hidden_share`."""
+    return call(masks.hidden_share, mask, check=_SHARE.validate_python)
 
 
 def keyframes(

@@ -11,7 +11,7 @@ from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import exif, guarded
 from splatmill_worker.images.decode import upright_size, whole
 
-GIVE = "; give JPEG, PNG, WebP, TIFF or HEIC photos, videos or zips"
+GIVE = "; give JPEG, PNG, WebP, TIFF, HEIC or AVIF photos, videos or zips"
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,11 @@ from splatmill_worker.errors import UnusablePicture, UnusableVideo
 
 pillow_heif.register_heif_opener()
 
-FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF")
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "AVIF")
 """Pillow's names of the formats that are read. Its other readers, some of which start programs, are never called."""
+
+AVIF_BRANDS = (b"avif", b"avis")
+"""Major brands of AVIF: a picture and a sequence of pictures."""
 
 MAX_PICTURE_BYTES = 2 * 2**30
 """Bytes of a picture's file: some readers take the whole file into memory."""
@@ -225,11 +228,23 @@ def _opened(path: Path, name: str) -> Image.Image:
     try:
         return Image.open(path, formats=FORMATS)
     except UnidentifiedImageError as error:
+        if _starts_as_avif(path):
+            # Pillow reads all of such a file at once, and takes one that is cut off for one of another format.
+            raise UnusablePicture(
+                "image_truncated", name, "it does not decode completely: parts of it are damaged or missing"
+            ) from error
         raise UnusablePicture(
             "not_an_image",
             name,
             "it is not an image, or its format is not supported",
         ) from error
+
+
+def _starts_as_avif(path: Path) -> bool:
+    """Whether the first box of a file names a brand of AVIF."""
+    with path.open("rb") as file:
+        start = file.read(12)
+    return start[4:8] == b"ftyp" and start[8:] in AVIF_BRANDS
 
 
 def _check_pixels(image: Image.Image, name: str) -> None:

@@ -19,6 +19,7 @@ from PIL import Image
 from splatmill_worker.images import lens as lenses
 from splatmill_worker.images.decode import Pixels
 from splatmill_worker.images.decoders import decode
+from splatmill_worker.images.masks import MIN_SHOWN, shown_part
 from splatmill_worker.scene import Camera, Lens, View
 
 MAX_SAMPLES = 4
@@ -178,14 +179,11 @@ def _check_shape(view: View, path: Path, size: tuple[int, int]) -> None:
 
 
 def _read_mask(view: View, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """The mask at `size` (width, height): True for pixels to train on; black hides, as in COLMAP."""
+    """The mask at `size` (width, height): True for pixels to train on."""
     assert view.mask is not None
     mask = decode(view.mask, upright=view.upright)
     _check_shape(view, view.mask, mask.size)
-    # A mask with transparent pixels hides these; any other hides dark ones.
-    drawn = mask.mode == "RGBA" and np.asarray(mask)[:, :, 3].min() < 255
-    grey = mask.getchannel("A") if drawn else mask.convert("L")
-    return np.asarray(grey.resize(size, Image.Resampling.BOX)) >= 128
+    return np.asarray(shown_part(mask).resize(size, Image.Resampling.BOX)) >= MIN_SHOWN
 
 
 def _area(planes: torch.Tensor, width: int, height: int) -> torch.Tensor:

@@ -11,10 +11,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from splatmill.schema.masks import masks_beside, paired, without_mask_folder
+from splatmill.schema.outputs import own_outputs
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES
 from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
 from splatmill_worker.images import archive, decoders, exif, unpacked_room
-from splatmill_worker.images.masks import mask_of, masks_under
+from splatmill_worker.images.masks import masks_under, remarks
 
 IGNORED_PREFIXES = (".", "__MACOSX")
 """Beginnings of the names of files and folders that are left out without mention."""
@@ -61,11 +63,13 @@ class Prepared:
     photos: sorted by name.
     skipped: (name, reason) of every file that is left out.
     notes: sentences for the user.
+    warnings: sentences for the user about what is probably wrong.
     """
 
     photos: tuple[UsablePhoto, ...]
     skipped: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
@@ -110,7 +114,7 @@ def prepare(
     a size (they are then not decoded), and when their content is that of another file. Of a file with several pictures,
     the first is used.
 
-    masks: folder of the masks, if there is one; a mask may also lie beside its photo as name.jpg.png.
+    masks: folder of the masks, if there is one; others may lie among the photos (`splatmill.schema.masks`).
     on_progress: called as ("images", files examined, files in all, name of the file).
 
     Raises Refusal for a mask that is too large to be decoded and for archives and videos that together exceed
@@ -120,10 +124,15 @@ def prepare(
     given = given_files(images)
     for path in given:
         _expand(path.relative_to(images).as_posix(), path, None, workdir, frames, found, cancelled)
+    outputs = own_outputs(name for name, _, _ in found.files)
+    found.skipped += [(name, "it is a result of Splatmill, not a photo") for name in sorted(outputs)]
+    found.files = [file for file in found.files if file[0] not in outputs]
     beside = {name: path for name, path, _ in found.files}
-    mask_files = masks_under(masks) if masks is not None and masks.is_dir() else {}
-    own_masks = {name for name in beside if name.endswith(".png") and name[: -len(".png")] in beside}
+    own_masks = _own_masks(found)
+    mask_files = {inner: beside[name] for name, inner in own_masks.items()}
+    mask_files |= masks_under(masks) if masks is not None and masks.is_dir() else {}
     candidates = [file for file in found.files if file[0] not in own_masks]
+    pairs = paired([name for name, _, _ in candidates], mask_files)
     photos: dict[str, UsablePhoto] = {}
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         inspected = pool.map(lambda file: None if cancelled() else _inspect(*file), candidates)
@@ -138,11 +147,8 @@ def prepare(
             if same is not None:
                 found.skipped.append((name, f"its content is the same as that of {same.name}"))
                 continue
-            mask = mask_of(name, mask_files)
-            if mask is None and f"{name}.png" in own_masks:
-                mask = beside[f"{name}.png"]
             try:
-                photos[result.sha256] = _with_mask(result, mask, found)
+                photos[result.sha256] = _with_mask(result, mask_files.get(pairs.get(name, "")), found)
             except UnusablePicture as error:
                 if error.code != "decoder_ended":
                     raise
@@ -155,11 +161,19 @@ def prepare(
         name, reason = found.skipped[0]
         raise UnusablePicture("decoder_ended", name, f"no photo is left; of this one: {reason}")
     ordered = tuple(sorted(photos.values(), key=lambda photo: photo.name))
-    known = {photo.name for photo in ordered} | {name for name, _ in found.skipped} | own_masks | found.opened
+    known = (
+        {photo.name for photo in ordered}
+        | {name for name, _ in found.skipped}
+        | own_masks.keys()
+        | found.opened
+    )
     lost = [name for path in given if (name := path.relative_to(images).as_posix()) not in known]
     if lost:
         raise CaptureIncomplete(f"{images.name}/", lost, len(given))
-    return Prepared(ordered, tuple(found.skipped), tuple(found.notes))
+    masked = [photo.mask for photo in ordered if photo.mask is not None]
+    unused = mask_files.keys() - pairs.values()
+    notes, warnings = remarks(len(ordered), masked, unused, decoders.hidden_share)
+    return Prepared(ordered, tuple(found.skipped), (*found.notes, *notes), tuple(warnings))
 
 
 def given_files(images: Path) -> list[Path]:
@@ -173,6 +187,19 @@ def given_files(images: Path) -> list[Path]:
         and path.name.lower() not in IGNORED_NAMES
         and not any(part.startswith(IGNORED_PREFIXES) for part in path.relative_to(images).parts)
     ]
+
+
+def _own_masks(found: _Found) -> dict[str, str]:
+    """The masks among the photos, each with its name without the folder of masks.
+
+    Where all pictures lie in such folders, they are photos.
+    """
+    pictures = [name for name, _, video in found.files if video is None]
+    masks = {name: inner for name in pictures if (inner := without_mask_folder(name)) is not None}
+    photos = [name for name in pictures if name not in masks]
+    if not photos:
+        return {}
+    return masks | {name: name for name in masks_beside(photos)}
 
 
 def _expand(

@@ -80,7 +80,7 @@ def load_model(prepared: Prepared, folder: Path, known: KnownDistance | None = N
         left_out=(*prepared.skipped, *document["left_out"].items()),
         notes=(*prepared.notes, *document["notes"]),
     )
-    scene = replace(scene, facts=document["facts"], warnings=tuple(document["warnings"]))
+    scene = replace(scene, facts=document["facts"], warnings=(*prepared.warnings, *document["warnings"]))
     if (folder / STEREO).is_file():
         scene = stereo.add(scene, stereo.StereoPoints.load(folder / STEREO))
     if (folder / FRAME).is_file():

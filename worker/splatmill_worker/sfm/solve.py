@@ -59,7 +59,14 @@ def reconstruct(
     prepared = prepare(
         images, masks, workdir, frames=options.frames, on_progress=on_progress, cancelled=cancelled
     )
-    return reconstruct_photos(prepared, workdir, options, on_progress, cancelled, observer, known)
+    try:
+        return reconstruct_photos(prepared, workdir, options, on_progress, cancelled, observer, known)
+    except SfmFailed as error:
+        if not prepared.warnings:
+            raise
+        # What is probably wrong with the files may be the cause, and there will be no report that names it.
+        advice = " ".join(filter(None, (error.advice, *prepared.warnings)))
+        raise SfmFailed(error.code, error.message, error.facts, advice) from error
 
 
 def reconstruct_photos(
@@ -105,7 +112,7 @@ def _require_photos(prepared: Prepared) -> None:
             "no_images",
             f"None of the {len(prepared.skipped)} files is a usable photo.",
             facts,
-            "Give JPEG, PNG, WebP, TIFF or HEIC photos, a video, or a zip of photos.",
+            "Give JPEG, PNG, WebP, TIFF, HEIC or AVIF photos, a video, or a zip of photos.",
         )
     if count < checks.MIN_PHOTOS:
         raise SfmFailed(

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from splatmill.schema import storable_name
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.load import load_views
 from splatmill_worker.scene import split
@@ -279,3 +280,18 @@ def test_both_sources_of_fox_agree() -> None:
         b = theirs.viewmat[:3, :3] @ first[1].viewmat[:3, :3].T
         angle = math.degrees(math.acos(min(1.0, (np.trace(a @ b.T) - 1.0) / 2.0)))
         assert angle < 2.0  # they agree to about 0.8 degrees: their principal points differ by 7 pixels
+
+
+def test_a_photo_that_was_renamed_for_storage_has_its_camera(tmp_path: Path) -> None:
+    names = ["x:1.png", " lead.png", "plain.png"]
+    for name in names:
+        (tmp_path / "images").mkdir(exist_ok=True)
+        Image.new("RGB", (64, 48)).save(tmp_path / "images" / storable_name(name))
+    frames = [{"file_path": f"images/{name}", "transform_matrix": np.eye(4).tolist()} for name in names]
+    document = {"fl_x": 60.0, "w": 64, "h": 48, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    given = posed.find(tmp_path)
+    assert given is not None
+    scene = given.load()
+    assert {view.name for view in scene.views} == {storable_name(name) for name in names}
+    assert scene.left_out == ()

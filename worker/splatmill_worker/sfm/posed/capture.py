@@ -7,7 +7,8 @@ from pathlib import Path
 
 from splatmill.data_sets import find_cameras, walk
 from splatmill.schema.photos import PHOTO_SUFFIXES
-from splatmill_worker.images.decoders import mask_fault
+from splatmill_worker.images.decoders import hidden_share, mask_fault
+from splatmill_worker.images.masks import remarks
 from splatmill_worker.scene import Scene, Source
 from splatmill_worker.sfm.posed import colmap_model, transforms
 from splatmill_worker.sfm.posed.files import ImageFiles
@@ -46,7 +47,15 @@ class PosedInput:
             scene = colmap_model.load_largest(self.models, files, self.notes)
         else:
             scene = transforms.load(self.transforms, self.source, files, self.directory, self.notes)
-        return _without_unfit_masks(replace(scene, warnings=(*self.warnings, *scene.warnings)))
+        scene = _without_unfit_masks(scene)
+        masks = [view.mask for view in scene.views if view.mask is not None]
+        unused = {name for name in files.unused_masks if files.masks[name] not in masks}
+        notes, warnings = remarks(len(scene.views), masks, unused, hidden_share)
+        return replace(
+            scene,
+            notes=(*scene.notes, *notes),
+            warnings=(*self.warnings, *scene.warnings, *warnings),
+        )
 
 
 def find(directory: Path) -> PosedInput | None:

@@ -6,15 +6,18 @@ import filecmp
 import re
 import unicodedata
 from collections.abc import Callable, Set
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from splatmill.schema.photos import MASK_FOLDERS, PHOTO_SUFFIXES
+from splatmill.data_sets import walk
+from splatmill.schema.captures import UnsafeName, storable_name
+from splatmill.schema.masks import masks_beside, paired, without_mask_folder
+from splatmill.schema.photos import PHOTO_SUFFIXES
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import decoders
-from splatmill_worker.images.masks import mask_of, masks_under
 
 SIZED = re.compile(r"(images|input|rgb)(_\d+)?", re.ASCII | re.IGNORECASE)
 """Folders in which tools put the photos of a data set, and those reduced so many times."""
@@ -40,23 +43,29 @@ class ImageFiles:
     def under(directory: Path) -> ImageFiles:
         """The files under `directory`/images, or under `directory` itself when it has no such folder."""
         root = directory / "images" if (directory / "images").is_dir() else directory
-        masks = next((directory / name for name in MASK_FOLDERS if (directory / name).is_dir()), None)
+        pictures = {
+            name: path
+            for name in walk(directory)
+            if (path := directory / name).suffix.lower() in PHOTO_SUFFIXES and path.is_file()
+        }
+        inside = {name: inner for name in pictures if (inner := without_mask_folder(name)) is not None}
         found = {
             path.relative_to(root).as_posix(): path
-            for path in sorted(root.rglob("*"))
-            if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()
+            for name, path in pictures.items()
+            if name not in inside and path.is_relative_to(root)
         }
-        if masks is not None and masks.is_relative_to(root):
-            inner = masks.relative_to(root).as_posix() + "/"
-            found = {name: path for name, path in found.items() if not name.startswith(inner)}
-        return ImageFiles(root, found, masks_under(masks) if masks is not None else {})
+        beside = {name: found[name] for name in masks_beside(found)}
+        masks = {inner.removeprefix("images/"): pictures[name] for name, inner in inside.items()}
+        photos = {name: path for name, path in found.items() if name not in beside}
+        return ImageFiles(root, photos, beside | masks)
 
     def photo(self, name: str) -> tuple[str, Path] | None:
         """Relative name and path of the photo that `name` refers to; None when there is none, or no single one.
 
         It is the photo with the most trailing path components in common, the file name at least. When no file name
         agrees, the suffix may be missing or differ. Names in another case, or in another form of Unicode, count where
-        none agrees exactly. Of one photo in several sizes (images_2/, images_4/), it is the largest.
+        none agrees exactly. Of one photo in several sizes (images_2/, images_4/), it is the largest. A photo that was
+        renamed for storage is found by the name it had.
         """
         best = self.candidates(name)
         found = best[0] if len(best) == 1 else self._largest(best)
@@ -81,10 +90,28 @@ class ImageFiles:
 
     def mask(self, name: str) -> Path | None:
         """The mask of the photo with this relative name; None when it has none."""
-        return mask_of(name, self.masks)
+        return self.masks.get(self._pairs.get(name, ""))
+
+    @property
+    def unused_masks(self) -> set[str]:
+        """Names of the masks that belong to none of the photos."""
+        return self.masks.keys() - set(self._pairs.values())
 
     def candidates(self, name: str) -> list[str]:
         """The photos that `name` fits equally well."""
+        best = self._fitting(name)
+        # A colon is changed only where the name begins with its letter, so both the path and its last part are tried.
+        for changed in () if best else (name, name.rpartition("/")[2]):
+            with suppress(UnsafeName):
+                best = best or self._fitting(storable_name(changed))
+        return best
+
+    @cached_property
+    def _pairs(self) -> dict[str, str]:
+        return paired(self.photos, self.masks)
+
+    def _fitting(self, name: str) -> list[str]:
+        """The photos that the very `name` fits equally well."""
         parts = [
             part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in (".", "..", "/")
         ]

@@ -7,9 +7,10 @@ from pathlib import Path
 
 from splatmill.data_sets import MAX_DEPTH, TwoDataSets
 from splatmill.schema.formats import is_model_file
-from splatmill.schema.photos import ARCHIVE_SUFFIXES, MASK_FOLDERS
+from splatmill.schema.photos import ARCHIVE_SUFFIXES
 from splatmill_worker.images import prepare
 from splatmill_worker.images.archive import Allowance
+from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.sfm.posed.capture import find
 
 
@@ -43,7 +44,7 @@ def data_set(capture: Path, workdir: Path, cancelled: Callable[[], bool] = lambd
 
 
 def _is_data_set(folder: Path) -> bool:
-    masked = (folder / "images").is_dir() and any((folder / name).is_dir() for name in MASK_FOLDERS)
+    masked = (folder / "images").is_dir() and mask_folder(folder) is not None
     try:
         return masked or find(folder) is not None
     except TwoDataSets:

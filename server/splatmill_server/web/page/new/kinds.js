@@ -10,7 +10,11 @@
  * @property {string[]} videos
  * @property {string[]} archives
  * @property {string[]} masks
- * @property {string[]} mask_folders
+ * @property {string[]} mask_folders in lower case
+ * @property {string[]} mask_endings
+ * @property {string[]} mask_beginnings
+ * @property {string[]} output_marks
+ * @property {string[]} output_media
  * @property {number} min_photo_side pixels
  */
 
@@ -19,6 +23,7 @@
  * @property {{role: Role, name: string, path: string}[]} files
  * @property {string[]} ignored paths
  * @property {string | null} problem why the files cannot be read as one capture
+ * @property {string[]} outputs paths of pictures, videos and zips that are results of Splatmill
  */
 
 const MODEL_SUFFIXES = [".bin", ".txt"];
@@ -33,7 +38,7 @@ const MODEL_PLACES = /** @type {[number, RegExp][]} */ ([
 const MAX_DEPTH = 4;
 
 /** Folders that say what lies in them, so their name is kept where everything lies in one folder. */
-const TELLING = ["images", "masks", "mask", "sparse", "colmap"];
+const TELLING = ["images", "masks", "mask", "segmentation", "segmentations", "sparse", "colmap"];
 
 /** The suffix of a path in lower case, with its dot. @param {string} path */
 export function suffix(path) {
@@ -49,23 +54,25 @@ export function suffix(path) {
  * @returns {Sorted}
  */
 export function sort(paths, accepted) {
-  const seen = [...paths].filter((path) => !isHidden(path)).sort(byCodePoint);
+  const shown = [...paths].filter((path) => !isHidden(path)).sort(byCodePoint);
+  const outputs = ownOutputs(shown, accepted);
+  const seen = shown.filter((path) => !outputs.has(path));
   const isPhoto = (/** @type {string} */ path) => accepted.photos.includes(suffix(path));
   const isWhole = (/** @type {string} */ path) => [...accepted.videos, ...accepted.archives].includes(suffix(path));
   const cameras = camerasIn(seen);
   // Cameras in a folder without photos are those of the photos around it.
   const top = seen.some((path) => path.startsWith(cameras.top) && isPhoto(path)) ? cameras.top : "";
   const photoRoot = seen.some((path) => path.startsWith(`${top}images/`) && isPhoto(path)) ? `${top}images/` : top;
-  const maskRoot = accepted.mask_folders.map((folder) => `${top}${folder}/`).find((root) => seen.some((path) => path.startsWith(root)));
+  const masks = masksIn(seen.filter((path) => path.startsWith(top) && isPhoto(path)), top, photoRoot, accepted);
   const poses = namesOf(cameras, seen);
   /** @type {Sorted} */
-  const found = { files: [], ignored: [], problem: cameras.problem };
+  const found = { files: [], ignored: [], problem: cameras.problem, outputs: [] };
   for (const path of seen) {
     const pose = poses.get(path);
+    const mask = masks.get(path);
     if (pose !== undefined) found.files.push({ role: "poses", name: pose, path });
-    else if (maskRoot && path.startsWith(maskRoot)) {
-      if (isPhoto(path)) found.files.push({ role: "masks", name: path.slice(maskRoot.length), path });
-    } else if (path.startsWith(photoRoot) && isPhoto(path)) {
+    else if (mask !== undefined) found.files.push({ role: "masks", name: mask, path });
+    else if (path.startsWith(photoRoot) && isPhoto(path)) {
       found.files.push({ role: "images", name: path.slice(photoRoot.length), path });
     } else found.ignored.push(path);
   }
@@ -73,6 +80,7 @@ export function sort(paths, accepted) {
     found.files.push(...found.ignored.filter(isWhole).map((path) => /** @type {const} */ ({ role: "images", name: path, path })));
     found.ignored = found.ignored.filter((path) => !isWhole(path));
   }
+  found.outputs.push(...outputs);
   for (const file of found.files) file.name = file.name.normalize("NFC");
   return found;
 }
@@ -92,6 +100,64 @@ export function withoutTop(paths) {
 function isHidden(path) {
   const parts = path.split("/");
   return parts.some((part) => part.startsWith(".")) || parts.slice(0, -1).some((part) => part.startsWith("__MACOSX"));
+}
+
+/**
+ * The pictures, videos and zips in folders of results.
+ * @param {string[]} paths
+ * @param {Accepted} accepted
+ */
+function ownOutputs(paths, accepted) {
+  const split = paths.map((path) => ({ path, folder: path.slice(0, path.lastIndexOf("/") + 1), last: path.slice(path.lastIndexOf("/") + 1) }));
+  /** @type {Map<string, number>} */
+  const marks = new Map();
+  for (const { folder, last } of split) if (accepted.output_marks.includes(last)) marks.set(folder, (marks.get(folder) ?? 0) + 1);
+  return new Set(split.filter(({ folder, last }) => accepted.output_media.includes(last) && (marks.get(folder) ?? 0) >= 2).map(({ path }) => path));
+}
+
+/**
+ * The name in the capture of each picture that is a mask.
+ * @param {string[]} pictures all under `top`
+ * @param {string} top
+ * @param {string} photoRoot
+ * @param {Accepted} accepted
+ */
+function masksIn(pictures, top, photoRoot, accepted) {
+  /** @type {Map<string, string>} */
+  const masks = new Map();
+  for (const path of pictures) {
+    const parts = path.slice(top.length).split("/");  // a folder around the data set may be called masks too
+    const folder = parts.slice(0, -1).findIndex((part) => accepted.mask_folders.includes(part.toLowerCase()));
+    if (folder >= 0) masks.set(path, top + parts.filter((_, index) => index !== folder).join("/"));
+  }
+  const photos = pictures.filter((path) => path.startsWith(photoRoot) && !masks.has(path));
+  if (photos.length === 0) return new Map();
+  const whole = new Set(photos.map((path) => path.toLowerCase()));
+  const known = new Set([...whole, ...[...whole].map(stem)]);
+  for (const path of photos) {
+    const own = stem(path.toLowerCase());
+    if (whole.has(own) || unmarked(own, accepted).some((name) => known.has(name))) masks.set(path, path);
+  }
+  for (const [path, name] of masks) masks.set(path, name.slice((name.startsWith(photoRoot) ? photoRoot : top).length));
+  return masks;
+}
+
+/** A path without its suffix. @param {string} path */
+function stem(path) {
+  return path.slice(0, path.length - suffix(path).length);
+}
+
+/**
+ * The names of the photos that a mask of this name, in lower case and without its suffix, may belong to.
+ * @param {string} name
+ * @param {Accepted} accepted
+ */
+function unmarked(name, accepted) {
+  const start = name.lastIndexOf("/") + 1;
+  const [folder, last] = [name.slice(0, start), name.slice(start)];
+  const names = accepted.mask_endings.filter((end) => last.endsWith(end) && last !== end).map((end) => last.slice(0, -end.length));
+  names.push(...accepted.mask_beginnings.filter((begin) => last.startsWith(begin) && last !== begin).map((begin) => last.slice(begin.length)));
+  return names.map((name) => folder + name);
 }
 
 /** @typedef {{top: string, transforms: string[], models: string[], problem: string | null}} Cameras */

@@ -5,7 +5,7 @@
 const WORKERS = Math.max(1, Math.min(4, (navigator.hardwareConcurrency || 2) - 1));
 
 /** Formats that every browser with these workers decodes. A file of them that does not decode is damaged. */
-const SHOWN = [".jpg", ".jpeg", ".png", ".webp"];
+const SHOWN = [".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif"];
 
 export class Looking {
   /** @param {(looked: Looked) => void} onLooked */

@@ -1,0 +1,17 @@
+"""Which files are results that Splatmill wrote, by their names, so that none is read as a photo."""
+
+from collections import Counter
+from collections.abc import Iterable
+
+OUTPUT_MARKS = ("model.ply", "report.json", "cameras.json")
+"""Names of files of which a folder of results holds two at least. The first two are written before any picture."""
+
+OUTPUT_MEDIA = ("preview.jpg", "report.png", "novel_view.png", "orbit.mp4", "progress.mp4", "cameras.zip")
+"""Names of pictures, videos and zips that are written to a folder of results."""
+
+
+def own_outputs(names: Iterable[str]) -> set[str]:
+    """Return those of the files `names` that are pictures, videos and zips in folders of results."""
+    placed = [(name, *name.rpartition("/")[::2]) for name in names]
+    marks = Counter(folder for _, folder, last in placed if last in OUTPUT_MARKS)
+    return {name for name, folder, last in placed if last in OUTPUT_MEDIA and marks[folder] >= 2}
