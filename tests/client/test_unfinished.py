@@ -71,7 +71,7 @@ class Command:
             job, step = self.steps()
             return job != known and step >= 5
 
-        wait_for(trained, 60)
+        wait_for(trained, 150)
         process.send_signal(sent)
         said, _ = process.communicate(timeout=120)
         return process.returncode, said
