@@ -20,7 +20,7 @@ FULL_CIRCLE = math.radians(220)
 within the arc of the photos, because no photo shows the model from outside of it."""
 
 UP: Float = np.array([0.0, -1.0, 0.0])
-"""The axis that points up in a model without cameras, if nothing else is said: y points down in a `.ply`, and every
+"""The axis that points up in a model without cameras, unless `--up` names another: y points down in a `.ply`, and every
 other format is turned into its frame when it is read."""
 
 MIDDLE = 4.0
