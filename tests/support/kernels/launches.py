@@ -97,7 +97,7 @@ class _NoWaitingCalls(TorchFunctionMode):
         name = getattr(func, "__name__", "")
         if not _Pause.depth:
             assert name not in WAITING_METHODS | FROM_HOST, f"{name} waits for the device"
-            if name == "to":
+            if name == "to" and not (args[0].is_pinned() and (kwargs or {}).get("non_blocking")):
                 moved = [
                     a for a in (*args[1:], *(kwargs or {}).values()) if isinstance(a, (str, torch.device))
                 ]

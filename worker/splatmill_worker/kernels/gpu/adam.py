@@ -75,7 +75,7 @@ def drift_kernel(
 
 @triton.jit
 def adam_kernel(
-    params: Floats, grads: Floats, exp_avg: Floats, exp_avg_sq: Floats, seen: Bytes, travel: Floats, decay1: Floats,
+    values: Floats, grads: Floats, exp_avg: Floats, exp_avg_sq: Floats, seen: Bytes, travel: Floats, decay1: Floats,
     decay2: Floats, refused: Ints, count: Int, rate: Float, size: Float, root: Float, keep: Float, add: Float,
     CHANNELS: tl.constexpr, VISIBLE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -85,7 +85,7 @@ def adam_kernel(
     i = e // CHANNELS
     if VISIBLE:
         shown = shown & (tl.load(seen + i, mask=shown, other=0) != 0)
-    p = tl.load(params + e, mask=shown, other=0.0)
+    p = tl.load(values + e, mask=shown, other=0.0)
     g = tl.load(grads + e, mask=shown, other=0.0)
     m = tl.load(exp_avg + e, mask=shown, other=0.0)
     v = tl.load(exp_avg_sq + e, mask=shown, other=0.0)
@@ -95,7 +95,7 @@ def adam_kernel(
         m *= tl.load(decay1 + i, mask=shown, other=1.0)
         v *= tl.load(decay2 + i, mask=shown, other=1.0)
     p, m, v, bad = advance(p, g, m, v, rate, size, root, keep, add)
-    tl.store(params + e, p, mask=shown)
+    tl.store(values + e, p, mask=shown)
     tl.store(exp_avg + e, m, mask=shown)
     tl.store(exp_avg_sq + e, v, mask=shown)
     number = tl.sum((bad & shown).to(tl.int32), axis=0)
@@ -116,7 +116,7 @@ def advance(p, g, m, v, rate, size, root, keep, add):
 
 @triton.jit
 def planes_kernel(
-    params: Floats, grads: Floats, exp_avg: Floats, exp_avg_sq: Floats, seen: Bytes, travel: Floats, decay1: Floats,
+    values: Floats, grads: Floats, exp_avg: Floats, exp_avg_sq: Floats, seen: Bytes, travel: Floats, decay1: Floats,
     decay2: Floats, refused: Ints, count: Int, stride: Int, channels: Int, means_rate: Float, scales_rate: Float,
     quats_rate: Float, opacity_rate: Float, dc_rate: Float, rest_rate: Float, size: Float, root: Float, keep: Float,
     add: Float, BLOCK: tl.constexpr,
@@ -134,13 +134,13 @@ def planes_kernel(
         late = tl.where(channel < OPACITY, opacity_rate, tl.where(channel < DC, dc_rate, rest_rate))
         rate = tl.where(channel < QUATS, rate, late)
         place = channel * stride + i
-        p = tl.load(params + place, mask=shown, other=0.0)
+        p = tl.load(values + place, mask=shown, other=0.0)
         g = tl.load(grads + place, mask=shown, other=0.0)
         m = tl.load(exp_avg + place, mask=shown, other=0.0)
         v = tl.load(exp_avg_sq + place, mask=shown, other=0.0)
         p -= rate * gone * tl.where(v > 0.0, m / tl.sqrt_rn(v), 0.0)
         p, m, v, bad = advance(p, g, m * keep1, v * keep2, rate, size, root, keep, add)
-        tl.store(params + place, p, mask=shown)
+        tl.store(values + place, p, mask=shown)
         tl.store(exp_avg + place, m, mask=shown)
         tl.store(exp_avg_sq + place, v, mask=shown)
         number += (bad & shown).to(tl.int32)

@@ -16,9 +16,11 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import torch
 import triton
 from triton.backends.compiler import GPUTarget
-from triton.compiler import ASTSource
+from triton.compiler import ASTSource, make_backend
+from triton.runtime.jit import create_function_from_signature
 
 from . import adam, bin, composite, composite_backward, knn, loss, photos, project, project_backward, step
 from .argument import declared
@@ -110,7 +112,8 @@ def variants() -> Iterator[Variant]:
 def compile_variant(variant: Variant, setting: triton.Config, architecture: int) -> Compiled:
     """Compile one kernel for `architecture`, with arrays aligned to 16 bytes, as torch allocates them.
 
-    Raises KeyError for an argument without a declared type (`argument`).
+    Raises KeyError for an argument without a declared type (`argument`), and TypeError where a launch could not pass
+    the arguments on.
     """
     function = variant.kernel.fn if hasattr(variant.kernel, "configs") else variant.kernel
     constants = {**variant.constants, **setting.kwargs}
@@ -122,9 +125,11 @@ def compile_variant(variant: Variant, setting: triton.Config, architecture: int)
         signature[name] = variant.types.get(name) or declared(function, name)
         if signature[name].startswith("*"):
             attributes[(position,)] = [["tt.divisibility", 16]]
+    target = GPUTarget("cuda", architecture, 32)
+    _bind(function, signature, constants, target)
     made = triton.compile(
         ASTSource(function, signature, constants, attributes),
-        target=GPUTarget("cuda", architecture, 32),
+        target=target,
         options={"num_warps": setting.num_warps, "num_stages": setting.num_stages},
     )
     registers, spilled = resources(made.asm["cubin"])
@@ -132,6 +137,25 @@ def compile_variant(variant: Variant, setting: triton.Config, architecture: int)
         f"{k}={v}" for k, v in {**variant.constants, **setting.all_kwargs()}.items() if v is not None
     )
     return Compiled(function.__name__, chosen, architecture, registers, spilled, made.metadata.shared)
+
+
+def _bind(
+    function: triton.JITFunction[..., None],
+    signature: dict[str, str],
+    constants: dict[str, object],
+    target: GPUTarget,
+) -> None:
+    """Bind arguments of the types of `signature` as a launch does, which compilation by itself leaves out.
+
+    Triton binds them in a function that it generates, where an argument can have the name of a variable, such as
+    `params`.
+    """
+    floats, zeros = torch.empty(4), {"i32": 0, "fp32": 0.0}
+    given = {name: constants.get(name, zeros.get(type_, floats)) for name, type_ in signature.items()}
+    bind = create_function_from_signature(function.signature, function.params, make_backend(target))
+    bound = bind(**given)[0]
+    if any(bound[name] is not value for name, value in given.items()):
+        raise TypeError(f"{function.__name__}: Triton binds {bound} where {given} were given.")
 
 
 def resources(binary: bytes) -> tuple[int, int]:
