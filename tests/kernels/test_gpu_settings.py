@@ -166,6 +166,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         use(monkeypatch, kernel, [triton.Config({"BLOCK": 64}, num_warps=2)])
     for kernel in PROJECTIONS:
         use(monkeypatch, kernel, [triton.Config({"BLOCK": 4}, num_warps=1)])
+    use(monkeypatch, composite.composite_kernel, [triton.Config({"BATCH": 2}, num_warps=2, num_stages=1)])
 
 
 @pytest.mark.usefixtures("small")

@@ -51,6 +51,9 @@ def composite_kernel(
     BACKGROUND: tl.constexpr, WITH_DEPTH: tl.constexpr, CHECKPOINTS: tl.constexpr, SEGMENT: tl.constexpr,
     BATCH: tl.constexpr,
 ):  # fmt: skip
+    tl.static_assert(
+        SEGMENT % BATCH == 0, "every segment starts with a batch, or its checkpoint is not written"
+    )
     tile = tl.program_id(0)
     column, row = tile_pixels(tile, columns)
     x = column.to(tl.float32) + 0.5
