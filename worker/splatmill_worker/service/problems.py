@@ -11,6 +11,13 @@ from splatmill.schema import Problem
 from splatmill_worker.errors import DiskReserveReached, FolderInUse, QuotaReached, WorkerError
 
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_DISK_FULL_MESSAGES = (
+    "database or disk is full",
+    "disk i/o error",
+    "no registered database factory succeeded",
+)
+"""Parts of the messages of RuntimeErrors by which COLMAP reports that its database could not be written or made."""
+
 _NOT_PERMITTED = {errno.EACCES, errno.EPERM, errno.EROFS}
 _OUT_OF_MEMORY = (
     "can't allocate memory",
@@ -50,8 +57,10 @@ def keeps_progress(error: BaseException) -> bool:
     """Return whether a restart of the job may go on from its checkpoint: the cause lies outside of the training."""
     if isinstance(error, OSError):
         return error.errno in _DISK_FULL | _NOT_PERMITTED
-    return is_transient(error) or isinstance(
-        error, DiskReserveReached | QuotaReached | StorageError | MemoryError
+    return (
+        is_transient(error)
+        or isinstance(error, DiskReserveReached | QuotaReached | StorageError | MemoryError)
+        or _mentions(error, _DISK_FULL_MESSAGES)
     )
 
 
@@ -90,7 +99,13 @@ def problem_of(error: BaseException) -> Problem:
                 facts={"file": error.filename},
                 advice="Give the worker's user write access to its data folder, then restart the job.",
             )
-    if isinstance(error, MemoryError) or any(part in str(error).lower() for part in _OUT_OF_MEMORY):
+    if _mentions(error, _DISK_FULL_MESSAGES):
+        return Problem.of(
+            "storage_full",
+            f"The worker could not write COLMAP's database, most likely because the disk is full: {_first_line(error)}",
+            advice="Free space in the worker's data folder, then restart the job.",
+        )
+    if isinstance(error, MemoryError) or _mentions(error, _OUT_OF_MEMORY):
         return Problem.of(
             "out_of_memory",
             f"The worker ran out of memory: {_first_line(error)}",
@@ -102,6 +117,10 @@ def problem_of(error: BaseException) -> Problem:
         facts={"where": _where(error)},
         advice="Look for the cause in the job's log, which contains the traceback, and please report it.",
     )
+
+
+def _mentions(error: BaseException, parts: tuple[str, ...]) -> bool:
+    return any(part in str(error).lower() for part in parts)
 
 
 def _first_line(error: BaseException) -> str:

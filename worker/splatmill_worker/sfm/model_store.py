@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from splatmill.schema import KnownDistance, ModelFrame
-from splatmill_worker.colmap import pycolmap
+from splatmill_worker.colmap import pycolmap, write_model
 from splatmill_worker.images.prepare import Prepared
 from splatmill_worker.scene import Scene, View
 from splatmill_worker.sfm import features, stereo
@@ -43,7 +43,7 @@ def store_model(run: SfmRun, final: FinalModel, folder: Path) -> None:
     partial = folder.with_name(f"{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    final.model.write_binary(partial)
+    write_model(final.model, partial)
     scene = scene_of(ModelPoints.of(final.model), views, source="sfm")
     if run.options.stereo and stereo.has_few_points(scene):
         # Photos are swept one after the other, so that each torch call gets all threads.

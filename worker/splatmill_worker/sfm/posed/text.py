@@ -3,17 +3,20 @@
 import sys
 from pathlib import Path
 
-from splatmill_worker.colmap import pycolmap
+from splatmill_worker.colmap import pycolmap, write_model
 
 
 def main(folder: Path) -> int:
     """Replace the binary files of the COLMAP model in `folder` by text, print their paths, and return the status."""
     try:
         model = pycolmap.Reconstruction(folder)
-        model.write_text(folder)
+        write_model(model, folder, text=True)
     except (OSError, ValueError, RuntimeError, IndexError) as error:
         said = (str(error).strip().splitlines() or [type(error).__name__])[-1][:200]
-        print(f"Error: The COLMAP model in {folder} could not be read: {said}", file=sys.stderr)
+        print(
+            f"Error: The COLMAP model in {folder} could not be read and written as text: {said}",
+            file=sys.stderr,
+        )
         return 1
     spaced = sum(" " in image.name for image in model.images.values())
     if spaced:

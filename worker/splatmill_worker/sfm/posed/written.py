@@ -15,7 +15,7 @@ import numpy.typing as npt
 from plyfile import PlyData, PlyElement
 
 from splatmill.files import replacing
-from splatmill_worker.colmap import pycolmap
+from splatmill_worker.colmap import pycolmap, write_model
 from splatmill_worker.images.lens import colmap_camera
 from splatmill_worker.scene import Float, Scene, View
 from splatmill_worker.sfm.posed.transforms import OPENGL_TO_OPENCV
@@ -50,7 +50,7 @@ def write_cameras(
     ]
     points = scene.points - offset
     with tempfile.TemporaryDirectory(prefix="splatmill-cameras-") as folder, replacing(path) as part:
-        model_of(views, points, scene).write_binary(folder)
+        write_model(model_of(views, points, scene), Path(folder))
         with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for file in sorted(Path(folder).iterdir()):
                 archive.write(file, f"{MODEL}/{file.name}")
