@@ -77,7 +77,7 @@ def test_backends_are_chosen_by_the_tensors_device() -> None:
 def test_importing_the_package_imports_no_triton_and_starts_no_gpu() -> None:
     program = (
         "import sys, torch, splatmill_worker.kernels.ops, splatmill_worker.kernels.gpu.device, "
-        "splatmill_worker.splat.engine.protocol, splatmill_worker.splat.engine.parallel, splatmill_worker.pipeline\n"
+        "splatmill_worker.splat.engine.protocol, splatmill_worker.pipeline\n"
         "assert 'triton' not in sys.modules, 'triton was imported'\n"
         "assert not torch.cuda.is_initialized(), 'a GPU was touched'\n"
     )

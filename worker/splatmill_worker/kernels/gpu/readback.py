@@ -32,13 +32,9 @@ class Numbers(NamedTuple):
 
 
 class Readback:
-    """A queue of copies that are on their way from the device.
+    """A queue of copies that are on their way from the device."""
 
-    steady: numbers are handed out exactly `AHEAD` steps late, so that several processes read the same ones.
-    """
-
-    def __init__(self, *, steady: bool = False) -> None:
-        self._steady = steady
+    def __init__(self) -> None:
         self._pending: deque[tuple[tuple[int, tuple[int, int, int]], ToHost]] = deque()
         self._latest: Numbers | None = None
 
@@ -51,8 +47,7 @@ class Readback:
         found = []
         while self._pending:
             name, numbers = self._pending[0]
-            early = self._steady or not numbers.arrived
-            if early and self._latest is not None and len(self._pending) <= AHEAD:
+            if not numbers.arrived and self._latest is not None and len(self._pending) <= AHEAD:
                 break
             loss, l1, ssim, visible, pairs, refused = numbers.wait()
             self._latest = Numbers(name, loss, l1, ssim, int(visible), int(pairs), int(refused))

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 import triton
@@ -49,19 +49,6 @@ FIRST_PAIRS = 3
 
 SCORES_BLOCK = 256
 """Gaussians per program of `scores_kernel`."""
-
-
-class Together(Protocol):
-    """Several processes that train one scene; every call leaves the same bits in all of them."""
-
-    def average_(self, values: Tensor) -> None:
-        """Replace values by their mean over the processes."""
-
-    def add_(self, values: Tensor) -> None:
-        """Replace values by their sum over the processes."""
-
-    def largest_(self, values: Tensor) -> None:
-        """Replace values by their maximum over the processes."""
 
 
 class StepResult(NamedTuple):
@@ -158,12 +145,10 @@ class Step:
         sh: Tensor,
         *,
         where: torch.device | str | None = None,
-        together: Together | None = None,
     ) -> None:
         """Take means [N,3], log_scales [N,3], quats [N,4], logit_opacities [N] and sh [N, up to 16, 3].
 
-        where: the device; None is the current GPU, or the CPU under the interpreter. together: the processes over whose
-        views a step is averaged.
+        where: the device; None is the current GPU, or the CPU under the interpreter.
         """
         self.keep_scores = True
         if where is None:
@@ -174,10 +159,9 @@ class Step:
         if self.device.type == "cuda" and self.device.index is None:
             # With its number, as in the device of its tensors.
             self.device = torch.device("cuda", torch.cuda.current_device())
-        self._together = together
         self._rooms: dict[ViewKey, Room] = {}
         self._photos = Photos(self.device, device.room_for_stats(self.device))
-        self._readback = Readback(steady=together is not None)
+        self._readback = Readback()
         self._steps, self._beta2 = 0, BETA2
         # Counts `replace`: list sizes that arrive from before the last one say nothing of the room needed now.
         self._generation = 0
@@ -382,8 +366,6 @@ class Step:
             seen = self._differentiate(view, d_color, None, None)
             refused = torch.zeros(1, dtype=torch.int32, device=self.device)
             self._move(seen, degree, rates, step, refused)
-        if self._together is not None:
-            self._together.average_(losses)
         self._listen(view.key, losses, view.lists.used, refused)
         return StepResult(*self._readback.latest[1:])
 
@@ -452,27 +434,15 @@ class Step:
         return view.lists.shown.view(torch.uint8)
 
     def _score(self, view: _View, gradient: Tensor) -> None:
-        """Add a view's gradient records [N, 16] to the scores, of all processes where there are several."""
-        scores = self._scores if self._together is None else torch.zeros_like(self._scores)
+        """Add a view's gradient records [N, 16] to the scores."""
         if self.count:
             scores_kernel[(triton.cdiv(self.count, SCORES_BLOCK),)](
-                gradient, view.records, scores, self.count, 0.5 * view.width, 0.5 * view.height,
+                gradient, view.records, self._scores, self.count, 0.5 * view.width, 0.5 * view.height,
                 2.0 / max(view.width, view.height), BLOCK=SCORES_BLOCK,
             )  # fmt: skip
-        if self._together is not None:
-            extent = scores[MAX_EXTENT].clone()
-            self._together.largest_(extent)
-            scores[MAX_EXTENT] = 0.0
-            self._together.add_(scores)
-            self._scores += scores
-            torch.maximum(self.max_extent, extent, out=self.max_extent)
 
     def _move(self, seen: Tensor, degree: int, rates: Rates, step: int, refused: Tensor) -> None:
         channels = PLANES["sh"].start + 3 * (degree + 1) ** 2
-        if self._together is not None:
-            # A Gaussian that any process saw moves in all of them.
-            self._together.average_(self._gradient[:channels])
-            self._together.largest_(seen)
         if self._rates is None:
             # What `replace` was given has missed nothing, whatever the number of this step: a resumed run begins late.
             self._last.fill_(step - 1)

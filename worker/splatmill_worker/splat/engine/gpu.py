@@ -6,7 +6,7 @@ from collections.abc import Hashable
 
 from torch import Tensor
 
-from splatmill_worker.kernels.gpu.step import Step, Together
+from splatmill_worker.kernels.gpu.step import Step
 from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
@@ -18,16 +18,10 @@ class GpuEngine(Step):
     These kernels compute no gradient of the camera, so `pose_gradient` stays None; the plan refines no poses here.
     """
 
-    def __init__(
-        self,
-        gaussians: Gaussians,
-        *,
-        where: str | None = None,
-        together: Together | None = None,
-    ) -> None:
+    def __init__(self, gaussians: Gaussians, *, where: str | None = None) -> None:
         self.keep_pose_gradient = False
         self.pose_gradient: Tensor | None = None
-        super().__init__(**gaussians.padded(3).parameters(), where=where, together=together)
+        super().__init__(**gaussians.padded(3).parameters(), where=where)
 
     def train_photo(
         self,
