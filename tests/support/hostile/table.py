@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tests.support.hostile.entry import Hostile
+from tests.support.hostile.table_colors import COLORS
 from tests.support.hostile.table_decoders import DECODERS
 from tests.support.hostile.table_files import FILES
 from tests.support.hostile.table_headers import HEADERS
@@ -23,4 +24,5 @@ HOSTILE: tuple[Hostile, ...] = (
     *POSES,
     *MODELS,
     *DECODERS,
+    *COLORS,
 )

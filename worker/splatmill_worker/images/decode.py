@@ -1,4 +1,4 @@
-"""Decodes one photo: upright by its EXIF orientation, with 8 bits per channel, and reduced by a whole factor."""
+"""Decodes one photo: upright by its EXIF orientation, as sRGB of 8 bits per channel, and reduced by a whole factor."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from splatmill_worker.images import guarded
+from splatmill_worker.images.photo_colors import PhotoColors
 
 Pixels = npt.NDArray[np.uint8]
 ORIENTATION = 0x0112
@@ -48,6 +49,15 @@ def sizes(path: Path, name: str) -> tuple[tuple[int, int], tuple[int, int]]:
         return image.size, upright_size(image)
 
 
+def colors(path: Path, name: str) -> str:
+    """How the colours of a picture become sRGB, as `PhotoColors.remark` says it; nothing is decoded.
+
+    Raises UnusablePicture, about the file `name`, and OSError.
+    """
+    with guarded.opened(path, name) as image:
+        return PhotoColors.of(image, tags(image), path).remark(image.mode)
+
+
 def orientation(image: Image.Image) -> int:
     """The EXIF orientation, 1 to 8; 1 (as stored) when there is none or it is invalid."""
     value = tags(image).get(ORIENTATION, 1)
@@ -68,7 +78,7 @@ def tags(image: Image.Image) -> Image.Exif:
 
 
 def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool = True) -> Image.Image:
-    """The photo as an RGB, RGBA or grey image with 8 bits per channel.
+    """The photo as an sRGB image with or without alpha, or a grey one, with 8 bits per channel.
 
     at_least: width and height that the caller needs. The photo is reduced by the largest whole factor that leaves this
         size: JPEGs in the DCT, which saves most of the decoding time, others by a box filter. Only factors that divide
@@ -79,6 +89,7 @@ def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool
     """
     with guarded.opened(path) as image:
         turn = UPRIGHT.get(orientation(image)) if upright else None
+        stored = PhotoColors.of(image, tags(image), path)
         want = at_least
         if want is not None and turn is not None and orientation(image) in TURNED:
             want = want[1], want[0]
@@ -95,6 +106,7 @@ def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool
                 factor = _factor(image.size, want, range(MAX_REDUCTION, 0, -1))
                 if factor > 1:
                     photo = photo.reduce(factor)
+            photo = stored.srgb(photo)
             # `image` is closed at the end of the block, so it must not be returned itself.
             return photo.copy() if photo is image else photo
 
@@ -117,7 +129,8 @@ def picture_of(values: Pixels) -> Image.Image:
 
 
 def whole(image: Image.Image, name: str) -> Image.Image:
-    """An opened picture decoded to its end, as RGB, RGBA or grey with 8 bits per channel, as stored.
+    """An opened picture decoded to its end, as RGB, RGBA or grey with 8 bits per channel, as stored. Colours of print
+    become sRGB.
 
     Raises UnusablePicture, about the file `name`, when it does not decode.
     """
@@ -137,6 +150,8 @@ def _factor(size: tuple[int, int], at_least: tuple[int, int], choices: Iterable[
 
 def _plain_mode(photo: Image.Image) -> Image.Image:
     """The photo as RGB, RGBA or L with 8 bits per channel."""
+    if photo.mode in ("CMYK", "LAB"):
+        photo = PhotoColors(photo.info.get("icc_profile")).srgb(photo)
     if photo.mode in ("RGB", "RGBA", "L"):
         return photo
     if photo.mode.startswith(("I;16", "I", "F")):

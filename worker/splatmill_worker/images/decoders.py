@@ -83,6 +83,8 @@ _SIZES: TypeAdapter[tuple[tuple[int, int], tuple[int, int]]] = TypeAdapter(
 )
 _PICTURE: TypeAdapter[Picture | str] = TypeAdapter(Picture | str)
 _FAULT: TypeAdapter[str | None] = TypeAdapter(str | None)
+_TEXT: TypeAdapter[str] = TypeAdapter(str)
+_REMARKS: TypeAdapter[list[str]] = TypeAdapter(list[str])
 _SHARE = TypeAdapter(Annotated[float, Field(ge=0.0, le=1.0)])
 
 log = logging.getLogger("splatmill.decoders")
@@ -167,6 +169,11 @@ def sizes(path: Path, name: str) -> tuple[tuple[int, int], tuple[int, int]]:
     return call(decode_here.sizes, path, name, check=_SIZES.validate_python)
 
 
+def photo_colors(path: Path, name: str) -> str:
+    """Like `splatmill_worker.images.decode.colors`."""
+    return call(decode_here.colors, path, name, check=_TEXT.validate_python)
+
+
 def examine(path: Path, name: str) -> Picture | str:
     """Like `splatmill_worker.images.examine.examine`."""
     try:
@@ -206,6 +213,16 @@ def keyframes(
     else:
         _active.keyframes(path, count, write, cancelled)
     return [written[number] for number in sorted(written)]
+
+
+def video_remarks(path: Path) -> list[str]:
+    """Like `splatmill_worker.images.video.remarks`."""
+    return call(
+        video.remarks,
+        path,
+        check=_REMARKS.validate_python,
+        fault=lambda code, name, reason: UnusableVideo(name, reason),
+    )
 
 
 def ended(path: Path) -> str | None:

@@ -9,7 +9,8 @@ from pathlib import Path
 from splatmill.schema.photos import MIN_PHOTO_SIDE
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import exif, guarded
-from splatmill_worker.images.decode import upright_size, whole
+from splatmill_worker.images.decode import tags, upright_size, whole
+from splatmill_worker.images.photo_colors import PhotoColors
 
 GIVE = "; give JPEG, PNG, WebP, TIFF, HEIC or AVIF photos, videos or zips"
 
@@ -21,12 +22,14 @@ class Picture:
     width, height: in pixels, with the EXIF orientation applied.
     exif: the tags that structure from motion uses.
     several: whether the file holds further pictures.
+    colors: how its colours become sRGB, as `PhotoColors.remark` says it.
     """
 
     width: int
     height: int
     exif: exif.Exif
     several: bool
+    colors: str
 
 
 def examine(path: Path, name: str) -> Picture | str:
@@ -42,8 +45,9 @@ def examine(path: Path, name: str) -> Picture | str:
                         f"{MIN_PHOTO_SIDE}"
                     )
                 width, height = upright_size(image)
-                tags = exif.read(image)
                 several = guarded.several(image)
+                colors = PhotoColors.of(image, tags(image), path).remark(image.mode)
+                found = exif.read(image)
                 if image.format == "JPEG":
                     # This decodes at the smallest DCT scale, and still reads the whole file.
                     image.draft(None, (1, 1))
@@ -53,4 +57,4 @@ def examine(path: Path, name: str) -> Picture | str:
         return error.reason + (GIVE if error.code == "not_an_image" else "")
     except OSError as error:
         return f"it cannot be read: {error}"
-    return Picture(width, height, tags, several)
+    return Picture(width, height, found, several, colors)

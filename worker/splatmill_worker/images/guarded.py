@@ -54,6 +54,12 @@ MAX_VIDEO_FRAMES = 1_000_000
 MAX_READING_SECONDS = 3600.0
 """Wall time that one pass over a video may take. Two are made: to choose frames, and to write them."""
 
+MAX_CHUNKS = 100
+"""Chunks of a PNG before its pixels that are looked through."""
+
+UNSPECIFIED = 2
+"""The code of H.273 for primaries, transfer function and matrix that a file does not name."""
+
 _BYTES_PER_PIXEL = 4
 DECODE_ERRORS = (
     *(
@@ -144,6 +150,42 @@ def several(image: Image.Image) -> bool:
     return True
 
 
+def avif_tags(path: Path) -> tuple[int, int]:
+    """The primaries and the transfer function that an AVIF names by H.273, which Pillow does not return.
+
+    They are 2, unspecified, where FFmpeg cannot read the file.
+    """
+    options = {
+        "protocol_whitelist": "file",
+        "format_whitelist": "mov",
+        "max_pixels": str(MAX_PHOTO_PIXELS),
+    }
+    try:
+        with av.open(str(path), options=options, metadata_errors="replace", timeout=60.0) as container:
+            codec = container.streams.video[0].codec_context
+            return int(codec.color_primaries), int(codec.color_trc)
+    except (av.FFmpegError, ValueError, LookupError, AttributeError):
+        return UNSPECIFIED, UNSPECIFIED
+
+
+def png_tags(path: Path) -> tuple[int, int]:
+    """The primaries and the transfer function that the chunk cICP of a PNG names by H.273, which Pillow does not read.
+
+    They are 2, unspecified, without such a chunk among the first MAX_CHUNKS.
+    """
+    with path.open("rb") as file:
+        file.seek(8)
+        for _ in range(MAX_CHUNKS):
+            length, kind = int.from_bytes(file.read(4)), file.read(4)
+            if kind == b"cICP" and length == 4:
+                primaries, transfer, *_ = file.read(4).ljust(4, b"\0")
+                return primaries, transfer
+            if kind in (b"IDAT", b""):
+                break
+            file.seek(length + 4, os.SEEK_CUR)
+    return UNSPECIFIED, UNSPECIFIED
+
+
 def own_picture(path: Path) -> Image.Image:
     """Open a picture that this program wrote itself, such as a frame of the progress film."""
     return Image.open(path)
@@ -183,10 +225,7 @@ def opened_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.V
                 path.name,
                 f"its frames have no size, or more than {MAX_FRAME_PIXELS / 1e6:.0f} million pixels",
             )
-        if stream.frames > MAX_VIDEO_FRAMES:
-            raise UnusableVideo(
-                path.name, f"it has {stream.frames} frames; at most {MAX_VIDEO_FRAMES} are read"
-            )
+        check_frames(path.name, stream.frames)
         stream.thread_type = "AUTO"
         stream.codec_context.options = {"max_pixels": str(MAX_FRAME_PIXELS)}
         yield container, stream
@@ -201,6 +240,12 @@ def check_length(name: str, seconds: float) -> None:
         )
 
 
+def check_frames(name: str, count: int) -> None:
+    """Raise UnusableVideo for a video that has more than MAX_VIDEO_FRAMES."""
+    if count > MAX_VIDEO_FRAMES:
+        raise UnusableVideo(name, f"it has {count} or more frames; at most {MAX_VIDEO_FRAMES} are read")
+
+
 def frames(
     name: str, container: av.container.InputContainer, stream: av.VideoStream
 ) -> Iterator[av.VideoFrame]:
@@ -208,8 +253,7 @@ def frames(
     began = time.monotonic()
     for number, frame in enumerate(container.decode(stream)):
         _check_frame(name, frame.width, frame.height)
-        if number >= MAX_VIDEO_FRAMES:
-            raise UnusableVideo(name, f"it has more than {MAX_VIDEO_FRAMES} frames")
+        check_frames(name, number + 1)
         if time.monotonic() - began > MAX_READING_SECONDS:
             raise UnusableVideo(
                 name, f"reading it took longer than {MAX_READING_SECONDS:.0f} seconds, up to frame {number}"

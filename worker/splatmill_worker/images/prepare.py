@@ -15,7 +15,7 @@ from splatmill.schema.masks import masks_beside, paired, without_mask_folder
 from splatmill.schema.outputs import own_outputs
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES
 from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
-from splatmill_worker.images import archive, decoders, exif, unpacked_room
+from splatmill_worker.images import archive, decoders, exif, photo_colors, unpacked_room
 from splatmill_worker.images.masks import masks_under, remarks
 
 IGNORED_PREFIXES = (".", "__MACOSX")
@@ -43,6 +43,7 @@ class UsablePhoto:
     mask: path of the mask, if there is one.
     sequence: name of the video that the photo is a frame of, if it is one.
     several: whether the file holds further pictures, which are not used.
+    colors: how its colours become sRGB, as `PhotoColors.remark` says it.
     """
 
     name: str
@@ -54,6 +55,7 @@ class UsablePhoto:
     mask: Path | None = None
     sequence: str | None = None
     several: bool = False
+    colors: str = ""
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Prepared:
     photos: sorted by name.
     skipped: (name, reason) of every file that is left out.
     notes: sentences for the user.
-    warnings: sentences for the user about what is probably wrong.
+    warnings: sentences for the user about what is probably wrong, assumed or converted.
     """
 
     photos: tuple[UsablePhoto, ...]
@@ -88,7 +90,7 @@ class _Found:
     files: name, path, and name of the video that the file is a frame of.
     opened: names of the zips and videos whose content is among the files.
     allowance: what further zips may unpack to.
-    skipped, notes: as in `Prepared`.
+    skipped, notes, warnings: as in `Prepared`.
     """
 
     files: list[tuple[str, Path, str | None]] = field(default_factory=list)
@@ -96,6 +98,7 @@ class _Found:
     allowance: archive.Allowance = field(default_factory=archive.Allowance)
     skipped: list[tuple[str, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
 
 def prepare(
@@ -173,7 +176,8 @@ def prepare(
     masked = [photo.mask for photo in ordered if photo.mask is not None]
     unused = mask_files.keys() - pairs.values()
     notes, warnings = remarks(len(ordered), masked, unused, decoders.hidden_share)
-    return Prepared(ordered, tuple(found.skipped), (*found.notes, *notes), tuple(warnings))
+    found.warnings += photo_colors.sentences([photo.colors for photo in ordered])
+    return Prepared(ordered, tuple(found.skipped), (*found.notes, *notes), (*found.warnings, *warnings))
 
 
 def given_files(images: Path) -> list[Path]:
@@ -242,6 +246,7 @@ def _expand(
             found.files += [(f"{prefix}_{p.stem.rpartition('_')[2]}.jpg", p, name) for p in pictures]
             found.opened.add(name)
             found.notes.append(f"{len(pictures)} frames were taken from the video {name}.")
+            found.warnings += [remark.format(name) for remark in decoders.video_remarks(path)]
         else:
             found.files.append((name, path, None))
     except UnusableVideo as error:
@@ -307,6 +312,7 @@ def _inspect(name: str, path: Path, sequence: str | None) -> UsablePhoto | str:
         found.exif,
         sequence=sequence,
         several=found.several,
+        colors=found.colors,
     )
 
 

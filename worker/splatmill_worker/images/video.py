@@ -10,17 +10,18 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
 import av
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
 from splatmill_worker.errors import Cancelled, UnusableVideo
-from splatmill_worker.images import guarded
+from splatmill_worker.images import guarded, video_frame
 from splatmill_worker.images.flow import Grey, displacement
+from splatmill_worker.images.video_times import Passed
 
 SHARPNESS_SIDE = 480
 """Pixels of the longest side of the reduced frame on which sharpness is measured."""
@@ -44,9 +45,6 @@ QUALITY = 95
 MAX_WRITTEN_BYTES = 16 * 2**30
 """Bytes of all frames of a video as JPEGs: some formats draw noise that takes no bytes in the video."""
 
-DEFAULT_RATE = 30.0
-"""Frames per second assumed for videos without time stamps."""
-
 
 class Candidate(NamedTuple):
     """A frame that may be taken.
@@ -66,8 +64,8 @@ def keyframes(
 ) -> Iterator[tuple[int, bytes]]:
     """Yield the numbers and the JPEGs of at most `count` frames of the video at `path`, in order.
 
-    The rotation in the video is applied. Of a video with a damaged end, the frames before the damage are used. The
-    video is decoded twice: to choose the frames, and to encode them.
+    They are sRGB, upright, and have square pixels. Of a video with a damaged end, the frames before the damage are
+    used. The video is decoded twice: to choose the frames, and to encode them.
 
     Raises UnusableVideo when the file has no video that decodes or exceeds a limit, and Cancelled.
     """
@@ -75,10 +73,10 @@ def keyframes(
         raise ValueError(f"{count} frames were asked for; ask for at least 1.")
     numbers = chosen(_candidates(path, CANDIDATES * count, cancelled), count)
     done = size = 0
-    with _decoded(path, cancelled) as (_, frames):
+    with _decoded(path, cancelled) as (aspect, frames):
         for number, frame in frames:
             if number == numbers[done]:
-                picture = _jpeg(frame)
+                picture = _jpeg(video_frame.picture(frame, aspect))
                 size += len(picture)
                 if size > MAX_WRITTEN_BYTES:
                     raise UnusableVideo(
@@ -89,6 +87,23 @@ def keyframes(
                 done += 1
                 if done == len(numbers):
                     break
+
+
+def remarks(path: Path) -> list[str]:
+    """What is assumed or converted in the video at `path`, as sentences with {} for its name.
+
+    Raises UnusableVideo as `keyframes` does.
+    """
+    with _decoded(path, lambda: False) as (aspect, frames):
+        for _, frame in frames:
+            return video_frame.remarks(frame, aspect)
+    return []
+
+
+def _jpeg(image: Image.Image) -> bytes:
+    picture = io.BytesIO()
+    image.save(picture, "JPEG", quality=QUALITY, subsampling=0)
+    return picture.getvalue()
 
 
 def chosen(candidates: Sequence[Candidate], count: int) -> list[int]:
@@ -131,17 +146,17 @@ def _sharpest(path: Path, count: int, cancelled: Callable[[], bool]) -> Iterator
     without a frame are skipped."""
     best: tuple[int, float, Grey] | None = None
     interval = 0
-    with _decoded(path, cancelled) as (length, frames):
+    passed = Passed.of(path, cancelled)
+    with _decoded(path, cancelled) as (aspect, frames):
         for number, frame in frames:
-            time = frame.time if frame.time is not None else number / DEFAULT_RATE
-            at = min(count - 1, max(interval, int(time / length * count)))
+            at = min(count - 1, max(interval, int(passed.share(frame.pts, number) * count)))
             if at != interval and best is not None:
                 yield best
                 best = None
             interval = at
-            score = sharpness(_grey(frame, SHARPNESS_SIDE))
+            score = sharpness(video_frame.grey(frame, aspect, SHARPNESS_SIDE))
             if best is None or score > best[1]:
-                best = number, score, _grey(frame, MOTION_SIDE)
+                best = number, score, video_frame.grey(frame, aspect, MOTION_SIDE)
     if best is not None:
         yield best
 
@@ -149,8 +164,8 @@ def _sharpest(path: Path, count: int, cancelled: Callable[[], bool]) -> Iterator
 @contextmanager
 def _decoded(
     path: Path, cancelled: Callable[[], bool]
-) -> Iterator[tuple[float, Iterator[tuple[int, av.VideoFrame]]]]:
-    """The length of the video in seconds, and its frames with their numbers, up to where it is damaged.
+) -> Iterator[tuple[Fraction | None, Iterator[tuple[int, av.VideoFrame]]]]:
+    """The width of a pixel over its height, and the frames with their numbers, up to where the video is damaged.
 
     Raises UnusableVideo where no frame decodes or a limit is exceeded, and Cancelled.
     """
@@ -166,58 +181,7 @@ def _decoded(
 
     try:
         with guarded.opened_video(path) as (container, stream):
-            length = _duration(path, container, stream)
-            guarded.check_length(path.name, length)
-            yield length, frames()
+            yield stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio, frames()
     except av.FFmpegError as error:
         if not seen:
             raise UnusableVideo(path.name, f"it does not decode as video ({error})") from error
-
-
-def _duration(path: Path, container: av.container.InputContainer, stream: av.VideoStream) -> float:
-    """The video's length in seconds: that of the stream, of the container, by the number of frames, or as measured."""
-    if stream.duration and stream.time_base:
-        return max(float(stream.duration * stream.time_base), 1e-3)
-    if container.duration:
-        return max(container.duration / av.time_base, 1e-3)
-    rate = float(stream.average_rate) if stream.average_rate else DEFAULT_RATE
-    return max(stream.frames / rate or _measured(path, rate), 1e-3)
-
-
-def _measured(path: Path, rate: float) -> float:
-    """The length by the last time stamp, or by the number of packets at `rate`: browsers record without a length."""
-    last = 0.0
-    with guarded.opened_video(path) as (container, stream):
-        for number, packet in enumerate(container.demux(stream)):
-            end = (
-                packet.pts * packet.time_base
-                if packet.pts is not None and packet.time_base
-                else number / rate
-            )
-            last = max(last, float(end))
-            guarded.check_length(path.name, last)
-    return last + 1.0 / rate
-
-
-def _grey(frame: av.VideoFrame, side: int) -> Grey:
-    """The frame in grey [H,W], reduced to a longest side of `side` pixels."""
-    factor = min(1.0, side / max(frame.width, frame.height))
-    width, height = max(3, int(frame.width * factor)), max(3, int(frame.height * factor))
-    small = frame.reformat(width=width, height=height, format="gray", interpolation="AREA")
-    grey: npt.NDArray[np.float32] = small.to_ndarray().astype(np.float32)
-    return grey
-
-
-def _jpeg(frame: av.VideoFrame) -> bytes:
-    """A frame, upright."""
-    image: Image.Image = frame.to_image()  # type: ignore[no-untyped-call]  # PyAV leaves it untyped
-    turn = {
-        90: Image.Transpose.ROTATE_90,
-        180: Image.Transpose.ROTATE_180,
-        270: Image.Transpose.ROTATE_270,
-    }.get(round(frame.rotation) % 360)
-    if turn is not None:
-        image = image.transpose(turn)
-    picture = io.BytesIO()
-    image.save(picture, "JPEG", quality=QUALITY, subsampling=0)
-    return picture.getvalue()

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from splatmill.data_sets import find_cameras, walk
 from splatmill.schema.photos import PHOTO_SUFFIXES
-from splatmill_worker.images.decoders import hidden_share, mask_fault
+from splatmill_worker.images.decoders import hidden_share, mask_fault, photo_colors
 from splatmill_worker.images.masks import remarks
+from splatmill_worker.images.photo_colors import sentences
 from splatmill_worker.scene import Scene, Source
 from splatmill_worker.sfm.posed import colmap_model, transforms
 from splatmill_worker.sfm.posed.files import ImageFiles
@@ -51,10 +52,11 @@ class PosedInput:
         masks = [view.mask for view in scene.views if view.mask is not None]
         unused = {name for name in files.unused_masks if files.masks[name] not in masks}
         notes, warnings = remarks(len(scene.views), masks, unused, hidden_share)
+        colors = [photo_colors(view.image, view.name) for view in scene.views]
         return replace(
             scene,
             notes=(*scene.notes, *notes),
-            warnings=(*self.warnings, *scene.warnings, *warnings),
+            warnings=(*self.warnings, *scene.warnings, *sentences(colors), *warnings),
         )
 
 

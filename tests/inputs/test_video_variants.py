@@ -1,0 +1,87 @@
+"""Videos as phones and converters write them give the cameras and the colours of the plain SDR frames: HDR (HLG),
+stamps that begin at one hour, and pixels that are not square."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image
+
+from splatmill_worker import sfm
+from splatmill_worker.images.prepare import prepare
+from splatmill_worker.synthetic.ray_caster import look_at, picture, still_life
+from tests.inputs.conftest import Build
+
+FRAMES, FOCAL_LENGTH = 45, 315.0
+"""Of the video, before it is encoded."""
+
+VIDEOS = {"hlg.mov": "HDR", "late.mkv": "does not name", "anamorphic.mp4": "not square"}
+"""The videos, each with a part of what is said of it."""
+
+
+def cameras() -> list[npt.NDArray[np.float64]]:
+    """Matrices from the world to the camera of each frame."""
+    angles = [2 * math.pi * number / FRAMES * 0.75 for number in range(FRAMES)]
+    eyes = [
+        3.7 * np.array([math.cos(a) * math.cos(0.5), math.sin(a) * math.cos(0.5), math.sin(0.5)])
+        for a in angles
+    ]
+    return [look_at(eye, np.array([0, 0, 0.25]), 384, 288, FOCAL_LENGTH).viewmat for eye in eyes]
+
+
+def only(built: Build, name: str, folder: Path) -> Path:
+    images = folder / "images"
+    images.mkdir()
+    shutil.copy(built("video-variants") / name, images)
+    return images
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", VIDEOS)
+def test_the_frames_have_the_colours_of_sdr(built: Build, name: str, tmp_path: Path) -> None:
+    """All frames but one at most, at 33.5 dB and more; the encoded SDR frames themselves are at 35."""
+    prepared = prepare(only(built, name, tmp_path), None, tmp_path / "work", frames=150)
+    assert len(prepared.photos) >= FRAMES - 1
+    assert any(VIDEOS[name] in warning for warning in prepared.warnings)
+    for photo in prepared.photos[::11]:
+        with Image.open(photo.path) as frame:
+            found = np.asarray(frame, float)
+        number = int(photo.path.stem.rpartition("_")[2])
+        eye = np.linalg.inv(cameras()[number])[:3, 3]
+        truth = picture(still_life(0), look_at(eye, np.array([0, 0, 0.25]), 384, 288, FOCAL_LENGTH), 2)
+        assert found.shape == truth.shape
+        assert 10 * math.log10(255**2 / ((found - truth) ** 2).mean()) > 33.5
+        spread = [float((np.max(each, 2) - np.min(each, 2)).mean()) for each in (found, truth.astype(float))]
+        assert spread[0] == pytest.approx(spread[1], rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", VIDEOS)
+def test_the_cameras_are_those_of_the_frames(built: Build, name: str, tmp_path: Path) -> None:
+    """Rotations to a quarter of a degree after one common rotation, and square pixels."""
+    options = sfm.SfmOptions(stereo=False)
+    scene = sfm.reconstruct(
+        only(built, name, tmp_path),
+        None,
+        tmp_path / "work",
+        options,
+        lambda stage, done, total, note: None,
+        lambda: False,
+    )
+    assert len(scene.views) >= FRAMES - 1
+    numbers = [int(view.image.stem.rpartition("_")[2]) for view in scene.views]
+    found = np.stack([view.camera.viewmat[:3, :3] for view in scene.views])
+    truth = np.stack([cameras()[number][:3, :3] for number in numbers])
+    u, _, v = np.linalg.svd(np.einsum("nji,njk->ik", found, truth))
+    common = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+    cosines = (np.einsum("nij,jk,nik->n", found, common, truth) - 1) / 2
+    assert np.degrees(np.arccos(np.clip(cosines, -1, 1))).max() < 0.25
+    camera = scene.views[0].camera
+    assert (camera.width, camera.height) == (384, 288)
+    assert camera.fx == pytest.approx(camera.fy, rel=0.01)
+    assert camera.fx == pytest.approx(FOCAL_LENGTH, rel=0.02)
