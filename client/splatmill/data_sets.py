@@ -8,17 +8,52 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 MAX_DEPTH = 4
 """Folders around a data set that are looked into: zips and programs often put it into folders of their own."""
 
-_PLACES = (
-    re.compile(r"(?:^|(?<=/))sparse/(?:\d+/)?\Z", re.IGNORECASE | re.ASCII),
-    re.compile(r"(?:^|(?<=/))colmap/sparse/(?:\d+/)?\Z", re.IGNORECASE | re.ASCII),
-    re.compile(r"(?:^|(?<=/))\d+/\Z", re.ASCII),
+PLACES = ("sparse/[N/]", "colmap/sparse/[N/]", "N/")
+"""Folders of a data set in which tools put COLMAP models, in order of preference; the data set's own is the last. N is
+a number, and brackets enclose what may be missing."""
+
+_PATTERNS = tuple(
+    re.compile(
+        r"(?:^|(?<=/))" + place.replace("[N/]", r"(?:\d+/)?").replace("N/", r"\d+/") + r"\Z",
+        re.IGNORECASE | re.ASCII,
+    )
+    for place in PLACES
 )
-"""Folders of a data set in which tools put COLMAP models, in order of preference; the data set's own is the last."""
+
+MODEL_FILES = ("cameras.bin", "cameras.txt")
+"""Names, in lower case, of the files by which a COLMAP model is found."""
+
+TRANSFORMS = "transforms*.json"
+"""Pattern of the names, in lower case, of files with cameras of nerfstudio and others."""
+
+KEYFRAMES = ("keyframes/corrected_cameras/", "keyframes/cameras/")
+"""Folders in which the raw data of Polycam have a .json file with the camera of each photo, in order of preference."""
+
+CAMERA_PROGRAMS = {
+    "COLMAP, GLOMAP, and programs that export a COLMAP model": MODEL_FILES,
+    "nerfstudio, instant-ngp, Blender (NeRF synthetic)": (TRANSFORMS,),
+    "Polycam (raw data)": tuple(f"{folder}*.json" for folder in KEYFRAMES),
+}
+"""Programs whose cameras are read, with patterns of the names, in lower case, of their files."""
+
+OTHER_CAMERAS = {
+    "OpenDroneMap or OpenSfM": ("reconstruction.json", "shots.geojson"),
+    "Metashape": ("cameras.xml", "*.psx"),
+    "Bundler": ("bundle*.out",),
+    "OpenMVG": ("sfm_data.json", "sfm_data.bin"),
+    "Meshroom": ("*.sfm",),
+    "VisualSFM": ("*.nvm",),
+    "OpenMVS": ("*.mvs",),
+    "LLFF": ("poses_bounds.npy",),
+    "Record3D": ("*.r3d",),
+}
+"""Programs whose cameras are not read, with patterns of the names, in lower case, of their files."""
 
 
 class TwoDataSets(ValueError):
@@ -30,7 +65,7 @@ class Cameras:
     """The files of cameras of one data set.
 
     top: the folder of the data set, with a slash at its end; empty where it is the folder itself.
-    transforms: names of the transforms*.json files in it.
+    transforms: names of the transforms*.json files in it, or else of the files in one of its KEYFRAMES.
     models: its folders with a COLMAP model, each with a slash at its end, in order of their numbers. They are
         alternatives: COLMAP writes a model for each set of photos that it could not join with the others.
     """
@@ -67,20 +102,25 @@ def find_cameras(names: Sequence[str]) -> Cameras | None:
     Raises TwoDataSets where several data sets lie side by side.
     """
     transforms: dict[str, list[str]] = {}
+    captured: dict[str, dict[int, list[str]]] = {}
     models: dict[str, list[tuple[int, str]]] = {}
     lower = {name.lower() for name in names}
     for name in names:
         folder, base = _split(name)
         base = base.lower()
-        if base.startswith("transforms") and base.endswith(".json"):
+        if fnmatchcase(base, TRANSFORMS):
             transforms.setdefault(folder, []).append(name)
-        elif base in ("cameras.bin", "cameras.txt"):
+        elif base.endswith(".json") and (place := keyframes(folder)) is not None:
+            captured.setdefault(place[0], {}).setdefault(place[1], []).append(name)
+        elif base in MODEL_FILES:
             top, rank = _place(folder)
             # A file called cameras.txt in some folder is a model only together with its images.
             if top == "" or f"{folder.lower()}images{base[-4:]}" in lower:
                 found = models.setdefault(top, [])
                 if (rank, folder) not in found:
                     found.append((rank, folder))
+    for top, ranked in captured.items():
+        transforms.setdefault(top, ranked[min(ranked)])
     tops = sorted({*transforms, *models}, key=lambda top: (top.count("/"), top))
     if not tops or tops[0].count("/") > MAX_DEPTH:
         return None
@@ -95,14 +135,37 @@ def find_cameras(names: Sequence[str]) -> Cameras | None:
     return Cameras(top, tuple(transforms.get(top, ())), tuple(folders))
 
 
+def other_cameras(names: Sequence[str]) -> list[str]:
+    """A sentence for each of OTHER_CAMERAS among the files `names`, which have no cameras that are read."""
+    first = {
+        program: name
+        for program, patterns in OTHER_CAMERAS.items()
+        for name in reversed(names)
+        if any(fnmatchcase(_split(name)[1].lower(), pattern) for pattern in patterns)
+    }
+    return [
+        f"The cameras of {program} in {name} are not read: cameras are recovered from the photos. To use those, export "
+        "them from there as a COLMAP model or a transforms.json."
+        for program, name in first.items()
+    ]
+
+
 def _place(folder: str) -> tuple[str, int]:
     """The data set that a folder with a COLMAP model belongs to, and the rank of its place there."""
     # "colmap/sparse/" ends in "sparse/" too, so that the longest place is asked for first.
     for rank in (1, 0, 2):
-        found = _PLACES[rank].search(folder)
+        found = _PATTERNS[rank].search(folder)
         if found:
             return folder[: found.start()], rank
-    return folder, len(_PLACES)
+    return folder, len(PLACES)
+
+
+def keyframes(folder: str) -> tuple[str, int] | None:
+    """The data set with this folder of Polycam's cameras, and its rank among KEYFRAMES; None for another folder."""
+    for rank, place in enumerate(KEYFRAMES):
+        if f"/{folder.lower()}".endswith(f"/{place}"):
+            return folder[: -len(place)], rank
+    return None
 
 
 def _number(folder: str) -> tuple[bool, int, str]:

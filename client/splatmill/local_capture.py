@@ -7,12 +7,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatmill.data_sets import Cameras, TwoDataSets, find_cameras, walk
+from splatmill.data_sets import Cameras, TwoDataSets, find_cameras, other_cameras, walk
 from splatmill.errors import NothingToUpload
 from splatmill.schema.captures import Role, UnsafeName, safe_name, storable_name
 from splatmill.schema.masks import masks_beside, without_mask_folder
 from splatmill.schema.outputs import own_outputs
-from splatmill.schema.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES, VIDEO_SUFFIXES
+from splatmill.schema.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES, VIDEO_SUFFIXES, unread
 
 MODEL_SUFFIXES = frozenset({".bin", ".txt"})
 MODEL_STEMS = frozenset({"cameras", "images", "points3d", "rigs", "frames"})  # in lower case
@@ -43,6 +43,7 @@ class Found:
     renamed: relative names of the files that are stored under other names, each with its name in the capture.
     left_out: relative names of the files that no name can be made for, each with the reason.
     outputs: relative names of pictures, videos and zips that are results of Splatmill.
+    remarks: sentences about files that hold photos or cameras and are not read.
     """
 
     files: tuple[LocalFile, ...]
@@ -51,6 +52,7 @@ class Found:
     renamed: tuple[tuple[str, str], ...] = ()
     left_out: tuple[tuple[str, str], ...] = ()
     outputs: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @staticmethod
     def of(files: Iterable[LocalFile], ignored: Iterable[str] = ()) -> "Found":
@@ -135,12 +137,16 @@ def find_files(path: str | os.PathLike[str]) -> Found:
             kinds = ", ".join(sorted(suffix.removeprefix(".") for suffix in PHOTO_SUFFIXES))
             raise NothingToUpload(
                 f"{root} contains no photos, no video and no zip archive.",
-                f"Photos are {kinds} files.",
+                " ".join(unread(ignored) or [f"Photos are {kinds} files."]),
             )
     found = Found.of(files, ignored)
     if not found.count(Role.images):
         raise NothingToUpload(found.left_out[0][1], "Rename the files.")
-    return replace(found, top=cameras.top, outputs=tuple(sorted(outputs)))
+    remarks = unread(ignored) + ([] if poses else other_cameras(ignored))
+    beside = [name for name in ignored if _suffix(name) in VIDEO_SUFFIXES + ARCHIVE_SUFFIXES]
+    if beside:
+        remarks.append(f"Videos and zips are not used where there are photos: {', '.join(beside)}.")
+    return replace(found, top=cameras.top, outputs=tuple(sorted(outputs)), remarks=tuple(remarks))
 
 
 def printable(name: str) -> str:
@@ -168,7 +174,7 @@ def _single(path: Path) -> Found:
     if _suffix(path.name) not in PHOTO_SUFFIXES + VIDEO_SUFFIXES + ARCHIVE_SUFFIXES:
         raise NothingToUpload(
             f"{path.name} is neither a photo, nor a video, nor a zip archive.",
-            "Give a folder of photos, a zip archive or a video.",
+            " ".join(unread([path.name]) or ["Give a folder of photos, a zip archive or a video."]),
         )
     return Found.of([_local(Role.images, path.name, path)])
 

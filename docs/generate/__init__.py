@@ -1,4 +1,4 @@
-"""The pages that are made from the program each time the documentation is built; none of them is committed.
+"""The pages that are made from the program each time the documentation is built; one of them is committed.
 
 One module per page. Each has a function `page()` that returns the page as Markdown.
 """
@@ -11,6 +11,7 @@ from docs.generate import (
     errors,
     formats,
     hostile,
+    inputs,
     metrics,
     python_errors,
     rest,
@@ -29,11 +30,19 @@ PAGES = {
     "settings.md": settings.page,
 }
 
+COMMITTED = {"inputs.md": inputs.page}
+"""Pages beside those written by hand, which are committed because the README leads to them. A test compares them."""
+
 
 def write_pages(folder: Path) -> None:
-    """Write every generated page into `folder`; a page whose text has not changed keeps its time stamp."""
+    """Write every generated page into `folder`, and the committed ones beside it.
+
+    A page whose text has not changed keeps its time stamp.
+    """
     folder.mkdir(exist_ok=True)
-    for name, page in PAGES.items():
-        path, text = folder / name, page()
+    places = {folder / name: page for name, page in PAGES.items()}
+    places |= {folder.parent / name: page for name, page in COMMITTED.items()}
+    for path, page in places.items():
+        text = page()
         if not path.is_file() or path.read_text() != text:
             path.write_text(text)

@@ -11,6 +11,7 @@ import io
 import json
 import random
 import re
+import shutil
 import subprocess
 import zipfile
 from collections.abc import Iterator
@@ -23,6 +24,7 @@ from playwright.sync_api import Locator, Page, Request, expect
 
 from splatmill.local_capture import find_files
 from splatmill.schema import describe_options
+from splatmill_worker.images.prepare import prepare
 from tests.browser.conftest import Open, SmallModel, Visit
 from tests.support import still_life
 from tests.support.paths import ROOT
@@ -174,6 +176,12 @@ TREES = {
     "other cases": "Scene/images/A.JPG Scene/Transforms.JSON",
     "numbered models": "a.jpg 0/cameras.bin 1/cameras.bin 1/images.bin",
     "too deep": "a.jpg 1a/2a/3a/4a/5a/transforms.json",
+    "raw data of Polycam": "keyframes/images/1.jpg keyframes/cameras/1.json keyframes/corrected_images/1.jpg "
+    "keyframes/corrected_cameras/1.json keyframes/depth/1.png mesh_info.json",
+    "raw data of Polycam some folders down": "x/Scan/Keyframes/images/1.jpg x/Scan/Keyframes/cameras/1.json x/raw.glb",
+    "kinds that are not read": "a.jpg b.DNG c.dng old.bmp photos.rar x/VID_1.insv film.mts clip.mp4",
+    "cameras that are not read": "images/a.jpg opensfm/Reconstruction.json cameras.xml scan.nvm bundle.rd.out a.xml",
+    "cameras that are not needed": "images/a.jpg transforms.json cameras.xml",
     "videos": "a.mov b.webm",
     "a zip": "photos.zip",
     "code points": "é.jpg Z.jpg a.jpg \U0001f600.jpg ﬁ.jpg",
@@ -184,8 +192,10 @@ def test_files_are_sorted_as_by_the_command_line(page: Page, tmp_path: Path) -> 
     opened(page)
     script = """async (paths) => {
       const { sort } = await import("/page/any/new/kinds.js");
+      const { remarks } = await import("/page/any/new/remarks.js");
       const { accepted } = await (await fetch("/v1/info")).json();
-      return sort(paths, accepted);
+      const sorted = sort(paths, accepted);
+      return { ...sorted, remarks: remarks(sorted, accepted) };
     }"""
     for title, names in TREES.items():
         root = tmp_path / title
@@ -200,6 +210,50 @@ def test_files_are_sorted_as_by_the_command_line(page: Page, tmp_path: Path) -> 
         ], title
         assert here["ignored"] == list(found.ignored), title
         assert here["outputs"] == list(found.outputs), title
+        assert here["remarks"] == list(found.remarks), title
+
+
+def test_what_the_job_would_warn_of_is_said_before_the_upload(
+    page: Page, photos: Path, tmp_path: Path
+) -> None:
+    scene = tmp_path / "given/scene"
+    (scene / "masks").mkdir(parents=True)
+    (scene / "images").mkdir()
+    for path in sorted(photos.iterdir())[:4]:
+        shutil.copy(path, scene / "images")
+        mask = Image.new("L", (64, 48), 0)
+        mask.paste(255, (0, 0, 16, 48))
+        mask.save(scene / "masks" / f"{path.stem}.png")
+    mask.save(scene / "masks/other.png")
+    (scene / "transforms.json").write_text("{}")
+    for name in ("model.ply", "report.json", "preview.jpg", "IMG_1.dng"):
+        (tmp_path / "given" / name).write_bytes(b"x")
+    opened(page)
+    give(page, tmp_path / "given")
+    remarks = page.locator("#remarks li")
+    worker = prepare(scene / "images", scene / "masks", tmp_path / "work").warnings
+    expect(remarks).to_have_text(
+        [
+            "The cameras are those in scene/.",
+            "Results of an earlier training, not read as photos: preview.jpg.",
+            "Not read are raw photos: IMG_1.dng. Develop them as JPEG or TIFF, all with the same settings.",
+            *worker,
+        ],
+        timeout=CHECKED,
+    )
+    assert [part in sentence for part, sentence in zip(("other.png", "hide 75%"), worker, strict=True)] == [
+        True
+    ] * 2
+
+
+def test_two_data_sets_are_refused_before_the_upload(page: Page, photos: Path, tmp_path: Path) -> None:
+    for name in ("chair", "table"):
+        (tmp_path / "given" / name).mkdir(parents=True)
+        shutil.copy(sorted(photos.iterdir())[0], tmp_path / "given" / name / f"{name}.jpg")
+        (tmp_path / "given" / name / "transforms.json").write_text("{}")
+    opened(page)
+    give(page, tmp_path / "given")
+    expect(page.locator("#remarks")).to_contain_text("several data sets, in chair/ and in table/")
 
 
 def test_a_folder_with_cameras_is_dropped(visit: Visit, service: Up, tmp_path: Path, jobs: None) -> None:

@@ -236,6 +236,47 @@ def test_paths_with_nothing_to_train(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["a.jpg", "b.DNG", "c.dng"], ["Not read are raw photos: b.DNG and 1 more. Develop them as JPEG"]),
+        (
+            ["a.jpg", "photos.rar", "old.bmp"],
+            ["pictures of other formats: old.bmp. Save", "other formats: photos.rar"],
+        ),
+        (["a.jpg", "x/VID_1.insv"], ["360-degree camera: x/VID_1.insv. Export flat"]),
+        (
+            ["images/a.jpg", "opensfm/reconstruction.json"],
+            ["cameras of OpenDroneMap or OpenSfM in opensfm/rec"],
+        ),
+        (
+            ["a.jpg", "cameras.xml", "Poses_Bounds.npy"],
+            ["Metashape in cameras.xml", "LLFF in Poses_Bounds.npy"],
+        ),
+        (["images/a.jpg", "sparse/0/cameras.bin", "sparse/0/images.bin", "cameras.xml"], []),
+        (["a.jpg", "clip.mp4", "more.zip"], ["not used where there are photos: clip.mp4, more.zip"]),
+        (["a.jpg", "notes.txt", "data.json", "x.xml"], []),
+    ],
+)
+def test_what_holds_photos_or_cameras_and_is_not_read_is_said(
+    tmp_path: Path, names: list[str], said: list[str]
+) -> None:
+    remarks = find_files(tree(tmp_path, *names)).remarks
+    assert len(remarks) == len(said)
+    assert all(part in sentence for part, sentence in zip(said, remarks, strict=True))
+
+
+@pytest.mark.parametrize("name", ["IMG_1.cr3", "scan.7z", "a.gif", "v.mts"])
+def test_a_kind_that_is_not_read_is_refused_with_what_to_do(tmp_path: Path, name: str) -> None:
+    tree(tmp_path, name)
+    for path in (tmp_path, tmp_path / name):
+        with pytest.raises(
+            NothingToUpload, match=r"Develop them|Unpack them|Save them|Convert them"
+        ) as refused:
+            find_files(path)
+        assert name in str(refused.value)
+
+
+@pytest.mark.parametrize(
     ("bad", "stem"),
     [
         (b"x:1.jpg", "x_1"),

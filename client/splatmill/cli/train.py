@@ -160,6 +160,8 @@ def _announce(found: Found) -> None:
         typer.echo(
             f"results of an earlier training, not read as photos: {', '.join(map(printable, found.outputs))}"
         )
+    for sentence in found.remarks:
+        typer.echo(printable(sentence), err=True)
     for name, stored in found.renamed:
         typer.echo(f"renamed: {name!a} is stored as {stored}", err=True)
 

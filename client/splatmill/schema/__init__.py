@@ -109,6 +109,7 @@ if TYPE_CHECKING:
         Limits,
         QueueInfo,
         Ready,
+        Unread,
         WorkerInfo,
     )
     from splatmill.schema.jobs import (
@@ -171,6 +172,7 @@ if TYPE_CHECKING:
         MAX_PHOTO_PIXELS,
         MIN_PHOTO_SIDE,
         PHOTO_SUFFIXES,
+        UNREAD_KINDS,
         VIDEO_SUFFIXES,
     )
     from splatmill.schema.port import DEFAULT_PORT
@@ -252,6 +254,7 @@ __all__ = [
     "SHA256_HEADER",
     "SNAPSHOT_MEDIA_TYPE",
     "TIME_LAPSE",
+    "UNREAD_KINDS",
     "VIDEO_SUFFIXES",
     "Accepted",
     "Backend",
@@ -374,6 +377,7 @@ __all__ = [
     "Switch",
     "Time",
     "TrainOptions",
+    "Unread",
     "UnsafeName",
     "UnusedPhoto",
     "Use",

@@ -35,6 +35,14 @@ class Limits(Response):
     max_render_pixels: int = Field(description="Pixels of a rendered image.")
 
 
+class Unread(Response):
+    """A kind of files with photos, videos or archives that is not read."""
+
+    what: str
+    suffixes: list[str]
+    advice: str = Field(description="What to do, as a sentence.")
+
+
 class Accepted(Response):
     """Which files count as what, by the suffix of their name in lower case, and the least size of a photo."""
 
@@ -58,6 +66,11 @@ class Accepted(Response):
     )
     output_media: list[str] = Field(
         default_factory=list, description="Names of files in such a folder that are not read as photos."
+    )
+    unread: list[Unread] = Field(default_factory=list, description="Kinds of files that are not read.")
+    other_cameras: dict[str, list[str]] = Field(
+        default_factory=dict,
+        description="Programs whose cameras are not read, with patterns of the names, in lower case, of their files.",
     )
     min_photo_side: int = Field(
         description="Pixels; photos with a shorter side are left out of the training."

@@ -3,6 +3,7 @@
 import asyncio
 import shutil
 from collections.abc import Sequence
+from dataclasses import asdict
 
 import httpx
 import redis
@@ -15,6 +16,7 @@ from splatmill.backplane import entries, lines, memory, rendering, workers
 from splatmill.backplane.lines import Waiting
 from splatmill.backplane.rendering import RendererState
 from splatmill.backplane.workers import WorkerRecord
+from splatmill.data_sets import OTHER_CAMERAS
 from splatmill.schema import (
     ARCHIVE_SUFFIXES,
     MASK_BEGINNINGS,
@@ -27,6 +29,7 @@ from splatmill.schema import (
     OUTPUT_MARKS,
     OUTPUT_MEDIA,
     PHOTO_SUFFIXES,
+    UNREAD_KINDS,
     VIDEO_SUFFIXES,
     Accepted,
     Health,
@@ -36,6 +39,7 @@ from splatmill.schema import (
     QueueInfo,
     Ready,
     Scope,
+    Unread,
     WorkerInfo,
     describe_options,
 )
@@ -85,6 +89,8 @@ def get_info(service: Shared, who: Who) -> Info:
             mask_beginnings=list(MASK_BEGINNINGS),
             output_marks=list(OUTPUT_MARKS),
             output_media=list(OUTPUT_MEDIA),
+            unread=[Unread(**asdict(kind)) for kind in UNREAD_KINDS],
+            other_cameras={program: list(names) for program, names in OTHER_CAMERAS.items()},
             min_photo_side=MIN_PHOTO_SIDE,
         ),
         local=service.settings.local,

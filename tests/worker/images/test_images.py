@@ -265,3 +265,18 @@ def test_a_photo_of_another_shape_than_its_camera_is_refused(tmp_path: Path) -> 
     view = View("a", Camera(64, 64, 60.0, 60.0, 32.0, 32.0, np.eye(4)), tmp_path / "a.png")
     with pytest.raises(ValueError, match="different shape"):
         load_view(view, 32)
+
+
+def test_the_preview_of_a_raw_photo_is_no_photo(photos: Path, tmp_path: Path) -> None:
+    picture().save(photos / "a.jpg")
+    # A .dng is a TIFF whose first picture is a small preview.
+    picture(256, 192).save(photos / "IMG_1.DNG", "TIFF")
+    with zipfile.ZipFile(photos / "more.zip", "w") as archive_file:
+        archive_file.write(photos / "IMG_1.DNG", "2.nef")
+        archive_file.writestr("opensfm/reconstruction.json", "[]")
+    result = prepared(photos, tmp_path)
+    assert [photo.name for photo in result.photos] == ["a.jpg"]
+    assert reasons(result)["IMG_1.DNG"] == reasons(result)["more/2.nef"] == "raw photos are not read"
+    raw, cameras = result.warnings
+    assert "raw photos: IMG_1.DNG and 1 more. Develop them as JPEG or TIFF" in raw
+    assert "cameras of OpenDroneMap or OpenSfM in more/opensfm/reconstruction.json are not read" in cameras

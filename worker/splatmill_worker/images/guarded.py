@@ -24,13 +24,13 @@ import av
 import pillow_heif
 from PIL import Image, UnidentifiedImageError
 
-from splatmill.schema.photos import MAX_PHOTO_PIXELS
+from splatmill.schema.photos import MAX_PHOTO_PIXELS, PHOTO_FORMATS, VIDEO_FORMATS
 from splatmill_worker import memory
 from splatmill_worker.errors import UnusablePicture, UnusableVideo
 
 pillow_heif.register_heif_opener()
 
-FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "AVIF")
+FORMATS = tuple(PHOTO_FORMATS)
 """Pillow's names of the formats that are read. Its other readers, some of which start programs, are never called."""
 
 AVIF_BRANDS = (b"avif", b"avis")
@@ -39,8 +39,8 @@ AVIF_BRANDS = (b"avif", b"avis")
 MAX_PICTURE_BYTES = 2 * 2**30
 """Bytes of a picture's file: some readers take the whole file into memory."""
 
-CONTAINERS = "mov,matroska,avi"
-"""FFmpeg's names of the video containers that are read: MP4, MOV and M4V; MKV and WebM; AVI."""
+CONTAINERS = ",".join(VIDEO_FORMATS)
+"""FFmpeg's names of the video containers that are read, for its option."""
 
 MAX_FRAME_PIXELS = 8192 * 4320
 """Pixels of a video's frame: 8K as cinemas have it."""

@@ -11,9 +11,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from splatmill.data_sets import other_cameras
 from splatmill.schema.masks import masks_beside, paired, without_mask_folder
 from splatmill.schema.outputs import own_outputs
-from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES
+from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES, unread, unread_kind
 from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
 from splatmill_worker.images import archive, decoders, exif, photo_colors, unpacked_room
 from splatmill_worker.images.masks import masks_under, remarks
@@ -177,6 +178,8 @@ def prepare(
     unused = mask_files.keys() - pairs.values()
     notes, warnings = remarks(len(ordered), masked, unused, decoders.hidden_share)
     found.warnings += photo_colors.sentences([photo.colors for photo in ordered])
+    skipped = [name for name, _ in found.skipped]
+    warnings += [*unread(skipped), *other_cameras(skipped)]
     return Prepared(ordered, tuple(found.skipped), (*found.notes, *notes), (*found.warnings, *warnings))
 
 
@@ -247,6 +250,9 @@ def _expand(
             found.opened.add(name)
             found.notes.append(f"{len(pictures)} frames were taken from the video {name}.")
             found.warnings += [remark.format(name) for remark in decoders.video_remarks(path)]
+        elif (kind := unread_kind(name)) is not None:
+            # Pillow would read the small preview in a raw photo.
+            found.skipped.append((name, f"{kind.what} are not read"))
         else:
             found.files.append((name, path, None))
     except UnusableVideo as error:

@@ -123,11 +123,11 @@ function take(given) {
   const added = items.add(given);
   for (const item of added) {
     if (item.kind === "archive") void items.open(item).then(redraw);
-    looking.add(item.id, item.file, item.kind === "photo", suffix(item.path));
+    looking.add(item.id, item.file, item.kind, suffix(item.path));
   }
   if (!items.used.length && !start.held.length) {
     const kinds = info.accepted.photos.map((/** @type {string} */ ending) => ending.slice(1)).join(", ");
-    notify(`None of these files can be used. Photos are ${kinds} files.`, "warning");
+    notify(`None of these files can be used. ${items.remarks.join(" ") || `Photos are ${kinds} files.`}`, "warning");
   }
   start.adopt();
   redraw();
@@ -170,6 +170,7 @@ function redraw() {
   byId("settings").hidden = byId("go").hidden = !usable;
   byId("drop").classList.toggle("small-drop", any);
   byId("summary").textContent = summary();
+  byId("remarks").replaceChildren(...items.remarks.map((sentence) => h("li", {}, sentence)));
   if (items.photos.every((item) => item.state !== "waiting" || item.lost)) byId("checked").textContent = summary();
   const bad = advised().length;
   const leave = byId("leave-all");

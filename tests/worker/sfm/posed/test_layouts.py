@@ -3,19 +3,32 @@
 Does not prove that the names and the text of other programs are read (test_variants.py does).
 """
 
+import json
 import zipfile
 from pathlib import Path
 
 import pytest
 
 from splatmill.data_sets import TwoDataSets
+from splatmill.local_capture import find_files
 from splatmill.schema import TrainOptions
 from splatmill_worker.capture import posed_scene
 from splatmill_worker.errors import Refusal
 from splatmill_worker.images.archive import UnsafeArchive, unpack
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.posed import zipped
-from tests.support.posed_sets import ALL, COUNT, NAMES, check, loaded, model, photos, transforms, zip_of
+from tests.support.posed_sets import (
+    ALL,
+    COUNT,
+    NAMES,
+    check,
+    frames,
+    loaded,
+    model,
+    photos,
+    transforms,
+    zip_of,
+)
 
 
 @pytest.mark.parametrize("top", ["scene", "my scene/export", "a/b/c/d", "dense/0"])
@@ -103,3 +116,52 @@ def test_a_broken_model_among_several_is_named(tmp_path: Path) -> None:
     assert "sparse/0 is not used: cameras.txt could not be read" in scene.warnings[0].replace(
         "The COLMAP model in 0/ could not be read: ", ""
     )
+
+
+# The raw data of Polycam: a file with the camera of each photo.
+
+
+def polycam(folder: Path, kind: str = "corrected_", change: dict[int, object] | None = None) -> None:
+    """Cameras whose world is that of `viewmat`, with its x, y and z as the z, x and y of Polycam."""
+    cameras, images = folder / f"keyframes/{kind}cameras", folder / f"keyframes/{kind}images"
+    cameras.mkdir(parents=True)
+    photos(images, [f"{1700 + k}.jpg" for k in range(COUNT)])
+    for k, frame in enumerate(frames()):
+        x, y, z, _ = frame["transform_matrix"]
+        elements = {f"t_{i}{j}": row[j] for i, row in enumerate((y, z, x)) for j in range(4)}
+        camera: object = elements | {"fx": 60, "fy": 61, "cx": 32, "cy": 24, "width": 64, "height": 48}
+        (cameras / f"{1700 + k}.json").write_text(json.dumps((change or {}).get(k, camera)))
+    (folder / "mesh_info.json").write_text('{"alignmentTransform": []}')
+
+
+@pytest.mark.parametrize("kind", ["corrected_", ""])
+@pytest.mark.parametrize("form", ["folder", "scene/", "zip", "upload"])
+def test_the_raw_data_of_polycam_are_read(tmp_path: Path, kind: str, form: str) -> None:
+    polycam(tmp_path / "made" / ("scene" if form == "scene/" else ""), kind)
+    capture = tmp_path / "made"
+    if form == "zip":
+        zip_of(capture, tmp_path / "zip/images/raw.zip")
+        capture = zipped.data_set(tmp_path / "zip", tmp_path / "work")
+    elif form == "upload":
+        for file in find_files(tmp_path / "made").files:
+            stored = tmp_path / "upload" / file.role / file.name
+            stored.parent.mkdir(parents=True, exist_ok=True)
+            stored.write_bytes(file.path.read_bytes())
+        capture = tmp_path / "upload"
+    scene = loaded(capture)
+    check(scene, {f"keyframes/{kind}images/{1700 + k}.jpg": k for k in range(COUNT)})
+    assert scene.views[0].camera.fy == 61
+    assert scene.warnings == ()
+
+
+def test_corrected_cameras_of_polycam_come_first(tmp_path: Path) -> None:
+    polycam(tmp_path)
+    polycam(tmp_path, "", {k: {} for k in range(COUNT)})
+    check(loaded(tmp_path), {f"keyframes/corrected_images/{1700 + k}.jpg": k for k in range(COUNT)})
+
+
+def test_a_photo_of_polycam_without_a_pose_is_left_out(tmp_path: Path) -> None:
+    polycam(tmp_path, change={3: {"fx": 60}, 4: None})
+    scene = loaded(tmp_path)
+    assert len(scene.views) == COUNT - 2
+    assert any("2 of 12 in corrected_cameras" in warning for warning in scene.warnings)

@@ -1,11 +1,13 @@
-"""Finds the cameras that a capture brings, in the layouts of COLMAP, nerfstudio, instant-ngp and Blender."""
+"""Finds the cameras that a capture brings, in the layouts of COLMAP, nerfstudio, instant-ngp, Blender and
+Polycam."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 
-from splatmill.data_sets import find_cameras, walk
+from splatmill.data_sets import TRANSFORMS, find_cameras, walk
 from splatmill.schema.photos import PHOTO_SUFFIXES
 from splatmill_worker.images.decoders import hidden_share, mask_fault, photo_colors
 from splatmill_worker.images.masks import remarks
@@ -91,7 +93,11 @@ def find(directory: Path) -> PosedInput | None:
                 of = f"The COLMAP model in {models[0].relative_to(directory)} is used"
                 notes.append(f"{of}, not {', '.join(path.name for path in json_files)}.")
             return PosedInput(place, "colmap", models, (), tuple(notes), warnings)
-        plain = tuple(path for path in json_files if path.name.lower() == "transforms.json")
+        plain = tuple(
+            path
+            for path in json_files
+            if path.name.lower() == "transforms.json" or not fnmatchcase(path.name.lower(), TRANSFORMS)
+        )
         if plain:
             return PosedInput(place, "transforms", (), plain, tuple(notes), warnings)
         return PosedInput(place, "blender", (), json_files, tuple(notes), warnings)

@@ -1,12 +1,14 @@
-"""Scenes from transforms.json of nerfstudio and instant-ngp, and transforms_{train,test}.json of Blender data sets.
+"""Scenes from transforms.json of nerfstudio and instant-ngp, transforms_{train,test}.json of Blender data sets, and the
+raw data of Polycam.
 
-Both hold camera-to-world matrices with OpenGL axes (x right, y up, z backward).
+All hold camera-to-world matrices with OpenGL axes (x right, y up, z backward).
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,12 +16,14 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from splatmill.data_sets import keyframes
 from splatmill.schema.quantities import format_bytes
 from splatmill_worker import point_file
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.images import decoders
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
+from splatmill_worker.sfm.posed import polycam
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
 from splatmill_worker.sfm.posed.files import ImageFiles, missing, readings
 from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_PARAMETER, MAX_SIDE, MOST_FAULTY
@@ -55,8 +59,7 @@ def load(
     messages = list(notes)
     warnings: list[str] = []
     points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    for path in paths:
-        document = _read(path)
+    for path, document in _documents(paths):
         split = _split_of(path)
         if split == "val":
             messages.append(f"{path.name} is not used: it is a validation set.")
@@ -129,7 +132,21 @@ def load(
     )
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _documents(paths: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Each transforms document with its path; the files of Polycam are one document, with the path of their folder."""
+    if all(keyframes(f"{path.parent.as_posix()}/") for path in paths):
+        yield paths[0].parent, polycam.document(paths, _parsed)
+        return
+    for path in paths:
+        document = _parsed(path)
+        if not isinstance(document, dict) or not isinstance(document.get("frames"), list):
+            raise ValueError(
+                f"{path.name} has no list `frames`. Give a transforms file with one entry in `frames` per photo."
+            )
+        yield path, document
+
+
+def _parsed(path: Path) -> Any:
     size = path.stat().st_size
     if size > MAX_FILE_BYTES:
         raise ValueError(f"{path.name} has {size} bytes; at most {MAX_FILE_BYTES} are read.")
@@ -137,16 +154,11 @@ def _read(path: Path) -> dict[str, Any]:
         text = path.read_bytes()
         if parsed_bytes(text) > MAX_PARSED_BYTES:
             raise ValueError(f"its lists and objects would take {format_bytes(parsed_bytes(text))} of memory")
-        document = json.loads(text)
+        return json.loads(text)
     except RecursionError as error:
         raise ValueError(f"{path.name} is not readable JSON: it is nested too deeply.") from error
     except (OSError, ValueError) as error:
         raise ValueError(f"{path.name} is not readable JSON: {error}.") from error
-    if not isinstance(document, dict) or not isinstance(document.get("frames"), list):
-        raise ValueError(
-            f"{path.name} has no list `frames`. Give a transforms file with one entry in `frames` per photo."
-        )
-    return document
 
 
 def parsed_bytes(text: bytes) -> int:

@@ -2,6 +2,7 @@
 
 import { namesIn } from "./zip.js";
 import { sort, suffix, withoutTop } from "./kinds.js";
+import { onMasks, places, remarks } from "./remarks.js";
 import { verdicts } from "./verdicts.js";
 
 /**
@@ -18,6 +19,7 @@ import { verdicts } from "./verdicts.js";
  * @property {number} width
  * @property {number} height
  * @property {import("./measure.js").Measures | null} measures
+ * @property {number | null} hidden share of its pixels that a mask hides; null while not known
  * @property {string | null} thumbnail address
  * @property {string | null} lost why its bytes cannot be read
  * @property {string[] | null} inside names of the files in an archive; null where they are not known
@@ -41,6 +43,8 @@ export class Items {
     this.count = 0;
     /** @type {string | null} why the files cannot be one capture */
     this.problem = null;
+    /** @type {string[]} sentences about files that are not used, or are used otherwise than may be expected */
+    this.said = [];
   }
 
   /** All items in order of their paths. */
@@ -71,7 +75,7 @@ export class Items {
       /** @type {Item} */
       const item = {
         id: ++this.count, path: free, file, role: null, name: free, kind: "ignored", left: false, digest: null, state: "waiting", width: 0, height: 0,
-        measures: null, thumbnail: null, lost: null, inside: null, verdict: { kind: "waiting", text: "" }, stored: false, problem: null,
+        measures: null, hidden: null, thumbnail: null, lost: null, inside: null, verdict: { kind: "waiting", text: "" }, stored: false, problem: null,
       };
       this.byPath.set(free, item);
       added.push(item);
@@ -101,6 +105,7 @@ export class Items {
   sort() {
     const sorted = sort(this.byPath.keys(), this.accepted);
     this.problem = sorted.problem;
+    this.said = [...places(sorted), ...remarks(sorted, this.accepted)];
     const order = new Map(sorted.files.map(({ path, role, name }) => [path, { role, name }]));
     const before = this.byPath;
     this.byPath = new Map();
@@ -129,6 +134,12 @@ export class Items {
       const item = photos[index];
       item.verdict = item.lost ? { kind: "bad", text: item.lost } : verdict;
     });
+  }
+
+  /** Sentences about files that are not used, and about masks. */
+  get remarks() {
+    const used = this.used;
+    return [...(this.problem ? [this.problem] : []), ...this.said, ...onMasks(used.filter(({ kind }) => kind === "mask"), used.filter(({ kind }) => kind === "photo").map(({ name }) => name), this.accepted)];
   }
 
   /** Read the list of an archive. @param {Item} item */

@@ -15,6 +15,8 @@
  * @property {string[]} mask_beginnings
  * @property {string[]} output_marks
  * @property {string[]} output_media
+ * @property {{what: string, suffixes: string[], advice: string}[]} unread
+ * @property {Record<string, string[]>} other_cameras patterns of names, in lower case, by program
  * @property {number} min_photo_side pixels
  */
 
@@ -24,6 +26,7 @@
  * @property {string[]} ignored paths
  * @property {string | null} problem why the files cannot be read as one capture
  * @property {string[]} outputs paths of pictures, videos and zips that are results of Splatmill
+ * @property {string} top folder of the data set, with a slash at its end, where it is not the given one
  */
 
 const MODEL_SUFFIXES = [".bin", ".txt"];
@@ -34,11 +37,14 @@ const MODEL_PLACES = /** @type {[number, RegExp][]} */ ([
   [1, /(?:^|(?<=\/))colmap\/sparse\/(?:\d+\/)?$/i], [0, /(?:^|(?<=\/))sparse\/(?:\d+\/)?$/i], [2, /(?:^|(?<=\/))\d+\/$/],
 ]);
 
+/** Folders in which the raw data of Polycam have a .json file for each photo, the preferred one first. */
+const KEYFRAMES = ["keyframes/corrected_cameras/", "keyframes/cameras/"];
+
 /** Folders around a data set that are looked into. */
 const MAX_DEPTH = 4;
 
 /** Folders that say what lies in them, so their name is kept where everything lies in one folder. */
-const TELLING = ["images", "masks", "mask", "segmentation", "segmentations", "sparse", "colmap"];
+const TELLING = ["images", "masks", "mask", "segmentation", "segmentations", "sparse", "colmap", "keyframes"];
 
 /** The suffix of a path in lower case, with its dot. @param {string} path */
 export function suffix(path) {
@@ -66,7 +72,7 @@ export function sort(paths, accepted) {
   const masks = masksIn(seen.filter((path) => path.startsWith(top) && isPhoto(path)), top, photoRoot, accepted);
   const poses = namesOf(cameras, seen);
   /** @type {Sorted} */
-  const found = { files: [], ignored: [], problem: cameras.problem, outputs: [] };
+  const found = { files: [], ignored: [], problem: cameras.problem, outputs: [], top: cameras.top };
   for (const path of seen) {
     const pose = poses.get(path);
     const mask = masks.get(path);
@@ -143,7 +149,7 @@ function masksIn(pictures, top, photoRoot, accepted) {
 }
 
 /** A path without its suffix. @param {string} path */
-function stem(path) {
+export function stem(path) {
   return path.slice(0, path.length - suffix(path).length);
 }
 
@@ -152,7 +158,7 @@ function stem(path) {
  * @param {string} name
  * @param {Accepted} accepted
  */
-function unmarked(name, accepted) {
+export function unmarked(name, accepted) {
   const start = name.lastIndexOf("/") + 1;
   const [folder, last] = [name.slice(0, start), name.slice(start)];
   const names = accepted.mask_endings.filter((end) => last.endsWith(end) && last !== end).map((end) => last.slice(0, -end.length));
@@ -168,14 +174,16 @@ function unmarked(name, accepted) {
  * @returns {Cameras}
  */
 function camerasIn(paths) {
-  /** @type {Map<string, {transforms: string[], models: Map<string, number>}>} */
+  /** @type {Map<string, {transforms: string[], keyframes: string[][], models: Map<string, number>}>} */
   const sets = new Map();
   const lower = new Set(paths.map((path) => path.toLowerCase()));
-  const of = (/** @type {string} */ top) => sets.get(top) ?? sets.set(top, { transforms: [], models: new Map() }).get(top);
+  const of = (/** @type {string} */ top) => sets.get(top) ?? sets.set(top, { transforms: [], keyframes: KEYFRAMES.map(() => []), models: new Map() }).get(top);
   for (const path of paths) {
     const folder = path.slice(0, path.lastIndexOf("/") + 1);
     const base = path.slice(folder.length).toLowerCase();
+    const place = KEYFRAMES.findIndex((name) => `/${folder.toLowerCase()}`.endsWith(`/${name}`));
     if (base.startsWith("transforms") && base.endsWith(".json")) of(folder)?.transforms.push(path);
+    else if (place >= 0 && base.endsWith(".json")) of(folder.slice(0, -KEYFRAMES[place].length))?.keyframes[place].push(path);
     else if (base === "cameras.bin" || base === "cameras.txt") {
       const { top, rank } = placeOf(folder);
       if (top === "" || lower.has(`${folder.toLowerCase()}images${base.slice(-4)}`)) of(top)?.models.set(folder, rank);
@@ -188,12 +196,13 @@ function camerasIn(paths) {
   if (tops.length > 1 && depth(tops[1]) === depth(tops[0])) {
     return { ...none, problem: `There are cameras of several data sets, in ${tops[0]} and in ${tops[1]}. Give the folder of one of them.` };
   }
-  const { transforms, models } = /** @type {{transforms: string[], models: Map<string, number>}} */ (sets.get(tops[0]));
+  const { transforms, keyframes, models } = /** @type {{transforms: string[], keyframes: string[][], models: Map<string, number>}} */ (sets.get(tops[0]));
   const best = Math.min(...models.values());
   const folders = [...models.keys()].filter((folder) => models.get(folder) === best);
   const last = (/** @type {string} */ folder) => Number(numberOf(folder) ?? Infinity);
   folders.sort((one, other) => (last(one) === last(other) ? byCodePoint(one, other) : last(one) - last(other)));
-  return { top: tops[0], transforms, models: folders, problem: null };
+  const first = transforms.length ? transforms : keyframes.find((paths) => paths.length) ?? [];
+  return { top: tops[0], transforms: first, models: folders, problem: null };
 }
 
 /** The data set that a folder with a COLMAP model belongs to, and the rank of its place there. @param {string} folder */

@@ -1,7 +1,7 @@
 // The worker that looks at one file at a time: digest, size, thumbnail and measures.
 
 import { sha256 } from "./digest.js";
-import { MEASURED_SIDE, measure } from "./measure.js";
+import { MEASURED_SIDE, hidden, measure } from "./measure.js";
 
 /** Pixels of the longest side of a thumbnail. */
 const THUMBNAIL = 240;
@@ -17,17 +17,18 @@ const LARGEST = 60e6;
  * @property {number} width
  * @property {number} height
  * @property {import("./measure.js").Measures | null} measures
+ * @property {number | null} hidden share of its pixels that a mask hides
  * @property {Blob | null} thumbnail
  * @property {string} [error] why the file could not be read at all
  */
 
-/** @param {MessageEvent<{id: number, file: File, photo: boolean, shown: boolean, library: string}>} message */
-async function onMessage({ data: { id, file, photo, shown, library } }) {
+/** @param {MessageEvent<{id: number, file: File, kind: string, shown: boolean, library: string}>} message */
+async function onMessage({ data: { id, file, kind, shown, library } }) {
   /** @type {Looked} */
-  const looked = { id, digest: null, state: "unchecked", width: 0, height: 0, measures: null, thumbnail: null };
+  const looked = { id, digest: null, state: "unchecked", width: 0, height: 0, measures: null, hidden: null, thumbnail: null };
   try {
     looked.digest = await sha256(file, library);
-    if (photo && file.size <= LARGEST && "OffscreenCanvas" in globalThis) await decode(file, shown, looked);
+    if (["photo", "mask"].includes(kind) && file.size <= LARGEST && "OffscreenCanvas" in globalThis) await decode(file, kind, shown, looked);
   } catch (error) {
     looked.error = String(error);
   }
@@ -36,10 +37,11 @@ async function onMessage({ data: { id, file, photo, shown, library } }) {
 
 /**
  * @param {File} file
+ * @param {string} kind photo or mask
  * @param {boolean} shown whether browsers decode this format
  * @param {Looked} looked
  */
-async function decode(file, shown, looked) {
+async function decode(file, kind, shown, looked) {
   /** @type {ImageBitmap} */
   let picture;
   try {
@@ -53,7 +55,8 @@ async function decode(file, shown, looked) {
     looked.height = picture.height;
     const canvas = drawn(picture, MEASURED_SIDE);
     const pixels = context(canvas).getImageData(0, 0, canvas.width, canvas.height);
-    looked.measures = measure(pixels.data, canvas.width, canvas.height);
+    if (kind === "mask") looked.hidden = hidden(pixels.data);
+    else looked.measures = measure(pixels.data, canvas.width, canvas.height);
     looked.thumbnail = await drawn(canvas, THUMBNAIL).convertToBlob({ type: "image/webp", quality: 0.8 });
     looked.state = "read";
   } finally {

@@ -11,7 +11,7 @@ export class Looking {
   /** @param {(looked: Looked) => void} onLooked */
   constructor(onLooked) {
     this.onLooked = onLooked;
-    /** @type {{id: number, file: File, photo: boolean, ending: string}[]} */
+    /** @type {{id: number, file: File, kind: string, ending: string}[]} */
     this.queue = [];
     /** @type {Worker[]} */
     this.idle = [];
@@ -23,11 +23,11 @@ export class Looking {
    * Look at a file once a worker is free.
    * @param {number} id
    * @param {File} file
-   * @param {boolean} photo whether to decode it as a photo; of others only the digest is taken
+   * @param {string} kind of the item: a photo or mask is decoded; of others only the digest is taken
    * @param {string} ending suffix of its name
    */
-  add(id, file, photo, ending) {
-    this.queue.push({ id, file, photo, ending });
+  add(id, file, kind, ending) {
+    this.queue.push({ id, file, kind, ending });
     if (!this.idle.length && this.started < WORKERS) this.start();
     this.next();
   }
@@ -47,8 +47,8 @@ export class Looking {
     const worker = this.queue.length ? this.idle.pop() : undefined;
     const file = worker && this.queue.shift();
     if (!worker || !file) return;
-    const { id, photo, ending } = file;
-    worker.postMessage({ id, file: file.file, photo, shown: SHOWN.includes(ending), library: this.library });
+    const { id, kind, ending } = file;
+    worker.postMessage({ id, file: file.file, kind, shown: SHOWN.includes(ending), library: this.library });
   }
 }
 

@@ -13,6 +13,9 @@ const HASH_SIDE = 16;
 /** Alpha of 255 below which a pixel counts as transparent. */
 const OPAQUE = 128;
 
+/** Grey level or alpha of 255 from which a pixel of a mask is shown. */
+const SHOWN = 128;
+
 /**
  * @typedef {object} Measures
  * @property {number} blur 0 (sharp) to 1
@@ -87,6 +90,20 @@ function blurAlong(grey, lines, length, nextLine, next) {
     }
   }
   return own > 0 ? (own - lost) / own : 1;
+}
+
+/**
+ * The share of its pixels that a mask hides: the transparent ones where it has any, and else the dark ones.
+ * @param {Uint8ClampedArray} pixels RGBA
+ */
+export function hidden(pixels) {
+  const drawn = pixels.some((value, at) => at % 4 === 3 && value < 255);
+  let count = 0;
+  for (let at = 0; at < pixels.length; at += 4) {
+    const level = drawn ? pixels[at + 3] : 0.299 * pixels[at] + 0.587 * pixels[at + 1] + 0.114 * pixels[at + 2];
+    if (level < SHOWN) count++;
+  }
+  return (4 * count) / pixels.length;
 }
 
 /** @param {Uint32Array} counts of each level @param {number} total @param {number} share */

@@ -1,0 +1,199 @@
+"""The page of inputs, from the tables that the code itself reads, and from the answers to small inputs."""
+
+import textwrap
+
+from docs.generate.markdown import choices, code, table
+
+from splatmill.data_sets import CAMERA_PROGRAMS, MAX_DEPTH, OTHER_CAMERAS, PLACES
+from splatmill.schema.captures import MAX_PART_BYTES, MAX_PARTS
+from splatmill.schema.formats import MODEL_FORMATS
+from splatmill.schema.masks import MASK_BEGINNINGS, MASK_ENDINGS, MASK_FOLDERS
+from splatmill.schema.outputs import OUTPUT_MARKS, OUTPUT_MEDIA
+from splatmill.schema.photos import (
+    ARCHIVE_SUFFIXES,
+    MAX_PHOTO_PIXELS,
+    MIN_PHOTO_SIDE,
+    PHOTO_FORMATS,
+    UNREAD_KINDS,
+    VIDEO_FORMATS,
+)
+from splatmill_worker.colmap_files import MODELS
+from splatmill_worker.images import archive, guarded, masks, prepare
+from splatmill_worker.images.lens import PINHOLE_MODELS
+from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam
+from tests.support.inputs.example import answer
+from tests.support.inputs.table import EXAMPLES
+
+
+def page() -> str:
+    """The page of inputs."""
+    parts = [*_introduction(), *_photos(), *_masks(), *_cameras(), *_points(), *_models(), *_answers()]
+    return "\n".join(part if part.startswith(("#", "|")) else _filled(part) for part in parts)
+
+
+def _filled(text: str) -> str:
+    """Paragraphs in lines of equal length, whatever the values in them."""
+    paragraphs = (
+        textwrap.fill(" ".join(part.split()), 120, break_on_hyphens=False) for part in text.split("\n\n")
+    )
+    return "\n\n".join(paragraphs) + "\n"
+
+
+def _introduction() -> list[str]:
+    return [
+        "# Inputs\n",
+        """What `splatmill train PATH`, the SDK and the web page read, what is assumed, and what is refused. This page
+        is made from the tables that the program itself reads. The answers at its end are those that the program gives
+        while the page is made. [Photographing for splats](photographing.md) says how to take photos, and
+        [Formats](formats.md) what models hold.
+
+        PATH is a photo, a video, a zip, or a folder of photos, with or without their cameras. The command says before
+        the training, and the web page before the upload, which files are not used. What the job leaves out is in
+        `report.json` and on the page of the report; a warning there says what is probably wrong. The log has the
+        rest.""",
+    ]
+
+
+def _photos() -> list[str]:
+    return [
+        "## Photos\n",
+        table(
+            ["format", "suffixes"], [[name, choices(suffixes)] for name, suffixes in PHOTO_FORMATS.items()]
+        ),
+        f"""Suffixes count in either case. A file in a zip is recognised by its content. The EXIF orientation is
+        applied. Of a file with several pictures, the first is used. Hidden files and folders are ignored, and so are
+        {choices(prepare.IGNORED_NAMES)}. A photo is left out, with the reason, if it is damaged or cut off, has the
+        same bytes as another one, has a side under {MIN_PHOTO_SIDE} pixels, or more than
+        {MAX_PHOTO_PIXELS // 10**6} million pixels.
+
+        Photos without EXIF are taken to be of one camera for each folder and each video. Where the motion of the camera
+        does not determine them, pixels are taken to be square, and the focal length to be that of EXIF, or else 1.2
+        times the longest side.
+
+        A file whose name cannot be stored (`x:1.jpg`, a space at an end, bytes that are not UTF-8) is stored under a
+        similar name, and both names are given. A path of more than {MAX_PARTS} parts is left out; a part of more than
+        {MAX_PART_BYTES} bytes is shortened.""",
+        "### Videos\n",
+        table(
+            ["container", "suffixes"], [[name, choices(suffixes)] for name, suffixes in VIDEO_FORMATS.items()]
+        ),
+        f"""A video is read up to {guarded.MAX_VIDEO_SECONDS / 3600:.0f} hours, with frames of up to
+        {guarded.MAX_FRAME_PIXELS // 10**6} million pixels. Videos and zips in a folder are used only where it has no
+        photos.""",
+        "### Zips\n",
+        f"""{choices(ARCHIVE_SUFFIXES)} files hold photos or a whole data set. All zips and videos of a capture together
+        hold up to {archive.MAX_ENTRIES:,} files. A zip in a zip is not unpacked.""",
+        "### Photos, videos and archives that are not read\n",
+        table(
+            ["what", "suffixes", "what to do"],
+            [[kind.what, choices(kind.suffixes), kind.advice] for kind in UNREAD_KINDS],
+        ),
+        f"""Results of Splatmill among the photos are not read as photos: the files {choices(OUTPUT_MEDIA)} in a folder
+        with two of {choices(OUTPUT_MARKS)}.""",
+    ]
+
+
+def _masks() -> list[str]:
+    folders = choices(f"{folder}/a.png" for folder in MASK_FOLDERS)
+    endings = choices(f"a{ending}.png" for ending in MASK_ENDINGS)
+    whole = choices(f"a.jpg{ending}.png" for ending in ("", *MASK_ENDINGS))
+    beginnings = choices(f"{beginning}a.png" for beginning in MASK_BEGINNINGS)
+    rows = [
+        ["in a folder of masks, at any depth", f"{folders}, or a name of the next row"],
+        ["beside its photo", f"{endings}, {beginnings}, {whole}"],
+    ]
+    return [
+        "## Masks\n",
+        table(["where", "the mask of `a.jpg`"], rows),
+        f"""Case does not matter, and neither does the suffix, if it is that of a photo. A picture with such a name
+        beside the photos is a photo where no photo has the rest of its name. Where the folders of masks and photos
+        differ, a file name that occurs once is enough.
+
+        Pixels darker than {masks.MIN_SHOWN} of 255 are hidden; in a mask with transparent pixels, these are. A mask of
+        another shape than its photo is not used. The log says how many photos have a mask and what share of their
+        pixels the masks hide. A warning names masks that belong to no photo. Another is given for masks that hide more
+        than {masks.MAX_HIDDEN:.0%} of the pixels of all photos, which are probably inverted. Where a photo is
+        transparent, it is hidden too.""",
+    ]
+
+
+def _cameras() -> list[str]:
+    fields = choices((*polycam.INTRINSICS, "k1", "k2", "k3", "k4", "p1", "p2"))
+    return [
+        "## Photos with cameras\n",
+        table(
+            ["program", "files, in either case"],
+            [[program, choices(names)] for program, names in CAMERA_PROGRAMS.items()],
+        ),
+        f"""Given cameras are used as they are, and are not recovered again. A data set lies in the given folder or up
+        to {MAX_DEPTH} folders down; of two side by side, none is used, and both are named. A COLMAP model is preferred
+        to the other files. Its folder is the given one or one of {choices(PLACES)} in it, where N is a number, and what
+        is in brackets may be missing. `images` is needed beside `cameras`, both as `.bin` or both as `.txt`; `points3D`
+        may be missing. Of several models, up to {colmap_model.MOST_MODELS}, the one with the most of the photos is
+        used, and a warning names the others. Text may have a byte-order mark, any line ends, and names with spaces.
+
+        In `transforms.json`, a frame or the document has {fields}. `camera_angle_x` and `camera_angle_y` may stand for
+        the focal lengths; a size that is missing is that of the photo. `transform_matrix` is from camera to world, 4 x
+        4 or 3 x 4, with OpenGL axes. The frames of `transforms_test.json` and those in `test_filenames` are held out;
+        those of `transforms_val.json` are left out. `mask_path` names the mask of a frame. Of the raw data of Polycam,
+        corrected cameras are preferred.
+
+        A photo is found by the name that its camera gives. Where none has it, the photo is the one that agrees in the
+        last parts of its path, with `/` or `\\` between folders, in another case, form of accents or suffix, if it is
+        the only one. Of the same photos in several sizes, as in `images_2` and `images_4`, the largest are used. A
+        camera may be of another size than its photo, with the same shape up to {colmap_model.MAX_ASPECT_ERROR:.0%}.
+
+        A frame without a matrix is left out with a warning. Up to {model_files.MOST_FAULTY:.0%} of the poses are left
+        out if no camera can have them (mirrored, sheared, not finite); with more, the job fails and names the first. It
+        fails also if no photo has a camera, or if a file with cameras cannot be read.""",
+        "### Lenses\n",
+        table(
+            ["COLMAP's model", "parameters", "photos"],
+            [[code(name), str(count), _undistorted(name)] for name, count in MODELS.values()],
+        ),
+        "### Cameras that are not read\n",
+        table(
+            ["program", "files, in either case"],
+            [[program, choices(names)] for program, names in OTHER_CAMERAS.items()],
+        ),
+        "Cameras are then recovered from the photos, and a sentence names the file.",
+    ]
+
+
+def _undistorted(model: str) -> str:
+    return "as they are" if model in PINHOLE_MODELS else "undistorted to a pinhole"
+
+
+def _points() -> list[str]:
+    return [
+        "## Points\n",
+        f"""Points are those of the COLMAP model, or of the `.ply` in the data set that `ply_file_path` in
+        `transforms.json` names. Points with tracks are used. Those without, such as a laser scan (up to
+        {points.MOST_LOOSE:,} of them), are used where photos show their colours; if photos show these hardly more often
+        than by chance, none is used, and the log says so. With fewer than {points.LEAST_POINTS}, points are
+        triangulated with the given cameras. A warning says when the cameras explain less than
+        {points.CONTRADICTED:.0%} of the matches between photos: then the poses or the intrinsics are wrong, or belong
+        to other photos.""",
+    ]
+
+
+def _models() -> list[str]:
+    return [
+        "## Model files\n",
+        table(
+            ["suffix", "format"],
+            [[code(form.suffix), form.name] for form in MODEL_FORMATS.values() if form.readable],
+        ),
+        """`splatmill convert`, `render`, `orbit` and `clean` read these, and a training may start from one (`--start`).
+        [Variants of the .ply](formats.md#variants-of-the-ply) has what is read otherwise than it stands in a file, or
+        not at all. -y is up in a `.ply`.""",
+    ]
+
+
+def _answers() -> list[str]:
+    parts = ["## What is answered\n"]
+    for area in dict.fromkeys(example.area for example in EXAMPLES):
+        answers = [(example.what, answer(example.make)) for example in EXAMPLES if example.area == area]
+        rows = [[what, given.kind, " ".join(given.said)] for what, given in answers]
+        parts += [f"### {area}\n", table(["input", "answer", "what is said"], rows)]
+    return parts

@@ -1,0 +1,79 @@
+// What is said of files before they are sent: those that are not read, and what is probably wrong with masks. The sentences
+// are those of the command line (client/splatmill/local_capture.py) and of the worker (images/masks.py); tests compare them.
+
+import { stem, suffix, unmarked } from "./kinds.js";
+
+/** Share of the pixels of all photos that masks may hide without a remark. */
+const MOST_HIDDEN = 0.5;
+
+/**
+ * Sentences about files that hold photos, videos or cameras and are not used.
+ * @param {import("./kinds.js").Sorted} sorted
+ * @param {import("./kinds.js").Accepted} accepted
+ * @returns {string[]}
+ */
+export function remarks({ files, ignored }, accepted) {
+  const said = [];
+  const read = new Map(accepted.unread.flatMap((kind) => kind.suffixes.map((ending) => [ending, kind])));
+  /** @type {Map<import("./kinds.js").Accepted["unread"][0], string[]>} */
+  const unread = new Map();
+  for (const path of ignored) {
+    const kind = read.get(suffix(path));
+    if (kind) unread.set(kind, [...(unread.get(kind) ?? []), path]);
+  }
+  for (const [kind, paths] of unread) {
+    said.push(`Not read are ${kind.what}: ${paths[0]}${paths.length > 1 ? ` and ${paths.length - 1} more` : ""}. ${kind.advice}`);
+  }
+  if (!files.some(({ role }) => role === "poses")) {
+    for (const [program, patterns] of Object.entries(accepted.other_cameras)) {
+      const first = ignored.find((path) => patterns.some((pattern) => fits(path.slice(path.lastIndexOf("/") + 1).toLowerCase(), pattern)));
+      if (first) said.push(`The cameras of ${program} in ${first} are not read: cameras are recovered from the photos. To use those, export them from there as a COLMAP model or a transforms.json.`);
+    }
+  }
+  const beside = ignored.filter((path) => [...accepted.videos, ...accepted.archives].includes(suffix(path)));
+  if (beside.length) said.push(`Videos and zips are not used where there are photos: ${beside.join(", ")}.`);
+  return said;
+}
+
+/**
+ * Sentences about where the cameras lie, and about results that are not used.
+ * @param {import("./kinds.js").Sorted} sorted
+ * @returns {string[]}
+ */
+export function places({ top, outputs }) {
+  return [
+    ...(top ? [`The cameras are those in ${top}.`] : []),
+    ...(outputs.length ? [`Results of an earlier training, not read as photos: ${outputs.join(", ")}.`] : []),
+  ];
+}
+
+/**
+ * Sentences about masks that belong to no photo, and about masks that hide most of what they belong to.
+ * @param {{name: string, hidden: number | null}[]} masks
+ * @param {string[]} photos names
+ * @param {import("./kinds.js").Accepted} accepted
+ * @returns {string[]}
+ */
+export function onMasks(masks, photos, accepted) {
+  const said = [];
+  const last = (/** @type {string} */ name) => name.slice(name.lastIndexOf("/") + 1).toLowerCase();
+  const known = new Set(photos.flatMap((name) => [last(name), stem(last(name))]));
+  const used = masks.filter(({ name }) => [stem(last(name)), ...unmarked(stem(last(name)), accepted)].some((form) => known.has(form)));
+  const unused = masks.filter((mask) => !used.includes(mask)).map(({ name }) => name).sort();
+  if (unused.length) {
+    const are = unused.length === 1 ? "1 mask belongs" : `${unused.length} masks belong`;
+    said.push(`${are} to no photo by name, and no use is made of it: ${unused.slice(0, 5).join(", ")}${unused.length > 5 ? ", ..." : ""}.`);
+  }
+  const shares = used.flatMap(({ hidden }) => (hidden === null ? [] : [hidden]));
+  const hidden = shares.reduce((sum, share) => sum + share, 0) / shares.length;
+  if (hidden * used.length > MOST_HIDDEN * photos.length) {
+    said.push(`The masks of ${used.length} of ${photos.length} photos hide ${Math.round(100 * hidden)}% of their pixels. Black hides, and white is trained on: if the masks show in white what they should hide, invert them.`);
+  }
+  return said;
+}
+
+/** Whether a name fits a pattern in which * stands for any letters. @param {string} name @param {string} pattern */
+function fits(name, pattern) {
+  const [begin, ...rest] = pattern.split("*");
+  return rest.length ? name.startsWith(begin) && name.endsWith(rest[0]) && name.length >= begin.length + rest[0].length : name === pattern;
+}

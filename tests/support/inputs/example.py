@@ -1,0 +1,88 @@
+"""A small input as people have them, and what the command line and the worker make of it short of any training."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from splatmill.data_sets import TwoDataSets
+from splatmill.errors import NothingToUpload
+from splatmill.local_capture import find_files
+from splatmill.schema import Role
+from splatmill_worker.errors import WorkerError
+from splatmill_worker.images.masks import mask_folder
+from splatmill_worker.images.prepare import prepare
+from splatmill_worker.scene import Scene
+from splatmill_worker.sfm import posed
+from splatmill_worker.sfm.posed import zipped
+
+Kind = Literal["used", "used with a remark", "refused"]
+
+CAMERAS = {
+    "colmap": "of a COLMAP model",
+    "transforms": "of transforms.json",
+    "blender": "of a Blender data set",
+    "sfm": "to be recovered",
+}
+
+
+@dataclass(frozen=True)
+class Example:
+    """An input: its area on the page, what it is, a function that makes it in a folder, and the kind of the answer."""
+
+    area: str
+    what: str
+    make: Callable[[Path], object]
+    kind: Kind
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What comes of an input: its kind, and sentences."""
+
+    kind: Kind
+    said: tuple[str, ...]
+
+
+def answer(make: Callable[[Path], object]) -> Answer:
+    """Return what is said of the input that `make` makes in a folder, before cameras are recovered and trained."""
+    with tempfile.TemporaryDirectory(prefix="splatmill-example-") as name:
+        root = Path(name)
+        given, capture, work = (root / part for part in ("photos", "capture", "work"))
+        given.mkdir()
+        make(given)
+        try:
+            found = find_files(given)
+            for file in found.files:
+                stored = capture / file.role / file.name
+                stored.parent.mkdir(parents=True, exist_ok=True)
+                stored.write_bytes(file.path.read_bytes())
+            count, source, masks, said = _read(capture, work)
+        except (NothingToUpload, WorkerError, ValueError, TwoDataSets) as error:
+            return Answer("refused", (str(error).replace(f"{given}", "The folder"),))
+    renamed = [f"{before!a} is stored as {after}." for before, after in found.renamed]
+    results = [f"A result of an earlier training, not a photo: {path}." for path in found.outputs]
+    remarks = (*found.remarks, *renamed, *results, *said)
+    hidden = f" and {masks} masks" if masks else ""
+    used = f"{count} photos{hidden}, cameras {CAMERAS[source]}."
+    return Answer("used with a remark" if remarks else "used", (used, *remarks))
+
+
+def _read(capture: Path, work: Path) -> tuple[int, str, int, list[str]]:
+    """Photos, source of the cameras, masks, and sentences: warnings, and why files are left out."""
+    capture = zipped.data_set(capture, work)
+    given = posed.find(capture)
+    if given is not None:
+        scene: Scene = given.load()
+        masks = sum(view.mask is not None for view in scene.views)
+        return len(scene.views), scene.source, masks, [*scene.warnings, *_reasons(scene.left_out)]
+    prepared = prepare(capture / Role.images, mask_folder(capture), work)
+    masks = sum(photo.mask is not None for photo in prepared.photos)
+    return len(prepared.photos), "sfm", masks, [*prepared.warnings, *_reasons(prepared.skipped)]
+
+
+def _reasons(left_out: tuple[tuple[str, str], ...]) -> list[str]:
+    return [f"{name} is left out: {reason.rstrip('.')}." for name, reason in left_out]

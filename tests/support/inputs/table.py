@@ -1,0 +1,187 @@
+"""Small inputs as people have them, with the kind of answer that each gets. docs/generate/inputs.py prints the answers.
+
+A row added here is a row of the page, and a case of tests/inputs/test_examples.py.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from tests.support.inputs.example import Example
+from tests.support.posed_sets import COUNT, NAMES, frames, model, photos, transforms, zip_of
+
+Make = Callable[[Path], object]
+
+
+def _noise(path: Path, seed: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.random.default_rng(seed).integers(0, 255, (48, 64, 3), np.uint8)).save(path)
+
+
+def plain(folder: Path, suffix: str = ".jpg", count: int = 4) -> None:
+    """Photos without cameras."""
+    for seed in range(count):
+        _noise(folder / f"{seed}.jpg", seed)
+        (folder / f"{seed}.jpg").rename(folder / f"{seed}{suffix}")
+
+
+def with_file(name: str, data: bytes = b"x") -> Make:
+    def make(folder: Path) -> None:
+        plain(folder)
+        for one in name.split():
+            (folder / one).parent.mkdir(parents=True, exist_ok=True)
+            (folder / one).write_bytes(data)
+
+    return make
+
+
+def alone(name: str) -> Make:
+    return lambda folder: (folder / name).write_bytes(b"x")
+
+
+def spaced(folder: Path) -> None:
+    plain(folder)
+    (folder / "1.jpg").rename(folder / "x:1.jpg")
+    (folder / "2.jpg").rename(folder / " lead.jpg")
+
+
+def cut_off(folder: Path) -> None:
+    plain(folder)
+    data = (folder / "2.jpg").read_bytes()
+    (folder / "2.jpg").write_bytes(data[: len(data) // 2])
+
+
+def twice(folder: Path) -> None:
+    plain(folder)
+    (folder / "again.jpg").write_bytes((folder / "1.jpg").read_bytes())
+
+
+def small(folder: Path) -> None:
+    plain(folder)
+    Image.new("RGB", (12, 90)).save(folder / "stamp.png")
+
+
+def masked(form: str, hidden: float = 0.25, size: tuple[int, int] = (64, 48)) -> Make:
+    def make(folder: Path) -> None:
+        plain(folder)
+        for seed in range(4):
+            columns = np.full((size[1], size[0]), 255, np.uint8)
+            columns[:, : round(hidden * size[0])] = 0
+            path = folder / form.format(seed)
+            path.parent.mkdir(exist_ok=True)
+            Image.fromarray(columns).save(path)
+
+    return make
+
+
+def colmap(folder: Path, top: str = "") -> None:
+    photos(folder / top / "images")
+    model(folder / top / "sparse/0")
+
+
+def several_models(folder: Path) -> None:
+    photos(folder / "images")
+    model(folder / "sparse/0", dict(enumerate(NAMES[:3])))
+    model(folder / "sparse/1", {k: name for k, name in enumerate(NAMES) if k > 2})
+
+
+def two_sets(folder: Path) -> None:
+    colmap(folder, "chair")
+    colmap(folder, "table")
+
+
+def renamed_case(folder: Path) -> None:
+    photos(folder / "images", [name.upper() for name in NAMES])
+    model(folder / "sparse/0")
+
+
+def two_sizes(folder: Path) -> None:
+    photos(folder / "images_2", size=(64, 48))
+    photos(folder / "images_4", size=(32, 24))
+    model(folder / "sparse/0")
+
+
+def zipped_set(folder: Path) -> None:
+    colmap(folder.parent / "made", "scene")
+    zip_of(folder.parent / "made", folder / "scene.zip")
+
+
+def no_camera(folder: Path) -> None:
+    photos(folder / "images")
+    model(folder / "sparse/0", dict(enumerate(NAMES[:-1])))
+
+
+def other_names(folder: Path) -> None:
+    photos(folder / "images", [f"IMG_{k}.jpg" for k in range(COUNT)])
+    model(folder / "sparse/0")
+
+
+def with_frames(change: Callable[[list[dict[str, object]]], object], encode: str = "utf-8") -> Make:
+    def make(folder: Path) -> None:
+        photos(folder / "images")
+        of = frames()
+        change(of)
+        transforms(folder / "transforms.json", of, lambda text: text.encode(encode))
+
+    return make
+
+
+def _set(matrix: object, *numbers: int) -> Callable[[list[dict[str, object]]], object]:
+    return lambda of: [of[number].update(transform_matrix=matrix) for number in numbers]
+
+
+def polycam(folder: Path) -> None:
+    photos(folder / "keyframes/images", [f"{k}.jpg" for k in range(COUNT)])
+    (folder / "keyframes/cameras").mkdir()
+    for k, frame in enumerate(frames()):
+        rows = np.roll(np.array(frame["transform_matrix"])[:3], -1, axis=0)
+        camera = {f"t_{i}{j}": rows[i, j] for i in range(3) for j in range(4)}
+        camera |= {"fx": 60, "fy": 61, "cx": 32, "cy": 24, "width": 64, "height": 48}
+        (folder / f"keyframes/cameras/{k}.json").write_text(json.dumps(camera))
+
+
+MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
+
+EXAMPLES: tuple[Example, ...] = (
+    Example("Photos", "four photos called .jfif", partial(plain, suffix=".jfif"), "used"),
+    Example("Photos", "one photo called x:1.jpg, one that begins with a space", spaced, "used with a remark"),
+    Example("Photos", "one photo is cut off", cut_off, "used with a remark"),
+    Example("Photos", "one photo twice", twice, "used with a remark"),
+    Example("Photos", "one picture of 12 x 90 pixels", small, "used with a remark"),
+    Example("Photos", "raw photos beside JPEGs", with_file("IMG_1.DNG IMG_2.DNG"), "used with a remark"),
+    Example("Photos", "nothing but a raw photo", alone("IMG_1.CR3"), "refused"),
+    Example("Photos", "a video beside photos", with_file("walk.mp4"), "used with a remark"),
+    Example(
+        "Photos",
+        "results of Splatmill",
+        with_file("a/model.ply a/report.json a/preview.jpg"),
+        "used with a remark",
+    ),
+    Example("Photos", "nothing but a text", alone("notes.txt"), "refused"),
+    Example("Masks", "masks/NAME.PNG", masked("masks/{}.PNG"), "used"),
+    Example("Masks", "NAME_mask.png beside the photos", masked("{}_mask.png"), "used"),
+    Example("Masks", "masks that hide nine tenths", masked("masks/{}.png", 0.9), "used with a remark"),
+    Example("Masks", "masks that belong to no photo", masked("masks/frame_{}.png"), "used with a remark"),
+    Example("Cameras", "a COLMAP model two folders down", partial(colmap, top="export/scene"), "used"),
+    Example("Cameras", "the same in a zip", zipped_set, "used"),
+    Example("Cameras", "sparse/0 with 3 photos, sparse/1 with 9", several_models, "used with a remark"),
+    Example("Cameras", "two data sets side by side", two_sets, "refused"),
+    Example("Cameras", "photos in another case than the model", renamed_case, "used"),
+    Example("Cameras", "the photos in images_2 and images_4", two_sizes, "used with a remark"),
+    Example("Cameras", "one photo without a camera", no_camera, "used with a remark"),
+    Example("Cameras", "a model of photos with other names", other_names, "refused"),
+    Example(
+        "Cameras", "transforms.json with a byte-order mark", with_frames(lambda of: None, "utf-8-sig"), "used"
+    ),
+    Example("Cameras", "one frame without a matrix", with_frames(_set(None, 5)), "used with a remark"),
+    Example("Cameras", "one mirrored pose of twelve", with_frames(_set(MIRRORED, 5)), "used with a remark"),
+    Example("Cameras", "two mirrored poses of twelve", with_frames(_set(MIRRORED, 5, 6)), "refused"),
+    Example("Cameras", "the raw data of Polycam", polycam, "used"),
+    Example("Cameras", "cameras of OpenSfM", with_file("opensfm/reconstruction.json"), "used with a remark"),
+)
