@@ -29,6 +29,9 @@ _PATTERNS = tuple(
 MODEL_FILES = ("cameras.bin", "cameras.txt")
 """Names, in lower case, of the files by which a COLMAP model is found."""
 
+MODEL_PARTS = (*MODEL_FILES, "images.bin", "images.txt")
+"""Names, in lower case, of the files that a COLMAP model must have, of one suffix."""
+
 TRANSFORMS = "transforms*.json"
 """Pattern of the names, in lower case, of files with cameras of nerfstudio and others."""
 
@@ -135,19 +138,28 @@ def find_cameras(names: Sequence[str]) -> Cameras | None:
     return Cameras(top, tuple(transforms.get(top, ())), tuple(folders))
 
 
-def other_cameras(names: Sequence[str]) -> list[str]:
-    """A sentence for each of OTHER_CAMERAS among the files `names`, which have no cameras that are read."""
-    first = {
-        program: name
-        for program, patterns in OTHER_CAMERAS.items()
-        for name in reversed(names)
-        if any(fnmatchcase(_split(name)[1].lower(), pattern) for pattern in patterns)
-    }
-    return [
-        f"The cameras of {program} in {name} are not read: cameras are recovered from the photos. To use those, export "
-        "them from there as a COLMAP model or a transforms.json."
-        for program, name in first.items()
-    ]
+def unread_cameras(names: Sequence[str]) -> list[str]:
+    """Sentences about files with cameras that are not read, among files where `find_cameras` finds none.
+
+    They are of OTHER_CAMERAS, lie too deep, or are a part of a COLMAP model.
+    """
+    bases = [(name, _split(name)[1].lower()) for name in names]
+    recovered = "cameras are recovered from the photos."
+    said = []
+    for program, patterns in OTHER_CAMERAS.items():
+        first = next((name for name, base in bases if any(fnmatchcase(base, one) for one in patterns)), None)
+        if first is not None:
+            said.append(
+                f"The cameras of {program} in {first} are not read: {recovered} To use those, export them from there "
+                "as a COLMAP model or a transforms.json."
+            )
+    first = next((name for name, base in bases if base in MODEL_PARTS or fnmatchcase(base, TRANSFORMS)), None)
+    if first is not None:
+        said.append(
+            f"{first} is not read: {recovered} A COLMAP model has cameras and images, both as .bin or both as .txt, "
+            f"and lies at most {MAX_DEPTH} folders down, as a transforms.json does."
+        )
+    return said
 
 
 def _place(folder: str) -> tuple[str, int]:

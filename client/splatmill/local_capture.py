@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatmill.data_sets import Cameras, TwoDataSets, find_cameras, other_cameras, walk
+from splatmill.data_sets import Cameras, TwoDataSets, find_cameras, unread_cameras, walk
 from splatmill.errors import NothingToUpload
 from splatmill.schema.captures import Role, UnsafeName, safe_name, storable_name
 from splatmill.schema.masks import masks_beside, without_mask_folder
@@ -142,7 +142,7 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     found = Found.of(files, ignored)
     if not found.count(Role.images):
         raise NothingToUpload(found.left_out[0][1], "Rename the files.")
-    remarks = unread(ignored) + ([] if poses else other_cameras(ignored))
+    remarks = unread(ignored) + ([] if poses else unread_cameras(ignored))
     beside = [name for name in ignored if _suffix(name) in VIDEO_SUFFIXES + ARCHIVE_SUFFIXES]
     if beside:
         remarks.append(f"Videos and zips are not used where there are photos: {', '.join(beside)}.")

@@ -181,6 +181,7 @@ TREES = {
     "raw data of Polycam some folders down": "x/Scan/Keyframes/images/1.jpg x/Scan/Keyframes/cameras/1.json x/raw.glb",
     "kinds that are not read": "a.jpg b.DNG c.dng old.bmp photos.rar x/VID_1.insv film.mts clip.mp4",
     "cameras that are not read": "images/a.jpg opensfm/Reconstruction.json cameras.xml scan.nvm bundle.rd.out a.xml",
+    "half a model": "images/a.jpg sparse/0/images.txt sparse/0/points3D.txt",
     "cameras that are not needed": "images/a.jpg transforms.json cameras.xml",
     "videos": "a.mov b.webm",
     "a zip": "photos.zip",

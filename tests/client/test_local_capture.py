@@ -254,6 +254,14 @@ def test_paths_with_nothing_to_train(tmp_path: Path):
         ),
         (["images/a.jpg", "sparse/0/cameras.bin", "sparse/0/images.bin", "cameras.xml"], []),
         (["a.jpg", "clip.mp4", "more.zip"], ["not used where there are photos: clip.mp4, more.zip"]),
+        (
+            ["a.jpg", "sparse/0/images.bin", "sparse/0/points3D.bin"],
+            ["sparse/0/images.bin is not read: cameras are rec"],
+        ),
+        (
+            ["a.jpg", "1/2/3/4/5/Transforms.json"],
+            ["1/2/3/4/5/Transforms.json is not read: cameras are recovered"],
+        ),
         (["a.jpg", "notes.txt", "data.json", "x.xml"], []),
     ],
 )

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from splatmill_worker.scene import Camera, Normalization, Scene, View, looked_at, split, viewmat_of
+from splatmill_worker.scene import Camera, Normalization, Scene, View, looked_at, omissions, split, viewmat_of
 
 Split = Literal["train", "test"]
 
@@ -125,3 +125,12 @@ def test_normalisation_keeps_every_picture_and_is_undone(offset: float) -> None:
 def test_a_scene_whose_cameras_do_not_spread_gets_its_scale_from_the_points() -> None:
     scene = scene_of(["a"])
     assert 0.001 < Normalization.of(scene).scale < 1.0
+
+
+def test_files_left_out_for_one_reason_have_one_sentence() -> None:
+    depth = [(f"{k}.depth.png", "no camera is given for it") for k in range(30)]
+    assert omissions([("a.jpg", "the file is empty."), *depth]) == [
+        "a.jpg is left out: the file is empty.",
+        "0.depth.png and 29 more are left out: no camera is given for it.",
+    ]
+    assert len(omissions(depth[:3])) == 3

@@ -28,7 +28,7 @@ from splatmill_worker.events import Emit, TrainingEvents, progress_events
 from splatmill_worker.images.load import load_views
 from splatmill_worker.kernels.gpu.device import absence, describe
 from splatmill_worker.live import LiveCameras, LiveScene, Looks, Onlookers, placement_of, store_placement
-from splatmill_worker.scene import Normalization, Scene, View
+from splatmill_worker.scene import Normalization, Scene, View, omissions
 from splatmill_worker.sfm.posed.written import write_cameras
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.engine.protocol import Engine
@@ -232,8 +232,8 @@ def _recover_cameras(task: Task, stages: Stages) -> Cameras:
         task.emit(LogEvent(message=note))
     for warning in scene.warnings:
         task.emit(LogEvent(level="warning", message=warning))
-    for name, reason in scene.left_out:
-        task.emit(LogEvent(level="warning", message=f"{name} is left out: {reason}"))
+    for sentence in omissions(scene.left_out):
+        task.emit(LogEvent(level="warning", message=sentence))
     normalization = Normalization.of(scene)
     training, held_out = split_views(scene, task.options)
     world = ExportWorld.of(normalization, scene)

@@ -6,6 +6,7 @@ Cameras follow OpenCV: x right, y down, z forward, world-to-camera matrices, and
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -17,6 +18,9 @@ from splatmill.schema import ModelFrame
 
 Float = npt.NDArray[np.float64]
 Real = npt.NDArray[np.floating[Any]]
+NAMED = 3
+"""Files left out for one reason, up to which each has a sentence of its own."""
+
 Source = Literal["sfm", "colmap", "transforms", "blender"]
 """Where cameras come from: structure from motion, a COLMAP model, transforms.json, or a Blender data set."""
 
@@ -226,6 +230,20 @@ class Scene:
     def centers(self) -> Float:
         """The cameras' positions [views,3]."""
         return np.array([view.camera.center for view in self.views]).reshape(-1, 3)
+
+
+def omissions(left_out: Sequence[tuple[str, str]]) -> list[str]:
+    """Sentences about files that are not used, given with the reasons: one for all files of a reason that are many."""
+    names: dict[str, list[str]] = {}
+    for name, reason in left_out:
+        names.setdefault(reason.removesuffix("."), []).append(name)
+    sentences = []
+    for reason, files in names.items():
+        if len(files) <= NAMED:
+            sentences += [f"{name} is left out: {reason}." for name in files]
+        else:
+            sentences.append(f"{files[0]} and {len(files) - 1} more are left out: {reason}.")
+    return sentences
 
 
 def split(scene: Scene, holdout: int = 8) -> tuple[tuple[View, ...], tuple[View, ...]]:

@@ -15,7 +15,7 @@ from splatmill.schema import Role
 from splatmill_worker.errors import WorkerError
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.images.prepare import prepare
-from splatmill_worker.scene import Scene
+from splatmill_worker.scene import Scene, omissions
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.posed import zipped
 
@@ -78,11 +78,7 @@ def _read(capture: Path, work: Path) -> tuple[int, str, int, list[str]]:
     if given is not None:
         scene: Scene = given.load()
         masks = sum(view.mask is not None for view in scene.views)
-        return len(scene.views), scene.source, masks, [*scene.warnings, *_reasons(scene.left_out)]
+        return len(scene.views), scene.source, masks, [*scene.warnings, *omissions(scene.left_out)]
     prepared = prepare(capture / Role.images, mask_folder(capture), work)
     masks = sum(photo.mask is not None for photo in prepared.photos)
-    return len(prepared.photos), "sfm", masks, [*prepared.warnings, *_reasons(prepared.skipped)]
-
-
-def _reasons(left_out: tuple[tuple[str, str], ...]) -> list[str]:
-    return [f"{name} is left out: {reason.rstrip('.')}." for name, reason in left_out]
+    return len(prepared.photos), "sfm", masks, [*prepared.warnings, *omissions(prepared.skipped)]

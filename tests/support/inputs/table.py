@@ -146,6 +146,25 @@ def polycam(folder: Path) -> None:
         (folder / f"keyframes/cameras/{k}.json").write_text(json.dumps(camera))
 
 
+def half_a_model(folder: Path) -> None:
+    colmap(folder)
+    (folder / "sparse/0/cameras.txt").unlink()
+
+
+def with_depth(folder: Path) -> None:
+    photos(folder / "images")
+    for k in range(COUNT):
+        Image.new("L", (64, 48)).save(folder / f"images/view {k:02}.depth.png")
+    transforms(folder / "transforms.json")
+
+
+def blender(folder: Path) -> None:
+    for split in ("train", "val"):
+        photos(folder / split, [f"r_{k}.png" for k in range(4)])
+        of = [frame | {"file_path": f"./{split}/r_{k}"} for k, frame in enumerate(frames()[:4])]
+        transforms(folder / f"transforms_{split}.json", of)
+
+
 MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
 
 EXAMPLES: tuple[Example, ...] = (
@@ -168,9 +187,19 @@ EXAMPLES: tuple[Example, ...] = (
     Example("Masks", "NAME_mask.png beside the photos", masked("{}_mask.png"), "used"),
     Example("Masks", "masks that hide nine tenths", masked("masks/{}.png", 0.9), "used with a remark"),
     Example("Masks", "masks that belong to no photo", masked("masks/frame_{}.png"), "used with a remark"),
+    Example(
+        "Masks",
+        "masks of another shape than the photos",
+        masked("masks/{}.png", size=(64, 64)),
+        "used with a remark",
+    ),
     Example("Cameras", "a COLMAP model two folders down", partial(colmap, top="export/scene"), "used"),
     Example("Cameras", "the same in a zip", zipped_set, "used"),
     Example("Cameras", "sparse/0 with 3 photos, sparse/1 with 9", several_models, "used with a remark"),
+    Example("Cameras", "images.txt without cameras.txt", half_a_model, "used with a remark"),
+    Example(
+        "Cameras", "a data set five folders down", partial(colmap, top="a/b/c/d/e"), "used with a remark"
+    ),
     Example("Cameras", "two data sets side by side", two_sets, "refused"),
     Example("Cameras", "photos in another case than the model", renamed_case, "used"),
     Example("Cameras", "the photos in images_2 and images_4", two_sizes, "used with a remark"),
@@ -182,6 +211,8 @@ EXAMPLES: tuple[Example, ...] = (
     Example("Cameras", "one frame without a matrix", with_frames(_set(None, 5)), "used with a remark"),
     Example("Cameras", "one mirrored pose of twelve", with_frames(_set(MIRRORED, 5)), "used with a remark"),
     Example("Cameras", "two mirrored poses of twelve", with_frames(_set(MIRRORED, 5, 6)), "refused"),
+    Example("Cameras", "a depth picture beside each photo", with_depth, "used with a remark"),
+    Example("Cameras", "a Blender data set with a validation set", blender, "used with a remark"),
     Example("Cameras", "the raw data of Polycam", polycam, "used"),
     Example("Cameras", "cameras of OpenSfM", with_file("opensfm/reconstruction.json"), "used with a remark"),
 )

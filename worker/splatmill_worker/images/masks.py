@@ -92,6 +92,16 @@ def remarks(
     return notes, warnings
 
 
+def unfit(faults: Sequence[tuple[str, str]]) -> list[str]:
+    """A sentence for the user on photos whose mask is not used, each with what is wrong with the mask."""
+    if not faults:
+        return []
+    (name, fault), count = faults[0], len(faults)
+    if count == 1:
+        return [f"The mask of {name} is not used: {fault}."]
+    return [f"The masks of {count} photos are not used, such as that of {name}: {fault}."]
+
+
 def _measured(masks: Sequence[Path], share: Callable[[Path], float]) -> list[float]:
     """What `share` returns of some of the masks, without those that do not decode: they end the loading of photos."""
     chosen = [

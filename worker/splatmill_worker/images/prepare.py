@@ -11,13 +11,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from splatmill.data_sets import other_cameras
+from splatmill.data_sets import unread_cameras
 from splatmill.schema.masks import masks_beside, paired, without_mask_folder
 from splatmill.schema.outputs import own_outputs
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES, unread, unread_kind
 from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
 from splatmill_worker.images import archive, decoders, exif, photo_colors, unpacked_room
-from splatmill_worker.images.masks import masks_under, remarks
+from splatmill_worker.images.masks import masks_under, remarks, unfit
 
 IGNORED_PREFIXES = (".", "__MACOSX")
 """Beginnings of the names of files and folders that are left out without mention."""
@@ -92,6 +92,7 @@ class _Found:
     opened: names of the zips and videos whose content is among the files.
     allowance: what further zips may unpack to.
     skipped, notes, warnings: as in `Prepared`.
+    unfit_masks: name of each photo whose mask is not used, with what is wrong with the mask.
     """
 
     files: list[tuple[str, Path, str | None]] = field(default_factory=list)
@@ -100,6 +101,7 @@ class _Found:
     skipped: list[tuple[str, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    unfit_masks: list[tuple[str, str]] = field(default_factory=list)
 
 
 def prepare(
@@ -179,7 +181,7 @@ def prepare(
     notes, warnings = remarks(len(ordered), masked, unused, decoders.hidden_share)
     found.warnings += photo_colors.sentences([photo.colors for photo in ordered])
     skipped = [name for name, _ in found.skipped]
-    warnings += [*unread(skipped), *other_cameras(skipped)]
+    warnings += [*unfit(found.unfit_masks), *unread(skipped), *unread_cameras(skipped)]
     return Prepared(ordered, tuple(found.skipped), (*found.notes, *notes), (*found.warnings, *warnings))
 
 
@@ -323,12 +325,12 @@ def _inspect(name: str, path: Path, sequence: str | None) -> UsablePhoto | str:
 
 
 def _with_mask(photo: UsablePhoto, mask: Path | None, found: _Found) -> UsablePhoto:
-    """The photo with `mask`, or without it and with a note when it is unreadable or has another shape."""
+    """The photo with `mask`, or without it when it is unreadable or has another shape."""
     if mask is None:
         return photo
     fault = decoders.mask_fault(mask, (photo.width, photo.height))
     if fault is not None:
-        found.notes.append(f"The mask of {photo.name} is not used: {fault}.")
+        found.unfit_masks.append((photo.name, fault))
         return photo
     return replace(photo, mask=mask)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from splatmill.data_sets import TRANSFORMS, find_cameras, walk
 from splatmill.schema.photos import PHOTO_SUFFIXES
 from splatmill_worker.images.decoders import hidden_share, mask_fault, photo_colors
-from splatmill_worker.images.masks import remarks
+from splatmill_worker.images.masks import remarks, unfit
 from splatmill_worker.images.photo_colors import sentences
 from splatmill_worker.scene import Scene, Source
 from splatmill_worker.sfm.posed import colmap_model, transforms
@@ -105,13 +105,13 @@ def find(directory: Path) -> PosedInput | None:
 
 
 def _without_unfit_masks(scene: Scene) -> Scene:
-    """The scene without masks that are unreadable or of another shape than their photo, each named in a note."""
-    views, notes = [], []
+    """The scene without masks that are unreadable or of another shape than their photo, with a warning."""
+    views, faults = [], []
     for view in scene.views:
         if view.mask is not None:
             fault = mask_fault(view.mask, (view.camera.width, view.camera.height), upright=view.upright)
             if fault is not None:
-                notes.append(f"The mask of {view.name} is not used: {fault}.")
+                faults.append((view.name, fault))
                 view = replace(view, mask=None)
         views.append(view)
-    return replace(scene, views=tuple(views), notes=(*scene.notes, *notes))
+    return replace(scene, views=tuple(views), warnings=(*scene.warnings, *unfit(faults)))

@@ -56,6 +56,7 @@ def load(
     views: dict[str, View] = {}
     left_out: list[tuple[str, str]] = []
     unusable: dict[str, str] = {}
+    validation: set[str] = set()
     messages = list(notes)
     warnings: list[str] = []
     points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
@@ -63,6 +64,7 @@ def load(
         split = _split_of(path)
         if split == "val":
             messages.append(f"{path.name} is not used: it is a validation set.")
+            validation |= {_called(index, frame, files) for index, frame in enumerate(document["frames"])}
             continue
         tests = _test_names(path, document)
         without, faulty = 0, 0
@@ -117,7 +119,7 @@ def load(
     named = {name for name, _ in left_out}
     copies, copy_warnings = files.copies(used)
     left_out += [
-        (name, "no camera is given for it")
+        (name, "validation sets are not used" if name in validation else "no camera is given for it")
         for name, path in files.photos.items()
         if path not in used and path not in copies and name not in named
     ]

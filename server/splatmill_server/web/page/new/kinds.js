@@ -41,7 +41,7 @@ const MODEL_PLACES = /** @type {[number, RegExp][]} */ ([
 const KEYFRAMES = ["keyframes/corrected_cameras/", "keyframes/cameras/"];
 
 /** Folders around a data set that are looked into. */
-const MAX_DEPTH = 4;
+export const MAX_DEPTH = 4;
 
 /** Folders that say what lies in them, so their name is kept where everything lies in one folder. */
 const TELLING = ["images", "masks", "mask", "segmentation", "segmentations", "sparse", "colmap", "keyframes"];

@@ -1,7 +1,7 @@
 // What is said of files before they are sent: those that are not read, and what is probably wrong with masks. The sentences
 // are those of the command line (client/splatmill/local_capture.py) and of the worker (images/masks.py); tests compare them.
 
-import { stem, suffix, unmarked } from "./kinds.js";
+import { MAX_DEPTH, stem, suffix, unmarked } from "./kinds.js";
 
 /** Share of the pixels of all photos that masks may hide without a remark. */
 const MOST_HIDDEN = 0.5;
@@ -24,14 +24,26 @@ export function remarks({ files, ignored }, accepted) {
   for (const [kind, paths] of unread) {
     said.push(`Not read are ${kind.what}: ${paths[0]}${paths.length > 1 ? ` and ${paths.length - 1} more` : ""}. ${kind.advice}`);
   }
-  if (!files.some(({ role }) => role === "poses")) {
-    for (const [program, patterns] of Object.entries(accepted.other_cameras)) {
-      const first = ignored.find((path) => patterns.some((pattern) => fits(path.slice(path.lastIndexOf("/") + 1).toLowerCase(), pattern)));
-      if (first) said.push(`The cameras of ${program} in ${first} are not read: cameras are recovered from the photos. To use those, export them from there as a COLMAP model or a transforms.json.`);
-    }
-  }
+  if (!files.some(({ role }) => role === "poses")) said.push(...unreadCameras(ignored, accepted));
   const beside = ignored.filter((path) => [...accepted.videos, ...accepted.archives].includes(suffix(path)));
   if (beside.length) said.push(`Videos and zips are not used where there are photos: ${beside.join(", ")}.`);
+  return said;
+}
+
+/**
+ * Sentences about files with cameras that are not read: of other programs, too deep, or a part of a COLMAP model.
+ * @param {string[]} paths
+ * @param {import("./kinds.js").Accepted} accepted
+ */
+function unreadCameras(paths, accepted) {
+  const recovered = "cameras are recovered from the photos.";
+  const first = (/** @type {string[]} */ patterns) => paths.find((path) => patterns.some((pattern) => fits(path.slice(path.lastIndexOf("/") + 1).toLowerCase(), pattern)));
+  const said = Object.entries(accepted.other_cameras).flatMap(([program, patterns]) => {
+    const path = first(patterns);
+    return path ? [`The cameras of ${program} in ${path} are not read: ${recovered} To use those, export them from there as a COLMAP model or a transforms.json.`] : [];
+  });
+  const part = first(["cameras.bin", "cameras.txt", "images.bin", "images.txt", "transforms*.json"]);
+  if (part) said.push(`${part} is not read: ${recovered} A COLMAP model has cameras and images, both as .bin or both as .txt, and lies at most ${MAX_DEPTH} folders down, as a transforms.json does.`);
   return said;
 }
 
