@@ -20,7 +20,7 @@ def test_names_with_spaces_are_read_and_written_again(built: Build, trained: Tra
     folder = built("colmap-text-spaces")
     # The photos that are held out of the plain still life: its names sort in the order of their numbers.
     held_out = [
-        option for number in range(0, 30, 8) for option in ("--test-views", f"my photo ({number}).jpg")
+        option for number in range(1, 31, 8) for option in ("--test-views", f"my photo ({number}).jpg")
     ]
     result = trained(folder, *held_out)
     assert result.report["facts"]["source"] == "colmap"
