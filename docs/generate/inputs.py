@@ -19,6 +19,7 @@ from splatmill.schema.photos import (
 )
 from splatmill_worker.colmap_files import MODELS
 from splatmill_worker.images import archive, guarded, masks, prepare
+from splatmill_worker.images.colors import PRIMARIES, TRANSFERS
 from splatmill_worker.images.lens import PINHOLE_MODELS
 from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam
 from tests.support.inputs.example import answer
@@ -80,6 +81,14 @@ def _photos() -> list[str]:
         f"""A video is read up to {guarded.MAX_VIDEO_SECONDS / 3600:.0f} hours, with frames of up to
         {guarded.MAX_FRAME_PIXELS // 10**6} million pixels. Videos and zips in a folder are used only where it has no
         photos.""",
+        "### Colours\n",
+        table(
+            ["in the file, by its number in H.273", "read as"],
+            [*_codes("primaries", PRIMARIES), *_codes("transfer", TRANSFERS)],
+        ),
+        """Colours are brought to sRGB with 8 bits per channel. A photo is read by its ICC profile, or else by its tags
+        or the EXIF mark of Adobe RGB; a video by its tags. PQ and HLG are converted by one rule, which
+        [Photographing](photographing.md#what-can-be-given) has. The report says what was converted or assumed.""",
         "### Zips\n",
         f"""{choices(ARCHIVE_SUFFIXES)} files hold photos or a whole data set. All zips and videos of a capture together
         hold up to {archive.MAX_ENTRIES:,} files. A zip in a zip is not unpacked.""",
@@ -90,6 +99,13 @@ def _photos() -> list[str]:
         ),
         f"""Results of Splatmill among the photos are not read as photos: the files {choices(OUTPUT_MEDIA)} in a folder
         with two of {choices(OUTPUT_MARKS)}.""",
+    ]
+
+
+def _codes(kind: str, names: dict[int, str]) -> list[list[str]]:
+    return [
+        [f"{kind} {', '.join(str(number) for number, name in names.items() if name == read)}", read]
+        for read in dict.fromkeys(names.values())
     ]
 
 
