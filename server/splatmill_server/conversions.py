@@ -29,6 +29,7 @@ from splatmill_server.leases import lease
 from splatmill_server.models import Models, model_not_found
 from splatmill_server.problems import ProblemError
 from splatmill_server.renderer import post
+from splatmill_server.root_path import address
 from splatmill_server.space.quota import RECORD_BYTES, Arrival, Quota
 
 STORED_AS_IT_IS = "ply"
@@ -83,7 +84,7 @@ class Conversions:
                     media_type=form.media_type,
                     loses=form.loses,
                     readers=[*form.readers],
-                    address=f"/v1/models/{model_id}/download/{key}",
+                    address=address(f"/v1/models/{model_id}/download/{key}"),
                     bytes=model.bytes if key == STORED_AS_IT_IS else found[0].size if found else None,
                     conversion=found[1] if found else None,
                 )

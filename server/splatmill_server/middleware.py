@@ -26,6 +26,7 @@ from splatmill_server.problems import (
     problem_of_storage,
     shown_path,
 )
+from splatmill_server.root_path import HEADER, locate, location, own_path
 from splatmill_server.service import Service
 
 log = structlog.get_logger()
@@ -41,6 +42,7 @@ class RequestMiddleware:
         self.app = app
         self.authentication = service.authentication
         self.rate = service.rate
+        self.root_path = service.settings.root_path
         self.max_body = service.settings.max_json_bytes
         self.metrics = service.metrics
         self.level = logging.INFO if service.settings.access_log else logging.DEBUG
@@ -63,6 +65,8 @@ class RequestMiddleware:
                 marked = MutableHeaders(scope=message)
                 marked["X-Request-ID"] = request_id
                 marked["X-Content-Type-Options"] = "nosniff"
+                if "location" in marked:
+                    marked["Location"] = location(scope, marked["Location"])
             await send(message)
 
         scope.setdefault("state", {})["caller"] = NOBODY
@@ -81,7 +85,7 @@ class RequestMiddleware:
             route = getattr(scope.get("route"), "path", None)
             self.metrics.request(scope["method"], route, status, seconds)
             caller: Caller = scope["state"]["caller"]
-            level = logging.DEBUG if scope["path"] in PROBES else self.level
+            level = logging.DEBUG if own_path(scope) in PROBES else self.level
             log.log(
                 logging.WARNING if status >= 500 else level,
                 "request",
@@ -89,7 +93,7 @@ class RequestMiddleware:
                 owner=caller.owner,
                 key=caller.key_name,
                 method=scope["method"][:16],
-                path=shown_path(scope["path"]),
+                path=shown_path(scope),
                 status=status,
                 seconds=round(seconds, 4),
                 bytes=sent,
@@ -108,9 +112,9 @@ class RequestMiddleware:
         try:
             await self.app(scope, receive, send_noted)
         except ClientDisconnect:
-            log.debug("the client disconnected", path=shown_path(scope["path"]))
+            log.debug("the client disconnected", path=shown_path(scope))
         except Exception as error:
-            log.exception("unexpected error", method=scope["method"], path=shown_path(scope["path"]))
+            log.exception("unexpected error", method=scope["method"], path=shown_path(scope))
             if begun:
                 raise  # The status is already sent, so only a broken connection shows that the rest is missing.
             problem = Problem.of(
@@ -125,7 +129,16 @@ class RequestMiddleware:
 
     async def _admit(self, scope: Scope, headers: Headers) -> None:
         """Find the caller. Raises ProblemError for a request that is refused before its body is read."""
-        if not is_open(scope["path"]):
+        try:
+            locate(scope, headers, self.root_path)
+        except ValueError as error:
+            raise ProblemError(
+                "invalid_request",
+                f"The header {HEADER}, which the proxy before the server has sent, cannot be used: {error}.",
+                advice="Let the proxy set it to the path below which it publishes the server, or set "
+                "SPLATMILL_ROOT_PATH.",
+            ) from error
+        if not is_open(own_path(scope)):
             try:
                 scope["state"]["caller"] = await self.authentication.caller(scope, headers)
             except StorageError as error:
@@ -178,6 +191,7 @@ def _job_of(scope: Scope) -> dict[str, str]:
 def _streams(scope: Scope, headers: Headers) -> bool:
     """Return whether the endpoint streams the body and limits its files itself."""
     multipart = headers.get("content-type", "").lower().startswith("multipart/form-data")
-    return (scope["method"] in ("PUT", "PATCH") and scope["path"].startswith("/v1/captures/")) or (
-        scope["method"] == "POST" and scope["path"] == "/v1/jobs" and multipart
+    method, path = scope["method"], own_path(scope)
+    return (method in ("PUT", "PATCH") and path.startswith("/v1/captures/")) or (
+        method == "POST" and path == "/v1/jobs" and multipart
     )

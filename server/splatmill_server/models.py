@@ -27,6 +27,7 @@ from splatmill_server.filters import Filter
 from splatmill_server.jobs.records import Jobs, read_record
 from splatmill_server.lists import Ended, Lists, each
 from splatmill_server.problems import ProblemError
+from splatmill_server.root_path import address
 
 _HEADER_BYTES = 8192
 _VERTICES = re.compile(rb"^element vertex (\d+)\s*$", re.MULTILINE)
@@ -292,10 +293,10 @@ def _ended(record: Job) -> Ended:
 
 
 def _links(model_id: str) -> dict[str, str]:
-    base = f"/v1/models/{model_id}"
+    base = address(f"/v1/models/{model_id}")
     return {
         "self": base,
-        "job": f"/v1/jobs/{model_id}",
+        "job": address(f"/v1/jobs/{model_id}"),
         "cameras": f"{base}/cameras",
         "render": f"{base}/render",
         "orbit": f"{base}/orbit",

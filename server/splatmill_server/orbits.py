@@ -33,6 +33,7 @@ from splatmill_server.access.caller import Caller
 from splatmill_server.models import Models
 from splatmill_server.problems import ProblemError
 from splatmill_server.renderer import no_renderer, post
+from splatmill_server.root_path import address
 from splatmill_server.space.quota import RECORD_BYTES, Quota
 from splatmill_server.turns import Turns
 from splatmill_server.unfinished import Unfinished
@@ -372,5 +373,5 @@ def _failed(found: Orbit, problem: Problem) -> Orbit:
 
 
 def _with_links(found: Orbit) -> Orbit:
-    base = f"/v1/models/{found.model}/orbits/{found.id}"
+    base = address(f"/v1/models/{found.model}/orbits/{found.id}")
     return found.model_copy(update={"links": {"self": base, "video": f"{base}/video"}})

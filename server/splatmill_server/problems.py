@@ -12,9 +12,11 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.routing import Match
+from starlette.types import Scope
 
 from splatmill.backplane.storage import StorageError, StorageFullError
 from splatmill.schema import PROBLEM_MEDIA_TYPE, PROBLEMS, Problem, UnsafeName, code_for_status
+from splatmill_server.root_path import own_path
 from splatmill_server.validation import problem_of_validation
 
 log = structlog.get_logger()
@@ -58,7 +60,8 @@ class ProblemResponse(Response):
         super().__init__(named.model_dump_json(exclude_none=True), problem.status, headers)
 
 
-_METHODS = ("DELETE", "GET", "HEAD", "OPTIONS", "PATCH", "POST", "PUT")
+METHODS = ("DELETE", "GET", "HEAD", "OPTIONS", "PATCH", "POST", "PUT")
+"""The methods of all endpoints."""
 
 
 def _methods(request: Request) -> list[str]:
@@ -68,7 +71,7 @@ def _methods(request: Request) -> list[str]:
         asked = {**request.scope, "method": method}
         return any(route.matches(asked)[0] is Match.FULL for route in request.app.routes)
 
-    return [method for method in _METHODS if accepted(method)]
+    return [method for method in METHODS if accepted(method)]
 
 
 def install(app: FastAPI) -> None:
@@ -108,13 +111,13 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(redis.RedisError)
     def on_redis(request: Request, error: redis.RedisError) -> Response:
-        log.warning("queue unavailable", error=str(error), path=shown_path(request.url.path))
+        log.warning("queue unavailable", error=str(error), path=shown_path(request.scope))
         problem = problem_of_redis(error)
         return ProblemResponse(problem, request.url.path, {"Retry-After": "5"})
 
     @app.exception_handler(StorageError)
     def on_storage(request: Request, error: StorageError) -> Response:
-        log.warning("storage error", error=str(error), path=shown_path(request.url.path))
+        log.warning("storage error", error=str(error), path=shown_path(request.scope))
         return ProblemResponse(problem_of_storage(error), request.url.path)
 
     @app.exception_handler(ClientDisconnect)
@@ -123,9 +126,9 @@ def install(app: FastAPI) -> None:
         return ProblemResponse(body_cut_off(), request.url.path)
 
 
-def shown_path(path: str) -> str:
-    """Return a path as logs may show it: without the token of a shared link."""
-    return _SHARED.sub("/s/...", path)
+def shown_path(scope: Scope) -> str:
+    """Return the path of a request as logs may show it: without the token of a shared link."""
+    return _SHARED.sub("/s/...", own_path(scope))
 
 
 def problem_of_redis(error: redis.RedisError) -> Problem:

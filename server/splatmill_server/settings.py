@@ -4,6 +4,7 @@ import ipaddress
 from pathlib import Path
 from typing import Self
 
+import httpx
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
@@ -12,7 +13,7 @@ from splatmill.backplane.address import DEFAULT_URL
 from splatmill.backplane.log_lines import LogFormat
 from splatmill.backplane.private_files import parse_mask
 from splatmill.schema import DEFAULT_PORT, ByteSize, Duration
-from splatmill_server import outgoing
+from splatmill_server import outgoing, root_path
 
 
 class Settings(BaseSettings):
@@ -64,6 +65,22 @@ class Settings(BaseSettings):
         description="Names of proxies before the server, separated by commas; `*.example.org` stands for all names "
         "that end so. Browsers' pages under these names may use the server. A server without keys is otherwise "
         "addressed by names of its machine only.",
+    )
+    root_path: str = Field(
+        default="",
+        description="Path below which a proxy publishes the server, such as /splats, whether or not it strips it from "
+        "what it passes on. Left out, it is what trusted proxies say in `X-Forwarded-Prefix`.",
+    )
+    forwarded_allow_ips: str = Field(
+        default="127.0.0.1",
+        validation_alias="FORWARDED_ALLOW_IPS",
+        description="Trusted proxies: addresses or networks, separated by commas, or `*` for all. They are believed "
+        "about a client's address (`X-Forwarded-For`), its scheme (`X-Forwarded-Proto`) and the root path.",
+    )
+    cors_origins: str = Field(
+        default="",
+        description="Origins whose web pages may use the API with a key, such as https://app.example.org, separated "
+        "by commas. Left out, no page of another origin may.",
     )
     session_seconds: int = Field(
         default=12 * 3600, gt=0, description="Seconds after which the session of a browser ends."
@@ -173,6 +190,22 @@ class Settings(BaseSettings):
         parse_mask(text)
         return text
 
+    @field_validator("root_path")
+    @classmethod
+    def _path(cls, text: str) -> str:
+        return root_path.checked(text)
+
+    @field_validator("cors_origins")
+    @classmethod
+    def _origins(cls, text: str) -> str:
+        for origin in split(text):
+            if not _is_origin(origin):
+                raise ValueError(
+                    f"{origin[:80]!r} is not an origin as browsers write it, such as https://app.example.org or "
+                    "http://localhost:5173: no path, no capitals, and no port 80 of http or 443 of https"
+                )
+        return text
+
     @field_validator("outgoing_allow")
     @classmethod
     def _hosts(cls, text: str) -> str:
@@ -197,12 +230,32 @@ class Settings(BaseSettings):
     @property
     def own_names(self) -> list[str]:
         """The names of `allowed_hosts`, in lower case."""
-        return [name.strip().lower() for name in self.allowed_hosts.split(",") if name.strip()]
+        return [name.lower() for name in split(self.allowed_hosts)]
+
+    @property
+    def cors(self) -> list[str]:
+        """The origins of `cors_origins`."""
+        return split(self.cors_origins)
 
     @property
     def local(self) -> bool:
         """Whether the server listens where only this machine reaches it, and so may do without keys."""
         return self.uds is not None or is_loopback(self.host)
+
+
+def split(text: str) -> list[str]:
+    """Return the parts of a list with commas that are not empty."""
+    return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def _is_origin(text: str) -> bool:
+    """Return whether a text is the origin of a page as browsers write it."""
+    try:
+        url = httpx.URL(text)
+        plain = bool(url.host) and "*" not in url.host and (url.port or 1) <= 65535
+    except (httpx.InvalidURL, ValueError):
+        return False
+    return plain and url.scheme in ("http", "https") and f"{url.scheme}://{url.netloc.decode()}" == text
 
 
 def is_loopback(host: str) -> bool:

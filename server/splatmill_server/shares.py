@@ -19,6 +19,7 @@ from splatmill.backplane.storage import Storage
 from splatmill.schema import CreateShare, Response, Share, SharedModel, ShareWithToken, Time
 from splatmill_server.models import Models
 from splatmill_server.problems import ProblemError
+from splatmill_server.root_path import address
 
 MAX_SHARES = 100
 """Links to one model that have not ended."""
@@ -95,7 +96,7 @@ class Shares:
             sha256=_digest(token),
         )
         self._store(share)
-        return ShareWithToken(**share.public().model_dump(), token=token, path=f"/s/{token}")
+        return ShareWithToken(**share.public().model_dump(), token=token, path=address(f"/s/{token}"))
 
     def of_model(self, model_id: str) -> list[Share]:
         """Return the links to a model, newest first, those that have ended too."""

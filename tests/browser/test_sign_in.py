@@ -12,8 +12,10 @@ import redis
 from playwright.sync_api import expect
 
 from splatmill.backplane.connection import connect
+from splatmill_server.root_path import HEADER
 from splatmill_server.settings import Settings
 from tests.browser.conftest import Open
+from tests.support.path_proxy import path_proxy
 from tests.support.redis_server import empty_redis
 from tests.support.served_app import ServedApp, served_app
 
@@ -104,3 +106,22 @@ def test_the_way_back_stays_on_this_server(keyed: ServedApp, open_window: Open) 
         assert visit.page.url == f"{str(keyed.http.base_url).rstrip('/')}/"
         visit.page.goto("about:blank")  # else the page goes to sign in by itself once its cookie is gone
         visit.context.clear_cookies()
+
+
+def test_below_a_path_a_key_opens_this_server_alone(keyed: ServedApp, open_window: Open) -> None:
+    with path_proxy(keyed.address[1], strip=True, sent={HEADER: "/splats"}) as address:
+        visit = open_window(address)
+        visit.watched.allow(r"status of 401")
+        page = visit.page
+        page.goto(f"{address}/jobs")
+        expect(page).to_have_url(f"{address}/sign-in?next=%2Fsplats%2Fjobs")
+        page.goto(f"{address}/sign-in?next=%2Fanother-program")
+        page.get_by_label("API key").fill("s3cret")
+        page.keyboard.press("Enter")
+        expect(page).to_have_url(f"{address}/")
+        (cookie,) = visit.context.cookies()
+        assert cookie["path"] == "/splats/"
+        page.locator("html[data-ready]").wait_for()
+        page.get_by_role("button", name="Sign out").click()
+        expect(page).to_have_url(f"{address}/sign-in")
+        assert visit.context.cookies() == []

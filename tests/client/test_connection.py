@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from splatmill import Client
-from splatmill.connection import retry_after
+from splatmill.connection import own_path, retry_after
 from splatmill.errors import ConnectionFailed, NotFound, Refused, ServerError, TooManyRequests, Unavailable
 from splatmill.schema import IDEMPOTENCY_HEADER, Problem
 
@@ -200,6 +200,21 @@ def test_addresses_that_are_refused(address, monkeypatch):
     monkeypatch.setenv("SPLATMILL_SERVER", "nonsense")
     with pytest.raises(ValueError, match=r"address of (a|the) server"):
         Client(address)
+
+
+@pytest.mark.parametrize(
+    ("server", "path"),
+    [
+        ("https://lab.example", "/splats/s/a"),
+        ("https://lab.example/", "/splats/s/a"),
+        ("https://lab.example/splats", "/s/a"),
+        ("https://lab.example/splats/", "/s/a"),
+        ("https://lab.example/spl", "/splats/s/a"),
+    ],
+)
+def test_addresses_in_answers_are_below_the_servers_own(server: str, path: str) -> None:
+    assert own_path(server, "/splats/s/a") == path
+    assert own_path(server, "/s/a") == "/s/a"  # of a server that does not know where a proxy has put it
 
 
 def test_a_proxy_does_not_stand_before_this_machine(peer, reply, monkeypatch):

@@ -53,6 +53,22 @@ def test_a_port_that_cannot_be_is_a_sentence(tmp_path: Path, port: str) -> None:
     assert "--port" in refused("--port", port, "--data", str(tmp_path / "data"))
 
 
+@pytest.mark.parametrize("path", ["splats", "/v1", "//elsewhere.example"])
+def test_a_root_path_that_cannot_be_is_a_sentence(tmp_path: Path, path: str) -> None:
+    said = refused("--port", "0", "--data", str(tmp_path / "data"), "--root-path", path)
+    assert "--root-path" in said
+    assert not (tmp_path / "data").exists()
+
+
+def test_below_a_root_path_the_address_has_it(tmp_path: Path) -> None:
+    up = Up(tmp_path / "data").start("--root-path", "/splats/")
+    try:
+        assert up.http.base_url.path == "/splats/"
+        assert up.http.post("/v1/captures", json={}).headers["location"].startswith("/splats/v1/captures/")
+    finally:
+        up.close()
+
+
 def test_a_folder_that_cannot_be_written_is_a_sentence(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("in the way")

@@ -25,10 +25,12 @@ def create(
     server: ServerOption = None,
 ) -> None:
     """Create a link to a model, and print its address, which the server cannot show again."""
+    from splatmill.connection import own_path
+
     with open_client(server) as client:
         made = client.model(model_id).shares.create(expires_in=expires_in, name=name)
         typer.echo(f"link {made.id}, valid until {made.expires_at:%Y-%m-%d %H:%M} UTC")
-        typer.echo(f"{client.server.rstrip('/')}{made.path}")
+        typer.echo(f"{client.server.rstrip('/')}{own_path(client.server, made.path)}")
 
 
 @shares.command("list")

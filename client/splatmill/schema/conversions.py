@@ -53,7 +53,7 @@ class ModelDownload(Response):
     media_type: str
     loses: str = Field(description="What a model loses in it.")
     readers: list[str] = Field(description="Programs of others that read it.")
-    address: str = Field(description="Address of the download, relative to the server.")
+    address: str = Field(description="Address of the download, on the server's host.")
     bytes: int | None = Field(
         default=None, ge=0, description="Size of the file; null until the model has been converted."
     )

@@ -95,7 +95,7 @@ class Job(Response):
     problem: Problem | None = Field(default=None, description="Why the job failed.")
     model: str | None = Field(default=None, description="Id of the finished model.")
     links: dict[str, str] = Field(
-        default_factory=dict, description="Addresses of what belongs to the job, relative to the server."
+        default_factory=dict, description="Addresses of what belongs to the job, on the server's host."
     )
 
 

@@ -41,7 +41,7 @@ class Model(Response):
     ssim: Measured = Field(default=None, description="Mean over the held-out photos.")
     files: list[ModelFile] = Field(default_factory=list)
     links: dict[str, str] = Field(
-        default_factory=dict, description="Addresses of what belongs to the model, relative to the server."
+        default_factory=dict, description="Addresses of what belongs to the model, on the server's host."
     )
 
 

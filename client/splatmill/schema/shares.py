@@ -37,7 +37,7 @@ class ShareWithToken(Share):
     """A new link. Its token is shown once."""
 
     token: str = Field(description="Who has it may see the model.")
-    path: str = Field(description="Address of the page that shows the model, relative to the server.")
+    path: str = Field(description="Address of the page that shows the model, on the server's host.")
 
 
 class ShareList(Response):

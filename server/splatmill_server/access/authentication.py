@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import redis
 from starlette.datastructures import Headers
-from starlette.requests import Request, cookie_parser
+from starlette.requests import Request
 from starlette.types import Scope
 
 from splatmill.backplane.storage import StorageError
@@ -40,7 +40,7 @@ class Authentication:
             return Caller.of(key)
         if self._bootstrap is None and self._settings.local and not self._keys.any():
             check_host(scope, headers, self._settings.host, self._settings.own_names)
-            check_origin(scope, headers, self._settings.own_names, required=False)
+            check_origin(scope, headers, self._settings.own_names, self._settings.cors, required=False)
             return KEYLESS
         cookie = session_cookie(headers)
         if given is None and cookie and (session := await self._sessions.find(cookie)) is not None:
@@ -93,4 +93,6 @@ def bearer(headers: Headers) -> str | None:
 
 def session_cookie(headers: Headers) -> str | None:
     """Return the cookie of a session, or None."""
-    return cookie_parser(headers.get("cookie", "")).get(COOKIE) or None
+    pairs = (part.strip().partition("=") for part in headers.get("cookie", "").split(";"))
+    # A browser sends the cookie of the longest path first: that of a server under another one comes after it.
+    return next((value for name, _, value in pairs if name == COOKIE), None) or None

@@ -3,7 +3,9 @@
 A page can make a browser send requests to any address. Two checks stop it: the header Host, which a browser sets to the
 name in the address, so that a name of the attacker that resolves to 127.0.0.1 (DNS rebinding) is refused; and the
 header Origin, which a browser sets to the page's own address with each request that may change something. Programs
-such as curl and the SDK send no Origin.
+such as curl and the SDK send no Origin. A proxy may have put another name into Host; then Sec-Fetch-Site counts, by
+which the browser compares the page with the address that it asked for. No script can set that header, and browsers send
+it to https and to loopback addresses alone, under which no attacker's name leads to the server.
 """
 
 from collections.abc import Sequence
@@ -40,10 +42,13 @@ def check_host(scope: Scope, headers: Headers, host: str, allowed: Sequence[str]
     )
 
 
-def check_origin(scope: Scope, headers: Headers, allowed: Sequence[str], *, required: bool) -> None:
+def check_origin(
+    scope: Scope, headers: Headers, allowed: Sequence[str], origins: Sequence[str] = (), *, required: bool
+) -> None:
     """Raise a 403 problem if a request that may change something comes from a page that is not the server's own.
 
     allowed: names of hosts whose pages may, as in SPLATMILL_ALLOWED_HOSTS.
+    origins: origins whose pages may, as in SPLATMILL_CORS_ORIGINS.
     required: whether the request must say where it comes from, as that of a browser does.
     """
     if scope["method"] in SAFE_METHODS:
@@ -53,7 +58,12 @@ def check_origin(scope: Scope, headers: Headers, allowed: Sequence[str], *, requ
         site = headers.get("sec-fetch-site")
         if site in ("same-origin", "none") or (site is None and not required):
             return
-    elif _same(origin, headers.get("host", "")) or _among(_name(origin.partition("//")[2]), allowed):
+    elif (
+        headers.get("sec-fetch-site") == "same-origin"
+        or _same(origin, headers.get("host", ""))
+        or _among(_name(origin.partition("//")[2]), allowed)
+        or origin in origins
+    ):
         return
     raise ProblemError(
         "origin_not_allowed",

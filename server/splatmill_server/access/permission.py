@@ -9,6 +9,7 @@ from fastapi import Depends, Request
 from splatmill.schema import Scope
 from splatmill_server.access.caller import Caller, Who
 from splatmill_server.problems import ProblemError
+from splatmill_server.root_path import own_path
 
 _OPEN = re.compile(
     r"/|/(healthz|readyz|openapi\.json|docs)|/(jobs|models)(/[^/]*)?|/sign-in|/(page|vendor|s)/.*", re.ASCII
@@ -50,7 +51,7 @@ def check_scope(who: Caller, needed: Scope) -> None:
 
 
 async def _permitted(request: Request, who: Who) -> None:  # as a coroutine, it takes no thread of the pool
-    if is_open(request.scope["path"]):
+    if is_open(own_path(request.scope)):
         return
     endpoint = getattr(request.scope.get("route"), "endpoint", None)
     by_method = Scope.read if request.method in SAFE_METHODS else Scope.train

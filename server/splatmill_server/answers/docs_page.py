@@ -25,6 +25,6 @@ def docs_page(document: dict[str, Any]) -> str:
         f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>\n'
         f"<h1>{title}</h1>\n{about}\n"
         "<p>This page is an overview. Parameters, schemas and examples are in "
-        '<a href="/openapi.json">/openapi.json</a>, which any OpenAPI viewer shows.\n'
+        '<a href="openapi.json">openapi.json</a>, which any OpenAPI viewer shows.\n'
         f"<table>\n{rows}\n</table>\n</html>\n"
     )

@@ -11,6 +11,7 @@ from splatmill_server.access.keys import digest
 from splatmill_server.access.permission import needs
 from splatmill_server.access.sessions import COOKIE, Session
 from splatmill_server.problems import ProblemError
+from splatmill_server.root_path import address
 from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.service import Shared
 
@@ -42,7 +43,13 @@ async def begin_session(service: Shared, who: Who, request: Request) -> Response
     secure = request.url.scheme == "https" or request.headers.get("origin", "").startswith("https://")
     response = Response(status_code=204, headers={"Cache-Control": "no-store"})
     response.set_cookie(
-        COOKIE, cookie, max_age=service.sessions.seconds, secure=secure, httponly=True, samesite="strict"
+        COOKIE,
+        cookie,
+        max_age=service.sessions.seconds,
+        path=address("/"),
+        secure=secure,
+        httponly=True,
+        samesite="strict",
     )
     return response
 
@@ -56,5 +63,5 @@ async def end_session(service: Shared, request: Request) -> Response:
     if (cookie := session_cookie(request.headers)) is not None:
         await service.sessions.end(cookie)
     response = Response(status_code=204)
-    response.delete_cookie(COOKIE, httponly=True, samesite="strict")
+    response.delete_cookie(COOKIE, path=address("/"), httponly=True, samesite="strict")
     return response

@@ -12,6 +12,7 @@ from splatmill.schema import DOWNLOADS, KeyLimits, ModelCameras, ModelDownloads,
 from splatmill_server.access.caller import Caller
 from splatmill_server.answers.model_outputs import model_file, model_in_format, rendered_by_query
 from splatmill_server.problems import ProblemError
+from splatmill_server.root_path import address
 from splatmill_server.routes.models import CAMERA_QUERY, RENDER_PROBLEMS, RENDERED
 from splatmill_server.routes.openapi import answer, binary, problems
 from splatmill_server.service import Shared
@@ -73,7 +74,7 @@ def get_shared_formats(
 ) -> ModelDownloads:
     """List the file formats in which the model that a link shows can be downloaded."""
     found = service.conversions.list(share.model)
-    base = f"/s/{token}/model/download"
+    base = address(f"/s/{token}/model/download")
     formats = [form.model_copy(update={"address": f"{base}/{form.format}"}) for form in found.formats]
     return found.model_copy(update={"formats": formats})
 

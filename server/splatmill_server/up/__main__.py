@@ -21,12 +21,13 @@ def main(argv: list[str] | None = None) -> int:
     key = os.environ.get("SPLATMILL_API_KEY") or None
     try:
         mask = _mask()
+        os.environ["SPLATMILL_ROOT_PATH"] = root_path = _root_path(chosen.root_path)
         with _listen(chosen.host, chosen.port, chosen.data) as listener:
             folder = DataFolder(chosen.data)
             if (exposed := exposure(folder.path, mask)) is not None:
                 _print(exposed)
             try:
-                url = _url(chosen.host, listener.getsockname()[1])
+                url = _url(chosen.host, listener.getsockname()[1]) + root_path
                 supervisor = Supervisor(folder, listener, _print)
 
                 def ready() -> None:
@@ -57,6 +58,16 @@ def _mask() -> int:
     return mask
 
 
+def _root_path(text: str) -> str:
+    """Return a root path without the slash at its end. Raises UpError for a text that is none."""
+    from splatmill_server.root_path import checked
+
+    try:
+        return checked(text)
+    except ValueError as error:
+        raise UpError(f"--root-path: {error}.") from error
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="splatmill up", description="Run the whole service on this machine."
@@ -77,6 +88,11 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         default=Path(os.environ.get("SPLATMILL_DATA") or "splatmill-data"),
         help="folder for all data (default: SPLATMILL_DATA, else splatmill-data)",
+    )
+    parser.add_argument(
+        "--root-path",
+        default=os.environ.get("SPLATMILL_ROOT_PATH") or "",
+        help="path below which a proxy publishes the service, such as /splats (default: SPLATMILL_ROOT_PATH)",
     )
     parser.add_argument(
         "--json-ready",

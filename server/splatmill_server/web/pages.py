@@ -10,6 +10,7 @@ from starlette.responses import FileResponse, Response
 
 from splatmill.schema import SharedModel
 from splatmill_server.problems import ProblemError
+from splatmill_server.root_path import own_path
 from splatmill_server.service import Service, Shared
 from splatmill_server.web import policy
 from splatmill_server.web.tree import StaticFile, Tree
@@ -98,8 +99,14 @@ def page(request: Request, name: str, *, embedded: bool = False, head: str = "")
     file = PAGE.find(name)
     if file is None:
         raise ProblemError("not_found", f"There is nothing at {request.url.path}.")
-    imports = import_map()
-    text = file.path.read_text(encoding="utf-8").replace('"/page/', f'"/page/{PAGE.digest}/')
+    # Relative, so that a page works below any path: what the browser knows of it, the server need not know.
+    root = "../" * (own_path(request.scope).count("/") - 1) or "./"
+    imports = import_map(root)
+    text = (
+        file.path.read_text(encoding="utf-8")
+        .replace('"/page/', f'"/page/{PAGE.digest}/')
+        .replace('="/', f'="{root}')
+    )
     inserted = f'<script type="importmap">{imports}</script>{head}' if imports else head
     text = text.replace(IMPORT_MAP_HERE, inserted, 1)
     if not imports:
@@ -138,14 +145,17 @@ def _poster(base: str, token: str, model: SharedModel) -> str:
     return "".join(f'\n<meta property="{name}" content="{escape(text)}">' for name, text in found.items())
 
 
-def import_map() -> str:
-    """Return the import map as JSON, or "" if the packages have not been fetched."""
+def import_map(root: str) -> str:
+    """Return the import map as JSON, or "" if the packages have not been fetched.
+
+    root: relative address of the server, which ends with a slash.
+    """
     known = VENDOR.folder / "imports.json"
     if not known.is_file():
         return ""
     imports = json.loads(known.read_text(encoding="utf-8"))["imports"]
     return json.dumps(
-        {"imports": {name: f"/vendor/{VENDOR.digest}/{path}" for name, path in imports.items()}}
+        {"imports": {name: f"{root}vendor/{VENDOR.digest}/{path}" for name, path in imports.items()}}
     )
 
 

@@ -9,6 +9,7 @@ import base64
 import hashlib
 import json
 import re
+from urllib.parse import urljoin
 
 import httpx
 import pytest
@@ -29,7 +30,7 @@ def test_pages_need_no_key_and_their_files_are_there(serve: Serve, path: str) ->
         assert answer.headers["content-type"] == "text/html; charset=utf-8"
         assert answer.headers["cache-control"] == "no-cache"
         assert stranger.head(path).status_code == 200
-        links = re.findall(r'(?:src|href)="(/page/[^"]+)"', answer.text)
+        links = [urljoin(path, link) for link in re.findall(r'(?:src|href)="([^"]+page/[^"]+)"', answer.text)]
         assert len(links) >= 4
         for link in links:
             file = stranger.get(link)
@@ -64,7 +65,7 @@ def test_only_the_import_map_may_run_inline(app: ServedApp) -> None:
 
 
 def test_files_are_compressed_where_the_client_accepts(app: ServedApp) -> None:
-    link = re.findall(r'"(/page/[^"]+base\.css)"', app.http.get("/").text)[0]
+    link = re.findall(r'"\.(/page/[^"]+base\.css)"', app.http.get("/").text)[0]
     plain = app.http.get(link, headers={"Accept-Encoding": "identity"})
     packed = app.http.get(link, headers={"Accept-Encoding": "br;q=1, gzip"})
     assert packed.headers["content-encoding"] == "gzip"

@@ -10,6 +10,7 @@ from tests.support.hostile.table_headers import HEADERS
 from tests.support.hostile.table_models import MODELS
 from tests.support.hostile.table_others import OTHERS
 from tests.support.hostile.table_poses import POSES
+from tests.support.hostile.table_proxies import PROXIES
 from tests.support.hostile.table_requests import REQUESTS
 from tests.support.hostile.table_services import SERVICES
 from tests.support.hostile.table_unpacked import UNPACKED
@@ -17,6 +18,7 @@ from tests.support.hostile.table_unpacked import UNPACKED
 HOSTILE: tuple[Hostile, ...] = (
     *REQUESTS,
     *HEADERS,
+    *PROXIES,
     *SERVICES,
     *OTHERS,
     *FILES,

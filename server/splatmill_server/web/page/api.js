@@ -1,5 +1,7 @@
 // The REST API: requests whose errors are the server's problem documents, pages of lists, and the events of a job.
 
+import { at, pathOfPage } from "./address.js";
+
 /**
  * @typedef {object} ProblemDocument
  * @property {string} code
@@ -41,7 +43,7 @@ export class Problem extends Error {
  * @param {boolean} [more.stay] throw the problem of a missing session in place of leading to the sign-in page
  */
 export async function request(method, path, { query = {}, json, body, headers = {}, signal, stay = false } = {}) {
-  const address = new URL(path, location.origin);
+  const address = new URL(at(path), location.origin);
   for (const [name, value] of Object.entries(query)) {
     for (const one of Array.isArray(value) ? value : [value]) {
       if (one !== null && one !== undefined && one !== "") address.searchParams.append(name, String(one));
@@ -108,8 +110,8 @@ export async function problemOf(response) {
 
 /** Lead to the sign-in page, which leads back here. */
 export function signIn() {
-  if (location.pathname === "/sign-in") return;
-  location.replace(`/sign-in?next=${encodeURIComponent(location.pathname + location.search)}`);
+  if (pathOfPage() === "/sign-in") return;
+  location.replace(`${at("/sign-in")}?next=${encodeURIComponent(location.pathname + location.search)}`);
 }
 
 /**
@@ -157,12 +159,12 @@ export async function* each(noun, query = {}) {
  * @param {string} id
  */
 export function modelAddress(id) {
-  return `/v1/models/${encodeURIComponent(id)}`;
+  return at(`/v1/models/${encodeURIComponent(id)}`);
 }
 
 /** The id at the end of this page's address, as in /jobs/ID. */
 export function idOfPage() {
-  return decodeURIComponent(location.pathname.split("/")[2] ?? "");
+  return decodeURIComponent(pathOfPage().split("/")[2] ?? "");
 }
 
 /** Milliseconds before a stream that the browser has given up is opened anew. */
@@ -185,7 +187,7 @@ export function follow(jobId, onRecord, onConnection = () => {}, onAnew = () => 
   /** @type {ReturnType<typeof setTimeout> | undefined} */
   let timer;
   const open = () => {
-    source = new EventSource(`/v1/jobs/${encodeURIComponent(jobId)}/events`);
+    source = new EventSource(at(`/v1/jobs/${encodeURIComponent(jobId)}/events`));
     for (const type of types) {
       source.addEventListener(type, (message) => onRecord(JSON.parse(/** @type {MessageEvent} */ (message).data)));
     }

@@ -1,12 +1,15 @@
 // Elements as function calls. Text is set as text, never as HTML, so names chosen by users cannot become markup.
 
+import { at } from "./address.js";
+
 /** @typedef {Node | string | number | false | null | undefined} Child */
 
 /**
  * Return a new element.
  *
  * Properties whose name begins with `on` are listeners; `class`, `data-...`, `aria-...` and others are attributes; false,
- * null and undefined leave an attribute out, true gives it no value.
+ * null and undefined leave an attribute out, true gives it no value. A `href` or `src` that begins with a slash is a path of
+ * this server.
  * @template {keyof HTMLElementTagNameMap} T
  * @param {T} tag
  * @param {Record<string, any>} [attributes]
@@ -18,7 +21,7 @@ export function h(tag, attributes = {}, ...children) {
   for (const [name, value] of Object.entries(attributes)) {
     if (name.startsWith("on")) element.addEventListener(name.slice(2).toLowerCase(), value);
     else if (value === true) element.setAttribute(name, "");
-    else if (value !== false && value !== null && value !== undefined) element.setAttribute(name, String(value));
+    else if (value !== false && value !== null && value !== undefined) element.setAttribute(name, name === "href" || name === "src" ? at(String(value)) : String(value));
   }
   append(element, children);
   return element;

@@ -1,5 +1,6 @@
 // The page of one model: the viewer with its tools, the comparison with held-out photos, downloads, orbit video, cameras.
 
+import { at } from "./address.js";
 import { get, idOfPage, modelAddress, request } from "./api.js";
 import { byId, h } from "./dom.js";
 import { ago, bytes, decibels, number } from "./format.js";
@@ -84,5 +85,5 @@ async function remove(model) {
   });
   if (!yes) return;
   await request("DELETE", `/v1/jobs/${encodeURIComponent(model.job)}`);
-  location.assign("/models");
+  location.assign(at("/models"));
 }

@@ -1,11 +1,12 @@
 // A shared model in the viewer: what the page of a link and its frame have in common.
 
+import { at, pathOfPage } from "./address.js";
 import { Problem, get } from "./api.js";
 import { byId, h } from "./dom.js";
 import { noticeOf } from "./shell.js";
 
 /** The address of the model that this page's link shows; below it are the same addresses as of a model of one's own. */
-export const address = `${location.pathname.split("/").slice(0, 3).join("/")}/model`;
+export const address = at(`${pathOfPage().split("/").slice(0, 3).join("/")}/model`);
 
 /**
  * Show the model of this page's link in `#view`, or say there why that cannot be done. Returns what the link tells of it,

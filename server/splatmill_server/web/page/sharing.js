@@ -1,6 +1,6 @@
 // The dialog that makes, shows and revokes links to a model.
 
-import { isLoopback } from "./address.js";
+import { at, isLoopback } from "./address.js";
 import { get, send } from "./api.js";
 import { h } from "./dom.js";
 import { moment } from "./format.js";
@@ -60,7 +60,7 @@ export async function openSharing(address, name) {
     event.preventDefault();
     void tried(async () => {
       const share = await send("POST", `${address}/shares`, { expires_in: term.value, name: label.value.trim() || null });
-      made.replaceChildren(link(`${location.origin}${share.path}`));
+      made.replaceChildren(link(`${location.origin}${at(share.path)}`));
       label.value = "";
       await show();
     });

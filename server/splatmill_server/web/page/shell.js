@@ -1,5 +1,6 @@
 // What every page has around its contents: header, navigation, theme switch, who is signed in, and notices.
 
+import { at, pathOfPage } from "./address.js";
 import { Problem, request, signIn, whole } from "./api.js";
 import { h } from "./dom.js";
 
@@ -67,7 +68,7 @@ async function me(open) {
 
 async function signOut() {
   await request("DELETE", "/v1/session", { stay: true });
-  location.assign("/sign-in");
+  location.assign(at("/sign-in"));
 }
 
 /** The icon's address, which the page's head names with its digest. */
@@ -77,7 +78,7 @@ function icon() {
 
 /** @param {string} href */
 function isCurrent(href) {
-  const here = location.pathname;
+  const here = pathOfPage();
   if (here === href) return "page";
   return href !== "/" && here.startsWith(`${href}/`) ? "true" : null;
 }

@@ -1,5 +1,6 @@
 // Exchanges an API key for the cookie of a session, which scripts cannot read, and leads back to where the reader was.
 
+import { at } from "./address.js";
 import { Problem, request } from "./api.js";
 import { byId } from "./dom.js";
 import { startShell } from "./shell.js";
@@ -10,9 +11,10 @@ const error = byId("key-error");
 
 /** The page to go to: one of this server's own, whatever the address says. */
 function next() {
-  const asked = new URLSearchParams(location.search).get("next") ?? "/";
+  const asked = new URLSearchParams(location.search).get("next") ?? at("/");
   const address = new URL(asked, location.origin);
-  return asked.startsWith("/") && address.origin === location.origin ? address.pathname + address.search : "/";
+  const own = asked.startsWith("/") && address.origin === location.origin && address.pathname.startsWith(at("/"));
+  return own ? address.pathname + address.search : at("/");
 }
 
 form.addEventListener("submit", async (event) => {

@@ -1,5 +1,6 @@
 // What a job shows while it runs: the scene in training, its cameras and points, or the newest preview picture.
 
+import { at } from "../address.js";
 import { Problem, request, whole } from "../api.js";
 import { h } from "../dom.js";
 import { bytes, number } from "../format.js";
@@ -15,7 +16,7 @@ const KINDS = /** @type {const} */ ({ scene: "Scene", cameras: "Cameras and poin
 export class LiveScene {
   /** @param {HTMLElement} container @param {string} jobId */
   constructor(container, jobId) {
-    this.address = `/v1/jobs/${encodeURIComponent(jobId)}`;
+    this.address = at(`/v1/jobs/${encodeURIComponent(jobId)}`);
     /** @type {Kind | null} */
     this.kind = null;
     /** What somebody has chosen; null: the most telling kind that there is. @type {Kind | null} */

@@ -1,7 +1,10 @@
 // What this browser remembers of an upload that is under way, so that it can go on after the page was closed: which capture
 // it goes to, and the names and sizes of its files. Browsers keep no files; they have to be given again.
 
-const KEY = "splatmill.upload";
+import { at } from "../address.js";
+
+/** Servers below several paths of one host share this storage. */
+const KEY = `splatmill.upload${at("/").slice(1)}`;
 
 /**
  * @typedef {object} Upload

@@ -1,5 +1,6 @@
 // From files and settings to a job: the capture is made, what it lacks is sent, the job is created once.
 
+import { at } from "../address.js";
 import { get, request, send, whole } from "../api.js";
 import { byId } from "../dom.js";
 import { number } from "../format.js";
@@ -126,7 +127,7 @@ export class Start {
       const job = await this.createJob();
       this.sending = null;
       forget();
-      location.assign(`/jobs/${job.id}`);
+      location.assign(at(`/jobs/${job.id}`));
       await new Promise(() => {}); // the page is being left
     } catch (error) {
       if (error instanceof DOMException && error.name === "AbortError") last = "Paused";

@@ -1,5 +1,6 @@
 // One request that sends bytes, with progress. `fetch` tells nothing of the bytes sent, so this is an XMLHttpRequest.
 
+import { at } from "../address.js";
 import { Problem } from "../api.js";
 
 /**
@@ -24,7 +25,7 @@ export function transfer(method, address, { headers, body = null, onSent = () =>
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();
     const abort = () => request.abort();
-    request.open(method, address);
+    request.open(method, at(address));
     for (const [name, value] of Object.entries(headers)) request.setRequestHeader(name, value);
     request.upload.addEventListener("progress", (event) => onSent(event.loaded));
     request.addEventListener("loadend", () => {
