@@ -146,8 +146,8 @@ class RequestMiddleware:
                 found = problem_of_storage(error)
                 raise ProblemError(found.code, found.detail, advice=found.advice) from error
             except redis.RedisError as error:
-                log.warning("sessions cannot be read", error=type(error).__name__)
-                found = problem_of_redis(error)
+                log.warning("sessions cannot be read", error=str(error))
+                found = problem_of_redis(error, known=False)
                 raise ProblemError(
                     found.code, found.detail, advice=found.advice, headers={"Retry-After": "5"}
                 ) from error

@@ -112,7 +112,7 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(redis.RedisError)
     def on_redis(request: Request, error: redis.RedisError) -> Response:
         log.warning("queue unavailable", error=str(error), path=shown_path(request.scope))
-        problem = problem_of_redis(error)
+        problem = problem_of_redis(error, known=bool(request.state.caller.scopes))
         return ProblemResponse(problem, request.url.path, {"Retry-After": "5"})
 
     @app.exception_handler(StorageError)
@@ -131,9 +131,13 @@ def shown_path(scope: Scope) -> str:
     return _SHARED.sub("/s/...", own_path(scope))
 
 
-def problem_of_redis(error: redis.RedisError) -> Problem:
-    """Return the problem for an error of Redis: it cannot be reached, or refuses the command."""
+def problem_of_redis(error: redis.RedisError, *, known: bool) -> Problem:
+    """Return the problem for an error of Redis: it cannot be reached, or refuses the command.
+
+    known: whether the caller is, and so may read Redis' own words, which may name hosts and users.
+    """
     cause = " ".join(str(error).split())[:300].removesuffix(".") or type(error).__name__
+    cause = cause if known else "the log of the server has the reason"
     if isinstance(error, redis.ResponseError):
         return Problem.of(
             "queue_unavailable",

@@ -9,6 +9,7 @@ import pytest
 
 from splatmill.backplane import layout, lists
 from splatmill.backplane.connection import connect
+from splatmill_server.access.sessions import COOKIE
 from tests.support.redis_server import RedisServer, empty_redis
 from tests.support.served_app import Serve, ServedApp, problem, served_app, store_model
 from tests.support.server_events import brief, follow
@@ -36,6 +37,10 @@ def test_stored_things_outlast_redis(serve: Serve, tmp_path: Path) -> None:
         ready = app.http.get("/readyz")
         assert (ready.status_code, ready.json()["ready"]) == (503, False)
         assert ready.json()["checks"]["storage"] == "ok"
+        # Anybody may ask, so that it names no address.
+        assert (
+            ready.json()["checks"]["redis"] == "Redis cannot be reached; the log of the server has the reason"
+        )
         assert app.http.get("/healthz").status_code == 200
         assert "splatmill_redis_up 0.0" in app.http.get("/metrics").text
         problem(app.http.get("/v1/models"), 503, "queue_unavailable")
@@ -48,6 +53,17 @@ def test_stored_things_outlast_redis(serve: Serve, tmp_path: Path) -> None:
         with empty_redis(folder):
             check_after_return(app, capture_id, waiting)
     client.close()
+
+
+def test_only_callers_with_a_key_read_what_redis_says(serve: Serve, tmp_path: Path) -> None:
+    app = serve(api_key="s3cret", redis_url=f"unix://{tmp_path}/secret-place.sock")
+    detail = problem(app.http.get("/v1/jobs"), 503, "queue_unavailable")["detail"]
+    assert "secret-place" in detail
+    stranger = {"Authorization": "none", "Cookie": f"{COOKIE}=of-anybody"}
+    for path in ("/v1/jobs", "/readyz"):
+        assert "secret-place" not in app.http.get(path, headers=stranger).text
+    detail = problem(app.http.get("/v1/jobs", headers=stranger), 503, "queue_unavailable")["detail"]
+    assert "the log of the server has the reason" in detail
 
 
 def check_after_return(app: ServedApp, capture_id: str, waiting: str) -> None:

@@ -308,6 +308,14 @@ class Jobs:
 
         return self._change(job_id, request_cancel)
 
+    def waiting(self, job_id: str) -> Job | None:
+        """Return a job that waits, which a restart leaves as it is, or None for one that has ended.
+
+        Raises 404 problems, and a 409 problem for a job that runs.
+        """
+        found = self.row(job_id)
+        return self._placed(found) if _waits(found, self._job(found)) else None
+
     def restart(self, job_id: str, *, most: int | None = None) -> Job:
         """Enqueue a job that has ended as a new generation, which resumes from its checkpoint if there is one.
 
@@ -317,15 +325,8 @@ class Jobs:
         needs = [*needs_of(known.capture, known.options), (StoredKind.model, job_id)]
 
         def begin_generation(found: JobRow, job: Job) -> dict[str, str] | None:
-            if job.state is JobState.queued and found.cancel_requested_at is None:
+            if _waits(found, job):
                 return None  # a repeated restart has no further effect
-            if not job.state.final:
-                raise ProblemError(
-                    "job_running",
-                    f"The job has not ended; its state is {job.state.value}.",
-                    advice="Cancel it first, or wait until it has ended.",
-                    facts={"state": job.state.value},
-                )
             if not self.storage.exists(layout.capture_record(found.capture)):
                 raise ProblemError(
                     "capture_not_found",
@@ -492,6 +493,20 @@ class Jobs:
                 facts={"job": known["job"]},
             )
         return cast(str, known["job"])
+
+
+def _waits(found: JobRow, job: Job) -> bool:
+    """Return whether a job waits, rather than having ended. Raises a 409 problem if it does neither."""
+    if job.state is JobState.queued and found.cancel_requested_at is None:
+        return True
+    if not job.state.final:
+        raise ProblemError(
+            "job_running",
+            f"The job has not ended; its state is {job.state.value}.",
+            advice="Cancel it first, or wait until it has ended.",
+            facts={"state": job.state.value},
+        )
+    return False
 
 
 def read_record(storage: Storage, job_id: str) -> Job:

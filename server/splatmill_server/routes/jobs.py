@@ -184,6 +184,8 @@ async def cancel_job(service: Shared, job_id: JobId) -> Job:
 )
 def restart_job(service: Shared, who: Who, job_id: JobId) -> Job:
     """Run a job that has ended again, with the same options, from its last checkpoint if there is one."""
+    if (waiting := service.jobs.waiting(job_id)) is not None:
+        return waiting
     with service.quota.job(who, service.jobs.owner(job_id) or who.owner) as keep_room:
         restarted = service.jobs.restart(job_id, most=who.limits.unfinished_jobs)
         keep_room(job_id)

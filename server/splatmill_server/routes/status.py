@@ -7,6 +7,7 @@ from dataclasses import asdict
 
 import httpx
 import redis
+import structlog
 from fastapi import APIRouter, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import HTMLResponse, JSONResponse, Response
@@ -49,6 +50,8 @@ from splatmill_server.access.permission import needs
 from splatmill_server.answers.docs_page import CONTENT_SECURITY_POLICY, docs_page
 from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.service import Service, Shared
+
+log = structlog.get_logger()
 
 router = APIRouter(tags=["service"])
 
@@ -211,7 +214,12 @@ def _redis_checks(service: Service) -> tuple[str, str, bool]:
     try:
         found = memory.read(service.redis)
     except redis.RedisError as error:
-        return f"Redis cannot be reached: {error}", "not known", False
+        log.warning(
+            "Redis is not ready", error=str(error)
+        )  # anybody may ask, and the text may name hosts and users
+        refused = isinstance(error, redis.ResponseError | redis.AuthenticationError)
+        said = "Redis refuses the request" if refused else "Redis cannot be reached"
+        return f"{said}; the log of the server has the reason", "not known", False
     return "ok", " ".join(found.trouble() or ["ok"]), found.full
 
 

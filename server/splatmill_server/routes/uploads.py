@@ -201,6 +201,8 @@ async def append_to_upload(
                 body_size=size,
             )
             arrival.beside = bytes_beside(file.name) if file is not None else 0
+            if file is not None and not new:
+                arrival.stored = 0  # its bytes were there already, and those that arrived are deleted
     if file is None:
         return Response(status_code=204, headers=_state(service, standing))
     return _stored(file, 201 if new else 200)

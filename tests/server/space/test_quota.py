@@ -150,6 +150,32 @@ def test_a_job_is_refused_once_the_quota_is_used_up_and_a_running_one_goes_on(
     assert people.state(job_id) == "succeeded"
 
 
+def test_a_restart_that_cannot_be_names_the_reason_and_not_the_quota(people: ServedApp, ann: Person) -> None:
+    capture = ann.capture(4000, 4000)
+    job = ann("POST", "/v1/jobs", json={"capture": capture}).json()["id"]
+    people.service.storage.put(f"{layout.capture_sfm(capture)}/database.db", b"s" * 5000)
+    people.service.usage.scan()
+    waits = ann("POST", f"/v1/jobs/{job}/restart")
+    assert (waits.status_code, waits.json()["state"]) == (202, "queued")
+    people.begin(job)
+    problem(ann("POST", f"/v1/jobs/{job}/restart"), 409, "job_running")
+    people.finish(job)
+    problem(ann("POST", f"/v1/jobs/{job}/restart"), 507, "quota_exceeded")
+
+
+def test_a_file_that_was_there_already_counts_once(people: ServedApp, ann: Person) -> None:
+    capture = ann.capture(100)
+    path = f"/v1/captures/{capture}/images/twice.zip"
+    sent, body = {"X-Owner": "ann", "X-Limit": "10000"}, b"p" * 3000
+    whole = {"Content-Type": "application/partial-upload", "Upload-Complete": "?1", "Upload-Offset": "0"}
+    begun = people.http.put(path, headers=sent | {"Upload-Complete": "?0", "Upload-Length": "3000"})
+    assert ann.put(capture, "twice.zip", body).status_code == 201
+    before = bytes_of(people)
+    again = people.http.patch(begun.headers["location"], content=body, headers=sent | whole)
+    assert again.status_code == 200, again.text
+    assert bytes_of(people) == before
+
+
 def test_a_job_that_was_created_is_answered_again_when_the_quota_is_used_up(
     people: ServedApp, ann: Person
 ) -> None:

@@ -24,7 +24,7 @@ def _preflight(bench: Bench) -> Answer:
 
 
 PROXIES: tuple[Hostile, ...] = (
-    *(_prefix(path) for path in ("//evil.example", '/"><script>', "/../v1", "/v1", "/" + "a b" * 2000)),
+    *(_prefix(path) for path in ("//evil.example", '/"><script>', "/../v1", "/v1", "/a b")),
     Hostile(
         AREA, "A page of another origin asks whether it may delete", _preflight, "405 `method_not_allowed`"
     ),

@@ -515,6 +515,20 @@ def test_a_reader_cannot_make_the_attempt_take_all_memory(
         )
 
 
+def test_a_reader_ends_with_the_attempt(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = acts(monkeypatch)
+    begun = threading.Event()
+
+    def cancelled() -> bool:
+        return begun.is_set() or bool(begun.set())  # at the second time that it is asked
+
+    with confined([photos], cancelled=cancelled), pytest.raises(Cancelled):
+        decoders.call_once(
+            known.endless, photos / "a.png", "", "", check=here.picture_of, fault=UnusablePicture
+        )
+    assert children() == []
+
+
 def test_what_a_function_raises_costs_no_process(photos: Path, confinement: Decoders) -> None:
     assert same(photos / "a.png")
     before = children()

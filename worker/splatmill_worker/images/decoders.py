@@ -93,14 +93,17 @@ _active: Decoders | None = None
 
 
 @contextmanager
-def confined(read: list[Path], ended: Path | None = None) -> Iterator[Decoders]:
+def confined(
+    read: list[Path], ended: Path | None = None, cancelled: Callable[[], bool] = lambda: False
+) -> Iterator[Decoders]:
     """Let decoding processes open the files of strangers within the block.
 
     read: the files and folders that they may open.
     ended: a file with the list of files that have ended their process twice, which the next attempt does not open.
+    cancelled: whether the reader of a model (`call_once`), which takes minutes for some, is to end.
     """
     global _active
-    decoders = Decoders(read, ended)
+    decoders = Decoders(read, ended, cancelled=cancelled)
     _active = decoders
     try:
         yield decoders
@@ -145,14 +148,16 @@ def call_once(
     """Like `call`, in a process that ends with the call, since the libraries that read models are large.
 
     It may take all the memory that is free (`reader_memory.limit`). Its answer may take a part of that, which this
-    process allocates as soon as the length is announced.
+    process allocates as soon as the length is announced. Raises Cancelled as well, within a fraction of a second.
     """
     if _active is None:
         return check(function(path, *arguments))
     limit = reader_memory.limit()
     own = Decoders(_active.read, processes=1, limit=limit, libraries=OWN_MEMORY + memory.mapped_files())
     try:
-        return own.call(Call(function, path, arguments, READING_SECONDS, limit // ANSWER_SHARE), check, fault)
+        most = limit // ANSWER_SHARE
+        asked = Call(function, path, arguments, READING_SECONDS, most, cancelled=_active.cancelled)
+        return own.call(asked, check, fault)
     finally:
         own.close()
 
@@ -240,6 +245,7 @@ class Decoders:
 
     held: what confines them, as `sandbox.confine` returns it; None before the first answer.
     read: the files and folders that they may open.
+    cancelled: of `confined`.
     limit, libraries: bytes of address space of each for what it reads, by default `memory_limit()`, and besides that.
     """
 
@@ -251,8 +257,10 @@ class Decoders:
         *,
         limit: int | None = None,
         libraries: int = LIBRARIES,
+        cancelled: Callable[[], bool] = lambda: False,
     ) -> None:
         self.read = read
+        self.cancelled = cancelled
         self.held: tuple[str, ...] | None = None
         self._room = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `close`
         self._root = read[0] if read else Path("/")

@@ -218,6 +218,10 @@ def _train(
         log.info("Using the cameras that an earlier job recovered from this capture.")
     if row.options.start_model is not None:
         folder.stage_start(row.options.start_model)
+
+    def stopped() -> bool:
+        return hand_back.requested() or disk.error is not None
+
     mirror = Mirror(folder, room, log.warning)
     live = LiveView(attempt, outbox.put)
     try:
@@ -226,7 +230,7 @@ def _train(
 
         folder.run.mkdir(parents=True, exist_ok=True)
         with (
-            decoders.confined([folder.path], folder.run / ENDED),
+            decoders.confined([folder.path], folder.run / ENDED, stopped),
             unpacked_room.claimed_by(room.unpack),
         ):
             result = _pipeline()(
@@ -234,14 +238,13 @@ def _train(
                 folder.run,
                 row.options,
                 lambda event: _forward(event, folder, room, outbox),
-                lambda: hand_back.requested() or disk.error is not None,
+                stopped,
                 onlookers=live,
             )
     except BaseException as error:
         # The next attempt, perhaps on another machine, needs the list of files that it must not open.
         mirror.close(copy=hand_back.requested() or is_decoder_end(error))
-        stopped = hand_back.requested() or disk.error is not None
-        if isinstance(error, Exception) and not stopped and not keeps_progress(error):
+        if isinstance(error, Exception) and not stopped() and not keeps_progress(error):
             folder.reset()
         raise
     finally:
