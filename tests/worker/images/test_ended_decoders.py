@@ -6,6 +6,7 @@ met exactly; `tests/service/test_ended_children.py` ends processes at random one
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -517,12 +518,8 @@ def test_a_reader_cannot_make_the_attempt_take_all_memory(
 
 def test_a_reader_ends_with_the_attempt(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     known = acts(monkeypatch)
-    begun = threading.Event()
-
-    def cancelled() -> bool:
-        return begun.is_set() or bool(begun.set())  # at the second time that it is asked
-
-    with confined([photos], cancelled=cancelled), pytest.raises(Cancelled):
+    asked = itertools.count()
+    with confined([photos], cancelled=lambda: next(asked) > 0), pytest.raises(Cancelled):
         decoders.call_once(
             known.endless, photos / "a.png", "", "", check=here.picture_of, fault=UnusablePicture
         )

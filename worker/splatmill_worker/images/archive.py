@@ -101,7 +101,8 @@ def unpack(
     the allowance is exceeded; Cancelled when `cancelled()` turns true.
     """
     try:
-        with _BoundedReads(io.FileIO(path)) as file, zipfile.ZipFile(cast(IO[bytes], file)) as archive:
+        bounded = BoundedReads(io.FileIO(path), MAX_DIRECTORY_BYTES, _list_too_long)
+        with bounded as file, zipfile.ZipFile(cast(IO[bytes], file)) as archive:
             _check_places(archive)
             for entry in archive.infolist():
                 entry.filename = entry.filename.replace("\\", "/")  # as some programs of Windows write them
@@ -139,20 +140,33 @@ def unpack(
         raise UnsafeArchive(f"it is not a complete zip file ({error})") from error
 
 
-class _BoundedReads(io.BufferedReader):
-    """A file of which no single read takes more than MAX_DIRECTORY_BYTES into memory."""
+class BoundedReads(io.BufferedReader):
+    """A file of which no single read takes more than `most` bytes into memory, while that is not None.
+
+    `zipfile` reads an archive's list of files at once, however its length is written.
+
+    refused: makes the error of a longer read, whose length it is called with.
+    """
+
+    def __init__(self, raw: io.FileIO, most: int, refused: Callable[[int], Exception]) -> None:
+        super().__init__(raw)
+        self.most: int | None = most
+        self._refused = refused
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is None or size < 0:
             here = self.tell()
             size = self.seek(0, io.SEEK_END) - here
             self.seek(here)
-        if size > MAX_DIRECTORY_BYTES:
-            raise UnsafeArchive(
-                f"its list of files has {size} bytes; at most {MAX_DIRECTORY_BYTES} are allowed, for {MAX_ENTRIES} "
-                "files"
-            )
+        if self.most is not None and size > self.most:
+            raise self._refused(size)
         return super().read(size)
+
+
+def _list_too_long(size: int) -> UnsafeArchive:
+    return UnsafeArchive(
+        f"its list of files has {size} bytes; at most {MAX_DIRECTORY_BYTES} are allowed, for {MAX_ENTRIES} files"
+    )
 
 
 def _check_places(archive: zipfile.ZipFile) -> None:

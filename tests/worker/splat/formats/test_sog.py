@@ -6,6 +6,7 @@ Does not prove what the palette of harmonics costs a trained scene: `splatmill b
 from __future__ import annotations
 
 import json
+import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -154,3 +155,43 @@ def test_damaged_archives_are_named(tmp_path: Path) -> None:
         registry.read(tmp_path / "meta.json")
     with pytest.raises(FileNotFoundError):
         registry.read(tmp_path / "none.sog")
+
+
+def _with_zip64(path: Path, size: int | None, *, hidden: bool) -> None:
+    """Give an archive the record of a large one, which says that its list has `size` bytes; None for the true number.
+
+    hidden: whether the usual record says nothing of it, and names the true number.
+    """
+    content = path.read_bytes()
+    magic, disk, first, here, count, length, start, comment = _LIST_END.unpack(content[-_LIST_END.size :])
+    at = len(content) - _LIST_END.size
+    record = struct.pack("<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, count, count, size or length, start)
+    locator = struct.pack("<4sLQL", b"PK\6\7", 0, at, 1)
+    shown = (here, count, length, start) if hidden else (0xFFFF, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFF)
+    path.write_bytes(content[:at] + record + locator + _LIST_END.pack(magic, disk, first, *shown, comment))
+
+
+_LIST_END = struct.Struct("<4s4H2IH")
+"""The record at the end of an archive (APPNOTE.TXT, 4.3.16)."""
+
+
+def test_an_archive_with_the_record_of_a_large_one_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "m.sog"
+    sog.write(path, some_gaussians(60, 1))
+    before = sog.read(path).gaussians
+    _with_zip64(path, None, hidden=False)
+    assert torch.equal(sog.read(path).gaussians.means, before.means)
+
+
+@pytest.mark.parametrize("hidden", [True, False])
+def test_a_long_list_is_refused_wherever_its_length_stands(tmp_path: Path, hidden: bool) -> None:
+    path = tmp_path / "m.sog"
+    sog.write(path, some_gaussians(60, 1))
+    with path.open("r+b") as file:  # room before the list, which is cut off of its true length
+        content = file.read()
+        start = _LIST_END.unpack(content[-_LIST_END.size :])[6]
+        file.seek(0)
+        file.write(content[:start] + bytes(200_000) + content[start:])
+    _with_zip64(path, 200_000, hidden=hidden)
+    with pytest.raises(ModelUnreadable, match="its list of files has 200000 bytes"):
+        sog.read(path)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import struct
+import io
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import Protocol
+from typing import IO, Protocol, cast
 
-MAX_LIST_BYTES = 2**16
-"""Bytes of an archive's list of its members, of which a model has up to eight."""
+from splatmill_worker.images.archive import BoundedReads
 
-_LIST_END, _LIST_END_MAGIC = struct.Struct("<4s4H2IH"), b"PK\5\6"
-"""The record at the end of an archive, whose sixth field is the length of the list (APPNOTE.TXT, 4.3.16)."""
+MAX_LIST_BYTES = 2**17
+"""Bytes of an archive's list of its members, of which a model has up to eight; `zipfile` reads half as many to find the
+list, those that a comment may take."""
 
 _ENCRYPTED = 1
 """The bit of a member's flags that says so."""
@@ -66,22 +66,14 @@ def opened(path: Path) -> Iterator[Files]:
     if not zipfile.is_zipfile(path):
         yield _Beside(path)
         return
-    _check_list(path)
-    with zipfile.ZipFile(path) as archive:
+    bounded = BoundedReads(io.FileIO(path), MAX_LIST_BYTES, _list_too_long)
+    with bounded as file, zipfile.ZipFile(cast(IO[bytes], file)) as archive:
+        file.most = None  # each member is compared with what is expected of it
         yield _Members(archive)
 
 
-def _check_list(path: Path) -> None:
-    """Raise ValueError for an archive whose list of members is long, each of which becomes an object."""
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - 2**16 - _LIST_END.size))
-        tail = file.read()
-    at = tail.rfind(_LIST_END_MAGIC)
-    if at < 0 or len(tail) - at < _LIST_END.size:
-        raise ValueError("its list of files is not complete")
-    length = _LIST_END.unpack_from(tail, at)[5]
-    if length > MAX_LIST_BYTES:
-        raise ValueError(f"its list of files has {length} bytes, and {MAX_LIST_BYTES} at most are read")
+def _list_too_long(size: int) -> ValueError:
+    return ValueError(f"its list of files has {size} bytes, and {MAX_LIST_BYTES} at most are read")
 
 
 def contents(files: Files, name: str, most: int) -> bytes:
