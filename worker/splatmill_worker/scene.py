@@ -177,6 +177,7 @@ class View:
     lens: projection of the photo itself; None: that of `camera`.
     split: as given by a data set that brings its own; None: by the rule of `split`.
     upright: whether the camera describes the photo with its EXIF orientation applied.
+    other: the view with the other `upright`, where the camera fits the photo both ways; None: it is decided.
     """
 
     name: str
@@ -186,6 +187,7 @@ class View:
     lens: Lens | None = None
     split: Literal["train", "test"] | None = None
     upright: bool = True
+    other: View | None = None
 
 
 class PointViews(NamedTuple):

@@ -40,13 +40,13 @@ def upright_size(image: Image.Image) -> tuple[int, int]:
     return (height, width) if orientation(image) in TURNED else (width, height)
 
 
-def sizes(path: Path, name: str) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Width and height of a picture in pixels, as stored and upright; nothing is decoded.
+def sizes(path: Path, name: str) -> tuple[tuple[int, int], tuple[int, int], int]:
+    """Width and height of a picture in pixels, as stored and upright, and its orientation; nothing is decoded.
 
     Raises UnusablePicture, about the file `name`, and OSError.
     """
     with guarded.opened(path, name) as image:
-        return image.size, upright_size(image)
+        return image.size, upright_size(image), orientation(image)
 
 
 def colors(path: Path, name: str) -> str:

@@ -78,9 +78,8 @@ INVALID = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, 
 """What the check of an answer may raise."""
 
 # What a process answers is checked, since a file may have taken the process over.
-_SIZES: TypeAdapter[tuple[tuple[int, int], tuple[int, int]]] = TypeAdapter(
-    tuple[tuple[int, int], tuple[int, int]]
-)
+_Size = tuple[int, int]
+_SIZES: TypeAdapter[tuple[_Size, _Size, int]] = TypeAdapter(tuple[_Size, _Size, int])
 _PICTURE: TypeAdapter[Picture | str] = TypeAdapter(Picture | str)
 _FAULT: TypeAdapter[str | None] = TypeAdapter(str | None)
 _TEXT: TypeAdapter[str] = TypeAdapter(str)
@@ -169,7 +168,7 @@ def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool
     return call(decode_here.pixels, path, at_least, upright, check=decode_here.picture_of)
 
 
-def sizes(path: Path, name: str) -> tuple[tuple[int, int], tuple[int, int]]:
+def sizes(path: Path, name: str) -> tuple[tuple[int, int], tuple[int, int], int]:
     """Like `splatmill_worker.images.decode.sizes`."""
     return call(decode_here.sizes, path, name, check=_SIZES.validate_python)
 

@@ -100,5 +100,5 @@ def _views(prepared: Prepared, model: pycolmap.Reconstruction) -> dict[int, View
         photo = prepared.photos[index]
         view = posed_view(model, by_photo[index], photo.name, photo.path, photo.mask)
         camera = view.camera.scaled_to(photo.width, photo.height)
-        views[by_photo[index]] = replace(view, camera=camera, upright=True)
+        views[by_photo[index]] = replace(view, camera=camera, upright=True, other=None)
     return views

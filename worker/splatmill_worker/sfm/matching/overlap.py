@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -30,8 +30,10 @@ PARALLEL = 0.1
 """Weight of a position that both photos show from the same direction."""
 
 
-def by_overlap(cameras: Sequence[Camera], partners: int) -> set[Pair]:
+def by_overlap(cameras: Sequence[Camera], partners: int, photos: Iterable[int] | None = None) -> set[Pair]:
     """Each photo with up to `partners` others that show most of the space in front of it at angles good for matching.
+
+    photos: indices of the photos to pair with others; None: of all.
 
     Positions in front of each photo, at depths from near to far, are projected into the others. Empty where all cameras
     are in one place.
@@ -47,8 +49,8 @@ def by_overlap(cameras: Sequence[Camera], partners: int) -> set[Pair]:
     near = NEAREST * float(np.median(nearest[np.isfinite(nearest)]))
     depths = np.geomspace(near, max(FARTHEST * radius, 4.0 * near), DEPTHS)
     chosen: set[Pair] = set()
-    for index, camera in enumerate(cameras):
-        score = _overlap(_positions(camera, depths), centers[index], cameras)
+    for index in range(len(cameras)) if photos is None else photos:
+        score = _overlap(_positions(cameras[index], depths), centers[index], cameras)
         score[index] = 0.0
         for other in np.argsort(-score, kind="stable")[:partners]:
             if score[other] > 0.0:

@@ -147,19 +147,25 @@ def fit_to_file(posed: tuple[Camera, Lens | None], name: str, path: Path, mask: 
     """A view with its camera at the size of the file at `path`.
 
     Whether the camera describes the photo before or after its EXIF orientation is applied depends on the tool that
-    made it, and is decided by the aspect ratio. Where both fit, the camera is taken to describe the photo as stored,
-    as those of most tools do.
+    made it, and is decided by the aspect ratio. Where both fit, the view is that of the photo as stored, and `other`
+    that of the upright one, between which `orientation.decided` chooses.
     """
     camera, lens = posed
     if mask is not None and (reason := decoders.ended(mask)) is not None:
         raise UnusablePicture("decoder_ended", name, f"of its mask: {reason}")
-    stored, upright = decoders.sizes(path, name)
-    aspect = camera.width / camera.height
-    stored_fits = abs(stored[0] / stored[1] / aspect - 1.0) < MAX_ASPECT_ERROR
-    turned = not stored_fits and stored != upright
-    width, height = upright if turned else stored
+    stored, upright, orientation = decoders.sizes(path, name)
+
+    def fits(size: tuple[int, int]) -> bool:
+        return abs(size[0] / size[1] * camera.height / camera.width - 1.0) < MAX_ASPECT_ERROR
+
     # The lens stays in its own pixels: the loader scales its look-up to the photo.
-    return View(name, camera.scaled_to(width, height), path, mask, lens, None, turned)
+    as_stored, as_upright = (
+        View(name, camera.scaled_to(*size), path, mask, lens, None, turned)
+        for size, turned in ((stored, False), (upright, True))
+    )
+    if not fits(stored) and stored != upright:
+        return as_upright
+    return replace(as_stored, other=as_upright) if orientation != 1 and fits(upright) else as_stored
 
 
 def scene_of(

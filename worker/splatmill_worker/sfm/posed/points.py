@@ -23,6 +23,7 @@ from splatmill_worker.sfm import stereo
 from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.sfm.matching import two_view
 from splatmill_worker.sfm.options import LEAN, STANDARD
+from splatmill_worker.sfm.posed import orientation
 from splatmill_worker.sfm.posed.evidence import Evidence, evidence_of
 from splatmill_worker.sfm.posed.triangulation import Triangulated, triangulate
 
@@ -68,8 +69,10 @@ def with_points(
     No camera is moved. Scenes of transparent photos without points stay as they are: training starts them from
     the visual hull (decisions: hull-start).
 
-    Raises OSError and ValueError for photos as `images.load_view` does, and Cancelled.
+    Raises OSError and ValueError for photos as `images.load_view` does, Refusal as `orientation.decided` does, and
+    Cancelled.
     """
+    scene = orientation.decided(scene, seed=seed, on_progress=on_progress, cancelled=cancelled)
     scene = _with_loose_points(scene, cancelled)
     if not _lacks_points(scene):
         return _with_stereo(scene, workdir, on_progress, cancelled)
@@ -292,7 +295,8 @@ def _digest(scene: Scene) -> str:
     digest.update(scene.points.tobytes())
     for view in scene.views:
         camera = view.camera
-        digest.update(repr((view.name, view.lens, view.split, camera.width, camera.height)).encode())
+        size = camera.width, camera.height
+        digest.update(repr((view.name, view.lens, view.split, view.upright, *size)).encode())
         digest.update(camera.viewmat.tobytes() + camera.K.tobytes())
         if view.mask is not None:
             digest.update(hashlib.sha256(view.mask.read_bytes()).digest())

@@ -199,7 +199,7 @@ def _view(
     values = {**document, **frame}
     try:
         viewmat = world_to_camera(np.array(frame["transform_matrix"], np.float64))
-        camera = _colmap_camera(values, relative, photo)
+        cameras = [_colmap_camera(values, size) for size in _sizes(values, relative, photo)]
     except (KeyError, TypeError, ValueError, ArithmeticError) as error:
         fault = f"{error.args[0]} is missing." if isinstance(error, KeyError) else str(error)
         raise ValueError(f"Frame {index} of {path.name} ({name}): {fault}") from error
@@ -207,7 +207,10 @@ def _view(
     if mask is None and isinstance(frame.get("mask_path"), str):
         beside = path.parent / _local(frame["mask_path"])
         mask = beside if _within(beside, capture) and beside.is_file() else None
-    return name, fit_to_file(camera_and_lens(camera, viewmat), relative, photo, mask)
+    view, *other = [
+        fit_to_file(camera_and_lens(camera, viewmat), relative, photo, mask) for camera in cameras
+    ]
+    return name, replace(view, other=other[0]) if other else view
 
 
 def _has_no_pose(frame: Any) -> bool:
@@ -261,12 +264,17 @@ def world_to_camera(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return viewmat_of(camera_to_world[:3, :3].T, camera_to_world[:3, 3])
 
 
-def _colmap_camera(values: dict[str, Any], name: str, photo: Path) -> pycolmap.Camera:
-    """The camera of a frame; its size is that of the file when w and h are missing."""
+def _sizes(values: dict[str, Any], name: str, photo: Path) -> list[tuple[int, int]]:
+    """Width and height of the camera of a frame; where w or h is missing those of the file, stored and upright."""
     if "w" in values and "h" in values:
-        width, height = int(values["w"]), int(values["h"])
-    else:
-        (width, height), _ = decoders.sizes(photo, name)
+        return [(int(values["w"]), int(values["h"]))]
+    stored, upright, _ = decoders.sizes(photo, name)
+    return [stored] if stored == upright else [stored, upright]
+
+
+def _colmap_camera(values: dict[str, Any], size: tuple[int, int]) -> pycolmap.Camera:
+    """The camera of a frame, for a photo of this width and height."""
+    width, height = size
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise ValueError(f"w and h are {width} and {height} pixels; they must be 1 to {MAX_SIDE}.")
     if "fl_x" in values or "fl_y" in values:
