@@ -22,6 +22,7 @@ from splatmill_worker.images import archive, guarded, masks, prepare
 from splatmill_worker.images.colors import PRIMARIES, TRANSFERS
 from splatmill_worker.images.lens import PINHOLE_MODELS
 from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam
+from splatmill_worker.sfm.posed.camera_models import is_panoramic
 from tests.support.inputs.example import answer
 from tests.support.inputs.table import EXAMPLES
 
@@ -177,6 +178,8 @@ def _cameras() -> list[str]:
 
 
 def _undistorted(model: str) -> str:
+    if is_panoramic(model):
+        return "refused"
     return "as they are" if model in PINHOLE_MODELS else "undistorted to a pinhole"
 
 

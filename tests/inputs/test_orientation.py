@@ -8,6 +8,7 @@ from tests.inputs.conftest import PLAIN_WITH_CAMERAS, Build, Train
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_photos_upside_down_train_with_cameras_of_upright_ones(built: Build, trained: Train) -> None:
     result = trained(built("orientation-180"))
     assert result.psnr > PLAIN_WITH_CAMERAS - 0.5

@@ -58,6 +58,8 @@ def posed_scene(
             )
         try:
             scene = given.load()
+        except posed.UnreadModel as error:
+            raise Refusal("poses_invalid", str(error), advice=error.advice) from error
         except (ValueError, OSError) as error:
             raise Refusal(
                 "poses_invalid",

@@ -152,7 +152,7 @@ def _cameras_bin(path: Path) -> Arrays:
     def entry(data: mmap.mmap, at: int) -> int:
         number, model, width, height = _CAMERA.unpack_from(data, at)
         if model not in MODELS:
-            raise ValueError(f"there is no camera model {model}")
+            raise ValueError(f"there is no camera model {model}; COLMAP's are {_listed()}")
         count = MODELS[model][1]
         parameters = struct.unpack_from(f"<{count}d", data, at + _CAMERA.size)
         cameras.add(number, model, width, height, parameters)
@@ -220,10 +220,16 @@ def _cameras_txt(path: Path) -> Arrays:
     for _, number, model, width, height, *parameters in _lines(path, 5):
         kind = _NUMBERS.get(model)
         if kind is None:
-            raise ValueError(f"camera {number[:40]} has the model {model[:40]!r}, which does not exist")
+            raise ValueError(
+                f"camera {number[:40]} has the model {model[:40]!r}, which does not exist; COLMAP's are {_listed()}"
+            )
         values = [float(value) for value in parameters]
         cameras.add(int(number), kind, int(width), int(height), values)
     return cameras.arrays()
+
+
+def _listed() -> str:
+    return ", ".join(f"{name} ({number})" for number, (name, _) in MODELS.items())
 
 
 def _images_txt(path: Path) -> Arrays:

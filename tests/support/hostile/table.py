@@ -7,6 +7,7 @@ from tests.support.hostile.table_colors import COLORS
 from tests.support.hostile.table_decoders import DECODERS
 from tests.support.hostile.table_files import FILES
 from tests.support.hostile.table_headers import HEADERS
+from tests.support.hostile.table_lenses import LENSES
 from tests.support.hostile.table_models import MODELS
 from tests.support.hostile.table_others import OTHERS
 from tests.support.hostile.table_poses import POSES
@@ -24,6 +25,7 @@ HOSTILE: tuple[Hostile, ...] = (
     *FILES,
     *UNPACKED,
     *POSES,
+    *LENSES,
     *MODELS,
     *DECODERS,
     *COLORS,

@@ -6,11 +6,18 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
+
 from splatmill.schema.photos import MIN_PHOTO_SIDE
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import exif, guarded
 from splatmill_worker.images.decode import tags, upright_size, whole
 from splatmill_worker.images.photo_colors import PhotoColors
+
+POLE_SPREAD = 0.25
+"""Spread of grey levels in the first and last row of a panorama over that of a usual row, at most: they are half a
+pixel from the poles."""
 
 GIVE = "; give JPEG, PNG, WebP, TIFF, HEIC or AVIF photos, videos or zips"
 
@@ -23,6 +30,8 @@ class Picture:
     exif: the tags that structure from motion uses.
     several: whether the file holds further pictures.
     colors: how its colours become sRGB, as `PhotoColors.remark` says it.
+    projection: of a panorama, by its XMP.
+    closed: whether it has the shape and the edges of a panorama of 360 by 180 degrees.
     """
 
     width: int
@@ -30,6 +39,8 @@ class Picture:
     exif: exif.Exif
     several: bool
     colors: str
+    projection: str | None = None
+    closed: bool = False
 
 
 def examine(path: Path, name: str) -> Picture | str:
@@ -47,14 +58,26 @@ def examine(path: Path, name: str) -> Picture | str:
                 width, height = upright_size(image)
                 several = guarded.several(image)
                 colors = PhotoColors.of(image, tags(image), path).remark(image.mode)
-                found = exif.read(image)
-                if image.format == "JPEG":
+                found, projection = exif.read(image), exif.projection(image)
+                wide = width == 2 * height
+                if image.format == "JPEG" and not wide:
                     # This decodes at the smallest DCT scale, and still reads the whole file.
                     image.draft(None, (1, 1))
                 with guarded.room(image):
-                    whole(image, name)
+                    photo = whole(image, name)
+                closed = wide and _is_closed(photo)
     except UnusablePicture as error:
         return error.reason + (GIVE if error.code == "not_an_image" else "")
     except OSError as error:
         return f"it cannot be read: {error}"
-    return Picture(width, height, found, several, colors)
+    return Picture(width, height, found, several, colors, projection, closed)
+
+
+def _is_closed(photo: Image.Image) -> bool:
+    """Whether the edges of a picture are those of a sphere: the left one continues the right one, and the upper and the
+    lower one are a point each, so of one colour."""
+    values = np.asarray(photo.convert("L"), np.float64)
+    columns = np.abs(np.diff(values, axis=1)).mean(axis=0)
+    seam = float(np.abs(values[:, 0] - values[:, -1]).mean())
+    poles = max(float(values[0].std()), float(values[-1].std()))
+    return seam <= float(columns.max()) and poles < POLE_SPREAD * float(values.std(axis=1).mean())

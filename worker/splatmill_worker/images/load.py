@@ -239,7 +239,7 @@ def _look_up(
         (np.arange(width * samples) + 0.5) / samples, (np.arange(height * samples) + 0.5) / samples
     )
     rays = np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1).reshape(-1, 2)
-    pixels = lenses.distort(lenses.colmap_camera(lens), rays)
+    pixels = lenses.distort(lens, rays)
     grid = pixels / (lens.width, lens.height) * 2.0 - 1.0
     shape = height * samples, width * samples
     inside = np.all(np.abs(grid) <= 1.0 + 1.0 / min(lens.width, lens.height), axis=1).reshape(shape)

@@ -28,6 +28,12 @@ IGNORED_NAMES = ("thumbs.db", "desktop.ini")
 MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 """Errors of the operating system that say nothing about the file: they end the attempt."""
 
+CUT_PANORAMAS = (
+    "Cut panoramas into pinhole photos of 90 degrees, the faces of a cube, and give these: COLMAP's example "
+    "panorama_sfm.py does so, and ns-process-data of nerfstudio with --camera-type equirectangular."
+)
+"""What to do about panoramas."""
+
 DEFAULT_FRAMES = 100
 """Frames taken from a video."""
 
@@ -45,6 +51,7 @@ class UsablePhoto:
     sequence: name of the video that the photo is a frame of, if it is one.
     several: whether the file holds further pictures, which are not used.
     colors: how its colours become sRGB, as `PhotoColors.remark` says it.
+    closed: whether it has the shape and the edges of a panorama of 360 by 180 degrees.
     """
 
     name: str
@@ -57,6 +64,7 @@ class UsablePhoto:
     sequence: str | None = None
     several: bool = False
     colors: str = ""
+    closed: bool = False
 
 
 @dataclass(frozen=True)
@@ -182,7 +190,19 @@ def prepare(
     found.warnings += photo_colors.sentences([photo.colors for photo in ordered])
     skipped = [name for name, _ in found.skipped]
     warnings += [*unfit(found.unfit_masks), *unread(skipped), *unread_cameras(skipped)]
+    found.warnings += _panoramas([photo.name for photo in ordered if photo.closed])
     return Prepared(ordered, tuple(found.skipped), (*found.notes, *notes), (*found.warnings, *warnings))
+
+
+def _panoramas(names: list[str]) -> list[str]:
+    """A warning about photos that look like panoramas; none where there are none."""
+    if not names:
+        return []
+    are = "1 photo is" if len(names) == 1 else f"{len(names)} photos are"
+    return [
+        f"{are} twice as wide as high with edges that meet, as those of 360-degree panoramas do (such as {names[0]}). "
+        f"They are taken for photos of a pinhole camera, which is wrong for panoramas. {CUT_PANORAMAS}"
+    ]
 
 
 def given_files(images: Path) -> list[Path]:
@@ -311,6 +331,8 @@ def _inspect(name: str, path: Path, sequence: str | None) -> UsablePhoto | str:
     found = decoders.examine(path, name)
     if isinstance(found, str):
         return found
+    if found.projection is not None:
+        return f"it is a panorama ({found.projection} by its XMP), which no pinhole camera shows. {CUT_PANORAMAS}"
     return UsablePhoto(
         name,
         path,
@@ -321,6 +343,7 @@ def _inspect(name: str, path: Path, sequence: str | None) -> UsablePhoto | str:
         sequence=sequence,
         several=found.several,
         colors=found.colors,
+        closed=found.closed,
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from splatmill.schema import KnownDistance, ModelFrame
 from splatmill_worker.colmap import pycolmap, write_model
+from splatmill_worker.images.lens import remarks
 from splatmill_worker.images.prepare import Prepared
 from splatmill_worker.scene import Scene, View
 from splatmill_worker.sfm import features, stereo
@@ -81,6 +82,7 @@ def load_model(prepared: Prepared, folder: Path, known: KnownDistance | None = N
         notes=(*prepared.notes, *document["notes"]),
     )
     scene = replace(scene, facts=document["facts"], warnings=(*prepared.warnings, *document["warnings"]))
+    scene = replace(scene, warnings=(*scene.warnings, *remarks(view.lens for view in scene.views)))
     if (folder / STEREO).is_file():
         scene = stereo.add(scene, stereo.StereoPoints.load(folder / STEREO))
     if (folder / FRAME).is_file():

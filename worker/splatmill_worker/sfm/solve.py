@@ -110,7 +110,11 @@ def _require_photos(prepared: Prepared) -> None:
     if count == 0:
         raise SfmFailed(
             "no_images",
-            f"None of the {len(prepared.skipped)} files is a usable photo.",
+            f"None of the {len(prepared.skipped)} files is a usable photo"
+            + (
+                f", such as {prepared.skipped[0][0]}: {prepared.skipped[0][1]}" if prepared.skipped else ""
+            ).rstrip(".")
+            + ".",
             facts,
             "Give JPEG, PNG, WebP, TIFF, HEIC or AVIF photos, a video, or a zip of photos.",
         )

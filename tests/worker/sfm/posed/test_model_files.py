@@ -179,7 +179,7 @@ def test_counts_beyond_the_file_cost_no_memory(tmp_path: Path) -> None:
         ({"cameras": ""}, "no cameras.txt, or an empty one"),
         ({"cameras": "1 PINHOLE 0 48 60 60 32 24\n"}, "0 x 48"),
         ({"cameras": "1 PINHOLE 64 48 -60 60 32 24\n"}, "has the parameters"),
-        ({"cameras": "1 EQUIRECTANGULAR 64 48 64 48\n"}, "spherical"),
+        ({"cameras": "1 EQUIRECTANGULAR 64 48 64 48\n"}, "EQUIRECTANGULAR"),
         ({"cameras": "1 UNHEARD_OF 64 48 60\n"}, "could not be read"),
         ({"images": "1 0 0 0 0 1 0 5 1 1.jpg\n\n"}, "rotation of '1.jpg'"),
         ({"images": "1 1 0 0 0 1e300 0 5 1 1.jpg\n\n"}, "translation of '1.jpg'"),

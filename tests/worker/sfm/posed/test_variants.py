@@ -236,7 +236,7 @@ def test_one_frame_that_no_camera_can_be_is_left_out_and_several_are_refused(
     assert "Frame 7" in reason
     given[3]["transform_matrix"] = given[7]["transform_matrix"]
     transforms(tmp_path / "transforms.json", given)
-    with pytest.raises(ValueError, match="Frame 7"):
+    with pytest.raises(ValueError, match="Frame 3"):
         loaded(tmp_path)
 
 

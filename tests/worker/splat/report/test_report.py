@@ -170,3 +170,14 @@ def test_photos_that_all_agree_are_said_to(tmp_path: Path) -> None:
 
 def test_json_gets_plain_values() -> None:
     assert plain({1: (math.inf, np.arange(2), True, Path("x"))}) == {"1": [None, [0, 1], True, "x"]}
+
+
+def test_where_the_cameras_are_wrong_no_photo_is_accused_of_another_light(tmp_path: Path) -> None:
+    found = (Disagreement("02.png", 4.0, 0.0, "other light", torch.zeros(2, 2, dtype=torch.bool)),)
+    result = replace(trained([30.0, 30.0, 12.0, 30.0, 29.0], True), disagreements=found)
+    for contradicted in (False, True):
+        report = report_of(tmp_path, result, said={"cameras_contradicted": contradicted})
+        (misfit,) = (each for each in report["warnings"] if each.startswith("02.png does not fit"))
+        assert ("light" in misfit) != contradicted
+        assert ("other light" in (tmp_path / "report.html").read_text()) != contradicted
+        assert report["disagreement"][0]["reason"] == (None if contradicted else "other light")

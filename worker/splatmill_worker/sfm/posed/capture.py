@@ -9,6 +9,7 @@ from pathlib import Path
 
 from splatmill.data_sets import TRANSFORMS, find_cameras, walk
 from splatmill.schema.photos import PHOTO_SUFFIXES
+from splatmill_worker.images import lens
 from splatmill_worker.images.decoders import hidden_share, mask_fault, photo_colors
 from splatmill_worker.images.masks import remarks, unfit
 from splatmill_worker.images.photo_colors import sentences
@@ -54,6 +55,7 @@ class PosedInput:
         masks = [view.mask for view in scene.views if view.mask is not None]
         unused = {name for name in files.unused_masks if files.masks[name] not in masks}
         notes, warnings = remarks(len(scene.views), masks, unused, hidden_share)
+        warnings += lens.remarks(view.lens for view in scene.views)
         colors = [photo_colors(view.image, view.name) for view in scene.views]
         return replace(
             scene,

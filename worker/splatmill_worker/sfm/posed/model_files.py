@@ -14,6 +14,8 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.colmap_files import Arrays
 from splatmill_worker.errors import Refusal
 from splatmill_worker.images import decoders
+from splatmill_worker.sfm.posed import camera_models
+from splatmill_worker.sfm.posed.camera_models import UnreadModel
 
 MAX_SIDE = 1_000_000
 """Pixels of a side of a camera."""
@@ -149,9 +151,8 @@ def _cameras(arrays: Arrays) -> dict[int, pycolmap.Camera]:
             )
         camera = pycolmap.Camera(model=name, width=width, height=height, params=parameters)
         if camera.is_spherical():
-            raise ValueError(
-                f"Camera {number} of the COLMAP model is spherical; photos of such cameras are not used."
-            )
+            error = UnreadModel.named(name, camera_models.COLMAP)
+            raise UnreadModel(f"Camera {number} of the COLMAP model: {error}.", error.advice)
         focal = [parameters[index] for index in camera.focal_length_idxs()]
         if not (np.abs(parameters).max() <= MAX_PARAMETER and min(focal, default=1.0) > 0.0):
             raise ValueError(f"Camera {number} of the COLMAP model has the parameters {parameters.tolist()}.")

@@ -195,6 +195,7 @@ def _with_triangulated(scene: Scene, found: Triangulated, cancelled: Callable[[]
         "matches": found.matches,
         "verified_pairs": found.pairs,
         "matches_explained_by_cameras": round(found.agreeing / max(1, found.matches), 4),
+        "cameras_contradicted": _contradicted(found),
         "match_error_px": None if not found.matches else round(found.disagreement, 3),
         "features_per_photo": found.features,
         "transparent_photos": found.transparent,

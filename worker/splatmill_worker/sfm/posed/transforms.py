@@ -24,6 +24,7 @@ from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.images import decoders
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed import polycam
+from splatmill_worker.sfm.posed.camera_models import UnreadModel, is_fisheye
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
 from splatmill_worker.sfm.posed.files import ImageFiles, missing, readings
 from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_PARAMETER, MAX_SIDE, MOST_FAULTY
@@ -67,7 +68,8 @@ def load(
             validation |= {_called(index, frame, files) for index, frame in enumerate(document["frames"])}
             continue
         tests = _test_names(path, document)
-        without, faulty = 0, 0
+        without = 0
+        faults: list[ValueError] = []
         for index, frame in enumerate(document["frames"]):
             if _has_no_pose(frame):
                 without += 1
@@ -79,9 +81,9 @@ def load(
                 unusable[error.facts["file"]] = error.reason
                 continue
             except ValueError as error:
-                faulty += 1
-                if faulty > MOST_FAULTY * len(document["frames"]):
-                    raise
+                faults.append(error)
+                if len(faults) > MOST_FAULTY * len(document["frames"]):
+                    raise faults[0] from None
                 left_out.append((_called(index, frame, files), str(error)))
                 continue
             if view is None:
@@ -200,6 +202,8 @@ def _view(
     try:
         viewmat = world_to_camera(np.array(frame["transform_matrix"], np.float64))
         cameras = [_colmap_camera(values, size) for size in _sizes(values, relative, photo)]
+    except UnreadModel as error:
+        raise UnreadModel(f"Frame {index} of {path.name} ({name}): {error}.", error.advice) from error
     except (KeyError, TypeError, ValueError, ArithmeticError) as error:
         fault = f"{error.args[0]} is missing." if isinstance(error, KeyError) else str(error)
         raise ValueError(f"Frame {index} of {path.name} ({name}): {fault}") from error
@@ -290,19 +294,20 @@ def _colmap_camera(values: dict[str, Any], size: tuple[int, int]) -> pycolmap.Ca
     else:
         raise ValueError("it has no focal length; give fl_x or camera_angle_x.")
     cx, cy = float(values.get("cx", 0.5 * width)), float(values.get("cy", 0.5 * height))
-    k1, k2, k3, k4, p1, p2 = (float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    largest = float(np.abs([fx, fy, cx, cy, k1, k2, k3, k4, p1, p2]).max())
+    radial = [float(values.get(f"k{order}", 0.0)) for order in range(1, 7)]
+    tangential = [float(values.get(key, 0.0)) for key in ("p1", "p2")]
+    largest = float(np.abs([fx, fy, cx, cy, *radial, *tangential]).max())
     if not (fx > 0 and fy > 0 and largest <= MAX_PARAMETER):
         raise ValueError(
             f"the focal lengths are {fx} and {fy} pixels; they must be positive, and all intrinsics at most "
             f"{MAX_PARAMETER:.0e}."
         )
-    if values.get("camera_model") == "OPENCV_FISHEYE" or values.get("is_fisheye"):
-        model, extra = "OPENCV_FISHEYE", [k1, k2, k3, k4]
-    elif k3 or k4:
-        model, extra = "FULL_OPENCV", [k1, k2, p1, p2, k3, k4, 0.0, 0.0]
+    if is_fisheye(values):
+        model, extra = "OPENCV_FISHEYE", radial[:4]
+    elif any(radial[2:]):
+        model, extra = "FULL_OPENCV", [*radial[:2], *tangential, *radial[2:]]
     else:
-        model, extra = "OPENCV", [k1, k2, p1, p2]
+        model, extra = "OPENCV", [*radial[:2], *tangential]
     return pycolmap.Camera(model=model, width=width, height=height, params=[fx, fy, cx, cy, *extra])
 
 

@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +94,10 @@ def write_report(
     render: renders the trained scene, for the pictures of the views that it shows worst.
     """
     trained, plan, offset = finished.trained, planned.plan, finished.exported.world.offset
+    if planned.scene.facts.get("cameras_contradicted"):
+        # The cameras or the lens are wrong: photos disagree for that, even if it looks like another light.
+        unexplained = tuple(each._replace(reason=None) for each in trained.disagreements)
+        trained = replace(trained, disagreements=unexplained)
     report: dict[str, Any] = plain(
         {
             "format": FORMAT,
