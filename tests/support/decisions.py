@@ -27,7 +27,8 @@ class Forced:
 
     options: fields of TrainOptions.
     plan: fields of the plan in place of those that were decided, with dots into its schedule.
-    capture: what the capture is like: "points", "random" or "model" (what training starts from), "masked", "distorted".
+    capture: what the capture is like: "points", "hull", "random" or "model" (what training starts from), "masked",
+        "distorted".
     """
 
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -46,7 +47,7 @@ def _by_option(name: str, *levels: Any) -> dict[str, Forced]:
 ALL = Budget(STEPS)
 
 NAMED: dict[str, dict[str, Forced]] = {
-    "initial": {name: Forced(capture=(name,)) for name in ("points", "random", "model")},
+    "initial": {name: Forced(capture=(name,)) for name in ("points", "hull", "random", "model")},
     "masks": {"some": Forced(capture=("masked",)), "none": Forced()},
     "undistortion": {"some": Forced(capture=("distorted",)), "none": Forced()},
     "end": {
@@ -141,12 +142,12 @@ def factors() -> dict[str, dict[str, Forced]]:
 
 
 def refused(known: Mapping[str, Mapping[str, Forced]]) -> set[Pair]:
-    """The pairs that a run refuses: random places and a given model leave nothing to seed or to compare beside."""
+    """The pairs that a run refuses: without points there is nothing to seed or to compare beside."""
     found = {
         frozenset(((name, "on"), ("initial", initial)))
         for name in ("far_shell", "gaps")
-        for initial in ("random", "model")
-    } | {frozenset((("exposure", "on"), ("initial", "random")))}
+        for initial in ("hull", "random", "model")
+    } | {frozenset((("exposure", "on"), ("initial", initial))) for initial in ("hull", "random")}
     if "gpu" in known["backend"]:
         found.add(frozenset((("pose_refinement", "on"), ("backend", "gpu"))))
     return found

@@ -71,15 +71,20 @@ def scene(lens: bool, points: bool) -> Scene:
 
 
 def capture(folder: Path, kinds: tuple[str, ...]) -> Path:
-    """A capture on disk. Without points, photos are transparent, and training starts at random places."""
-    transparent = "random" in kinds
+    """A capture on disk. Without points, photos are transparent around the middle of the still life, whose outlines
+    bound a hull, or one photo is transparent everywhere, which leaves training to start at random places."""
+    transparent = "random" in kinds or "hull" in kinds
     for name in ("images", "masks", "poses"):
         (folder / name).mkdir(parents=True)
-    for index, (_, rgb, depth) in enumerate(pictures()):
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    for index, (camera, rgb, depth) in enumerate(pictures()):
         # Every second photo is darker, so that there is light to compare.
         pixels = (rgb * (0.7 if index % 2 else 1.0)).astype(np.uint8)
         if transparent:
-            pixels = np.dstack([pixels, np.where(depth < 6.5, 255, 0).astype(np.uint8)])
+            places = camera.unproject(columns.ravel(), rows.ravel(), depth.ravel()).reshape(HEIGHT, WIDTH, 3)
+            near = np.hypot(places[..., 0], places[..., 1]) < 1.35
+            alpha = np.where(near if "hull" in kinds else index > 0, 255, 0)
+            pixels = np.dstack([pixels, np.broadcast_to(alpha, (HEIGHT, WIDTH)).astype(np.uint8)])
         Image.fromarray(pixels).save(folder / "images" / f"{index:02d}.png")
         if "masked" in kinds:
             mask = np.full((HEIGHT, WIDTH), 255, np.uint8)

@@ -47,6 +47,7 @@ from splatmill_worker.splat.report.report import FinishedTraining, PlannedScene,
 from splatmill_worker.splat.report.stages import Stages
 from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS, sample_frusta
 from splatmill_worker.splat.start.given_model import LEAST_ASSESSED, GivenModel, assess, read_given_model
+from splatmill_worker.splat.start.hull import Hull, NoHull, at_first, visual_hull
 from splatmill_worker.splat.start.points import ENOUGH_POINTS, from_points
 from splatmill_worker.splat.start.seeding import add_seeds
 from splatmill_worker.splat.train import checkpoint
@@ -110,8 +111,8 @@ def run(
         emit(StateEvent(state=JobState.training))
         photos = _load_photos(cameras, loading_size(options, task.kernels), stages)
         with stages.measured("plan"):
-            first, start = _first_gaussians(task, cameras, photos)
-            facts, light = _measure_facts(task, cameras, photos, first, start)
+            first = _first_gaussians(task, cameras, photos)
+            facts, light = _measure_facts(task, cameras, photos, first)
             plan = _make_plan(task, facts, revise)
         emit(PlanEvent(plan=plan.as_dict()))
         if plan.image_size < max(facts.width, facts.height):
@@ -252,8 +253,22 @@ def _load_photos(cameras: Cameras, size: int, stages: Stages) -> Photos:
     return Photos(training, held_out)
 
 
-def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaussians, GivenModel | None]:
-    """The Gaussians to start from, and the assessment of the given model; None where no model was given."""
+@dataclass(frozen=True)
+class First:
+    """The Gaussians that training may start from.
+
+    gaussians: all of them, before the plan limits their number.
+    model: the assessment of the given model; None where no model was given.
+    hull: the visual hull that points were added in, or why there is none; None where none was carved.
+    """
+
+    gaussians: Gaussians
+    model: GivenModel | None = None
+    hull: Hull | NoHull | None = None
+
+
+def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> First:
+    """The given model, or Gaussians made from points and in the visual hull of transparent photos, or at random."""
     path = start_model_path(task.capture, task.workdir, task.options)
     if path is not None:
         given = read_given_model(path, cameras.normalization, _most_given(task.options))
@@ -266,12 +281,17 @@ def _first_gaussians(task: Task, cameras: Cameras, photos: Photos) -> tuple[Gaus
         start = assess(gaussians, photos.training, antialiased=given.antialiased)
         if start.doubtful:
             task.emit(LogEvent(level="warning", message=_doubt_message(start)))
-        return gaussians, start
+        return First(gaussians, start)
     world = cameras.world
-    if len(world.points) >= ENOUGH_POINTS:
-        return from_points(torch.from_numpy(world.points), torch.from_numpy(world.colors)), None
     targets = [view.full for view in photos.training]
-    return from_points(*sample_frusta(targets, RANDOM_GAUSSIANS, task.options.seed)), None
+    hull = None
+    if any(target.alpha is not None for target in targets):
+        hull = visual_hull(targets, resolved(targets[0].rgb[..., 0].numel(), len(targets)))
+    if isinstance(hull, Hull):
+        return First(hull.gaussians(len(hull.points), world.points, world.colors), hull=hull)
+    if len(world.points) >= ENOUGH_POINTS:
+        return First(from_points(torch.from_numpy(world.points), torch.from_numpy(world.colors)), hull=hull)
+    return First(from_points(*sample_frusta(targets, RANDOM_GAUSSIANS, task.options.seed)), hull=hull)
 
 
 def _most_given(options: TrainOptions) -> int:
@@ -295,15 +315,17 @@ def _doubt_message(start: GivenModel) -> str:
     )
 
 
-def _measure_facts(
-    task: Task, cameras: Cameras, photos: Photos, gaussians: Gaussians, start: GivenModel | None
-) -> tuple[Facts, Light | None]:
+def _measure_facts(task: Task, cameras: Cameras, photos: Photos, first: First) -> tuple[Facts, Light | None]:
     """What can be measured before training: the scene, how fast this machine trains it, and the photos' light."""
     pixels = photos.training[0].full.rgb[..., 0].numel()
-    most = resolved(pixels, len(photos.training)) if start is None else 0
-    speed = probe(open_engine(gaussians, task.kernels), photos.training, most=most)
+    most = resolved(pixels, len(photos.training)) if first.model is None else 0
+    speed = probe(open_engine(first.gaussians, task.kernels), photos.training, most=most)
     facts, light = measure(cameras.world, photos.training, len(photos.held_out), speed)
-    facts = replace(facts, start=start)
+    facts = replace(facts, start=first.model)
+    if isinstance(first.hull, Hull):
+        facts = replace(facts, hull_points=len(first.hull.points))
+    elif first.hull is not None:
+        facts = replace(facts, no_hull=first.hull.reason)
     card = describe() if task.kernels == "gpu" else None
     return (facts if card is None else replace(facts, memory_available=card.free_bytes)), light
 
@@ -329,9 +351,13 @@ def _make_plan(task: Task, facts: Facts, revise: Revise) -> Plan:
     return plan
 
 
-def _seeded(first: Gaussians, cameras: Cameras, photos: Photos, plan: Plan) -> Gaussians:
+def _seeded(first: First, cameras: Cameras, photos: Photos, plan: Plan) -> Gaussians:
     """The first Gaussians within the plan's limit, with what the plan adds to those made from points."""
-    gaussians = first.most_opaque(plan.max_gaussians)
+    if isinstance(first.hull, Hull):
+        added = at_first(len(first.hull.points), plan.max_gaussians)
+        gaussians = first.hull.gaussians(added, cameras.world.points, cameras.world.colors)
+        return gaussians.most_opaque(plan.max_gaussians)
+    gaussians = first.gaussians.most_opaque(plan.max_gaussians)
     if plan.initial != "points":
         return gaussians
     return add_seeds(

@@ -27,6 +27,10 @@ Source = Literal["sfm", "colmap", "transforms", "blender"]
 MIN_DEPTH = 1e-9
 """Smallest depth, in world units, at which a point is projected; nearer ones and those behind the camera are not."""
 
+WRONG_OUTLINES = 0.05
+"""Share of the photos that show a place which may be wrong that it is transparent. Round a sphere, one photo in twenty
+grazes the surface so closely that leaving it out enlarges the radius by a thousandth."""
+
 MIN_SPREAD = 1e-3
 """Radius of the cameras over the median distance of the points, up to which the cameras count as one place."""
 

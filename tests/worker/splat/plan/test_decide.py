@@ -26,6 +26,9 @@ VARIANTS: list[dict[str, Any]] = [
     COVERED,
     {**COVERED, "views": 9},
     {"transparent": 43, "distorted": 0, "masked": 3},
+    {"transparent": 43, "hull_points": 60_000},
+    {"transparent": 43, "points": 0, "hull_points": 60_000},
+    {"transparent": 43, "no_hull": "The outlines do not bound an object: 43 %."},
     {
         "points": 3,
         "view_angle": None,
@@ -227,3 +230,21 @@ def test_facts_as_plain_values_hold_the_speed_and_the_model() -> None:
     assert told["speed"] == {"per_pixel": 2.6e-8, "per_gaussian": 9e-8}
     psnr = {"psnr": 27.0, "one_color": 12.0, "another": None}
     assert told["start"] == {"gaussians": 700, "degree": 2, **psnr, "antialiased": None}
+
+
+def test_a_hull_adds_gaussians_to_the_points_and_leaves_room() -> None:
+    facts = changed(transparent=43, points=3000, hull_points=60_000)
+    plan = planned(facts, steps=600)
+    assert plan.initial == "hull"
+    assert plan.densify
+    added = round(0.5 * plan.max_gaussians)
+    assert f"{added} more start at random within it." in plan.reasons["initial"]
+    assert f"Training starts with {3000 + added} Gaussians" in plan.reasons["densify"]
+
+
+def test_a_plan_without_a_hull_says_why() -> None:
+    reason = "The outlines of the photos do not bound an object: 43 % of it."
+    for points, initial in ((3000, "points"), (0, "random")):
+        plan = planned(changed(transparent=43, points=points, no_hull=reason))
+        assert plan.initial == initial
+        assert plan.reasons["initial"].endswith(reason)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 
 from splatmill_worker.images.load import Photo, load_view
-from splatmill_worker.scene import View
+from splatmill_worker.scene import WRONG_OUTLINES, View
 from splatmill_worker.sfm.callbacks import stop_if
 
 Float = npt.NDArray[np.float64]
@@ -48,6 +48,12 @@ class Evidence:
     through: npt.NDArray[np.int64]
     colors: Colors
     transparent: int
+
+    @property
+    def inside(self) -> Flags:
+        """Points that lie within the outlines of transparent photos [n]; a few of the photos may be wrong."""
+        flags: Flags = self.through <= WRONG_OUTLINES * (self.shown + self.through)
+        return flags
 
     @property
     def agreement(self) -> float:

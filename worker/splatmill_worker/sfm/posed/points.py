@@ -1,8 +1,8 @@
 """Points of scenes whose cameras were given: the given ones where photos confirm them, or else found with the cameras.
 
 What is tried, in this order: given points with tracks; given points without tracks, judged by their colours in the
-photos; features triangulated with the cameras as they are; a plane sweep (`stereo`). Where all of it fails, training
-starts at random, and `facts["no_points"]` of the scene says why.
+photos; features triangulated with the cameras as they are; a plane sweep (`stereo`), which comes before the features where
+photos are transparent. Where all of it fails, training starts without points, and `facts["no_points"]` of the scene says why.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def with_points(
 ) -> Scene:
     """The scene with the points that its photos confirm or give; what was found is kept in `workdir`.
 
-    No camera is moved. Scenes of transparent photos without points stay as they are: training starts them from
-    the visual hull (decisions: hull-start).
+    No camera is moved. Where photos are transparent, the plane sweep comes first, and features are searched for only if
+    it finds little: it serves cut-outs as well, in a quarter of the time (decisions: hull-start).
 
     Raises OSError and ValueError for photos as `images.load_view` does, Refusal as `orientation.decided` does, and
     Cancelled.
@@ -77,13 +77,9 @@ def with_points(
     if not _lacks_points(scene):
         return _with_stereo(scene, workdir, on_progress, cancelled)
     if _transparent(scene, cancelled):
-        return replace(
-            scene,
-            facts=scene.facts
-            | {
-                "no_points": "Photos are transparent, and bound the object better than the few points of its features."
-            },
-        )
+        swept = _with_stereo(scene, workdir, on_progress, cancelled)
+        if not _lacks_points(swept):
+            return swept
     stored = workdir / "sfm" / f"triangulated-{_digest(scene)}-{seed}.npz"
     if not stored.is_file():
         _save(_searched(scene, seed, on_progress, cancelled), stored)
@@ -110,7 +106,7 @@ def _with_loose_points(scene: Scene, cancelled: Callable[[], bool]) -> Scene:
     evidence = evidence_of(points, colors, views, cancelled)
     plain = bool((colors == colors[0]).all())
     kept = evidence.shown > 0 if plain else evidence.agreeing > 0
-    kept &= evidence.through == 0
+    kept &= evidence.inside
     note = _loose_note(given, len(points), int(kept.sum()), evidence, plain)
     if not plain and _elsewhere(evidence):
         kept[:] = False
@@ -141,7 +137,7 @@ def _elsewhere(evidence: Evidence) -> bool:
 
 def _loose_note(given: int, judged: int, kept: int, evidence: Evidence, plain: bool) -> str:
     unseen = int((evidence.shown == 0).sum())
-    through = int((evidence.through > 0).sum())
+    through = int((~evidence.inside).sum())
     thinned = "" if judged == given else f" Every {-(-given // judged)}th was taken, {judged} in all."
     why = "their colours were read from the photos" if plain else "photos show their colours"
     return (
@@ -183,10 +179,9 @@ def _contradicted(found: Triangulated) -> bool:
 def _with_triangulated(scene: Scene, found: Triangulated, cancelled: Callable[[], bool]) -> Scene:
     """The scene with the triangulated points in place of its own few, and what is to be said about them."""
     used = [index for index, view in enumerate(scene.views) if view.split != "test"]
-    through = evidence_of(
-        found.points, found.colors, [scene.views[index] for index in used], cancelled
-    ).through
-    kept = np.flatnonzero(through == 0)
+    kept = np.flatnonzero(
+        evidence_of(found.points, found.colors, [scene.views[index] for index in used], cancelled).inside
+    )
     tracks = [found.tracks[row] for row in kept]
     lengths = np.array([len(track) for track in tracks], np.int32)
     given = len(scene.points)
@@ -258,7 +253,7 @@ def _failure(scene: Scene, found: Triangulated) -> str:
 def _with_stereo(
     scene: Scene, workdir: Path, on_progress: OnProgress, cancelled: Callable[[], bool]
 ) -> Scene:
-    if scene.facts.get("transparent_photos") or not stereo.has_few_points(scene):
+    if not stereo.has_few_points(scene):
         return scene
     stored = workdir / "sfm" / f"posed-{_digest(scene)}.npz"
     return stereo.with_stereo_points(scene, stored, on_progress, cancelled)

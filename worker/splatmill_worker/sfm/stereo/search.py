@@ -16,14 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from splatmill_worker.images.load import load_view
-from splatmill_worker.scene import Scene, View, looked_at
+from splatmill_worker.scene import WRONG_OUTLINES, Scene, View, looked_at
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if
 from splatmill_worker.sfm.stereo.plane_sweep import MIN_AGREEING, GreyView, SweepResult, sweep
 from splatmill_worker.sfm.stereo.points import StereoPoints, add, observations_per_view
 
 Float = npt.NDArray[np.float64]
 
-VERSION = 3
+VERSION = 4
 """Version of the method; points stored under another version are searched for anew."""
 
 ENOUGH_OBSERVATIONS = 1000
@@ -138,14 +138,29 @@ def find_points(
     longest = max((max(view.camera.width, view.camera.height) for view in views), default=SIDE)
     seen = np.zeros((len(points) - len(scene.points), len(scene.views)), bool)
     seen[:, used] = np.concatenate([np.zeros((0, count), bool), *(batch.seen for batch in batches)])
+    points = points[len(scene.points) :]
+    kept = _inside_outlines(points, grey)
     return StereoPoints(
-        points[len(scene.points) :],
-        np.concatenate([np.zeros((0, 3), np.uint8), *(batch.colors for batch in batches)]),
-        np.concatenate([np.zeros(0), *(batch.errors for batch in batches)]) * max(1.0, longest / SIDE),
-        seen,
+        points[kept],
+        np.concatenate([np.zeros((0, 3), np.uint8), *(batch.colors for batch in batches)])[kept],
+        np.concatenate([np.zeros(0), *(batch.errors for batch in batches)])[kept] * max(1.0, longest / SIDE),
+        seen[kept],
         time.perf_counter() - started,
         given_up,
     )
+
+
+def _inside_outlines(points: Float, views: Sequence[GreyView]) -> npt.NDArray[np.bool_]:
+    """Points [n,3] that lie where no photo that shows them is transparent, bool [n]; a few photos may be wrong."""
+    shown, outside = np.zeros(len(points)), np.zeros(len(points))
+    for view in views:
+        place = view.camera.project(points)
+        shown += place.inside
+        if view.photo.alpha is not None:
+            rows = np.flatnonzero(place.inside)
+            at = place.rows[rows].astype(np.int64), place.columns[rows].astype(np.int64)
+            outside[rows] += view.photo.alpha[at] == 0
+    return outside <= WRONG_OUTLINES * shown
 
 
 def _used(scene: Scene) -> npt.NDArray[np.int64]:

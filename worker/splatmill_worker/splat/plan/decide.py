@@ -24,6 +24,7 @@ from splatmill_worker.splat.plan.reasons import Reasons
 from splatmill_worker.splat.plan.schedule import MANY_VISITS, Schedule
 from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS
 from splatmill_worker.splat.start.given_model import GivenModel
+from splatmill_worker.splat.start.hull import at_first
 from splatmill_worker.splat.start.points import ENOUGH_POINTS
 
 OPACITY_DECAY = 0.9
@@ -41,12 +42,16 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
     reasons = Reasons()
     image_size = decide_image_size(facts, options, reasons)
     scale = min(1.0, image_size / max(facts.width, facts.height))
-    start = _start(facts, reasons)
+    source, gaussians = _start(facts, reasons)
     needs = needs_of(facts, options, kernels, reasons, scale=scale)
-    initial = start.gaussians + (needs.added if start.source == "points" else 0)
+    initial = gaussians + (needs.added if source == "points" else 0)
     capacity = decide_capacity(
         facts, options, kernels, reasons, initial=initial, pixels=facts.pixels * scale**2
     )
+    if facts.hull_points is not None and source == "hull":
+        added = at_first(facts.hull_points, capacity.max_gaussians)
+        reasons.chosen["initial"] += f" {added} more start at random within it."
+        initial = min(initial + added, capacity.max_gaussians)
     densify = decide_densification(options, capacity, reasons, initial=initial)
     schedule = _schedule(facts, options, capacity, needs, densify, image_size, reasons)
     explain_undistortion(facts, reasons)
@@ -56,7 +61,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         image_size=image_size,
         max_gaussians=capacity.max_gaussians,
         densify=densify,
-        initial=start.source,
+        initial=source,
         kernels=kernels,
         background=decide_background(facts, options, reasons),
         exposure=decide_exposure(facts, options, reasons),
@@ -76,9 +81,9 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
 
 
 class _Start(NamedTuple):
-    """What the first Gaussians are made from, and their number."""
+    """What the first Gaussians are made from, and their number without those added in a hull."""
 
-    source: Literal["points", "random", "model"]
+    source: Literal["points", "hull", "random", "model"]
     gaussians: int
 
 
@@ -90,13 +95,22 @@ def _start(facts: Facts, reasons: Reasons) -> _Start:
         )
         reasons.forced.append("initial")
         return _Start("model", facts.start.gaussians)
+    if facts.hull_points is not None:
+        reasons.chosen["initial"] = (
+            f"The reconstruction has {facts.points} points; each becomes a Gaussian. The outlines of "
+            f"{facts.transparent} transparent photos bound the object by their visual hull."
+        )
+        return _Start("hull", facts.points)
+    unbounded = "" if facts.no_hull is None else f" {facts.no_hull}"
     if facts.points >= ENOUGH_POINTS:
-        reasons.chosen["initial"] = f"The reconstruction has {facts.points} points; each becomes a Gaussian."
+        reasons.chosen["initial"] = (
+            f"The reconstruction has {facts.points} points; each becomes a Gaussian.{unbounded}"
+        )
         return _Start("points", facts.points)
     because = "" if facts.no_points is None else f"{facts.no_points} "
     reasons.chosen["initial"] = (
         f"{because}The scene has {facts.points} points, fewer than {ENOUGH_POINTS}, so "
-        f"{RANDOM_GAUSSIANS} Gaussians start at random where the cameras look."
+        f"{RANDOM_GAUSSIANS} Gaussians start at random where the cameras look.{unbounded}"
     )
     return _Start("random", RANDOM_GAUSSIANS)
 

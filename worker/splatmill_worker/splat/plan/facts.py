@@ -82,6 +82,8 @@ class Facts:
     gap_points: number of Gaussians that would fill the gaps.
     shell_points: number of Gaussians of the far shell.
     shell_distance: distance from the origin to the nearest Gaussian of the far shell, in units of the world.
+    hull_points: number of points on the visual hull of transparent photos; None where training does not start from one.
+    no_hull: why the outlines of transparent photos give no hull to start from, a sentence; None where none was carved.
     no_points: why a posed scene has no points, a sentence; None where it has some.
     extent: radius around the cameras that holds nine points in ten, over the radius of the cameras.
     """
@@ -118,6 +120,8 @@ class Facts:
     shell_distance: float | None = None
     extent: float | None = None
     no_points: str | None = None
+    hull_points: int | None = None
+    no_hull: str | None = None
 
     @property
     def pixels(self) -> int:

@@ -27,7 +27,7 @@ class Plan:
     image_size: longest side of the photos, pixels.
     max_gaussians: largest number of Gaussians.
     densify: Gaussians are added in training.
-    initial: what the first Gaussians are made from: points, random places, or a given model.
+    initial: what the first Gaussians are made from: points, the visual hull, random places, or a given model.
     kernels: the backend of the engine.
     background: colour behind Gaussians and transparent photos in training.
     exposure: training photos are brought to the light that the photos around them have.
@@ -50,7 +50,7 @@ class Plan:
     image_size: int
     max_gaussians: int
     densify: bool
-    initial: Literal["points", "random", "model"]
+    initial: Literal["points", "hull", "random", "model"]
     kernels: Kernels
     background: Literal["black", "white", "random"]
     exposure: bool
