@@ -71,8 +71,9 @@ def scene(lens: bool, points: bool) -> Scene:
 
 
 def capture(folder: Path, kinds: tuple[str, ...]) -> Path:
-    """A capture on disk. Without points, photos are transparent around the middle of the still life, whose outlines
-    bound a hull, or one photo is transparent everywhere, which leaves training to start at random places."""
+    """A capture on disk. Without points, photos are transparent: around the middle of the still life, whose outlines
+    bound a hull, or behind the table, which frames cut, so that training starts at random places.
+    """
     transparent = "random" in kinds or "hull" in kinds
     for name in ("images", "masks", "poses"):
         (folder / name).mkdir(parents=True)
@@ -83,12 +84,12 @@ def capture(folder: Path, kinds: tuple[str, ...]) -> Path:
         if transparent:
             places = camera.unproject(columns.ravel(), rows.ravel(), depth.ravel()).reshape(HEIGHT, WIDTH, 3)
             near = np.hypot(places[..., 0], places[..., 1]) < 1.35
-            alpha = np.where(near if "hull" in kinds else index > 0, 255, 0)
-            pixels = np.dstack([pixels, np.broadcast_to(alpha, (HEIGHT, WIDTH)).astype(np.uint8)])
+            alpha = np.where(near if "hull" in kinds else depth < 6.5, 255, 0).astype(np.uint8)
+            pixels = np.dstack([pixels, alpha])
         Image.fromarray(pixels).save(folder / "images" / f"{index:02d}.png")
         if "masked" in kinds:
             mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
-            mask[:, : 1 + index] = 0
+            mask[:, : 1 + index // 4] = 0
             Image.fromarray(mask).save(folder / "masks" / f"{index:02d}.png")
     given = scene("distorted" in kinds, not transparent)
     model_of(list(given.views), given.points, given).write_binary(str(folder / "poses"))

@@ -1,8 +1,8 @@
 """Points of scenes whose cameras were given: the given ones where photos confirm them, or else found with the cameras.
 
 What is tried, in this order: given points with tracks; given points without tracks, judged by their colours in the
-photos; features triangulated with the cameras as they are; a plane sweep (`stereo`), which comes before the features where
-photos are transparent. Where all of it fails, training starts without points, and `facts["no_points"]` of the scene says why.
+photos; features triangulated with the cameras as they are; a plane sweep (`stereo`), which comes before the features
+where photos are transparent. Where all of it fails, `facts["no_points"]` of the scene says why.
 """
 
 from __future__ import annotations

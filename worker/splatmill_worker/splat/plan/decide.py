@@ -97,8 +97,8 @@ def _start(facts: Facts, reasons: Reasons) -> _Start:
         return _Start("model", facts.start.gaussians)
     if facts.hull_points is not None:
         reasons.chosen["initial"] = (
-            f"The reconstruction has {facts.points} points; each becomes a Gaussian. The outlines of "
-            f"{facts.transparent} transparent photos bound the object by their visual hull."
+            f"{facts.points} points of the reconstruction become Gaussians, and the outlines of {facts.transparent} "
+            "transparent photos bound the object by their visual hull."
         )
         return _Start("hull", facts.points)
     unbounded = "" if facts.no_hull is None else f" {facts.no_hull}"
