@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatmill.data_sets import TwoDataSets
 from splatmill.schema import Backend, TrainOptions, known_distance
 from splatmill_worker import sfm
 from splatmill_worker.errors import Refusal
+from splatmill_worker.images import overlays
+from splatmill_worker.images.copies import warning as copies_warning
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.kernels.gpu.device import absence
+from splatmill_worker.near_copies import near_copies, same_photos
 from splatmill_worker.scene import Scene, View, split
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.placed import PlacingObserver
 from splatmill_worker.sfm.posed import zipped
 from splatmill_worker.splat.plan.plan import Kernels
+
+MOST_NEAR = 0.5
+"""Share of the training views that may be left out as near copies of held-out ones."""
 
 OnProgress = Callable[[str, int, int, str], None]
 """Called with the stage, the number of steps done, their total (0 if unknown), and a note."""
@@ -57,7 +64,7 @@ def posed_scene(
                 advice="Leave out the option scale, or scale the given cameras.",
             )
         try:
-            scene = given.load()
+            scene = overlays.in_views(given.load(), workdir)
         except posed.UnreadModel as error:
             raise Refusal("poses_invalid", str(error), advice=error.advice) from error
         except (ValueError, OSError) as error:
@@ -87,6 +94,64 @@ def posed_scene(
         observer,
         None if options.scale is None else known_distance(options.scale),
     )
+
+
+@dataclass(frozen=True)
+class Split:
+    """The views to train on and the held-out ones.
+
+    training, held_out: the views.
+    left_out: the name of each view that is in neither, and the reason.
+    warnings: sentences for the user.
+    """
+
+    training: tuple[View, ...]
+    held_out: tuple[View, ...]
+    left_out: tuple[tuple[str, str], ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def honest_split(scene: Scene, options: TrainOptions) -> Split:
+    """Return the views of `split_views`, without copies, and to train on none that is a near copy of a held-out one.
+
+    Where these are more than MOST_NEAR of the training views, as in a slow video, `split` holds out every 16th view
+    instead of every 8th, and so on; where even that does not help, all are kept and a warning says what that means.
+    Raises as `split_views` does.
+    """
+    copies = same_photos(scene, options.test_views or ())
+    chosen = replace(scene, views=tuple(view for view in scene.views if view.name not in copies))
+    left_out = [(name, f"it shows the same as {original}") for name, original in copies.items()]
+    warnings = copies_warning(list(copies.items()))
+    step = options.holdout
+    while True:
+        train, test = split_views(chosen, options.model_copy(update={"holdout": step}))
+        near = near_copies(scene, test, train)
+        given = options.test_views is not None or any(view.split == "test" for view in test)
+        if len(near) <= MOST_NEAR * len(train) or given or len(test) < 2:
+            break
+        step *= 2
+    if len(near) > MOST_NEAR * len(train):
+        train, test = split_views(chosen, options)
+        copy, original = next(iter(near.items()))
+        warnings.append(
+            "Most photos were taken from nearly the same place as a held-out one, so the held-out PSNR says little "
+            f"about other views: {copy} and {original}, for example. Give photos from more places."
+        )
+    elif near:
+        copy, original = next(iter(near.items()))
+        spaced = (
+            "" if step == options.holdout else f" Every {step}th photo is held out, since so many are alike."
+        )
+        warnings.append(
+            f"{'1 photo is' if len(near) == 1 else f'{len(near)} photos are'} not trained on, since a held-out one was "
+            f"taken from nearly the same place, such as {original} and {copy}: the training would be shown what it is "
+            f"judged by.{spaced}"
+        )
+        left_out += [
+            (name, f"it is nearly the same as {held}, which is held out") for name, held in near.items()
+        ]
+        train = tuple(view for view in train if view.name not in near)
+    return Split(train, test, tuple(left_out), tuple(warnings))
 
 
 def split_views(scene: Scene, options: TrainOptions) -> tuple[tuple[View, ...], tuple[View, ...]]:

@@ -22,7 +22,7 @@ from splatmill.schema import (
     TrainOptions,
 )
 from splatmill_worker import memory
-from splatmill_worker.capture import choose_kernels, posed_scene, split_views, start_model_path
+from splatmill_worker.capture import choose_kernels, honest_split, posed_scene, start_model_path
 from splatmill_worker.errors import Cancelled, Refusal
 from splatmill_worker.events import Emit, TrainingEvents, progress_events
 from splatmill_worker.images.load import load_views
@@ -229,6 +229,12 @@ def _recover_cameras(task: Task, stages: Stages) -> Cameras:
         )
     if task.looks is not None and task.looks.seconds:
         stages.add("sfm", -task.looks.seconds)
+    parts = honest_split(scene, task.options)
+    scene = replace(
+        scene,
+        left_out=(*scene.left_out, *parts.left_out),
+        warnings=(*scene.warnings, *parts.warnings),
+    )
     for note in scene.notes:
         task.emit(LogEvent(message=note))
     for warning in scene.warnings:
@@ -236,11 +242,10 @@ def _recover_cameras(task: Task, stages: Stages) -> Cameras:
     for sentence in omissions(scene.left_out):
         task.emit(LogEvent(level="warning", message=sentence))
     normalization = Normalization.of(scene)
-    training, held_out = split_views(scene, task.options)
     world = ExportWorld.of(normalization, scene)
-    placement = placement_of(scene, world, (view.name for view in held_out))
+    placement = placement_of(scene, world, (view.name for view in parts.held_out))
     store_placement(placement, task.workdir, task.emit)
-    return Cameras(scene, normalization, normalization.apply(scene), training, held_out, world)
+    return Cameras(scene, normalization, normalization.apply(scene), parts.training, parts.held_out, world)
 
 
 def _load_photos(cameras: Cameras, size: int, stages: Stages) -> Photos:

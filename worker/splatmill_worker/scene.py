@@ -202,6 +202,20 @@ class PointViews(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Overlay:
+    """What never moves in the photos of one camera, as a logo, and is masked in all of them.
+
+    photos: their names.
+    caption: what it is, for the picture in the report.
+    region: bool [h,w], at low resolution.
+    """
+
+    photos: tuple[str, ...]
+    caption: str
+    region: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
 class Scene:
     """Posed photos and sparse points.
 
@@ -216,6 +230,7 @@ class Scene:
     left_out: (name, reason) of each photo or file that is not used.
     notes: sentences for the user.
     warnings: sentences for the user about what is probably wrong.
+    overlays: what is drawn over the photos, and masked.
     frame: how the world was chosen; None where it is that of given poses, or of a reconstruction as it came out.
     """
 
@@ -230,6 +245,7 @@ class Scene:
     left_out: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    overlays: tuple[Overlay, ...] = ()
     frame: ModelFrame | None = None
 
     @property

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 from PIL import Image
+from pydantic import PlainValidator
 
 from splatmill.schema.photos import MIN_PHOTO_SIDE
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import exif, guarded
-from splatmill_worker.images.decode import tags, upright_size, whole
+from splatmill_worker.images.copies import SMALL_SIDE, small_grey
+from splatmill_worker.images.decode import UPRIGHT, Pixels, orientation, tags, upright_size, whole
 from splatmill_worker.images.photo_colors import PhotoColors
 
 POLE_SPREAD = 0.25
@@ -20,6 +23,15 @@ POLE_SPREAD = 0.25
 pixel from the poles."""
 
 GIVE = "; give JPEG, PNG, WebP, TIFF, HEIC or AVIF photos, videos or zips"
+
+
+def _small(value: Any) -> Pixels:
+    """The picture that a decoding process sends; raises ValueError for anything else."""
+    if not isinstance(value, np.ndarray) or value.dtype != np.uint8 or value.ndim != 2 or not value.size:
+        raise ValueError("a small picture is grey values")
+    if max(value.shape) > SMALL_SIDE:
+        raise ValueError("a small picture is small")
+    return value
 
 
 @dataclass(frozen=True)
@@ -32,6 +44,7 @@ class Picture:
     colors: how its colours become sRGB, as `PhotoColors.remark` says it.
     projection: of a panorama, by its XMP.
     closed: whether it has the shape and the edges of a panorama of 360 by 180 degrees.
+    small: the grey picture at low resolution, upright, of `copies.small_grey`.
     """
 
     width: int
@@ -39,6 +52,7 @@ class Picture:
     exif: exif.Exif
     several: bool
     colors: str
+    small: Annotated[Pixels, PlainValidator(_small)] = field(compare=False)
     projection: str | None = None
     closed: bool = False
 
@@ -60,17 +74,20 @@ def examine(path: Path, name: str) -> Picture | str:
                 colors = PhotoColors.of(image, tags(image), path).remark(image.mode)
                 found, projection = exif.read(image), exif.projection(image)
                 wide = width == 2 * height
+                turn = UPRIGHT.get(orientation(image))
                 if image.format == "JPEG" and not wide:
-                    # This decodes at the smallest DCT scale, and still reads the whole file.
-                    image.draft(None, (1, 1))
+                    # This decodes at the smallest DCT scale that suffices, and still reads the whole file.
+                    image.draft(None, (SMALL_SIDE, SMALL_SIDE))
                 with guarded.room(image):
                     photo = whole(image, name)
                 closed = wide and _is_closed(photo)
+                small = small_grey(photo)
+                small = small if turn is None else np.asarray(Image.fromarray(small).transpose(turn))
     except UnusablePicture as error:
         return error.reason + (GIVE if error.code == "not_an_image" else "")
     except OSError as error:
         return f"it cannot be read: {error}"
-    return Picture(width, height, found, several, colors, projection, closed)
+    return Picture(width, height, found, several, colors, small, projection, closed)
 
 
 def _is_closed(photo: Image.Image) -> bool:

@@ -57,7 +57,7 @@ def _refined(before: Grey, after: Grey, flow: Grey) -> Grey:
     xx, yy = xx + NOISE, yy + NOISE
     determinant = xx * yy - xy * xy
     for _ in range(ROUNDS):
-        error = _sampled(after, y + flow[1], x + flow[0]) - before
+        error = sampled(after, y + flow[1], x + flow[0]) - before
         right, down = _window_mean(gradient_x * error), _window_mean(gradient_y * error)
         step = np.stack([yy * right - xy * down, xx * down - xy * right]) / determinant
         flow = flow - step.astype(np.float32)
@@ -94,8 +94,8 @@ def _window_mean(values: Grey) -> Grey:
     return mean
 
 
-def _sampled(picture: Grey, y: Grey, x: Grey) -> Grey:
-    """The picture at fractional pixels, by bilinear interpolation; outside, that of the nearest pixel."""
+def sampled(picture: Grey, y: Grey, x: Grey) -> Grey:
+    """A picture [H,W] at fractional pixels, by bilinear interpolation; outside, that of the nearest pixel."""
     height, width = picture.shape
     y, x = np.clip(y, 0, height - 1.001), np.clip(x, 0, width - 1.001)
     row, column = y.astype(np.intp), x.astype(np.intp)

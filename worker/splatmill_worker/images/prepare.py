@@ -9,15 +9,19 @@ import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+
+from PIL import Image
 
 from splatmill.data_sets import unread_cameras
 from splatmill.schema.masks import masks_beside, paired, without_mask_folder
 from splatmill.schema.outputs import own_outputs
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES, unread, unread_kind
 from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
-from splatmill_worker.images import archive, decoders, exif, photo_colors, unpacked_room
+from splatmill_worker.images import archive, copies, decoders, exif, overlays, photo_colors, unpacked_room
+from splatmill_worker.images.copies import SmallPicture
 from splatmill_worker.images.masks import masks_under, remarks, unfit
+from splatmill_worker.scene import Overlay
 
 IGNORED_PREFIXES = (".", "__MACOSX")
 """Beginnings of the names of files and folders that are left out without mention."""
@@ -75,12 +79,14 @@ class Prepared:
     skipped: (name, reason) of every file that is left out.
     notes: sentences for the user.
     warnings: sentences for the user about what is probably wrong, assumed or converted.
+    overlays: what never moves in the photos of each camera, and is masked.
     """
 
     photos: tuple[UsablePhoto, ...]
     skipped: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    overlays: tuple[Overlay, ...] = ()
 
     @property
     def key(self) -> str:
@@ -125,8 +131,8 @@ def prepare(
 
     Zips are unpacked into `workdir`, and `frames` frames of each video are stored there. Files are skipped, each
     with its reason, when they are no image or do not decode completely, when their header gives too small or too large
-    a size (they are then not decoded), and when their content is that of another file. Of a file with several pictures,
-    the first is used.
+    a size (they are then not decoded), and when they are copies of another photo (`images.copies`), of which the
+    largest is kept. Of a file with several pictures, the first is used.
 
     masks: folder of the masks, if there is one; others may lie among the photos (`splatmill.schema.masks`).
     on_progress: called as ("images", files examined, files in all, name of the file).
@@ -148,15 +154,17 @@ def prepare(
     candidates = [file for file in found.files if file[0] not in own_masks]
     pairs = paired([name for name, _, _ in candidates], mask_files)
     photos: dict[str, UsablePhoto] = {}
+    small: dict[str, SmallPicture] = {}
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         inspected = pool.map(lambda file: None if cancelled() else _inspect(*file), candidates)
-        for done, ((name, _, _), result) in enumerate(zip(candidates, inspected, strict=True), 1):
-            if result is None:
+        for done, ((name, _, _), inspection) in enumerate(zip(candidates, inspected, strict=True), 1):
+            if inspection is None:
                 raise Cancelled("Examining the photos was cancelled.")
             on_progress("images", done, len(candidates), name)
-            if isinstance(result, str):
-                found.skipped.append((name, result))
+            if isinstance(inspection, str):
+                found.skipped.append((name, inspection))
                 continue
+            result, small[name] = inspection
             same = photos.get(result.sha256)
             if same is not None:
                 found.skipped.append((name, f"its content is the same as that of {same.name}"))
@@ -174,7 +182,10 @@ def prepare(
         # The cause may lie outside of the photos, such as a lack of memory, which ends processes for any photo.
         name, reason = found.skipped[0]
         raise UnusablePicture("decoder_ended", name, f"no photo is left; of this one: {reason}")
-    ordered = tuple(sorted(photos.values(), key=lambda photo: photo.name))
+    ordered = sorted(photos.values(), key=lambda photo: photo.name)
+    originals = copies.copies([small[photo.name] for photo in ordered])
+    copied = [(ordered[copy].name, ordered[original].name) for copy, original in originals.items()]
+    ordered = _without_copies(ordered, originals, found)
     known = (
         {photo.name for photo in ordered}
         | {name for name, _ in found.skipped}
@@ -190,8 +201,31 @@ def prepare(
     found.warnings += photo_colors.sentences([photo.colors for photo in ordered])
     skipped = [name for name, _ in found.skipped]
     warnings += [*unfit(found.unfit_masks), *unread(skipped), *unread_cameras(skipped)]
+    hidden = overlays.hidden_in(
+        [
+            overlays.Candidate(
+                each.name,
+                each.width,
+                each.height,
+                each.sequence or PurePosixPath(each.name).parent.as_posix(),
+            )
+            for each in ordered
+        ],
+        lambda index, size: _picture(ordered[index], small, size),
+    )
+    ordered = [
+        photo if mask is None else replace(photo, mask=overlays.mask_file(mask, photo.mask, workdir))
+        for photo, mask in zip(ordered, hidden.regions, strict=True)
+    ]
+    found.warnings += [*copies.warning(copied), *hidden.warnings]
     found.warnings += _panoramas([photo.name for photo in ordered if photo.closed])
-    return Prepared(ordered, tuple(found.skipped), (*found.notes, *notes), (*found.warnings, *warnings))
+    return Prepared(
+        tuple(ordered),
+        tuple(found.skipped),
+        (*found.notes, *notes),
+        (*found.warnings, *warnings),
+        hidden.shown,
+    )
 
 
 def _panoramas(names: list[str]) -> list[str]:
@@ -216,6 +250,24 @@ def given_files(images: Path) -> list[Path]:
         and path.name.lower() not in IGNORED_NAMES
         and not any(part.startswith(IGNORED_PREFIXES) for part in path.relative_to(images).parts)
     ]
+
+
+def _without_copies(photos: list[UsablePhoto], originals: dict[int, int], found: _Found) -> list[UsablePhoto]:
+    """The photos without those that `copies` names; an original without a mask gets that of a copy of its shape."""
+    kept = dict(enumerate(photos))
+    for copy, original in originals.items():
+        mask = kept.pop(copy).mask
+        if mask is not None and kept[original].mask is None:
+            kept[original] = _with_mask(kept[original], mask, found)
+        found.skipped.append((photos[copy].name, f"it shows the same as {photos[original].name}"))
+    return list(kept.values())
+
+
+def _picture(photo: UsablePhoto, small: dict[str, SmallPicture], at_least: tuple[int, int]) -> Image.Image:
+    """The photo at least so large; the small picture where that suffices."""
+    if max(at_least) <= copies.SMALL_SIDE:
+        return Image.fromarray(small[photo.name].grey)
+    return decoders.decode(photo.path, at_least=at_least)
 
 
 def _own_masks(found: _Found) -> dict[str, str]:
@@ -326,14 +378,14 @@ def _filled_once(folder: Path, make: Callable[[Path], object]) -> Path:
     return folder
 
 
-def _inspect(name: str, path: Path, sequence: str | None) -> UsablePhoto | str:
-    """The photo, or the reason why the file is left out."""
+def _inspect(name: str, path: Path, sequence: str | None) -> tuple[UsablePhoto, SmallPicture] | str:
+    """The photo, also at low resolution, or the reason why the file is left out."""
     found = decoders.examine(path, name)
     if isinstance(found, str):
         return found
     if found.projection is not None:
         return f"it is a panorama ({found.projection} by its XMP), which no pinhole camera shows. {CUT_PANORAMAS}"
-    return UsablePhoto(
+    photo = UsablePhoto(
         name,
         path,
         _sha256(path),
@@ -345,6 +397,8 @@ def _inspect(name: str, path: Path, sequence: str | None) -> UsablePhoto | str:
         colors=found.colors,
         closed=found.closed,
     )
+    has_tags = found.exif.make is not None or found.exif.model is not None
+    return photo, SmallPicture(name, found.width, found.height, found.small, has_tags)
 
 
 def _with_mask(photo: UsablePhoto, mask: Path | None, found: _Found) -> UsablePhoto:

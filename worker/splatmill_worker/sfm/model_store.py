@@ -81,8 +81,12 @@ def load_model(prepared: Prepared, folder: Path, known: KnownDistance | None = N
         left_out=(*prepared.skipped, *document["left_out"].items()),
         notes=(*prepared.notes, *document["notes"]),
     )
-    scene = replace(scene, facts=document["facts"], warnings=(*prepared.warnings, *document["warnings"]))
-    scene = replace(scene, warnings=(*scene.warnings, *remarks(view.lens for view in scene.views)))
+    scene = replace(
+        scene,
+        facts=document["facts"],
+        warnings=(*prepared.warnings, *document["warnings"], *remarks(view.lens for view in scene.views)),
+        overlays=prepared.overlays,
+    )
     if (folder / STEREO).is_file():
         scene = stereo.add(scene, stereo.StereoPoints.load(folder / STEREO))
     if (folder / FRAME).is_file():

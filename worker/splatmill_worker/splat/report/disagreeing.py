@@ -60,16 +60,17 @@ def marked(trained: Trained) -> list[MarkedPhoto]:
     views = {view.name: view for view in trained.views}
     shown = [each for each in named(trained) if each.share > 0.0]
     return [
-        MarkedPhoto(f"{each.name}: {each.reason}", _marked(views[each.name], each.outliers))
+        MarkedPhoto(f"{each.name}: {each.reason}", marked_photo(views[each.name], each.outliers))
         for each in shown[:PICTURED]
     ]
 
 
-def _marked(view: TrainingView, outliers: Tensor) -> Tensor:
+def marked_photo(view: TrainingView, region: Tensor) -> Tensor:
+    """The photo uint8 [H, W, 3] with a `region` [h, w] of it marked."""
     photo = view.full.rgb
-    large = torch.nn.functional.interpolate(
-        outliers[None, None].float(), size=photo.shape[:2], mode="nearest"
-    )[0, 0, :, :, None]
+    large = torch.nn.functional.interpolate(region[None, None].float(), size=photo.shape[:2], mode="nearest")[
+        0, 0, :, :, None
+    ]
     tint = MARKED * large
     mixed: Tensor = (1.0 - tint) * photo.float() + tint * torch.tensor(MARK, dtype=torch.float32)
     return mixed.to(torch.uint8)

@@ -65,9 +65,16 @@ class Disagreeing:
 
 
 def render(
-    report: dict[str, Any], figure: Path, comparisons: Sequence[ViewComparison], disagreeing: Disagreeing
+    report: dict[str, Any],
+    figure: Path,
+    comparisons: Sequence[ViewComparison],
+    disagreeing: Disagreeing,
+    hidden: Sequence[MarkedPhoto] = (),
 ) -> str:
-    """The page as text, with the picture `figure` of the curve and the pictures of `comparisons` embedded."""
+    """The page as text, with the picture `figure` of the curve and the pictures of `comparisons` embedded.
+
+    hidden: photos with what never moves marked.
+    """
     curve = base64.b64encode(figure.read_bytes()).decode()
     parts = [
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
@@ -96,6 +103,7 @@ def render(
         "</div>",
         "<h2>Photos that disagree with the others</h2>",
         *_disagreeing(disagreeing),
+        *(["<h2>What never moves, and is masked</h2>", *_marked(hidden)] if hidden else []),
         "<h2>All evaluated views</h2>",
         _table(
             ["photo", "split", "PSNR (dB)", "PSNR, colours fitted (dB)", "SSIM"],
@@ -121,8 +129,12 @@ def _disagreeing(found: Disagreeing) -> list[str]:
         [each.name, each.reason, f"{each.decibels:.1f}", f"{100 * each.share:.1f}"] for each in found.named
     ]
     lines = [_table(["photo", "looks like", "worse by (dB)", "of its pixels (%)"], rows, 2)]
-    lines.append("<div class=pairs>")
-    for photo in found.marked:
+    return [*lines, *_marked(found.marked)]
+
+
+def _marked(photos: Sequence[MarkedPhoto]) -> list[str]:
+    lines = ["<div class=pairs>"]
+    for photo in photos:
         caption = html.escape(photo.caption)
         lines.append(
             f"<div class=pair><figure><img alt='photo' src='{data_uri(photo.picture, 480)}'>"

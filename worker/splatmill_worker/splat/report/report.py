@@ -136,8 +136,21 @@ def write_report(
     draw_curve(out / "report.png", report["curve"], report["seconds"])
     worst = _worst_views(planned, trained, render)
     named = page.Disagreeing(disagreeing.named(trained), disagreeing.marked(trained))
-    atomic_write(out / "report.html", page.render(report, out / "report.png", worst, named))
+    hidden = _hidden(planned, trained)
+    atomic_write(out / "report.html", page.render(report, out / "report.png", worst, named, hidden))
     return report
+
+
+def _hidden(planned: PlannedScene, trained: Trained) -> list[disagreeing.MarkedPhoto]:
+    """A photo of each camera with what never moves in its photos marked."""
+    views = {view.name: view for view in (*trained.views, *planned.held_out)}
+    pictures = []
+    for overlay in planned.scene.overlays:
+        name = next((name for name in overlay.photos if name in views), None)
+        if name is not None:
+            picture = disagreeing.marked_photo(views[name], torch.from_numpy(overlay.region))
+            pictures.append(disagreeing.MarkedPhoto(f"{name}: {overlay.caption}", picture))
+    return pictures
 
 
 def _worst_views(planned: PlannedScene, trained: Trained, render: Renderer) -> list[page.ViewComparison]:
@@ -218,7 +231,7 @@ def _unplaced(scene: Scene) -> list[str]:
         return []
     names = [name for name, _ in scene.left_out]
     shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-    photos = len(names) + len(scene.views)
+    photos = len({*names, *(view.name for view in scene.views)})
     verb = "is" if len(names) == 1 else "are"
     return [f"{len(names)} of {photos} photos {verb} not used: {shown}. The report lists the reasons."]
 

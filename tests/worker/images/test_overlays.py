@@ -1,0 +1,180 @@
+"""Proves what is found to stand still in photos, and masked: logos, watermarks, time codes, bars and dashboards, opaque
+and transparent, at several places; and that a scene alone, few photos, a slow camera and things that turn before a
+plain background have nothing masked.
+
+Not proven here: that digits which change are masked beside those that stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageDraw
+
+from splatmill_worker.images.overlay import MIN_PHOTOS
+from splatmill_worker.images.prepare import Prepared, prepare
+from splatmill_worker.synthetic import orbit, photograph, still_life
+
+WIDTH, HEIGHT = 320, 240
+Draw = Callable[[Image.Image, int], Image.Image]
+
+
+@cache
+def photos() -> tuple[Image.Image, ...]:
+    life = still_life(0)
+    return tuple(
+        Image.fromarray(photograph(life, camera, samples=1)[0]) for camera in orbit(16, WIDTH, HEIGHT)
+    )
+
+
+def drawn(draw: Callable[[ImageDraw.ImageDraw, int], None], alpha: float = 1.0) -> Draw:
+    def change(photo: Image.Image, number: int) -> Image.Image:
+        over = photo.copy()
+        draw(ImageDraw.Draw(over), number)
+        return Image.blend(photo, over, alpha)
+
+    return change
+
+
+def letters(pen: ImageDraw.ImageDraw, left: int, top: int, seed: int = 0, size: int = 5) -> None:
+    """A text of eight letters, which are patterns of squares."""
+    pattern = np.random.default_rng(seed).integers(0, 2, (3, 24))
+    for row, column in np.argwhere(pattern):
+        x, y = left + column * size, top + row * size
+        pen.rectangle((x, y, x + size - 1, y + size - 1), fill=(250, 250, 250))
+
+
+def two(pen: ImageDraw.ImageDraw, number: int) -> None:
+    letters(pen, 10, 8)
+    letters(pen, 185, 215, 1)
+
+
+def clock(pen: ImageDraw.ImageDraw, number: int) -> None:
+    """A date that stays, and a time that changes, on black."""
+    pen.rectangle((10, 210, 250, 232), fill=(0, 0, 0))
+    letters(pen, 14, 214)
+    letters(pen, 140, 214, seed=number + 1, size=4)
+
+
+def bars(pen: ImageDraw.ImageDraw, number: int) -> None:
+    pen.rectangle((0, 0, WIDTH, 23), fill=(0, 0, 0))
+    pen.rectangle((0, HEIGHT - 24, WIDTH, HEIGHT), fill=(0, 0, 0))
+
+
+def dashboard(pen: ImageDraw.ImageDraw, number: int) -> None:
+    pen.polygon(((0, 180), (120, 180), (150, 240), (0, 240)), fill=(20 + 3 * number,) * 3)
+
+
+# What is drawn, at which places (x, y) it is masked, and which share of the photo at most.
+FOUND: dict[str, tuple[Draw, tuple[tuple[int, int], ...], float]] = {
+    "a logo": (drawn(lambda pen, k: letters(pen, 10, 215)), ((60, 222),), 0.08),
+    "a half transparent one": (drawn(lambda pen, k: letters(pen, 180, 8), 0.5), ((240, 15),), 0.08),
+    "two": (
+        drawn(two),
+        ((60, 15), (240, 222)),
+        0.15,
+    ),
+    "a grey disc": (
+        drawn(lambda pen, k: pen.ellipse((250, 10, 300, 60), fill=(110, 110, 110))),
+        ((275, 35),),
+        0.08,
+    ),
+    "a clock": (drawn(clock), ((60, 222),), 0.15),
+    "bars": (drawn(bars), ((160, 10), (160, 230), (10, 10)), 0.25),
+    "a dashboard": (drawn(dashboard), ((60, 220), (20, 230)), 0.2),
+}
+
+
+def prepared(tmp_path: Path, change: Draw, count: int = 16) -> Prepared:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for k, photo in enumerate(photos()[:count]):
+        change(photo, k).save(folder / f"{k:02d}.jpg", quality=92)
+    return prepare(folder, None, tmp_path / "work")
+
+
+@pytest.mark.parametrize(("draw", "places", "most"), FOUND.values(), ids=FOUND.keys())
+def test_what_never_moves_is_masked(
+    tmp_path: Path, draw: Draw, places: tuple[tuple[int, int], ...], most: float
+) -> None:
+    result = prepared(tmp_path, draw)
+    masks = {photo.mask for photo in result.photos}
+    assert len(masks) == 1
+    (path,) = masks
+    assert path is not None
+    mask = np.asarray(Image.open(path).resize((WIDTH, HEIGHT), Image.Resampling.NEAREST))
+    assert [int(mask[y, x]) for x, y in places] == [0] * len(places)
+    assert mask[HEIGHT // 2, WIDTH // 2] == 255
+    assert 0.0 < (mask == 0).mean() <= most
+    assert "never changes in 16 photos of 320 x 240 pixels" in result.warnings[-1]
+    assert [overlay.photos for overlay in result.overlays] == [tuple(f"{k:02d}.jpg" for k in range(16))]
+
+
+def turning(level: int) -> Draw:
+    """A thing of changing outline before a plain background."""
+
+    def change(photo: Image.Image, number: int) -> Image.Image:
+        inside = Image.new("L", photo.size, 0)
+        j = np.random.default_rng(number).uniform(-15, 15, 4)
+        ImageDraw.Draw(inside).ellipse((70 + j[0], 30 + j[1], 250 + j[2], 220 + j[3]), fill=255)
+        return Image.composite(photo, Image.new("RGB", photo.size, (level,) * 3), inside)
+
+    return change
+
+
+def slow(photo: Image.Image, number: int) -> Image.Image:
+    large = photos()[0].resize((2 * WIDTH, 2 * HEIGHT), Image.Resampling.BICUBIC)
+    return large.crop((4 * number, 100, 4 * number + WIDTH, 100 + HEIGHT))
+
+
+NOTHING: dict[str, Draw] = {
+    "a scene": lambda photo, number: photo,
+    "a white background": turning(255),
+    "a black background": turning(0),
+    "a grey background": turning(128),
+    "a slow camera": slow,
+}
+
+
+@pytest.mark.parametrize("change", NOTHING.values(), ids=NOTHING.keys())
+def test_a_scene_alone_has_nothing_masked(tmp_path: Path, change: Draw) -> None:
+    result = prepared(tmp_path, change)
+    assert [photo.mask for photo in result.photos] == [None] * 16
+    assert result.overlays == ()
+    assert result.warnings == ()
+
+
+def test_few_photos_have_nothing_masked(tmp_path: Path) -> None:
+    assert prepared(tmp_path, FOUND["a logo"][0], MIN_PHOTOS - 1).overlays == ()
+
+
+def test_a_still_background_with_detail_is_named_and_not_masked(tmp_path: Path) -> None:
+    def change(photo: Image.Image, number: int) -> Image.Image:
+        frame = photos()[0].copy()
+        frame.paste(photo.crop((110, 70, 210, 170)), (110, 70))
+        return frame
+
+    result = prepared(tmp_path, change)
+    assert [photo.mask for photo in result.photos] == [None] * 16
+    assert "Either the camera stood still, as before a turntable, or it hardly moved" in result.warnings[-1]
+
+
+def test_the_masks_of_photos_hide_both(tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    own = Image.new("L", (WIDTH, HEIGHT), 255)
+    ImageDraw.Draw(own).rectangle((200, 0, 320, 60), fill=0)
+    own.save(tmp_path / "masks" / "03.png")
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for k, photo in enumerate(photos()):
+        FOUND["a logo"][0](photo, k).save(folder / f"{k:02d}.jpg", quality=92)
+    result = prepare(folder, tmp_path / "masks", tmp_path / "work")
+    path = result.photos[3].mask
+    assert path is not None
+    assert path != result.photos[4].mask
+    mask = np.asarray(Image.open(path))
+    assert (mask[222, 60], mask[30, 260], mask[120, 160]) == (0, 0, 255)

@@ -1,0 +1,145 @@
+"""Proves that no photo is trained on that was taken from nearly the same place as a held-out one, however the camera
+was turned; that copies are used once; and that photos a step apart keep the split as it is.
+
+Not proven here: how well a scene trains on what is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from splatmill.schema import TrainOptions
+from splatmill_worker.capture import honest_split, split_views
+from splatmill_worker.images import overlays
+from splatmill_worker.scene import Camera, Scene, View, viewmat_of
+from tests.support import still_life
+
+OPTIONS = TrainOptions()
+
+
+def names(views: tuple[View, ...]) -> list[str]:
+    return [view.name for view in views]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    """The still life from sides that are 26 degrees apart, with its photos."""
+    made = still_life.scene()
+    views = []
+    for view, (_, rgb, _) in zip(made.views, still_life.pictures(), strict=True):
+        Image.fromarray(rgb).save(tmp_path / view.name)
+        views.append(replace(view, image=tmp_path / view.name))
+    return replace(made, views=tuple(views))
+
+
+def beside(view: View, name: str, shift: float, degrees: float = 0.0) -> View:
+    """A view moved sideways by a share of its distance from the origin, and turned about its vertical."""
+    camera = view.camera
+    rotation = camera.viewmat[:3, :3]
+    angle = np.radians(degrees)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    center = camera.center + shift * float(np.linalg.norm(camera.center)) * rotation[0]
+    return replace(view, name=name, camera=replace(camera, viewmat=viewmat_of(turn @ rotation, center)))
+
+
+def test_photos_a_step_apart_keep_their_split(scene: Scene) -> None:
+    parts = honest_split(scene, OPTIONS)
+    assert (parts.training, parts.held_out) == split_views(scene, OPTIONS)
+    assert (parts.left_out, parts.warnings) == ((), ())
+
+
+@pytest.mark.parametrize(("shift", "degrees"), [(0.0, 0.0), (0.001, 0.0), (0.0, 2.0), (0.001, -2.0)])
+def test_a_burst_of_a_held_out_photo_is_not_trained_on(
+    scene: Scene, tmp_path: Path, shift: float, degrees: float
+) -> None:
+    burst = beside(scene.views[0], "00b.png", shift, degrees)
+    noisy = np.random.default_rng(0).integers(0, 256, (72, 96, 3), np.uint8)
+    Image.fromarray(noisy).save(tmp_path / "00b.png")
+    burst = replace(burst, image=tmp_path / "00b.png")
+    views = (*scene.views, burst)
+    parts = honest_split(replace(scene, views=views, point_views=None), OPTIONS)
+    assert parts.left_out == (("00b.png", "it is nearly the same as 00.png, which is held out"),)
+    assert "00.png" in names(parts.held_out)
+    assert "00b.png" not in names(parts.training)
+    assert len(parts.training) + len(parts.held_out) == len(views) - 1
+    assert "1 photo is not trained on" in parts.warnings[0]
+
+
+def test_a_step_beside_a_held_out_photo_is_trained_on(scene: Scene) -> None:
+    views = (*scene.views, beside(scene.views[0], "00b.png", 0.03))
+    parts = honest_split(replace(scene, views=views, point_views=None), OPTIONS)
+    assert "00b.png" in names(parts.training)
+
+
+def test_a_smaller_copy_with_its_own_camera_is_used_once(scene: Scene, tmp_path: Path) -> None:
+    smaller = []
+    (tmp_path / "web").mkdir()
+    for view in scene.views:
+        path = tmp_path / "web" / view.name
+        Image.open(view.image).resize((48, 36), Image.Resampling.LANCZOS).save(path)
+        camera = view.camera.scaled_to(48, 36)
+        smaller.append(replace(view, name=f"web/{view.name}", camera=camera, image=path))
+    parts = honest_split(replace(scene, views=(*smaller, *scene.views), point_views=None), OPTIONS)
+    assert (names(parts.training), names(parts.held_out)) == tuple(map(names, split_views(scene, OPTIONS)))
+    assert dict(parts.left_out) == {f"web/{v.name}": f"it shows the same as {v.name}" for v in scene.views}
+
+
+def test_a_copy_of_a_given_test_photo_is_not_trained_on(scene: Scene) -> None:
+    test = replace(scene.views[0], split="test")
+    views = [replace(view, split="train") for view in scene.views[1:]]
+    copied = replace(test, name="again.png", split="train")
+    parts = honest_split(replace(scene, views=(test, *views, copied), point_views=None), OPTIONS)
+    assert names(parts.held_out) == ["00.png"]
+    assert "again.png" not in names(parts.training)
+
+
+def line(count: int, step: float) -> Scene:
+    """Cameras on a line, with points at a distance of 1 before them."""
+    views = tuple(
+        View(
+            f"{k:03d}.png",
+            Camera(100, 80, 100.0, 100.0, 50.0, 40.0, viewmat_of(np.eye(3), np.array([k * step, 0.0, 0.0]))),
+            Path(f"{k:03d}.png"),
+        )
+        for k in range(count)
+    )
+    points = np.random.default_rng(0).uniform((-0.3, -0.3, 0.95), (0.3 + count * step, 0.3, 1.05), (400, 3))
+    return Scene(views, points, np.zeros((400, 3), np.uint8), "sfm")
+
+
+def test_of_a_slow_video_fewer_frames_are_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splatmill_worker.capture.same_photos", lambda scene, test: {})
+    parts = honest_split(line(128, 0.0006), OPTIONS)
+    assert 1 < len(parts.held_out) < 16
+    places = np.array([view.camera.center[0] for view in parts.training])
+    for view in parts.held_out:
+        assert np.abs(places - view.camera.center[0]).min() > 0.0029
+    assert len(parts.training) > 32
+    assert "th photo is held out, since so many are alike" in parts.warnings[0]
+
+
+def test_photos_from_one_place_are_kept_with_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splatmill_worker.capture.same_photos", lambda scene, test: {})
+    scene = line(16, 0.00001)
+    parts = honest_split(scene, OPTIONS)
+    assert (parts.training, parts.held_out) == split_views(scene, OPTIONS)
+    assert "the held-out PSNR says little about other views" in parts.warnings[0]
+
+
+def test_a_logo_is_masked_where_cameras_are_given(scene: Scene, tmp_path: Path) -> None:
+    pattern = np.random.default_rng(1).integers(0, 2, (4, 12)).repeat(2, 0).repeat(2, 1) * 255
+    for view in scene.views:
+        rgb = np.asarray(Image.open(view.image)).copy()
+        rgb[60:68, 4:28] = pattern[..., None]
+        Image.fromarray(rgb).save(view.image)
+    masked = overlays.in_views(scene, tmp_path / "work")
+    (path,) = {view.mask for view in masked.views}
+    assert path is not None
+    mask = np.asarray(Image.open(path))
+    assert (mask[64, 16], mask[20, 60]) == (0, 255)
+    assert "at the bottom left, never changes in 14 photos" in masked.warnings[-1]

@@ -1,0 +1,147 @@
+"""Hides what never moves in the photos of each camera (`overlay`), and says so."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from splatmill.files import replacing
+from splatmill_worker.images import decoders
+from splatmill_worker.images.copies import SMALL_SIDE, small_grey
+from splatmill_worker.images.load import training_size
+from splatmill_worker.images.masks import MIN_SHOWN, shown_part
+from splatmill_worker.images.overlay import MIN_PHOTOS, still
+from splatmill_worker.scene import Overlay, Scene
+
+Region = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A photo in which something may never move.
+
+    name, width, height: of the photo.
+    source: the video or folder that it is from.
+    """
+
+    name: str
+    width: int
+    height: int
+    source: str
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """What is hidden in the photos.
+
+    regions: of each photo, bool [h,w] at low resolution; None where nothing is.
+    shown: the same by camera, for the report.
+    warnings: sentences for the user.
+    """
+
+    regions: tuple[Region | None, ...]
+    shown: tuple[Overlay, ...]
+    warnings: tuple[str, ...]
+
+
+def in_views(scene: Scene, workdir: Path) -> Scene:
+    """The scene with what never moves in its photos masked; the masks lie in `workdir`.
+
+    Raises as `decoders.decode` does.
+    """
+    views = scene.views
+    hidden = hidden_in(
+        [
+            Candidate(
+                each.name, each.camera.width, each.camera.height, PurePosixPath(each.name).parent.as_posix()
+            )
+            for each in views
+        ],
+        lambda index, size: decoders.decode(views[index].image, at_least=size, upright=views[index].upright),
+    )
+    masked = (
+        each
+        if region is None
+        else replace(each, mask=mask_file(region, each.mask, workdir, upright=each.upright))
+        for each, region in zip(views, hidden.regions, strict=True)
+    )
+    return replace(
+        scene, views=tuple(masked), warnings=(*scene.warnings, *hidden.warnings), overlays=hidden.shown
+    )
+
+
+def hidden_in(photos: Sequence[Candidate], decode: Callable[[int, tuple[int, int]], Image.Image]) -> Hidden:
+    """What never moves in the photos of one size and of one video or folder.
+
+    Those with fewer than MIN_PHOTOS in their folder are compared with all of their size.
+
+    decode: the photo with an index, at least so large where it is not smaller.
+    """
+    counts = Counter(((each.width, each.height), each.source) for each in photos)
+    groups: dict[tuple[object, ...], list[int]] = {}
+    for index, each in enumerate(photos):
+        size = each.width, each.height
+        groups.setdefault(
+            (size, each.source if counts[size, each.source] >= MIN_PHOTOS else None), []
+        ).append(index)
+    regions: list[Region | None] = [None] * len(photos)
+    shown, warnings = [], []
+    for members in groups.values():
+        first = photos[members[0]]
+        found = still(len(members), _pictures(first, members, decode))
+        if found is None:
+            continue
+        names = tuple(photos[index].name for index in members)
+        which = f"in {len(names)} photos of {first.width} x {first.height} pixels"
+        if not found.masked:
+            warnings.append(
+                f"{found.share:.0%} of the picture never changes {which}, such as {names[0]}. Either the camera stood "
+                "still, as before a turntable, or it hardly moved. If something turned before it, mask all else."
+            )
+            continue
+        what = f"{found.share:.0%} of the picture, {found.place}, never changes {which}"
+        shown.append(Overlay(names, what, found.region))
+        warnings.append(
+            f"{what}, such as {names[0]}. It is taken for a logo, a text, a bar or a part of the camera's holder, and "
+            "is masked in all of them; the report shows it. If it belongs to the scene, give photos from more sides."
+        )
+        for index in members:
+            regions[index] = found.region
+    return Hidden(tuple(regions), tuple(shown), tuple(warnings))
+
+
+def _pictures(
+    first: Candidate, members: Sequence[int], decode: Callable[[int, tuple[int, int]], Image.Image]
+) -> Callable[[int, int], npt.NDArray[np.float32]]:
+    """The grey pictures of the photos `members`, as `still` asks for them; `first` is one of them."""
+
+    def picture(index: int, factor: int) -> npt.NDArray[np.float32]:
+        width, height = training_size(first.width, first.height, SMALL_SIDE)
+        size = width * factor, height * factor
+        grey = Image.fromarray(small_grey(decode(members[index], size), SMALL_SIDE * factor))
+        return np.asarray(grey.resize(size, Image.Resampling.HAMMING), np.float32)
+
+    return picture
+
+
+def mask_file(region: Region, own: Path | None, workdir: Path, *, upright: bool = True) -> Path:
+    """A mask in `workdir` that hides the region, and what the photo's own mask hides."""
+    shown = Image.fromarray(np.where(region, 0, 255).astype(np.uint8))
+    if own is not None:
+        mine = shown_part(decoders.decode(own, upright=upright))
+        over = np.asarray(shown.resize(mine.size, Image.Resampling.NEAREST)) >= MIN_SHOWN
+        shown = Image.fromarray(np.where(over, np.asarray(mine), 0).astype(np.uint8))
+    digest = hashlib.sha256(shown.tobytes() + repr(shown.size).encode()).hexdigest()[:24]
+    path = workdir / "overlays" / f"{digest}.png"
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as part:
+            shown.save(part, "PNG")
+    return path

@@ -1,0 +1,122 @@
+"""Training photos that are near copies of held-out ones: of a burst, a bracket, or neighbouring frames of a slow video.
+
+What makes a held-out photo a test is that it was taken from another place. So two photos are near copies when the scene
+hardly shifts between their places, apart from how the camera was turned, and one shows most of what the other shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+
+import numpy as np
+
+from splatmill_worker.images import decoders
+from splatmill_worker.images.copies import SMALL_SIDE, SmallPicture, is_copy, small_grey
+from splatmill_worker.scene import Float, Scene, View, looked_at
+
+PARALLAX = 0.003
+"""Median shift of the scene between the places of two photos up to which they are near copies, as a share of the longer
+side: a third of the least spacing of the frames that are taken of a video (`images.video.STILL`), and of what lies
+between any two photos of captures around a thing."""
+
+OVERLAP = 0.8
+"""Share of what a held-out photo shows that its near copy shows as well."""
+
+POINTS = 200
+"""Points of the scene whose shift is measured, for each held-out photo."""
+
+LEAST_POINTS = 8
+"""Points below which the scene is taken to lie at the distance of what the cameras look at."""
+
+NEARBY = 8.0
+"""Factor by which photos may lie further apart than a shift of PARALLAX sideways needs, and are compared: a move along
+the view shifts the middle of a photo little."""
+
+
+def near_copies(scene: Scene, held_out: Sequence[View], training: Sequence[View]) -> dict[str, str]:
+    """The held-out photo of which each of some training photos is a near copy, by their names."""
+    found: dict[str, str] = {}
+    for view, other in _near(scene, held_out, training):
+        found.setdefault(other.name, view.name)
+    return found
+
+
+def same_photos(scene: Scene, test: Collection[str]) -> dict[str, str]:
+    """The photo of which each of some photos is a copy, resized for example, by their names.
+
+    test: names of photos to hold out. A copy of one of them among the others is a near copy, and not named here.
+    """
+    held = {view.name for view in scene.views if view.split == "test"} | set(test)
+    ranked = sorted(scene.views, key=lambda view: (-view.camera.width * view.camera.height, view.name))
+    rank = {view.name: index for index, view in enumerate(ranked)}
+    small: dict[str, SmallPicture] = {}
+    found: dict[str, str] = {}
+    for view, other in _near(scene, ranked, ranked):
+        later = rank[other.name] > rank[view.name] and (view.name in held) == (other.name in held)
+        if not later or view.name in found or other.name in found:
+            continue
+        for each in (view, other):
+            if each.name not in small:
+                small[each.name] = small_picture(each)
+        if is_copy(small[other.name], small[view.name]):
+            found[other.name] = view.name
+    return found
+
+
+def small_picture(view: View) -> SmallPicture:
+    """The photo at low resolution, as the view has it. Raises as `decoders.decode` does."""
+    photo = decoders.decode(view.image, at_least=(SMALL_SIDE, SMALL_SIDE), upright=view.upright)
+    return SmallPicture(view.name, view.camera.width, view.camera.height, small_grey(photo))
+
+
+def _near(scene: Scene, views: Sequence[View], others: Sequence[View]) -> Iterator[tuple[View, View]]:
+    """The pairs of one of `views` and one of `others`, which was taken from nearly the same place."""
+    if not scene.views:
+        return
+    centers = np.array([view.camera.center for view in others]).reshape(-1, 3)
+    observed = _observed(scene)
+    target = looked_at(scene.centers, np.array([view.camera.axis for view in scene.views]))
+    for view in views:
+        camera = view.camera
+        points = observed[view.name]
+        if len(points) < LEAST_POINTS:
+            points = _plane(view, float(np.linalg.norm(target - camera.center)))
+        here = camera.project(points)
+        points = points[here.inside]
+        if not len(points):
+            continue
+        depth = float(np.median(here.depths[here.inside]))
+        reach = NEARBY * PARALLAX * max(camera.width, camera.height) / camera.fx * depth
+        for index in np.flatnonzero(np.linalg.norm(centers - camera.center, axis=1) <= reach).tolist():
+            if others[index] is not view and _is_near(view, others[index], points):
+                yield view, others[index]
+
+
+def _is_near(view: View, other: View, points: Float) -> bool:
+    camera = view.camera
+    here, there = camera.project(points), camera.moved_to(other.camera.center).project(points)
+    shift = np.hypot(there.columns - here.columns, there.rows - here.rows) / max(camera.width, camera.height)
+    shift[np.isnan(shift)] = np.inf  # behind the other place
+    return bool(np.median(shift) <= PARALLAX and other.camera.project(points).inside.mean() >= OVERLAP)
+
+
+def _observed(scene: Scene) -> dict[str, Float]:
+    """Some of the points that each view observes, by its name; all points for each where tracks are not known."""
+    if scene.point_views is None:
+        return {view.name: scene.points[:: max(1, len(scene.points) // POINTS)] for view in scene.views}
+    offsets, views = scene.point_views
+    of_point = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+    result = {}
+    order = np.argsort(views, kind="stable")
+    starts = np.searchsorted(views[order], np.arange(len(scene.views) + 1))
+    for index, view in enumerate(scene.views):
+        own = of_point[order[starts[index] : starts[index + 1]]]
+        result[view.name] = scene.points[own[:: max(1, len(own) // POINTS)]]
+    return result
+
+
+def _plane(view: View, depth: float) -> Float:
+    """Points all over the photo at one depth."""
+    camera = view.camera
+    columns, rows = np.meshgrid(*(np.linspace(0.1, 0.9, 5) * side for side in (camera.width, camera.height)))
+    return camera.unproject(columns.ravel(), rows.ravel(), np.full(columns.size, max(depth, 1e-6)))
