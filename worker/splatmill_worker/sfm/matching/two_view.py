@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.callbacks import stop_if
@@ -25,6 +26,13 @@ MAX_ERROR_SHARE = 4.0 / 1000.0
 
 MIN_MAX_ERROR = 2.0
 """Pixels: the largest epipolar error is never smaller than this, however small the photos are."""
+
+STILL = 1.0
+"""Pixels by which a match moves at most that stands still: features are as exact as that."""
+
+MOVED = 0.02
+"""Share of the longest side by which half of the other matches move at least where still ones are dropped. So far from
+it, less than a thousandth of a scene's features stand still."""
 
 _Configuration = pycolmap.TwoViewGeometryConfiguration
 ROTATION_CONFIGURATIONS = (
@@ -52,6 +60,25 @@ class TwoView:
 def max_error(longest: int) -> float:
     """Largest epipolar error of an inlier, in pixels of photos whose longest side has `longest` pixels."""
     return max(MIN_MAX_ERROR, MAX_ERROR_SHARE * longest)
+
+
+def without_still(
+    matches: Matches, first: npt.NDArray[np.float64], second: npt.NDArray[np.float64], longest: int
+) -> Matches:
+    """The matches [m,2] without those that lie at one place of both photos, where most others moved.
+
+    They are of a logo or a dashboard that was not masked. Few enough for no geometry of their own are kept: where a
+    camera turns about a point, that point stays.
+
+    first, second: positions [n,2] of the features of both photos in pixels.
+    longest: side of the photos in pixels.
+    """
+    moved = np.linalg.norm(first[matches[:, 0]] - second[matches[:, 1]], axis=1)
+    still = np.asarray(moved <= STILL)
+    if still.sum() < MIN_INLIERS or still.all() or np.median(moved[~still]) < MOVED * longest:
+        return matches
+    kept: Matches = matches[~still]
+    return kept
 
 
 def match_pairs(
@@ -94,10 +121,12 @@ def match_pairs(
     def work(pair: Pair) -> tuple[Matches, pycolmap.TwoViewGeometry | None]:
         if cancelled():
             return np.zeros((0, 2), np.uint32), None
-        matches = matcher.match(*pair)
+        first, second = pair
+        matches = without_still(
+            matcher.match(*pair), features[first].points, features[second].points, longest
+        )
         if len(matches) < MIN_INLIERS:
             return matches, None
-        first, second = pair
         return matches, pycolmap.estimate_two_view_geometry(
             cameras[first], features[first].points, cameras[second], features[second].points, matches, options
         )
