@@ -18,7 +18,7 @@ from splatmill.schema.photos import (
     VIDEO_FORMATS,
 )
 from splatmill_worker.colmap_files import MODELS
-from splatmill_worker.images import archive, guarded, masks, prepare
+from splatmill_worker.images import archive, guarded, masks, overlay, prepare
 from splatmill_worker.images.colors import PRIMARIES, TRANSFERS
 from splatmill_worker.images.lens import PINHOLE_MODELS
 from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam
@@ -66,7 +66,9 @@ def _photos() -> list[str]:
         applied. Of a file with several pictures, the first is used. Hidden files and folders are ignored, and so are
         {choices(prepare.IGNORED_NAMES)}. A photo is left out, with the reason, if it is damaged or cut off, has the
         same bytes as another one, has a side under {MIN_PHOTO_SIDE} pixels, or more than
-        {MAX_PHOTO_PIXELS // 10**6} million pixels.
+        {MAX_PHOTO_PIXELS // 10**6} million pixels. Of photos that are copies of one another, the largest is used, and
+        what never moves in {overlay.MIN_PHOTOS} or more photos is masked
+        ([Photographing](photographing.md#copies-near-copies-and-what-never-moves)).
 
         Photos without EXIF are taken to be of one camera for each folder and each video. Where the motion of the camera
         does not determine them, pixels are taken to be square, and the focal length to be that of EXIF, or else 1.2
