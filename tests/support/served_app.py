@@ -133,6 +133,7 @@ def store_model(service: Service, job_id: str, name: str | None = None) -> None:
         "created_at": moment,
         "finished_at": moment,
         "model": job_id,
+        "generation": job.generation if job is not None else 1,
     }
     storage.put(layout.job_record(job_id), json.dumps(record).encode())
     lists.add_model(service.redis, job_id, row.now(), owner)

@@ -17,14 +17,14 @@ from splatmill.schema.tolerant import keep_readable
 class Verdict(BaseModel):
     """The end of a generation that the server decided, because no worker had ended it.
 
-    state: cancelled, or failed if the server gave the job up.
+    state: cancelled, failed if the server gave the job up, or succeeded if its model is stored and no worker said so.
     at: time of the decision.
     after: id of the last entry in the states stream at that time. Final states that a worker appends later are
         ignored, so that the end a client has seen never changes.
     problem: reason of a failure.
     """
 
-    state: Literal["cancelled", "failed"]
+    state: Literal["cancelled", "failed", "succeeded"]
     at: Time
     after: str = "0-0"
     problem: Problem | None = None

@@ -16,6 +16,7 @@ import structlog
 from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane import entries, expiry, keys, leases, lines, queue
+from splatmill.backplane.published import is_published
 from splatmill.backplane.row import JobRow
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import Problem
@@ -150,8 +151,9 @@ class Reaper:
         )  # from its line even without a record
         absent = found.state == "absent" and not self._is_restored(row.id)
         if withdrawn or found.state in _ENDED or absent:
-            self.jobs.give_verdict(row, "cancelled")
-            log.info("job cancelled", job=row.id)
+            if not self._has_succeeded(row):
+                self.jobs.give_verdict(row, "cancelled")
+                log.info("job cancelled", job=row.id)
             return True
         queue.stop(self.connection, row.id, row.generation)
         return False
@@ -188,7 +190,16 @@ class Reaper:
             self._give_up(row, found)
         return None
 
+    def _has_succeeded(self, row: JobRow) -> bool:
+        """End a job as succeeded if its model is stored: its attempt ended, or Redis was emptied, before it said so."""
+        published = is_published(self.jobs.storage, row.id, row.generation)
+        if published and self.jobs.give_verdict(row, "succeeded"):
+            log.warning("job had stored its model and was not reported as succeeded", job=row.id)
+        return published
+
     def _give_up(self, row: JobRow, found: queue.QueueStatus) -> None:
+        if self._has_succeeded(row):
+            return
         job = self.jobs.get(row.id)
         facts = {"attempts": job.attempt, "stage": last_stage(job), "reason": found.reason}
         lost = leases.lost(self.connection, entries.rq_id(row.id, row.generation))

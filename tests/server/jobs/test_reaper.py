@@ -19,7 +19,7 @@ import pytest
 from splatmill.backplane import entries, keys, leases, queue, row
 from splatmill.schema import JobState, ProgressEvent, StateEvent
 from tests.support.queue_entries import take, waiting
-from tests.support.served_app import Serve, ServedApp
+from tests.support.served_app import Serve, ServedApp, store_model
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow
@@ -173,6 +173,23 @@ def test_an_attempt_that_ends_without_a_word_is_noticed_on_the_second_look(
     assert app.state(job_id) == "queued"  # its last word may still be on its way
     app.service.reaper.tick()
     assert app.http.get(f"/v1/jobs/{job_id}").json()["problem"]["code"] == "worker_lost"
+
+
+@pytest.mark.parametrize("cancelled", [False, True])
+def test_a_job_whose_model_is_stored_has_succeeded_though_no_attempt_said_so(
+    app: ServedApp, tmp_path: Path, cancelled: bool
+) -> None:
+    job_id = app.job()
+    with worker(app, tmp_path / "pid", "return") as process:
+        process.wait(60)
+    store_model(app.service, job_id)
+    if cancelled:
+        app.http.post(f"/v1/jobs/{job_id}/cancel")
+    for _ in range(2):
+        app.service.reaper.tick()
+    job = app.http.get(f"/v1/jobs/{job_id}").json()
+    assert (job["state"], job["model"]) == ("succeeded", job_id)
+    assert [model["id"] for model in app.http.get("/v1/models").json()["models"]] == [job_id]
 
 
 def test_a_job_the_queue_forgot_is_queued_again_once(app: ServedApp) -> None:

@@ -11,11 +11,12 @@ import pytest
 import redis
 
 from splatmill.backplane import layout
+from splatmill.backplane.published import is_published
 from splatmill.backplane.storage import Storage
 from splatmill.schema import JobState, StateEvent
 from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.lock import JobLock
-from splatmill_worker.service.publish import is_published, publish
+from splatmill_worker.service.publish import publish
 from splatmill_worker.service.room import Room
 from tests.support.jobs import write_row
 
@@ -31,13 +32,13 @@ def test_a_model_is_published_for_its_generation(
 ) -> None:
     for name in ("model.ply", "report.json", "notes.txt"):
         (tmp_path / name).write_text(name)
-    first, second = attempt(connection, 1), attempt(connection, 2)
+    first = attempt(connection, 1)
     row = write_row(connection, JOB)
     first.report(StateEvent(state=JobState.exporting))
-    assert not is_published(local, first)
+    assert not is_published(local, JOB, 1)
     publish(local, first, row, tmp_path, room)
-    assert is_published(local, first)
-    assert not is_published(local, second), "a restarted job is trained again"
+    assert is_published(local, JOB, 1)
+    assert not is_published(local, JOB, 2), "a restarted job is trained again"
     record = json.loads(local.get(layout.job_record(JOB)))
     assert (record["state"], record["model"], record["attempt"]) == ("succeeded", JOB, 3)
     stored = {entry.path.rsplit("/", 1)[-1] for entry in local.entries(layout.model(JOB))}

@@ -17,15 +17,6 @@ from splatmill_worker.service.room import Room
 _RECORD, _PREVIEW = "job.json", "preview.jpg"
 
 
-def is_published(storage: Storage, attempt: Attempt) -> bool:
-    """Return whether an earlier attempt at this generation stored the whole model, but ended before it reported so."""
-    try:
-        record = json.loads(storage.get(layout.job_record(attempt.job_id)))
-    except (FileNotFoundError, ValueError):
-        return False
-    return isinstance(record, dict) and record.get("generation") == attempt.generation
-
-
 def _in_folders(out: Path) -> list[str]:
     """Return the names of the files in the folders of a model."""
     found = (path.relative_to(out).as_posix() for path in sorted(out.glob("*/*")))

@@ -19,6 +19,7 @@ import redis
 from splatmill.backplane import events, layout
 from splatmill.backplane import row as rows
 from splatmill.backplane.fold import fold
+from splatmill.backplane.published import is_published
 from splatmill.backplane.row import JobRow
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill.garbage import uncollected
@@ -169,7 +170,7 @@ def _run(attempt: Attempt, row: JobRow, outbox: Outbox, can_retry: bool) -> None
     try:
         outbox.put(StateEvent(state=JobState.preparing))
         storage = Storage(storage_url())
-        if not publish.is_published(storage, attempt):
+        if not is_published(storage, attempt.job_id, attempt.generation):
             _train_and_publish(attempt, row, storage, outbox)
         outbox.put(StateEvent(state=JobState.succeeded))
     except Exception as error:  # the one place where a failure of a job becomes a problem
