@@ -118,6 +118,7 @@ class Bench:
         skipped = [f"{where}: {reason}" for where, reason in found.skipped]
         used = [row for row in found.photos if row.name != "good.jpg" or row.mask is not None]
         notes = [note for note in found.notes if "frames were taken" not in note]
+        notes += [warning for warning in found.warnings if "mask" in warning]
         if skipped:
             return Answer("left out", "; ".join(skipped))
         if notes:
@@ -137,7 +138,7 @@ class Bench:
             return Answer(f"the job fails: `{error.code}`", error.message)
         said = [f"{name} is left out: {reason}" for name, reason in scene.left_out]
         notes = [note for note in scene.notes if "Stereo" not in note]
-        return Answer(f"used: {len(scene.views)} cameras", " ".join([*notes, *said]))
+        return Answer(f"used: {len(scene.views)} cameras", " ".join([*notes, *scene.warnings, *said]))
 
     def start(self, data: bytes, suffix: str = ".ply") -> Answer:
         """What the worker makes of a file to start from, whose suffix tells its format."""

@@ -258,3 +258,19 @@ def test_one_pose_of_a_model_that_no_photo_can_have_is_left_out(tmp_path: Path, 
     check(scene, {name: k for name, k in ALL.items() if k != 7})
     assert [name for name, _ in scene.left_out] == [NAMES[7]]
     assert "not valid" in scene.left_out[0][1]
+
+
+@pytest.mark.parametrize("writer", ["colmap", "transforms"])
+def test_a_photo_of_another_shape_than_its_camera_is_left_out(tmp_path: Path, writer: str) -> None:
+    photos(tmp_path / "images")
+    photos(tmp_path / "images", NAMES[3:4], size=(64, 36))
+    if writer == "colmap":
+        model(tmp_path / "sparse/0")
+    else:
+        transforms(tmp_path / "transforms.json")
+    scene = loaded(tmp_path)
+    assert len(scene.views) == len(NAMES) - 1
+    reasons = dict(scene.left_out)
+    assert "64 x 36 pixels, another shape than the 64 x 48" in next(
+        v for k, v in reasons.items() if NAMES[3] in k
+    )

@@ -148,7 +148,7 @@ def fit_to_file(posed: tuple[Camera, Lens | None], name: str, path: Path, mask: 
 
     Whether the camera describes the photo before or after its EXIF orientation is applied depends on the tool that
     made it, and is decided by the aspect ratio. Where both fit, the view is that of the photo as stored, and `other`
-    that of the upright one, between which `orientation.decided` chooses.
+    that of the upright one, between which `orientation.decided` chooses. Raises UnusablePicture where neither fits.
     """
     camera, lens = posed
     if mask is not None and (reason := decoders.ended(mask)) is not None:
@@ -156,8 +156,17 @@ def fit_to_file(posed: tuple[Camera, Lens | None], name: str, path: Path, mask: 
     stored, upright, orientation = decoders.sizes(path, name)
 
     def fits(size: tuple[int, int]) -> bool:
-        return abs(size[0] / size[1] * camera.height / camera.width - 1.0) < MAX_ASPECT_ERROR
+        # Reduced sizes are rounded to whole pixels, which changes the aspect ratio of small photos the most.
+        error = abs(size[0] / size[1] * camera.height / camera.width - 1.0)
+        return error < MAX_ASPECT_ERROR + 2.0 / min(size)
 
+    if not fits(stored) and not fits(upright):
+        raise UnusablePicture(
+            "poses_invalid",
+            name,
+            f"it has {upright[0]} x {upright[1]} pixels, another shape than the {camera.width} x {camera.height} of "
+            "its camera; give the photo that the camera was made for, not cropped or rotated",
+        )
     # The lens stays in its own pixels: the loader scales its look-up to the photo.
     as_stored, as_upright = (
         View(name, camera.scaled_to(*size), path, mask, lens, None, turned)
