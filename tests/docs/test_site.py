@@ -20,7 +20,7 @@ ASSETS = re.compile(r'<(?:script|img|source|iframe)\b[^>]*\ssrc="([^"]+)"|<link\
 STYLED = re.compile(r"url\(\s*[\"']?(https?:)?//|@import\s+[\"'](https?:)?//")
 
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # on a loaded machine Sphinx takes minutes
 
 
 @pytest.fixture(scope="module")
