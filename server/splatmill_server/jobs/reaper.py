@@ -151,7 +151,17 @@ class Reaper:
         )  # from its line even without a record
         absent = found.state == "absent" and not self._is_restored(row.id)
         if withdrawn or found.state in _ENDED or absent:
-            if not self._has_succeeded(row):
+            try:
+                succeeded = self._has_succeeded(row)
+            except StorageError as error:
+                # A job that waits is cancelled also while storage does not answer.
+                if not withdrawn:
+                    raise
+                log.warning(
+                    "storage does not say whether a cancelled job has a model", job=row.id, error=str(error)
+                )
+                succeeded = False
+            if not succeeded:
                 self.jobs.give_verdict(row, "cancelled")
                 log.info("job cancelled", job=row.id)
             return True
