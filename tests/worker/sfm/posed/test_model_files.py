@@ -110,7 +110,7 @@ def test_small_files_do_not_become_large(tmp_path: Path) -> None:
 def test_points_and_transforms_that_would_fill_the_memory_are_refused(tmp_path: Path) -> None:
     write(tmp_path / "small.json", models.transforms())
     write(tmp_path / "nested.json", model_bombs.nested_json(10**7))
-    ((size, said),) = peaks(f"{TRANSFORMS}:_read", [tmp_path / "small.json", tmp_path / "nested.json"])
+    ((size, said),) = peaks(f"{TRANSFORMS}:_parsed", [tmp_path / "small.json", tmp_path / "nested.json"])
     assert "its lists and objects would take 1.3 GB" in said
     assert size < 100 * 10**6
     write(tmp_path / "small.ply", models.ply(3))
