@@ -216,5 +216,5 @@ def _answers() -> list[str]:
     for area in dict.fromkeys(example.area for example in EXAMPLES):
         answers = [(example.what, answer(example.make)) for example in EXAMPLES if example.area == area]
         rows = [[what, given.kind, " ".join(given.said)] for what, given in answers]
-        parts += [f"### {area}\n", table(["input", "answer", "what is said"], rows)]
+        parts += [f"### {area}\n", table(["input", "answer", "message"], rows)]
     return parts

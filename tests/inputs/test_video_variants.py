@@ -21,7 +21,7 @@ FRAMES, FOCAL_LENGTH = 45, 315.0
 """Of the video, before it is encoded."""
 
 VIDEOS = {"hlg.mov": "HDR", "late.mkv": "does not name", "anamorphic.mp4": "not square"}
-"""The videos, each with a part of what is said of it."""
+"""The videos, each with a part of its warning."""
 
 
 def cameras() -> list[npt.NDArray[np.float64]]:

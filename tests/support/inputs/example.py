@@ -48,7 +48,7 @@ class Answer:
 
 
 def answer(make: Callable[[Path], object]) -> Answer:
-    """Return what is said of the input that `make` makes in a folder, before cameras are recovered and trained."""
+    """Return the messages about the input that `make` makes in a folder, before cameras are recovered and trained."""
     with tempfile.TemporaryDirectory(prefix="splatmill-example-") as name:
         root = Path(name)
         given, capture, work = (root / part for part in ("photos", "capture", "work"))

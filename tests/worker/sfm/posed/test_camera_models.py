@@ -1,5 +1,5 @@
 """Proves which camera models are read, in transforms.json and in COLMAP models; that others are refused by name, with
-what is read and what to do; and what is said of panoramas without cameras.
+what is read and what to do; and the warning about panoramas without cameras.
 
 Does not prove how lenses are undistorted: tests/worker/images/test_lens.py does.
 """

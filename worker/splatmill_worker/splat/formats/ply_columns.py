@@ -38,7 +38,7 @@ def kept_rest(rest: int) -> list[str]:
 
 
 def rest_notes(degree: int) -> tuple[str, ...]:
-    """What is said of harmonics of `degree`: those above 3 are not read."""
+    """The note on harmonics of `degree`: those above 3 are not read."""
     return (f"Its harmonics of degree {degree} are read to degree 3.",) if degree > 3 else ()
 
 
