@@ -45,7 +45,9 @@ local function queue_up(entry, job, in_front)
   local row = redis.call('HMGET', '${job}' .. job, 'owner', 'priority', 'options')
   local owner, line = row[1] or '${owner}', wanted_line(row[3])
   local number
-  if in_front then number = redis.call('HINCRBY', counters, 'front', -1)
+  if in_front then
+    number = redis.call('HINCRBY', counters, 'front', -1)
+    redis.call('ZADD', turns, 0, owner)  -- its turn was interrupted, and comes again
   else number = redis.call('HINCRBY', counters, 'back', 1) end
   -- Numbers stay below 2^40, so that a priority weighs more than any of them.
   redis.call('ZADD', line_key(line, owner), number - (tonumber(row[2]) or 0) * 1099511627776, entry)

@@ -2,7 +2,9 @@
 
 There is a line for what a job asks of its worker: `gpu`, `cpu`, or `any` of the two. In a line, each owner's entries
 wait by priority, then in the order of arrival. The owner whose turn was longest ago is served next, with the first of
-its entries that the worker can run: a thousand jobs of one owner delay another's first by one job at most.
+its entries that the worker can run: a thousand jobs of one owner delay another's first by one job at most. An
+entry that comes back in front, because its worker stopped or was lost, gives its owner the turn back: what has begun is
+finished before something else begins.
 
 Entries arrive in RQ's list, from this version and from earlier ones, and `sort` moves them to the line that the job's
 row names. All steps are single scripts. In particular an entry is taken and leased in one step: a worker that is killed

@@ -66,6 +66,24 @@ def test_priority_orders_the_jobs_of_one_owner_and_overtakes_no_other(connection
     assert drain(connection) == ["a2", "b0", "a1", "a3", "a0", "a4"]
 
 
+@pytest.mark.parametrize("how", ["handed back", "worker lost", "process lost"])
+def test_what_was_interrupted_goes_on_before_another_owner_begins(connection: redis.Redis, how: str) -> None:
+    for job_id, owner in (("a0", "anna"), ("a1", "anna"), ("b0", "ben"), ("c0", "carl")):
+        submit(connection, job_id, owner)
+    lease, _ = lines.take(connection, "tester", LINES) or pytest.fail("nothing waits")
+    if how == "handed back":
+        assert lines.hand_back(connection, lease)
+    elif how == "worker lost":
+        assert leases.requeue(connection, lease, if_expired=False) == "waiting"
+    else:
+        leases.to_the_front(connection, lease.entry)
+        connection.zrem(leases.key(), lease.member)
+        connection.hset(f"rq:job:{lease.entry}", "status", "queued")
+        connection.rpush(entries.open_queue(connection).key, lease.entry)
+    assert lines.look(connection, [lease.entry]).position(lease.entry, LINES) == 0
+    assert drain(connection) == ["a0", "b0", "c0", "a1"]
+
+
 def test_a_worker_takes_only_what_it_serves(connection: redis.Redis) -> None:
     submit(connection, "gpu", backend="gpu")
     submit(connection, "cpu", backend="cpu")
