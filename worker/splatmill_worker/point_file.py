@@ -6,12 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyElement, PlyParseError
 
-from splatmill_worker import ply_header, reader_memory
+from splatmill_worker import ply_document, reader_memory
 
 POINT_BYTES = 150
 """Bytes that reading takes a point at its peak: two copies of the position in float64, and the file."""
+
+CHANNELS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+"""Names of the properties with colours, as programs write them."""
+
+GREY = 128
+"""The channels of points without colours."""
 
 
 def read(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
@@ -19,19 +25,30 @@ def read(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
 
     Raises ValueError for a file that cannot be read, and OSError.
     """
-    ply_header.check(path)
     try:
-        vertex = PlyData.read(str(path))["vertex"]
+        vertex = ply_document.read(path, "vertex")["vertex"]
         reader_memory.check(
             f"reading its {vertex.count:,} points", POINT_BYTES * vertex.count, path.stat().st_size
         )
         points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
-        channels = ("red", "green", "blue")
-        if {name.name for name in vertex.properties} >= set(channels):
-            colors = np.stack([np.asarray(vertex[channel], np.uint8) for channel in channels], 1)
-        else:
-            colors = np.full(points.shape, 128, np.uint8)
     except (PlyParseError, KeyError, IndexError) as error:
         raise ValueError(str(error)) from error
+    colors = _colors(vertex)
     finite = np.isfinite(points).all(axis=1)
     return points[finite], colors[finite]
+
+
+def _colors(vertex: PlyElement) -> npt.NDArray[np.uint8]:
+    """Colours [N,3] of 8 bits: channels reach up to 1, 255 or 65535, whichever the largest value needs."""
+    colors = np.full((vertex.count, 3), GREY, np.uint8)
+    names = {each.name for each in vertex.properties}
+    channels = next((each for each in CHANNELS if names.issuperset(each)), None)
+    if channels is None or not vertex.count:
+        return colors
+    values = [np.nan_to_num(vertex[channel], posinf=0, neginf=0) for channel in channels]
+    largest = max(float(value.max()) for value in values)
+    floats = any(value.dtype.kind == "f" for value in values)
+    full = 1.0 if floats and largest <= 1 else 255.0 if largest <= 255 else 65535.0
+    for index, value in enumerate(values):
+        colors[:, index] = np.clip(np.round(value * np.float32(255 / full)), 0, 255)
+    return colors

@@ -153,8 +153,8 @@ POSES = (
     _start("NaN in every Gaussian", models.ply(3, value=float("nan")), said="no Gaussian with finite values"),
     _start(
         "lists for numbers",
-        models.ply(1).replace(b"property float x", b"property list uint float x"),
-        said="list property",
+        models.ply(1, value=-1.0).replace(b"property float x", b"property list uint float x"),
+        said="ends in row 0 of 1 vertex rows",
     ),
     _start(
         "a mesh",

@@ -162,14 +162,6 @@ def test_no_gaussians_are_read_of_every_variant(scene: Gaussians, columns: Colum
         assert registry.read(path).gaussians.count == 0
 
 
-def test_the_faces_of_a_mesh_are_refused(columns: Columns, tmp_path: Path) -> None:
-    faces = np.zeros(1, dtype=[("vertex_indices", "O")])
-    faces["vertex_indices"][0] = np.array([0, 1, 2], np.int32)
-    path = stored(tmp_path / "mesh.ply", columns, PlyElement.describe(faces, "face"))
-    with pytest.raises(ModelUnreadable, match="list property"):
-        registry.read(path)
-
-
 def test_commands_and_training_say_what_is_read_otherwise(
     columns: Columns, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

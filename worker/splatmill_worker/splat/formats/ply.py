@@ -9,12 +9,15 @@ import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from splatmill.files import replacing
-from splatmill_worker import ply_header
+from splatmill_worker import ply_document
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.reader_memory import check_gaussians
 from splatmill_worker.splat.formats import ply_columns, ply_comments
 from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, finite, unit, visible
 from splatmill_worker.splat.gaussians import Gaussians
+
+COMPRESSED_ELEMENTS = ("chunk", "sh")
+"""Elements of a compressed .ply besides its vertices."""
 
 
 def property_names(degree: int) -> list[str]:
@@ -91,12 +94,7 @@ def read(path: Path) -> Contents:
 
 def decode(path: Path, document: PlyData) -> Contents:
     """What `read` returns, of a file that was parsed already."""
-    elements = {element.name: element for element in document.elements}
-    if "vertex" not in elements:
-        raise ModelUnreadable(
-            f"{path.name} has no vertex element; its elements are: {', '.join(elements) or 'none'}."
-        )
-    vertex = elements["vertex"]
+    vertex = document["vertex"]
     rest = sum(p.name.startswith("f_rest_") for p in vertex.properties)
     degree = ply_columns.degree_of(rest)
     if degree is None:
@@ -125,12 +123,10 @@ def check_count(path: Path, count: int, degree: int) -> None:
 
 
 def parsed(path: Path) -> PlyData:
-    """A .ply file whose header was checked against its size. Raises ModelUnreadable, and FileNotFoundError."""
+    """The elements of Gaussians in a .ply file of either form. Raises ModelUnreadable, and FileNotFoundError."""
     try:
-        ply_header.check(path)
-        document: PlyData = PlyData.read(str(path))
+        return ply_document.read(path, "vertex", *COMPRESSED_ELEMENTS)
     except FileNotFoundError:
         raise
     except (PlyParseError, ValueError, OSError, IndexError, KeyError) as error:
         raise ModelUnreadable(f"{path.name} could not be read as a .ply file: {error}.") from error
-    return document
