@@ -18,9 +18,10 @@ from splatmill.schema.photos import (
     VIDEO_FORMATS,
 )
 from splatmill_worker.colmap_files import MODELS
-from splatmill_worker.images import archive, guarded, masks, overlay, prepare
+from splatmill_worker.images import archive, guarded, mask_levels, overlay, prepare
 from splatmill_worker.images.colors import PRIMARIES, TRANSFERS
 from splatmill_worker.images.lens import PINHOLE_MODELS
+from splatmill_worker.scene import MIN_SHOWN
 from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam
 from splatmill_worker.sfm.posed.camera_models import is_panoramic
 from tests.support.inputs.example import answer
@@ -128,10 +129,12 @@ def _masks() -> list[str]:
         beside the photos is a photo where no photo has the rest of its name. Where the folders of masks and photos
         differ, a file name that occurs once is enough.
 
-        Pixels darker than {masks.MIN_SHOWN} of 255 are hidden; in a mask with transparent pixels, these are. A mask of
-        another shape than its photo is not used. The log says how many photos have a mask and what share of their
+        Pixels darker than {MIN_SHOWN} of 255 are hidden; in a mask with transparent pixels, these are. If all masks
+        together have two levels, both darker or both lighter than that, as pictures of labels 0 and 1 have, the lower
+        one hides and the higher one shows, and a warning says so. Masks that hide all of every photo end the job; one
+        that hides all of its photo is named. A mask of another shape than its photo is not used. The log says how many photos have a mask and what share of their
         pixels the masks hide. A warning names masks that belong to no photo. Another is given for masks that hide more
-        than {masks.MAX_HIDDEN:.0%} of the pixels of all photos, which are probably inverted. Where a photo is
+        than {mask_levels.MAX_HIDDEN:.0%} of the pixels of all photos, which are probably inverted. Where a photo is
         transparent, it is hidden too.""",
     ]
 

@@ -170,6 +170,10 @@ def looked_at(centers: Float, axes: Float, ridge: float = 1e-3, weights: Float |
     return target
 
 
+MIN_SHOWN = 128
+"""Level of a mask, 0 to 255, from which a pixel is shown, unless all masks together are pictures of two labels."""
+
+
 @dataclass(frozen=True)
 class View:
     """One photo and its camera.
@@ -178,6 +182,7 @@ class View:
     camera: the pinhole camera of the undistorted photo at full size.
     image: path of the photo.
     mask: path of its mask, if there is one.
+    shown_from: level of the mask, 0 to 255, from which a pixel is shown.
     lens: projection of the photo itself; None: that of `camera`.
     split: as given by a data set that brings its own; None: by the rule of `split`.
     upright: whether the camera describes the photo with its EXIF orientation applied.
@@ -188,6 +193,7 @@ class View:
     camera: Camera
     image: Path
     mask: Path | None = None
+    shown_from: int = MIN_SHOWN
     lens: Lens | None = None
     split: Literal["train", "test"] | None = None
     upright: bool = True

@@ -67,11 +67,11 @@ def small(folder: Path) -> None:
     Image.new("RGB", (12, 90)).save(folder / "stamp.png")
 
 
-def masked(form: str, hidden: float = 0.25, size: tuple[int, int] = (64, 48)) -> Make:
+def masked(form: str, hidden: float = 0.25, size: tuple[int, int] = (64, 48), white: int = 255) -> Make:
     def make(folder: Path) -> None:
         plain(folder)
         for seed in range(4):
-            columns = np.full((size[1], size[0]), 255, np.uint8)
+            columns = np.full((size[1], size[0]), white, np.uint8)
             columns[:, : round(hidden * size[0])] = 0
             path = folder / form.format(seed)
             path.parent.mkdir(exist_ok=True)
@@ -186,6 +186,8 @@ EXAMPLES: tuple[Example, ...] = (
     Example("Masks", "masks/NAME.PNG", masked("masks/{}.PNG"), "used"),
     Example("Masks", "NAME_mask.png beside the photos", masked("{}_mask.png"), "used"),
     Example("Masks", "masks that hide nine tenths", masked("masks/{}.png", 0.9), "used with a remark"),
+    Example("Masks", "masks of the labels 0 and 1", masked("masks/{}.png", white=1), "used with a remark"),
+    Example("Masks", "masks that hide everything", masked("masks/{}.png", 1), "refused"),
     Example("Masks", "masks that belong to no photo", masked("masks/frame_{}.png"), "used with a remark"),
     Example(
         "Masks",

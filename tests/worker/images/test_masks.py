@@ -4,6 +4,7 @@ Does not prove that hidden pixels stay out of the training; the tests of loading
 """
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,12 @@ import pytest
 from PIL import Image
 
 from splatmill_worker import sfm
-from splatmill_worker.errors import SfmFailed
+from splatmill_worker.errors import Refusal, SfmFailed
+from splatmill_worker.images import overlays
+from splatmill_worker.images.load import load_view
 from splatmill_worker.images.prepare import Prepared, prepare
-from splatmill_worker.sfm import posed
+from splatmill_worker.sfm import features, posed
+from splatmill_worker.sfm.features import FeatureStore
 
 SIZE = (64, 48)
 
@@ -73,6 +77,96 @@ def test_masks_that_hide_most_are_questioned(tmp_path: Path) -> None:
     for number in range(2):
         (tmp_path / f"masks/{number}.png").unlink()
     assert prepared(tmp_path, "masks").warnings == ()  # less than half of everything
+
+
+def _drawn(low: int, high: int, mode: str = "L", first_hidden: bool = False) -> Callable[[int], Image.Image]:
+    """Makes the mask of each photo, whose left quarter has the lower level; all of the first one, if `first_hidden`."""
+
+    def mask_of(number: int) -> Image.Image:
+        levels = np.full((SIZE[1], SIZE[0]), high, np.uint16)
+        levels[:, : SIZE[0] // (1 if first_hidden and number == 0 else 4)] = low
+        match mode:
+            case "I;16":
+                return Image.fromarray(levels)
+            case "F":
+                return Image.fromarray(levels.astype(np.float32))
+            case "P":
+                indexed = Image.fromarray(levels.astype(np.uint8)).convert("P")
+                indexed.putpalette([0, 0, 0, 128, 0, 0])
+                return indexed
+            case "LA":
+                black = Image.new("L", SIZE, 0)
+                return Image.merge("LA", [black, Image.fromarray(levels.astype(np.uint8))])
+        return Image.fromarray(levels.astype(np.uint8)).convert(mode)
+
+    return mask_of
+
+
+def _labelled(folder: Path, mask_of: Callable[[int], Image.Image], suffix: str = "png") -> None:
+    (folder / "masks").mkdir()
+    frames = []
+    for number in range(3):
+        photo(folder / f"images/{number}.jpg", number)
+        mask_of(number).save(folder / f"masks/{number}.{suffix}")
+        frames.append({"file_path": f"images/{number}.jpg", "transform_matrix": np.eye(4).tolist()})
+    document = {"fl_x": 60.0, "w": SIZE[0], "h": SIZE[1], "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize(
+    ("mask_of", "suffix", "levels"),
+    [
+        (_drawn(0, 1), "png", (0, 1)),
+        (_drawn(0, 1, first_hidden=True), "png", (0, 1)),
+        (_drawn(3, 7), "png", (3, 7)),
+        (_drawn(200, 255), "png", (200, 255)),
+        (_drawn(0, 1, "P"), "png", (0, 38)),
+        (_drawn(0, 1, "I;16"), "png", (0, 1)),
+        (_drawn(0, 1, "LA"), "png", (0, 1)),
+        (_drawn(0, 255, "LA"), "png", None),
+        (_drawn(0, 255, "1"), "png", None),
+        (_drawn(0, 65535, "I;16"), "png", None),
+        (_drawn(0, 1, "F"), "tif", None),
+    ],
+)
+def test_masks_of_two_labels_show_the_higher_one(
+    tmp_path: Path, mask_of: Callable[[int], Image.Image], suffix: str, levels: tuple[int, int] | None
+) -> None:
+    _labelled(tmp_path, mask_of, suffix)
+    named = [] if levels is None else [f"The masks have the levels {levels[0]} and {levels[1]} of 255 alone"]
+    named += ["1 mask hides all of a photo"] if mask_of(0).getextrema() == (0, 0) else []
+    found = prepared(tmp_path, "masks")
+    given = posed.find(tmp_path)
+    assert given is not None
+    scene = given.load()
+    assert [text.split(",")[0].split(":")[0] for text in found.warnings] == named
+    assert [text.split(",")[0].split(":")[0] for text in scene.warnings] == named
+    for view, one in zip(scene.views, found.photos, strict=True):
+        loaded = load_view(view, 64).mask
+        assert loaded is not None
+        hidden = 64 if len(named) == 2 and view.name == "0.jpg" else 16
+        assert not loaded[:, :hidden].any()
+        assert loaded[:, hidden:].all()
+        store = FeatureStore(tmp_path / "store")
+        features._reduce(one, 64, store, one.name)
+        reduced = np.asarray(Image.open(store.masks / f"{one.name}.png"))
+        assert np.array_equal(reduced, np.where(loaded, 255, 0))
+        region = np.zeros((6, 8), bool)
+        region[:, -1] = True
+        path = overlays.mask_file(region, one.mask, tmp_path / "work", shown_from=one.shown_from)
+        shown = np.asarray(Image.open(path)) >= 128
+        assert np.array_equal(shown[:, :56], loaded[:, :56])
+        assert not shown[:, 56:].any()
+
+
+@pytest.mark.parametrize(("low", "high", "span"), [(0, 0, "0"), (1, 1, "1")])
+def test_masks_that_hide_everything_are_refused(tmp_path: Path, low: int, high: int, span: str) -> None:
+    _labelled(tmp_path, _drawn(low, high))
+    given = posed.find(tmp_path)
+    assert given is not None
+    for load in (given.load, lambda: prepared(tmp_path, "masks")):
+        with pytest.raises(Refusal, match=f"all pixels of all 3 photos: their levels are {span} of 255"):
+            load()
 
 
 def test_a_mask_without_its_photo_is_named(tmp_path: Path) -> None:

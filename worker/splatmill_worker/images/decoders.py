@@ -84,7 +84,7 @@ _PICTURE: TypeAdapter[Picture | str] = TypeAdapter(Picture | str)
 _FAULT: TypeAdapter[str | None] = TypeAdapter(str | None)
 _TEXT: TypeAdapter[str] = TypeAdapter(str)
 _REMARKS: TypeAdapter[list[str]] = TypeAdapter(list[str])
-_SHARE = TypeAdapter(Annotated[float, Field(ge=0.0, le=1.0)])
+_LEVELS = TypeAdapter(Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=256, max_length=256)])
 
 log = logging.getLogger("splatmill.decoders")
 
@@ -191,9 +191,9 @@ def mask_fault(mask: Path, photo: tuple[int, int], *, upright: bool = True) -> s
     return call(masks.mask_fault, mask, photo, upright, check=_FAULT.validate_python)
 
 
-def hidden_share(mask: Path) -> float:
-    """Like `splatmill_worker.images.masks.hidden_share`."""
-    return call(masks.hidden_share, mask, check=_SHARE.validate_python)
+def mask_levels(mask: Path) -> list[int]:
+    """Like `splatmill_worker.images.masks.levels`."""
+    return call(masks.levels, mask, check=_LEVELS.validate_python)
 
 
 def keyframes(

@@ -19,8 +19,8 @@ from PIL import Image
 from splatmill_worker.images import lens as lenses
 from splatmill_worker.images.decode import Pixels
 from splatmill_worker.images.decoders import decode
-from splatmill_worker.images.masks import MIN_SHOWN, shown_part
-from splatmill_worker.scene import Camera, Lens, View
+from splatmill_worker.images.masks import shown_part
+from splatmill_worker.scene import MIN_SHOWN, Camera, Lens, View
 
 MAX_SAMPLES = 4
 """Largest number of look-ups per pixel and axis when a photo is undistorted; a larger photo is reduced first."""
@@ -183,7 +183,7 @@ def _read_mask(view: View, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
     assert view.mask is not None
     mask = decode(view.mask, upright=view.upright)
     _check_shape(view, view.mask, mask.size)
-    return np.asarray(shown_part(mask).resize(size, Image.Resampling.BOX)) >= MIN_SHOWN
+    return np.asarray(shown_part(mask, view.shown_from).resize(size, Image.Resampling.BOX)) >= MIN_SHOWN
 
 
 def _area(planes: torch.Tensor, width: int, height: int) -> torch.Tensor:

@@ -1,9 +1,8 @@
-"""Masks of photos: whether they fit, and how much they hide. Their names: `splatmill.schema.masks`."""
+"""Masks of photos: whether they fit, and which levels they have. Their names: `splatmill.schema.masks`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,22 +12,14 @@ from splatmill.schema.masks import MASK_FOLDERS, without_mask_folder
 from splatmill.schema.photos import MASK_SUFFIXES
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import guarded
-from splatmill_worker.images.decode import Pixels, decode, upright_size
+from splatmill_worker.images.decode import decode, upright_size
+from splatmill_worker.scene import MIN_SHOWN
 
 MAX_ASPECT_ERROR = 0.02
 """Relative difference of aspect ratios up to which a mask fits its photo."""
 
 MAX_SCALE = 8
 """Sides of the photo that a side of its mask may have: photos are given reduced by up to eight, their masks not."""
-
-MIN_SHOWN = 128
-"""Grey level from which a pixel of a mask is shown."""
-
-MAX_HIDDEN = 0.5
-"""Share of the pixels of all photos that masks may hide without a warning."""
-
-MAX_MEASURED = 64
-"""Masks of which the hidden share is measured; each is decoded for it."""
 
 MIN_SCALED_PIXELS = 50_000_000
 """Pixels up to which a mask of any scale is decoded."""
@@ -49,47 +40,21 @@ def masks_under(directory: Path) -> dict[str, Path]:
     }
 
 
-def shown_part(mask: Image.Image) -> Image.Image:
-    """The grey picture of what a decoded mask shows, 255, and hides, 0.
+def shown_part(mask: Image.Image, shown_from: int = MIN_SHOWN) -> Image.Image:
+    """The grey picture of what a decoded mask shows, from MIN_SHOWN on, and hides.
 
     A mask with transparent pixels hides these; any other hides dark ones, as in COLMAP.
+
+    shown_from: its level from which it shows; unless that is MIN_SHOWN, the picture is black and white.
     """
     drawn = mask.mode == "RGBA" and np.asarray(mask)[:, :, 3].min() < 255
-    return mask.getchannel("A") if drawn else mask.convert("L")
+    grey = mask.getchannel("A") if drawn else mask.convert("L")
+    return grey if shown_from == MIN_SHOWN else grey.point([0] * shown_from + [255] * (256 - shown_from))
 
 
-def hidden_share(mask: Path) -> float:
-    """The share of its pixels that a mask hides, 0 to 1. Raises as `decode` does."""
-    shown: Pixels = np.asarray(shown_part(decode(mask)))
-    return float((shown < MIN_SHOWN).mean())
-
-
-def remarks(
-    photos: int, masks: Sequence[Path], unused: Collection[str], share: Callable[[Path], float]
-) -> tuple[list[str], list[str]]:
-    """Sentences for the user, notes and warnings, on the masks of a capture with so many `photos`.
-
-    masks: one of each photo that has one.
-    unused: names of the masks that belong to no photo.
-    share: as `hidden_share`; it is asked of MAX_MEASURED masks at most, evenly spaced.
-    """
-    notes, warnings = [], []
-    if unused:
-        named = ", ".join(sorted(unused)[:5]) + (", ..." if len(unused) > 5 else "")
-        masks_are = "1 mask belongs" if len(unused) == 1 else f"{len(unused)} masks belong"
-        warnings.append(f"{masks_are} to no photo by name, and no use is made of it: {named}.")
-    shares = _measured(masks, share)
-    if shares:
-        hidden = sum(shares) / len(shares)
-        notes.append(
-            f"{len(masks)} of {photos} photos have a mask; the masks hide {hidden:.0%} of their pixels."
-        )
-        if hidden * len(masks) > MAX_HIDDEN * photos:
-            warnings.append(
-                f"The masks of {len(masks)} of {photos} photos hide {hidden:.0%} of their pixels. Black hides, and "
-                "white is trained on: if the masks show in white what they should hide, invert them."
-            )
-    return notes, warnings
+def levels(mask: Path) -> list[int]:
+    """The number of pixels of each level, 0 to 255, of a mask. Raises as `decode` does."""
+    return shown_part(decode(mask)).histogram()
 
 
 def unfit(faults: Sequence[tuple[str, str]]) -> list[str]:
@@ -100,22 +65,6 @@ def unfit(faults: Sequence[tuple[str, str]]) -> list[str]:
     if count == 1:
         return [f"The mask of {name} is not used: {fault}."]
     return [f"The masks of {count} photos are not used, such as that of {name}: {fault}."]
-
-
-def _measured(masks: Sequence[Path], share: Callable[[Path], float]) -> list[float]:
-    """What `share` returns of some of the masks, without those that do not decode: they end the loading of photos."""
-    chosen = [
-        masks[index] for index in np.linspace(0, len(masks) - 1, min(len(masks), MAX_MEASURED)).astype(int)
-    ]
-
-    def measured(mask: Path) -> float | None:
-        try:
-            return share(mask)
-        except (UnusablePicture, OSError):
-            return None
-
-    with ThreadPoolExecutor() as pool:
-        return [value for value in pool.map(measured, chosen) if value is not None]
 
 
 def mask_fault(mask: Path, photo: tuple[int, int], upright: bool = True) -> str | None:

@@ -16,9 +16,9 @@ from splatmill.files import replacing
 from splatmill_worker.images import decoders
 from splatmill_worker.images.copies import SMALL_SIDE, small_grey
 from splatmill_worker.images.load import training_size
-from splatmill_worker.images.masks import MIN_SHOWN, shown_part
+from splatmill_worker.images.masks import shown_part
 from splatmill_worker.images.overlay import MIN_PHOTOS, still
-from splatmill_worker.scene import Overlay, Scene
+from splatmill_worker.scene import MIN_SHOWN, Overlay, Scene
 
 Region = npt.NDArray[np.bool_]
 
@@ -69,7 +69,11 @@ def in_views(scene: Scene, workdir: Path) -> Scene:
     masked = (
         each
         if region is None
-        else replace(each, mask=mask_file(region, each.mask, workdir, upright=each.upright))
+        else replace(
+            each,
+            mask=mask_file(region, each.mask, workdir, upright=each.upright, shown_from=each.shown_from),
+            shown_from=MIN_SHOWN,
+        )
         for each, region in zip(views, hidden.regions, strict=True)
     )
     return replace(
@@ -131,11 +135,13 @@ def _pictures(
     return picture
 
 
-def mask_file(region: Region, own: Path | None, workdir: Path, *, upright: bool = True) -> Path:
-    """A mask in `workdir` that hides the region, and what the photo's own mask hides."""
+def mask_file(
+    region: Region, own: Path | None, workdir: Path, *, upright: bool = True, shown_from: int = MIN_SHOWN
+) -> Path:
+    """A mask in `workdir` that hides the region, and what the photo's own mask hides; it shows from MIN_SHOWN on."""
     shown = Image.fromarray(np.where(region, 0, 255).astype(np.uint8))
     if own is not None:
-        mine = shown_part(decoders.decode(own, upright=upright))
+        mine = shown_part(decoders.decode(own, upright=upright), shown_from)
         over = np.asarray(shown.resize(mine.size, Image.Resampling.NEAREST)) >= MIN_SHOWN
         shown = Image.fromarray(np.where(over, np.asarray(mine), 0).astype(np.uint8))
     digest = hashlib.sha256(shown.tobytes() + repr(shown.size).encode()).hexdigest()[:24]

@@ -18,10 +18,19 @@ from splatmill.schema.masks import masks_beside, paired, without_mask_folder
 from splatmill.schema.outputs import own_outputs
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES, unread, unread_kind
 from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
-from splatmill_worker.images import archive, copies, decoders, exif, overlays, photo_colors, unpacked_room
+from splatmill_worker.images import (
+    archive,
+    copies,
+    decoders,
+    exif,
+    mask_levels,
+    overlays,
+    photo_colors,
+    unpacked_room,
+)
 from splatmill_worker.images.copies import SmallPicture
-from splatmill_worker.images.masks import masks_under, remarks, unfit
-from splatmill_worker.scene import Overlay
+from splatmill_worker.images.masks import masks_under, unfit
+from splatmill_worker.scene import MIN_SHOWN, Overlay
 
 IGNORED_PREFIXES = (".", "__MACOSX")
 """Beginnings of the names of files and folders that are left out without mention."""
@@ -52,6 +61,7 @@ class UsablePhoto:
     width, height: in pixels, with the EXIF orientation applied.
     exif: the tags that structure from motion uses.
     mask: path of the mask, if there is one.
+    shown_from: level of the mask, 0 to 255, from which a pixel is shown.
     sequence: name of the video that the photo is a frame of, if it is one.
     several: whether the file holds further pictures, which are not used.
     colors: how its colours become sRGB, as `PhotoColors.remark` says it.
@@ -65,6 +75,7 @@ class UsablePhoto:
     height: int
     exif: exif.Exif
     mask: Path | None = None
+    shown_from: int = MIN_SHOWN
     sequence: str | None = None
     several: bool = False
     colors: str = ""
@@ -93,7 +104,7 @@ class Prepared:
         """A hash of the names and contents of all photos and masks."""
         digest = hashlib.sha256()
         for photo in self.photos:
-            mask = _sha256(photo.mask) if photo.mask is not None else ""
+            mask = f"{_sha256(photo.mask)}{photo.shown_from}" if photo.mask is not None else ""
             digest.update(f"{photo.name}\0{photo.sha256}\0{mask}\n".encode())
         return digest.hexdigest()
 
@@ -137,8 +148,9 @@ def prepare(
     masks: folder of the masks, if there is one; others may lie among the photos (`splatmill.schema.masks`).
     on_progress: called as ("images", files examined, files in all, name of the file).
 
-    Raises Refusal for a mask that is too large to be decoded and for archives and videos that together exceed
-    `archive.Allowance`, CaptureIncomplete when a file is neither used nor skipped, and Cancelled.
+    Raises Refusal for a mask that is too large to be decoded, for masks that hide all of every photo, and for archives
+    and videos that together exceed `archive.Allowance`, CaptureIncomplete when a file is neither used nor skipped, and
+    Cancelled.
     """
     found = _Found()
     given = given_files(images)
@@ -195,12 +207,12 @@ def prepare(
     lost = [name for path in given if (name := path.relative_to(images).as_posix()) not in known]
     if lost:
         raise CaptureIncomplete(f"{images.name}/", lost, len(given))
-    masked = [photo.mask for photo in ordered if photo.mask is not None]
     unused = mask_files.keys() - pairs.values()
-    notes, warnings = remarks(len(ordered), masked, unused, decoders.hidden_share)
+    judged = mask_levels.judged({photo.name: photo.mask for photo in ordered}, unused)
+    ordered = [replace(photo, shown_from=judged.shown_from) for photo in ordered]
     found.warnings += photo_colors.sentences([photo.colors for photo in ordered])
     skipped = [name for name, _ in found.skipped]
-    warnings += [*unfit(found.unfit_masks), *unread(skipped), *unread_cameras(skipped)]
+    warnings = [*judged.warnings, *unfit(found.unfit_masks), *unread(skipped), *unread_cameras(skipped)]
     hidden = overlays.hidden_in(
         [
             overlays.Candidate(
@@ -214,7 +226,13 @@ def prepare(
         lambda index, size: _picture(ordered[index], small, size),
     )
     ordered = [
-        photo if mask is None else replace(photo, mask=overlays.mask_file(mask, photo.mask, workdir))
+        photo
+        if mask is None
+        else replace(
+            photo,
+            mask=overlays.mask_file(mask, photo.mask, workdir, shown_from=photo.shown_from),
+            shown_from=MIN_SHOWN,
+        )
         for photo, mask in zip(ordered, hidden.regions, strict=True)
     ]
     found.warnings += [*copies.warning(copied), *hidden.warnings]
@@ -222,7 +240,7 @@ def prepare(
     return Prepared(
         tuple(ordered),
         tuple(found.skipped),
-        (*found.notes, *notes),
+        (*found.notes, *judged.notes),
         (*found.warnings, *warnings),
         hidden.shown,
     )

@@ -18,7 +18,9 @@ from splatmill.files import replacing
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.decoders import decode
 from splatmill_worker.images.load import training_size
+from splatmill_worker.images.masks import shown_part
 from splatmill_worker.images.prepare import UsablePhoto
+from splatmill_worker.scene import MIN_SHOWN
 from splatmill_worker.sfm.callbacks import OnProgress, native_token, stop_if
 from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.options import Effort
@@ -221,10 +223,10 @@ def _reduce(photo: UsablePhoto, side: int, store: FeatureStore, name: str) -> No
         grey = grey.resize(size, Image.Resampling.HAMMING)
     grey.save(target, compress_level=1)
     if photo.mask is not None:
-        mask = decode(photo.mask).convert("L").resize(size, Image.Resampling.BOX)
+        mask = shown_part(decode(photo.mask), photo.shown_from).resize(size, Image.Resampling.BOX)
         mask_path = store.masks / f"{name}.png"
         mask_path.parent.mkdir(parents=True, exist_ok=True)
-        mask.point(lambda value: 255 if value >= 128 else 0).save(mask_path, compress_level=1)
+        mask.point(lambda value: 255 if value >= MIN_SHOWN else 0).save(mask_path, compress_level=1)
 
 
 def _set_cameras(groups: Sequence[CameraGroup], names: dict[int, str], path: Path) -> None:

@@ -106,5 +106,7 @@ def _views(prepared: Prepared, model: pycolmap.Reconstruction) -> dict[int, View
         photo = prepared.photos[index]
         view = posed_view(model, by_photo[index], photo.name, photo.path, photo.mask)
         camera = view.camera.scaled_to(photo.width, photo.height)
-        views[by_photo[index]] = replace(view, camera=camera, upright=True, other=None)
+        views[by_photo[index]] = replace(
+            view, camera=camera, shown_from=photo.shown_from, upright=True, other=None
+        )
     return views

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from splatmill.data_sets import TRANSFORMS, find_cameras, walk
 from splatmill.schema.photos import PHOTO_SUFFIXES
-from splatmill_worker.images import lens
-from splatmill_worker.images.decoders import hidden_share, mask_fault, photo_colors
-from splatmill_worker.images.masks import remarks, unfit
+from splatmill_worker.images import lens, mask_levels
+from splatmill_worker.images.decoders import mask_fault, photo_colors
+from splatmill_worker.images.masks import unfit
 from splatmill_worker.images.photo_colors import sentences
 from splatmill_worker.scene import Scene, Source
 from splatmill_worker.sfm.posed import colmap_model, transforms
@@ -44,7 +44,8 @@ class PosedInput:
         """The scene with the cameras as they were given.
 
         `left_out` of the scene lists cameras whose photo is missing, and photos without a camera. Raises ValueError,
-        naming the file and the fault, when no usable view is left, and UnusablePicture for a mask that is too large.
+        naming the file and the fault, when no usable view is left, UnusablePicture for a mask that is too large, and
+        Refusal where the masks hide all of every photo.
         """
         files = ImageFiles.under(self.directory)
         if self.models:
@@ -54,12 +55,15 @@ class PosedInput:
         scene = _without_unfit_masks(scene)
         masks = [view.mask for view in scene.views if view.mask is not None]
         unused = {name for name in files.unused_masks if files.masks[name] not in masks}
-        notes, warnings = remarks(len(scene.views), masks, unused, hidden_share)
-        warnings += lens.remarks(view.lens for view in scene.views)
+        judged = mask_levels.judged({view.name: view.mask for view in scene.views}, unused)
+        scene = replace(
+            scene, views=tuple(replace(view, shown_from=judged.shown_from) for view in scene.views)
+        )
+        warnings = [*judged.warnings, *lens.remarks(view.lens for view in scene.views)]
         colors = [photo_colors(view.image, view.name) for view in scene.views]
         return replace(
             scene,
-            notes=(*scene.notes, *notes),
+            notes=(*scene.notes, *judged.notes),
             warnings=(*self.warnings, *scene.warnings, *sentences(colors), *warnings),
         )
 

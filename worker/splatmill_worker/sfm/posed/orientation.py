@@ -94,7 +94,7 @@ def _read(view: View, *, upright: bool) -> View:
     """A view, read in this way if it is undecided."""
     if view.other is None or not upright:
         return replace(view, other=None)
-    return replace(view.other, mask=view.mask, split=view.split)
+    return replace(view.other, mask=view.mask, shown_from=view.shown_from, split=view.split)
 
 
 def _explained(

@@ -295,5 +295,5 @@ def _digest(scene: Scene) -> str:
         digest.update(repr((view.name, view.lens, view.split, view.upright, *size)).encode())
         digest.update(camera.viewmat.tobytes() + camera.K.tobytes())
         if view.mask is not None:
-            digest.update(hashlib.sha256(view.mask.read_bytes()).digest())
+            digest.update(hashlib.sha256(view.mask.read_bytes()).digest() + bytes([view.shown_from]))
     return digest.hexdigest()[:24]
