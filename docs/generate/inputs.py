@@ -18,7 +18,7 @@ from splatmill.schema.photos import (
     VIDEO_FORMATS,
 )
 from splatmill_worker.colmap_files import MODELS
-from splatmill_worker.images import archive, guarded, mask_levels, overlay, prepare
+from splatmill_worker.images import archive, guarded, mask_levels, overlay, prepare, zip_names
 from splatmill_worker.images.colors import PRIMARIES, TRANSFERS
 from splatmill_worker.images.lens import PINHOLE_MODELS
 from splatmill_worker.scene import MIN_SHOWN
@@ -95,7 +95,11 @@ def _photos() -> list[str]:
         [Photographing](photographing.md#what-can-be-given) has. The report says what was converted or assumed.""",
         "### Zips\n",
         f"""{choices(ARCHIVE_SUFFIXES)} files hold photos or a whole data set. All zips and videos of a capture together
-        hold up to {archive.MAX_ENTRIES:,} files. A zip in a zip is not unpacked.""",
+        hold up to {archive.MAX_ENTRIES:,} files. A zip in a zip is not unpacked.
+
+        Names that do not say that they are UTF-8, and are not, are read in the encoding that makes them those which the
+        cameras name. Without cameras, it is the first one in which they are words of its language; a warning then has
+        another reading too. The order is {choices(zip_names.ENCODINGS)}.""",
         "### Photos, videos and archives that are not read\n",
         table(
             ["what", "suffixes", "what to do"],
@@ -132,10 +136,10 @@ def _masks() -> list[str]:
         Pixels darker than {MIN_SHOWN} of 255 are hidden; in a mask with transparent pixels, these are. If all masks
         together have two levels, both darker or both lighter than that, as pictures of labels 0 and 1 have, the lower
         one hides and the higher one shows, and a warning says so. Masks that hide all of every photo end the job; one
-        that hides all of its photo is named. A mask of another shape than its photo is not used. The log says how many photos have a mask and what share of their
-        pixels the masks hide. A warning names masks that belong to no photo. Another is given for masks that hide more
-        than {mask_levels.MAX_HIDDEN:.0%} of the pixels of all photos, which are probably inverted. Where a photo is
-        transparent, it is hidden too.""",
+        that hides all of its photo is named. A mask of another shape than its photo is not used. The log
+        says how many photos have a mask and what share of their pixels the masks hide. A warning names masks that
+        belong to no photo. Another is given for masks that hide more than {mask_levels.MAX_HIDDEN:.0%} of the pixels of
+        all photos, which are probably inverted. Where a photo is transparent, it is hidden too.""",
     ]
 
 

@@ -13,6 +13,7 @@ from splatmill_worker.errors import Refusal
 from splatmill_worker.images import overlays
 from splatmill_worker.images.copies import warning as copies_warning
 from splatmill_worker.images.masks import mask_folder
+from splatmill_worker.images.prepare import names_remark
 from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.near_copies import near_copies, same_photos
 from splatmill_worker.scene import Scene, View, split
@@ -70,7 +71,7 @@ def posed_scene(
         except (ValueError, OSError) as error:
             raise Refusal(
                 "poses_invalid",
-                str(error),
+                " ".join([str(error), *names_remark(capture)]),
                 advice="Correct the poses, or remove them to have the cameras recovered from the photos.",
             ) from error
         return posed.with_points(
@@ -84,7 +85,7 @@ def posed_scene(
         frames=options.max_video_frames,
         seed=options.seed,
     )
-    return sfm.reconstruct(
+    scene = sfm.reconstruct(
         images if images.is_dir() else capture,
         mask_folder(capture),
         workdir,
@@ -94,6 +95,7 @@ def posed_scene(
         observer,
         None if options.scale is None else known_distance(options.scale),
     )
+    return replace(scene, warnings=(*names_remark(capture), *scene.warnings))
 
 
 @dataclass(frozen=True)

@@ -182,22 +182,22 @@ class View:
     camera: the pinhole camera of the undistorted photo at full size.
     image: path of the photo.
     mask: path of its mask, if there is one.
-    shown_from: level of the mask, 0 to 255, from which a pixel is shown.
     lens: projection of the photo itself; None: that of `camera`.
     split: as given by a data set that brings its own; None: by the rule of `split`.
     upright: whether the camera describes the photo with its EXIF orientation applied.
     other: the view with the other `upright`, where the camera fits the photo both ways; None: it is decided.
+    shown_from: level of the mask, 0 to 255, from which a pixel is shown.
     """
 
     name: str
     camera: Camera
     image: Path
     mask: Path | None = None
-    shown_from: int = MIN_SHOWN
     lens: Lens | None = None
     split: Literal["train", "test"] | None = None
     upright: bool = True
     other: View | None = None
+    shown_from: int = MIN_SHOWN
 
 
 class PointViews(NamedTuple):

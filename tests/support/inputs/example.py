@@ -14,7 +14,7 @@ from splatmill.local_capture import find_files
 from splatmill.schema import Role
 from splatmill_worker.errors import WorkerError
 from splatmill_worker.images.masks import mask_folder
-from splatmill_worker.images.prepare import prepare
+from splatmill_worker.images.prepare import names_remark, prepare
 from splatmill_worker.scene import Scene, omissions
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.posed import zipped
@@ -62,7 +62,10 @@ def answer(make: Callable[[Path], object]) -> Answer:
                 stored.write_bytes(file.path.read_bytes())
             count, source, masks, said = _read(capture, work)
         except (NothingToUpload, WorkerError, ValueError, TwoDataSets) as error:
-            return Answer("refused", (str(error).replace(f"{given}", "The folder"),))
+            text = str(error).replace(f"{given}", "The folder")
+            return Answer(
+                "refused", (text, *(note for each in work.glob("unpacked/*") for note in names_remark(each)))
+            )
     renamed = [f"{before!a} is stored as {after}." for before, after in found.renamed]
     results = [f"A result of an earlier training, not a photo: {path}." for path in found.outputs]
     remarks = (*found.remarks, *renamed, *results, *said)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from tests.support import unmarked_zip
 from tests.support.inputs.example import Example
 from tests.support.posed_sets import COUNT, NAMES, frames, model, photos, transforms, zip_of
 
@@ -112,6 +113,15 @@ def zipped_set(folder: Path) -> None:
     zip_of(folder.parent / "made", folder / "scene.zip")
 
 
+def of_windows(folder: Path, names: str = "写真 {:02}.jpg") -> None:
+    made = folder.parent / "made"
+    photos(made / "images", [names.format(k) for k in range(COUNT)])
+    model(made / "sparse/0", {k: f"写真 {k:02}.jpg" for k in range(COUNT)})
+    files = sorted(path for path in made.rglob("*") if path.is_file())
+    entries = [(path.relative_to(made).as_posix().encode("cp932"), path.read_bytes()) for path in files]
+    unmarked_zip.write(folder / "scene.zip", entries)
+
+
 def no_camera(folder: Path) -> None:
     photos(folder / "images")
     model(folder / "sparse/0", dict(enumerate(NAMES[:-1])))
@@ -197,6 +207,13 @@ EXAMPLES: tuple[Example, ...] = (
     ),
     Example("Cameras", "a COLMAP model two folders down", partial(colmap, top="export/scene"), "used"),
     Example("Cameras", "the same in a zip", zipped_set, "used"),
+    Example("Cameras", "the same in a zip by a Japanese Windows", of_windows, "used with a remark"),
+    Example(
+        "Cameras",
+        "such a zip, where the model has other names",
+        partial(of_windows, names="表 {:02}.jpg"),
+        "refused",
+    ),
     Example("Cameras", "sparse/0 with 3 photos, sparse/1 with 9", several_models, "used with a remark"),
     Example("Cameras", "images.txt without cameras.txt", half_a_model, "used with a remark"),
     Example(

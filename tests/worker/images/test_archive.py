@@ -7,8 +7,11 @@ counts for an owner (tests/worker/service/test_room.py).
 
 from __future__ import annotations
 
+import json
 import os
+import struct
 import zipfile
+import zlib
 from pathlib import Path
 
 import pytest
@@ -16,6 +19,7 @@ import pytest
 from splatmill_worker.errors import Refusal, UnusableVideo
 from splatmill_worker.images import archive, decoders, prepare, video
 from splatmill_worker.images.archive import Allowance, UnsafeArchive, unpack
+from tests.support import unmarked_zip
 from tests.support.hostile import archives, pictures, videos
 
 
@@ -89,6 +93,65 @@ def test_a_colon_in_a_name_refuses_no_zip(tmp_path: Path) -> None:
     absolute = zipped(tmp_path, {"C:/1.jpg": b"1"}, zipfile.ZIP_STORED)
     with pytest.raises(UnsafeArchive, match="outside"):
         unpack(absolute, tmp_path / "other")
+
+
+JAPANESE = ["images/写真00.jpg", "images/ソ表 01.jpg"]
+CHINESE = ["images/房间/照片00.jpg", "images/房间/照片01.jpg"]
+KOREAN = ["사진/방0.jpg", "사진/방1.jpg"]
+RUSSIAN = ["images/Фото ёж 0.jpg", "images/Фото ёж 1.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("names", "encoding", "label"),
+    [
+        (JAPANESE, "cp932", "cp932 (Japanese)"),
+        (CHINESE, "gbk", "gb18030 (Chinese, simplified)"),
+        (["images/照片房間0.jpg"], "cp950", "cp950 (Chinese, traditional)"),
+        (KOREAN, "cp949", "cp949 (Korean)"),
+        (RUSSIAN, "cp866", "cp866 (Russian)"),
+        (RUSSIAN, "cp1251", "cp1251 (Russian, of Windows)"),
+        (["Küche/Größe 1.jpg"], "cp850", "cp850 (Western European)"),
+        (["Küche/Größe 1.jpg"], "cp1252", "cp1252 (Western European, of Windows)"),
+        (JAPANESE, "utf-8", ""),
+    ],
+)
+@pytest.mark.parametrize("form", ["sparse/0/images.txt", "transforms.json", "escaped", "none"])
+def test_names_that_do_not_say_their_encoding(
+    tmp_path: Path, names: list[str], encoding: str, label: str, form: str
+) -> None:
+    frames = {"frames": [{"file_path": f"./{name}"} for name in names]}
+    cameras = {
+        "sparse/0/images.txt": "".join(f"1 1 0 0 0 0 0 0 1 {name}\n\n" for name in names),
+        "transforms.json": json.dumps(frames, ensure_ascii=False),
+        "escaped": json.dumps(frames),
+    }
+    there = {} if form == "none" else {form.replace("escaped", "transforms.json"): cameras[form]}
+    files = [(name.encode(), text.encode()) for name, text in there.items()]
+    unmarked_zip.write(tmp_path / "set.zip", [*files, *((name.encode(encoding), b"x") for name in names)])
+    written = unpack(tmp_path / "set.zip", tmp_path / "target")
+    read = [path.relative_to(tmp_path / "target").as_posix() for path in written[len(there) :]]
+    remark = " ".join(prepare.names_remark(tmp_path / "target"))
+    if form == "none" and encoding in ("cp950", "cp1251", "cp1252"):
+        assert "; as " in remark  # the bytes are words in several encodings
+    else:
+        assert read == names
+        assert f"They are read as {label}: {names[0]}" in remark if label else remark == ""
+        assert remark.endswith("as the cameras name them.") == (bool(label) and form != "none")
+
+
+def test_the_name_in_the_extra_field_comes_first(tmp_path: Path) -> None:
+    raw = [name.encode("cp932") for name in JAPANESE]
+    named = [
+        struct.pack("<BI", 1, zlib.crc32(old)) + name.encode() for old, name in zip(raw, CHINESE, strict=True)
+    ]
+    extra = [struct.pack("<HH", 0x7075, len(each)) + each for each in named]
+    unmarked_zip.write(tmp_path / "set.zip", [(each, b"x") for each in raw], extra)
+    written = unpack(tmp_path / "set.zip", tmp_path / "target")
+    assert [path.relative_to(tmp_path / "target").as_posix() for path in written] == CHINESE
+    assert prepare.names_remark(tmp_path / "target") == []
+    renamed = [(each[:-1] + b"?", b"x") for each in raw]
+    unmarked_zip.write(tmp_path / "stale.zip", renamed, extra)
+    assert "?" in unpack(tmp_path / "stale.zip", tmp_path / "other")[0].name
 
 
 def test_results_of_a_training_in_a_zip_are_no_photos(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import IO, cast
 
 from splatmill_worker.errors import Cancelled, Refusal
-from splatmill_worker.images import unpacked_room
+from splatmill_worker.images import unpacked_room, zip_names
 from splatmill_worker.settings import max_unpacked
 
 MAX_ENTRIES = 20_000
@@ -36,6 +36,9 @@ zip bomb 1000 to 1."""
 
 RATIO_FLOOR = 2**20
 """Bytes of an unpacked file, and of all files of an archive, up to which their ratio is not limited."""
+
+REMARK = ".names"
+"""A file beside those of an archive, with a sentence for the user about how their names were read."""
 
 _LOCAL_HEADER_BYTES = 30
 """Bytes before a packed file, without its name."""
@@ -93,7 +96,8 @@ def unpack(
     """Write the archive's files under `target` and return their paths, in the archive's order.
 
     The declared sizes are checked before anything is written, and the real ones while writing: none exceeds what was
-    declared. Hidden files and the resource forks of macOS are left out. What is written is taken from `allowance` and
+    declared. Hidden files and the resource forks of macOS are left out. Where the encoding of the names is a guess, the
+    file REMARK says so. What is written is taken from `allowance` and
     from the owner's room, before it is written.
 
     Raises UnsafeArchive for absolute names, names with `..`, names that no file can have, links, encrypted files, files
@@ -104,6 +108,7 @@ def unpack(
         bounded = BoundedReads(io.FileIO(path), MAX_DIRECTORY_BYTES, _list_too_long)
         with bounded as file, zipfile.ZipFile(cast(IO[bytes], file)) as archive:
             _check_places(archive)
+            remark = zip_names.decode(archive)
             for entry in archive.infolist():
                 entry.filename = entry.filename.replace("\\", "/")  # as some programs of Windows write them
             entries = [entry for entry in archive.infolist() if not entry.filename.endswith("/")]
@@ -129,6 +134,8 @@ def unpack(
                         f"no file can have the name {entry.filename[:200]!r} ({error.strerror})"
                     ) from error
                 written.append(place)
+            if remark:
+                (target / REMARK).write_text(remark, "utf-8")
             return written
     except UnsafeArchive:
         raise

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 
 from PIL import Image
 
-from splatmill.data_sets import unread_cameras
+from splatmill.data_sets import MAX_DEPTH, unread_cameras
 from splatmill.schema.masks import masks_beside, paired, without_mask_folder
 from splatmill.schema.outputs import own_outputs
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES, unread, unread_kind
@@ -326,6 +326,7 @@ def _expand(
                 inner_name = f"{Path(name).with_suffix('').as_posix()}/{inner.relative_to(folder).as_posix()}"
                 _expand(inner_name, inner, name, workdir, frames, found, cancelled)
             found.opened.add(name)
+            found.warnings += names_remark(folder)
         elif suffix in ARCHIVE_SUFFIXES:
             found.skipped.append((name, "a zip inside a zip is not unpacked; give its photos themselves"))
         elif suffix in VIDEO_SUFFIXES:
@@ -372,6 +373,13 @@ def unpacked(
         allowance.take(name, len(files), _bytes_of(files))
         unpacked_room.take(folder.name, _bytes_of(files))
     return _filled_once(folder, lambda place: archive.unpack(path, place, cancelled, allowance))
+
+
+def names_remark(folder: Path) -> list[str]:
+    """A sentence for the user about how the names of an unpacked zip were read, in which `folder` lies; none where they
+    leave no doubt."""
+    places = (place / archive.REMARK for place in (folder, *folder.parents[:MAX_DEPTH]))
+    return [place.read_text("utf-8") for place in places if place.is_file()][:1]
 
 
 def _bytes_of(files: list[Path]) -> int:

@@ -13,6 +13,7 @@ from splatmill_worker.images import lens, mask_levels
 from splatmill_worker.images.decoders import mask_fault, photo_colors
 from splatmill_worker.images.masks import unfit
 from splatmill_worker.images.photo_colors import sentences
+from splatmill_worker.images.prepare import names_remark
 from splatmill_worker.scene import Scene, Source
 from splatmill_worker.sfm.posed import colmap_model, transforms
 from splatmill_worker.sfm.posed.files import ImageFiles
@@ -80,7 +81,7 @@ def find(directory: Path) -> PosedInput | None:
         if cameras is None:
             continue
         place, notes = directory, []
-        warnings: tuple[str, ...] = ()
+        warnings = tuple(names_remark(directory))
         if base == directory and cameras.top:
             notes = [f"The cameras are those in {cameras.top}."]
             photos = [name for name in names if Path(name).suffix.lower() in PHOTO_SUFFIXES]
@@ -88,7 +89,7 @@ def find(directory: Path) -> PosedInput | None:
             if len(outside) < len(photos):
                 place = directory / cameras.top
                 if outside:
-                    warnings = (
+                    warnings += (
                         f"Photos outside {cameras.top}, where the cameras are, are not used: {len(outside)}, such as "
                         f"{outside[0]}.",
                     )

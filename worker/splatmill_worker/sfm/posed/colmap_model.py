@@ -76,6 +76,11 @@ def _path(files: ImageFiles, name: str) -> Path | None:
     return None if found is None else found[1]
 
 
+def _instead(files: ImageFiles) -> str:
+    """A photo that there is, as a part of a sentence."""
+    return "".join(f": a photo of it is {name!r}" for name in list(files.photos)[:1])
+
+
 def _shown(folder: Path) -> str:
     return f"{folder.parent.name}/{folder.name}"
 
@@ -109,7 +114,7 @@ def scene_of_given(model: GivenModel, files: ImageFiles, notes: tuple[str, ...] 
         several = readings(first := lacking[0][0], files)
         raise ValueError(
             f"The COLMAP model names {len(lacking)} photos (such as {first!r}), and the capture has "
-            + (f"several of this name: {several}." if several else "none of them.")
+            + (f"several of this name: {several}." if several else f"none of them{_instead(files)}.")
             + " Give the photos the names that the model uses."
         )
     used = {view.image for view in views.values()}

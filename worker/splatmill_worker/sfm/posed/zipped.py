@@ -9,7 +9,7 @@ from splatmill.data_sets import MAX_DEPTH, TwoDataSets
 from splatmill.schema.formats import is_model_file
 from splatmill.schema.photos import ARCHIVE_SUFFIXES
 from splatmill_worker.images import prepare
-from splatmill_worker.images.archive import Allowance
+from splatmill_worker.images.archive import REMARK, Allowance
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.sfm.posed.capture import find
 
@@ -36,7 +36,7 @@ def data_set(capture: Path, workdir: Path, cancelled: Callable[[], bool] = lambd
     for _ in range(MAX_DEPTH):
         if _is_data_set(folder):
             return folder
-        inside = sorted(folder.iterdir())
+        inside = sorted(path for path in folder.iterdir() if path.name != REMARK)
         if len(inside) != 1 or not inside[0].is_dir():
             break
         folder = inside[0]

@@ -19,7 +19,7 @@ import { verdicts } from "./verdicts.js";
  * @property {number} width
  * @property {number} height
  * @property {import("./measure.js").Measures | null} measures
- * @property {number | null} hidden share of its pixels that a mask hides; null while not known
+ * @property {Uint32Array | null} levels number of pixels of each level of a mask; null while not known
  * @property {string | null} thumbnail address
  * @property {string | null} lost why its bytes cannot be read
  * @property {string[] | null} inside names of the files in an archive; null where they are not known
@@ -75,7 +75,7 @@ export class Items {
       /** @type {Item} */
       const item = {
         id: ++this.count, path: free, file, role: null, name: free, kind: "ignored", left: false, digest: null, state: "waiting", width: 0, height: 0,
-        measures: null, hidden: null, thumbnail: null, lost: null, inside: null, verdict: { kind: "waiting", text: "" }, stored: false, problem: null,
+        measures: null, levels: null, thumbnail: null, lost: null, inside: null, verdict: { kind: "waiting", text: "" }, stored: false, problem: null,
       };
       this.byPath.set(free, item);
       added.push(item);

@@ -1,7 +1,7 @@
 // The worker that looks at one file at a time: digest, size, thumbnail and measures.
 
 import { sha256 } from "./digest.js";
-import { MEASURED_SIDE, hidden, measure } from "./measure.js";
+import { MEASURED_SIDE, levels, measure } from "./measure.js";
 
 /** Pixels of the longest side of a thumbnail. */
 const THUMBNAIL = 240;
@@ -17,7 +17,7 @@ const LARGEST = 60e6;
  * @property {number} width
  * @property {number} height
  * @property {import("./measure.js").Measures | null} measures
- * @property {number | null} hidden share of its pixels that a mask hides
+ * @property {Uint32Array | null} levels number of pixels of each level of a mask
  * @property {Blob | null} thumbnail
  * @property {string} [error] why the file could not be read at all
  */
@@ -25,7 +25,7 @@ const LARGEST = 60e6;
 /** @param {MessageEvent<{id: number, file: File, kind: string, shown: boolean, library: string}>} message */
 async function onMessage({ data: { id, file, kind, shown, library } }) {
   /** @type {Looked} */
-  const looked = { id, digest: null, state: "unchecked", width: 0, height: 0, measures: null, hidden: null, thumbnail: null };
+  const looked = { id, digest: null, state: "unchecked", width: 0, height: 0, measures: null, levels: null, thumbnail: null };
   try {
     looked.digest = await sha256(file, library);
     if (["photo", "mask"].includes(kind) && file.size <= LARGEST && "OffscreenCanvas" in globalThis) await decode(file, kind, shown, looked);
@@ -55,7 +55,7 @@ async function decode(file, kind, shown, looked) {
     looked.height = picture.height;
     const canvas = drawn(picture, MEASURED_SIDE);
     const pixels = context(canvas).getImageData(0, 0, canvas.width, canvas.height);
-    if (kind === "mask") looked.hidden = hidden(pixels.data);
+    if (kind === "mask") looked.levels = levels(pixels.data);
     else looked.measures = measure(pixels.data, canvas.width, canvas.height);
     looked.thumbnail = await drawn(canvas, THUMBNAIL).convertToBlob({ type: "image/webp", quality: 0.8 });
     looked.state = "read";

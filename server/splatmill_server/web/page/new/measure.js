@@ -13,9 +13,6 @@ const HASH_SIDE = 16;
 /** Alpha of 255 below which a pixel counts as transparent. */
 const OPAQUE = 128;
 
-/** Grey level or alpha of 255 from which a pixel of a mask is shown. */
-const SHOWN = 128;
-
 /**
  * @typedef {object} Measures
  * @property {number} blur 0 (sharp) to 1
@@ -93,17 +90,16 @@ function blurAlong(grey, lines, length, nextLine, next) {
 }
 
 /**
- * The share of its pixels that a mask hides: the transparent ones where it has any, and else the dark ones.
+ * The number of pixels of each level of a mask: of alpha where it has transparent pixels, and else of grey.
  * @param {Uint8ClampedArray} pixels RGBA
  */
-export function hidden(pixels) {
+export function levels(pixels) {
   const drawn = pixels.some((value, at) => at % 4 === 3 && value < 255);
-  let count = 0;
+  const counts = new Uint32Array(256);
   for (let at = 0; at < pixels.length; at += 4) {
-    const level = drawn ? pixels[at + 3] : 0.299 * pixels[at] + 0.587 * pixels[at + 1] + 0.114 * pixels[at + 2];
-    if (level < SHOWN) count++;
+    counts[drawn ? pixels[at + 3] : Math.round(0.299 * pixels[at] + 0.587 * pixels[at + 1] + 0.114 * pixels[at + 2])]++;
   }
-  return (4 * count) / pixels.length;
+  return counts;
 }
 
 /** @param {Uint32Array} counts of each level @param {number} total @param {number} share */

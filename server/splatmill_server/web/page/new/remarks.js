@@ -59,9 +59,12 @@ export function places({ top, outputs }) {
   ];
 }
 
+/** Level of 255 from which a pixel of a mask is shown. */
+const SHOWN = 128;
+
 /**
- * Sentences about masks that belong to no photo, and about masks that hide most of what they belong to.
- * @param {{name: string, hidden: number | null}[]} masks
+ * Sentences about masks that belong to no photo, about masks of two labels, and about those that hide all or most.
+ * @param {{name: string, levels: Uint32Array | null}[]} masks
  * @param {string[]} photos names
  * @param {import("./kinds.js").Accepted} accepted
  * @returns {string[]}
@@ -76,7 +79,16 @@ export function onMasks(masks, photos, accepted) {
     const are = unused.length === 1 ? "1 mask belongs" : `${unused.length} masks belong`;
     said.push(`${are} to no photo by name, and no use is made of it: ${unused.slice(0, 5).join(", ")}${unused.length > 5 ? ", ..." : ""}.`);
   }
-  const shares = used.flatMap(({ hidden }) => (hidden === null ? [] : [hidden]));
+  const counts = used.flatMap(({ levels }) => (levels === null ? [] : [levels]));
+  const present = Array.from({ length: 256 }, (_, level) => level).filter((level) => counts.some((levels) => levels[level]));
+  const [low, high] = present;
+  let shownFrom = SHOWN;
+  if (present.length === 2 && (high < SHOWN || low >= SHOWN)) {
+    shownFrom = high;
+    said.push(`The masks have the levels ${low} and ${high} of 255 alone, as pictures of labels have. ${low} is taken to hide, and ${high} to show what is trained on: if it is the other way round, invert them.`);
+  }
+  const sum = (/** @type {Uint32Array} */ levels) => levels.reduce((all, count) => all + count, 0);
+  const shares = counts.map((levels) => sum(levels.subarray(0, shownFrom)) / sum(levels));
   const hidden = shares.reduce((sum, share) => sum + share, 0) / shares.length;
   if (hidden * used.length > MOST_HIDDEN * photos.length) {
     said.push(`The masks of ${used.length} of ${photos.length} photos hide ${Math.round(100 * hidden)}% of their pixels. Black hides, and white is trained on: if the masks show in white what they should hide, invert them.`);

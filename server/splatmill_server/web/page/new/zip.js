@@ -5,6 +5,12 @@ const ENTRY = 0x02014b50;
 const END_BYTES = 22;
 const LONGEST_COMMENT = 65535;
 
+const UTF8 = 0x800;
+
+/** Encodings of names without the flag of UTF-8. The server chooses among more (images/zip_names.py): here, folders and
+ * suffixes count, which a wrong one breaks where the second byte of a character is a backslash. */
+const ENCODINGS = ["utf-8", "shift_jis", "euc-kr", "gb18030", "big5", "ibm866"];
+
 /** Bytes of the list that are read at most. */
 const LONGEST_LIST = 16 << 20;
 
@@ -26,17 +32,32 @@ export async function namesIn(zip) {
 
 /** @param {DataView} list @returns {string[] | null} */
 function names(list) {
-  const text = new TextDecoder();
   const found = [];
+  const unmarked = new Set();
   for (let at = 0; at + 46 <= list.byteLength; ) {
     if (list.getUint32(at, true) !== ENTRY) return null;
     const length = list.getUint16(at + 28, true);
     if (at + 46 + length > list.byteLength) return null;
-    const name = text.decode(new Uint8Array(list.buffer, list.byteOffset + at + 46, length)).replaceAll("\\", "/");
-    if (!name.endsWith("/")) found.push(name);
+    found.push(new Uint8Array(list.buffer, list.byteOffset + at + 46, length));
+    if (!(list.getUint16(at + 8, true) & UTF8)) unmarked.add(found[found.length - 1]);
     at += 46 + length + list.getUint16(at + 30, true) + list.getUint16(at + 32, true);
   }
-  return found;
+  const text = new TextDecoder(ENCODINGS.find((encoding) => decodes([...unmarked], encoding)));
+  const marked = new TextDecoder();
+  return found
+    .map((name) => (unmarked.has(name) ? text : marked).decode(name).replaceAll("\\", "/"))
+    .filter((name) => !name.endsWith("/"));
+}
+
+/** @param {Uint8Array[]} names @param {string} encoding */
+function decodes(names, encoding) {
+  const text = new TextDecoder(encoding, { fatal: true });
+  try {
+    names.forEach((name) => text.decode(name));
+  } catch {
+    return false;
+  }
+  return true;
 }
 
 /** @param {Blob} zip @param {number} begin @param {number} end */
