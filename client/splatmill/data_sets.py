@@ -6,6 +6,7 @@ The rule is one for a local folder, an unpacked zip and the folder of a capture.
 
 import os
 import re
+import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -78,25 +79,62 @@ class Cameras:
     models: tuple[str, ...] = ()
 
 
-def walk(root: Path) -> list[str]:
-    """The relative names of all files under `root` except hidden ones, sorted. Raises OSError."""
+def walk(root: Path, left_out: dict[str, str] | None = None) -> list[str]:
+    """The relative names of all files under `root` except hidden ones, sorted.
+
+    What is no regular file, or cannot be read, is left out: opening a FIFO would wait for ever. Links are followed,
+    because data sets share photos through them; a folder is read once, where it lies rather than where a link leads to
+    it.
+
+    left_out: filled with the names of what is left out, and the reasons.
+
+    Raises OSError where `root` itself cannot be read.
+    """
+    omitted = {} if left_out is None else left_out
 
     def fail(error: OSError) -> None:
-        raise error
+        if Path(error.filename) == root:
+            raise error
+        omitted[Path(error.filename).relative_to(root).as_posix()] = f"it cannot be read: {error.strerror}"
 
     names: list[str] = []
     visited: set[tuple[int, int]] = set()
-    # Links are followed, because data sets share photos through them; a folder seen before ends a cycle.
-    for folder, subfolders, files in os.walk(root, onerror=fail, followlinks=True):
-        here = os.stat(folder)
-        if (here.st_dev, here.st_ino) in visited:
-            subfolders.clear()
-            continue
-        visited.add((here.st_dev, here.st_ino))
-        subfolders[:] = [name for name in subfolders if not name.startswith((".", "__MACOSX"))]
-        inside = Path(folder).relative_to(root)
-        names += [(inside / name).as_posix() for name in files if not name.startswith(".")]
+    begins = [str(root)]
+    for begin in begins:
+        for folder, subfolders, files in os.walk(begin, onerror=fail):
+            try:
+                here = os.stat(folder)
+            except OSError as error:
+                fail(error)
+                subfolders.clear()
+                continue
+            if (here.st_dev, here.st_ino) in visited:
+                subfolders.clear()
+                continue
+            visited.add((here.st_dev, here.st_ino))
+            subfolders[:] = sorted(name for name in subfolders if not name.startswith((".", "__MACOSX")))
+            begins += [path for name in subfolders if os.path.islink(path := os.path.join(folder, name))]
+            inside = Path(folder).relative_to(root)
+            for file in files:
+                if file.startswith("."):
+                    continue
+                name = (inside / file).as_posix()
+                if (reason := _unreadable(os.path.join(folder, file))) is None:
+                    names.append(name)
+                else:
+                    omitted[name] = reason
     return sorted(names)
+
+
+def _unreadable(path: str) -> str | None:
+    """Why a file is not read; None for a regular file that may be read."""
+    try:
+        mode = os.stat(path).st_mode
+    except OSError as error:
+        return "it is a link to nothing" if os.path.islink(path) else f"it cannot be read: {error.strerror}"
+    if not stat.S_ISREG(mode):
+        return "it is a device, a socket or a pipe, not a file"
+    return None if os.access(path, os.R_OK) else "it cannot be read: Permission denied"
 
 
 def find_cameras(names: Sequence[str]) -> Cameras | None:

@@ -3,7 +3,7 @@
 import json
 import os
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +16,10 @@ from splatmill.schema.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES, VIDEO_SUFF
 
 MODEL_SUFFIXES = frozenset({".bin", ".txt"})
 MODEL_STEMS = frozenset({"cameras", "images", "points3d", "rigs", "frames"})  # in lower case
+
+
+MOST_NAMED = 10
+"""Files that a sentence names, at most."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,8 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     `data_sets.find_cameras`. Hidden files and folders are ignored. Videos and zip archives are used only where there
     are no photos. Pictures in a folder of results are no photos (`splatmill.schema.outputs`).
 
-    A file whose name the service does not accept gets another one, or is left out.
+    A file whose name the service does not accept gets another one, or is left out. What is no regular file, or cannot
+    be read, is left out too (`data_sets.walk`).
 
     Raises NothingToUpload where the path does not exist, cannot be read or holds none of these.
     """
@@ -100,8 +105,9 @@ def find_files(path: str | os.PathLike[str]) -> Found:
         raise NothingToUpload(f"{root} does not exist.", "Give a folder of photos, a zip archive or a video.")
     if root.is_file():
         return _single(root)
+    unreadable: dict[str, str] = {}
     try:
-        names = walk(root)
+        names = walk(root, unreadable)
         cameras = find_cameras(names) or Cameras("")
     except OSError as error:
         raise NothingToUpload(f"{error.filename} cannot be read: {error.strerror}.") from error
@@ -123,12 +129,16 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     for name in names:
         if name in poses:
             files.append(_local(Role.poses, poses[name], root / name))
-        elif name in masks:
-            files.append(_local(Role.masks, masks[name], root / name))
-        elif name.startswith(photo_root) and _is_image(name):
-            files.append(_local(Role.images, name.removeprefix(photo_root), root / name))
-        else:
-            ignored.append(name)
+            continue
+        try:
+            if name in masks:
+                files.append(_local(Role.masks, masks[name], root / name))
+            elif name.startswith(photo_root) and _is_image(name):
+                files.append(_local(Role.images, name.removeprefix(photo_root), root / name))
+            else:
+                ignored.append(name)
+        except NothingToUpload as error:  # it was deleted since it was listed
+            unreadable[name] = str(error)
     if not any(file.role is Role.images for file in files):
         whole = [name for name in ignored if _suffix(name) in VIDEO_SUFFIXES + ARCHIVE_SUFFIXES]
         files += [_local(Role.images, name, root / name) for name in whole]
@@ -137,16 +147,25 @@ def find_files(path: str | os.PathLike[str]) -> Found:
             kinds = ", ".join(sorted(suffix.removeprefix(".") for suffix in PHOTO_SUFFIXES))
             raise NothingToUpload(
                 f"{root} contains no photos, no video and no zip archive.",
-                " ".join(unread(ignored) or [f"Photos are {kinds} files."]),
+                " ".join([*_left_out(unreadable), *(unread(ignored) or [f"Photos are {kinds} files."])]),
             )
     found = Found.of(files, ignored)
     if not found.count(Role.images):
         raise NothingToUpload(found.left_out[0][1], "Rename the files.")
-    remarks = unread(ignored) + ([] if poses else unread_cameras(ignored))
+    remarks = _left_out(unreadable) + unread(ignored) + ([] if poses else unread_cameras(ignored))
     beside = [name for name in ignored if _suffix(name) in VIDEO_SUFFIXES + ARCHIVE_SUFFIXES]
     if beside:
         remarks.append(f"Videos and zips are not used where there are photos: {', '.join(beside)}.")
     return replace(found, top=cameras.top, outputs=tuple(sorted(outputs)), remarks=tuple(remarks))
+
+
+def _left_out(unreadable: Mapping[str, str]) -> list[str]:
+    """A sentence about files that are not read; none where there are none."""
+    if not unreadable:
+        return []
+    shown = "; ".join(f"{name}: {reason}" for name, reason in sorted(unreadable.items())[:MOST_NAMED])
+    more = f"; and {len(unreadable) - MOST_NAMED} more" if len(unreadable) > MOST_NAMED else ""
+    return [f"Left out are {shown}{more}."]
 
 
 def printable(name: str) -> str:
@@ -160,8 +179,9 @@ def start_model(path: Path) -> LocalFile:
     Raises NothingToUpload where there is no such file, or where the service does not accept its name.
     """
     if not path.is_file():
+        lacking = "is not a file" if path.exists() else "does not exist"
         raise NothingToUpload(
-            f"The model {path} to start from does not exist.",
+            f"The model {path} to start from {lacking}.",
             "Give the path of a model file, or the id of a model.",
         )
     try:

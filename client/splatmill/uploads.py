@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from splatmill.chunked_uploads import PIECE, OnPosition, read_range, send_in_pieces
 from splatmill.connection import Connection, read_answer
-from splatmill.errors import InvalidRequest, NothingToUpload
+from splatmill.errors import InvalidRequest, NothingToUpload, SplatmillError
 from splatmill.local_capture import LocalFile
 from splatmill.schema.captures import SHA256_HEADER, CaptureFile, Role
 from splatmill.schema.events import Progress
@@ -62,7 +62,7 @@ async def upload(
     """
     total = sum(file.size for file in files)
     stored: list[CaptureFile] = []
-    flawed: list[tuple[str, InvalidRequest]] = []
+    flawed: list[tuple[str, Problem, SplatmillError]] = []
     tally = _Tally(total, on_progress)
     # Poses and masks go first: if one is refused, the upload fails before the photos are sent.
     held = {(file.role, file.name): file for file in stored_files}
@@ -75,7 +75,11 @@ async def upload(
             except InvalidRequest as error:
                 if file.role is not Role.images or error.code not in BAD_PHOTO_CODES:
                     raise
-                flawed.append((file.name, error))
+                flawed.append((file.name, error.problem, error))
+            except NothingToUpload as error:  # it was deleted since it was listed
+                if file.role is Role.poses or len(files) == 1:
+                    raise
+                flawed.append((file.name, Problem.of("file_not_found", str(error)), error))
             tally.end(file)
 
     try:
@@ -85,8 +89,8 @@ async def upload(
     except BaseExceptionGroup as errors:
         raise errors.exceptions[0] from None
     if flawed and not any(file.role is Role.images for file in stored):
-        raise flawed[0][1]
-    return Uploaded(tuple(stored), tuple((name, error.problem) for name, error in flawed))
+        raise flawed[0][2]
+    return Uploaded(tuple(stored), tuple((name, problem) for name, problem, _ in flawed))
 
 
 @dataclass
@@ -152,12 +156,15 @@ async def _send(
 
 
 async def key_of(files: Sequence[LocalFile]) -> str:
-    """Return a key that is the same for the same files: equal roles, names, sizes and contents.
-
-    Raises NothingToUpload for a file that cannot be read.
-    """
-    digests = [(file, *await asyncio.to_thread(_digest, file.path)) for file in files]
-    lines = sorted(f"{file.role.value}/{file.name}\n{size} {digest}" for file, digest, size in digests)
+    """Return a key that is the same for the same files that can be read: equal roles, names, sizes and contents."""
+    lines = []
+    for file in files:
+        try:
+            digest, size = await asyncio.to_thread(_digest, file.path)
+        except NothingToUpload:  # `upload` leaves it out, or ends with this error
+            continue
+        lines.append(f"{file.role.value}/{file.name}\n{size} {digest}")
+    lines.sort()
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 

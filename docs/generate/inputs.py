@@ -77,7 +77,8 @@ def _photos() -> list[str]:
 
         A file whose name cannot be stored (`x:1.jpg`, a space at an end, bytes that are not UTF-8) is stored under a
         similar name, and both names are given. A path of more than {MAX_PARTS} parts is left out; a part of more than
-        {MAX_PART_BYTES} bytes is shortened.""",
+        {MAX_PART_BYTES} bytes is shortened. Links are followed, to each folder once. A link to nothing, a pipe, a
+        socket or a device, and what may not be read or disappears before it is read, is left out by name.""",
         "### Videos\n",
         table(
             ["container", "suffixes"], [[name, choices(suffixes)] for name, suffixes in VIDEO_FORMATS.items()]
@@ -196,12 +197,12 @@ def _points() -> list[str]:
     return [
         "## Points\n",
         f"""Points are those of the COLMAP model, or of the `.ply` in the data set that `ply_file_path` in
-        `transforms.json` names. Points with tracks are used. Those without, such as a laser scan (up to
-        {points.MOST_LOOSE:,} of them), are used where photos show their colours; if photos show these hardly more often
-        than by chance, none is used, and the log says so. With fewer than {points.LEAST_POINTS}, points are
-        triangulated with the given cameras. A warning says when the cameras explain less than
-        {points.CONTRADICTED:.0%} of the matches between photos: then the poses or the intrinsics are wrong, or belong
-        to other photos.""",
+        `transforms.json` names, whose faces and lists are left out. Points with tracks are used. Those without, such as
+        a laser scan (up to {points.MOST_LOOSE:,} of them), are used where photos show their colours; if photos show
+        these hardly more often than by chance, none is used, and the log says so. With fewer than
+        {points.LEAST_POINTS}, points are triangulated with the given cameras. A warning says when the cameras explain
+        less than {points.CONTRADICTED:.0%} of the matches between photos: then the poses or the intrinsics are wrong,
+        or belong to other photos.""",
     ]
 
 

@@ -18,18 +18,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 from playwright.sync_api import Locator, Page, Request, expect
 
 from splatmill.local_capture import find_files
 from splatmill.schema import describe_options
-from splatmill_worker.images.mask_levels import judged
-from splatmill_worker.images.masks import levels
 from splatmill_worker.images.prepare import prepare
 from tests.browser.conftest import Open, SmallModel, Visit
-from tests.support import still_life, unmarked_zip
+from tests.support import still_life
 from tests.support.paths import ROOT
 from tests.support.programs import node, npm_package
 from tests.support.up import Up
@@ -248,28 +245,6 @@ def test_what_the_job_would_warn_of_is_said_before_the_upload(
     assert [part in sentence for part, sentence in zip(("other.png", "hide 75%"), worker, strict=True)] == [
         True
     ] * 2
-
-
-def test_masks_of_labels_and_zips_of_windows_are_read_as_by_the_worker(page: Page, tmp_path: Path) -> None:
-    opened(page)
-    script = """async ([levels, packed]) => {
-      const { onMasks } = await import("/page/any/new/remarks.js");
-      const { namesIn } = await import("/page/any/new/zip.js");
-      const { accepted } = await (await fetch("/v1/info")).json();
-      const masks = levels.map((each, number) => ({ name: `${number}.png`, levels: new Uint32Array(each) }));
-      const photos = levels.map((_, number) => `${number}.jpg`);
-      return [onMasks(masks, photos, accepted), await namesIn(new Blob([new Uint8Array(packed)]))];
-    }"""
-    unmarked_zip.write(tmp_path / "set.zip", [("images/ソ表.jpg".encode("cp932"), b"x"), (b"a/b.jpg", b"x")])
-    packed = list((tmp_path / "set.zip").read_bytes())
-    masks = {}
-    for number in range(3):
-        path = tmp_path / f"{number}.png"
-        Image.fromarray(np.tile(np.array([0, 1, 1, 1], np.uint8), (4, 1))).save(path)
-        masks[f"{number}.jpg"] = path
-    remarks, names = page.evaluate(script, [[levels(path) for path in masks.values()], packed])
-    assert remarks == list(judged(masks, []).warnings)
-    assert names == ["images/ソ表.jpg", "a/b.jpg"]
 
 
 def test_two_data_sets_are_refused_before_the_upload(page: Page, photos: Path, tmp_path: Path) -> None:

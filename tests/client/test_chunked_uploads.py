@@ -236,3 +236,16 @@ def test_one_bad_name_is_stored_under_another_and_one_is_refused(service, tmp_pa
     assert held == {"plain.jpg", storable_name(" lead.jpg")}
     [(name, problem)] = uploaded.refused
     assert (name, problem.code) == (deep, "name_invalid")
+
+
+def test_a_photo_that_is_deleted_during_the_upload_is_left_out_by_name(service, tmp_path):
+    for number in range(12):
+        (tmp_path / f"{number:02}.jpg").write_bytes(os.urandom(100))
+    last = tmp_path / "11.jpg"
+    with Client(service.url) as client:
+        capture, uploaded = client.upload(tmp_path, on_progress=lambda event: last.unlink(missing_ok=True))
+        held = {file.name for file in client.capture(capture.id).files}
+    assert held == {f"{number:02}.jpg" for number in range(11)}
+    [(name, problem)] = uploaded.refused
+    assert (name, problem.code) == ("11.jpg", "file_not_found")
+    assert "No such file" in problem.detail

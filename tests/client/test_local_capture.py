@@ -3,6 +3,7 @@
 Does not prove that the files hold what their names say; only transforms.json is opened.
 """
 
+import json
 import os
 import re
 from pathlib import Path
@@ -367,6 +368,71 @@ def test_a_name_that_cannot_be_changed_is_left_out(tmp_path: Path) -> None:
     (tmp_path / "1.jpg").unlink()
     with pytest.raises(NothingToUpload, match="17 parts"):
         find_files(tmp_path)
+
+
+ODD = {
+    "odd.jpg": ("a link to nothing", lambda path: path.symlink_to("/nowhere/x.jpg")),
+    "self.png": ("a link to nothing", lambda path: path.symlink_to(path)),
+    "pipe.jpg": ("a device, a socket or a pipe", os.mkfifo),
+    "null.jpg": ("a device, a socket or a pipe", lambda path: path.symlink_to("/dev/null")),
+    "a_mask.png": ("a device, a socket or a pipe", os.mkfifo),
+    "masks/b.png": ("a link to nothing", lambda path: path.symlink_to("gone.png")),
+    "transforms.json": ("a device, a socket or a pipe", os.mkfifo),
+    "sparse/0/cameras.bin": ("a link to nothing", lambda path: path.symlink_to("gone.bin")),
+}
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("name", ODD)
+def test_what_is_no_regular_file_is_left_out_by_name(tmp_path: Path, name: str) -> None:
+    tree(tmp_path, "a.jpg", "b.jpg", "x.jpg/c.jpg")
+    reason, make = ODD[name]
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    make(tmp_path / name)
+    (tmp_path / "loop").symlink_to(tmp_path)
+    (tmp_path / "a_link").symlink_to(tmp_path / "x.jpg")
+    found = find_files(tmp_path)
+    assert [(file.role, file.name) for file in found.files] == [
+        (Role.images, each) for each in ("a.jpg", "b.jpg", "x.jpg/c.jpg")
+    ]
+    assert [each for each in found.remarks if each.startswith("Left out")] == [
+        f"Left out are {name}: it is {reason}{', not a file' if 'pipe' in reason else ''}."
+    ]
+    for path in ("a.jpg", "b.jpg", "x.jpg/c.jpg"):
+        (tmp_path / path).unlink()
+    with pytest.raises(NothingToUpload, match=f"Left out are {name}: it is {reason}"):
+        find_files(tmp_path)
+
+
+def test_a_folder_of_photos_may_be_a_link(tmp_path: Path) -> None:
+    tree(tmp_path / "store", "1.jpg", "deep/2.jpg")
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene/images").symlink_to(tmp_path / "store")
+    (tmp_path / "scene/store").symlink_to(tmp_path / "store/deep")
+    names = [file.path.relative_to(tmp_path).as_posix() for file in find_files(tmp_path / "scene").files]
+    assert names == ["scene/images/1.jpg", "scene/images/deep/2.jpg"]
+
+
+def test_what_may_not_be_read_is_left_out_by_name(tmp_path: Path) -> None:
+    tree(tmp_path, "a.jpg", "b.jpg", "closed/c.jpg")
+    tmp_path.chmod(0o755)
+    (tmp_path / "b.jpg").chmod(0)
+    (tmp_path / "closed").chmod(0)
+    left_out: dict[str, str] = {}
+    reader, writer = os.pipe()
+    if os.fork() == 0:
+        try:
+            os.chdir(tmp_path)
+            if os.geteuid() == 0:
+                os.setuid(65534)  # whom permissions bind
+            os.write(writer, json.dumps([walk(Path("."), left_out), left_out]).encode())
+        finally:
+            os._exit(0)
+    os.close(writer)
+    denied = "it cannot be read: Permission denied"
+    with os.fdopen(reader) as answer:
+        assert json.loads(answer.read()) == [["a.jpg"], {"b.jpg": denied, "closed": denied}]
+    os.wait()
 
 
 @needs_data

@@ -7,9 +7,11 @@ Does not prove that reading is bounded in memory; tests/worker/sfm/posed/test_mo
 
 from __future__ import annotations
 
+import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,10 +78,10 @@ class Written:
     ids=lambda around: " ".join(f"{key}={value!r}" for key, value in around.items()),
 )
 def test_what_programs_write_around_the_vertices_changes_no_value(
-    tmp_path: Path, form: str, around: dict[str, object]
+    tmp_path: Path, form: str, around: dict[str, Any]
 ) -> None:
     path = tmp_path / "m.ply"
-    path.write_bytes(Written(form, **around).content())  # type: ignore[arg-type]
+    path.write_bytes(Written(form, **around).content())
     model = registry.read(path).gaussians
     assert np.allclose(model.means.numpy(), ROWS[:, :3], atol=1e-6)
     assert np.allclose(model.sh[:, 0].numpy(), ROWS[:, 3:6], atol=1e-6)
@@ -132,4 +134,14 @@ def test_damaged_lists_are_refused(tmp_path: Path, data: bytes, says: str) -> No
     with pytest.raises(ModelUnreadable, match=says):
         registry.read(tmp_path / "m.ply")
     with pytest.raises(ValueError, match=says):
+        point_file.read(tmp_path / "m.ply")
+
+
+@pytest.mark.timeout(20)
+def test_a_pipe_keeps_no_reader_waiting(tmp_path: Path) -> None:
+    for name in ("m.ply", "m.splat", "m.spz"):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(ModelUnreadable, match="not a regular file"):
+            registry.read(tmp_path / name)
+    with pytest.raises(ValueError, match="not a regular file"):
         point_file.read(tmp_path / "m.ply")

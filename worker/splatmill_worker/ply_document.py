@@ -67,6 +67,8 @@ def _tables(
     """The rows of each of `kept` in a binary file: mapped into memory, or gathered where they have lists."""
     place, size = header.size, path.stat().st_size
     for element in elements:
+        if element in kept and not _plain(element):
+            raise ValueError(f"its {element.name} rows hold nothing but lists")
         row = np.dtype([(each.name, order + TYPES[each.kind]) for each in _plain(element)])
         if element.ragged:
             with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
@@ -156,7 +158,7 @@ class _Text(io.TextIOBase):
     def read(self, size: int | None = -1, /) -> str:
         return self._head.read(size)
 
-    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]
+    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]  # plyfile reads texts
         return next(self._lines, "")
 
 

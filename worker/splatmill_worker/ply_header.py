@@ -4,6 +4,7 @@ them."""
 from __future__ import annotations
 
 import re
+import stat
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,9 +82,12 @@ def read(path: Path, *names: str) -> Header:
     Lines end in any way; bytes that are not ASCII become `\\xNN`. Raises ValueError, with what is wrong, when the file
     is no .ply, is too short, or has no element called names[0]; OSError when it cannot be opened.
     """
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):  # a pipe would keep its reader waiting
+        raise ValueError("it is not a regular file")
     with path.open("rb") as file:
         head = file.read(MAX_HEADER_BYTES)
-    size = path.stat().st_size
+    size = status.st_size
     begin = _BEGIN.match(head)
     if begin is None:
         raise ValueError("it does not begin with 'ply'")

@@ -13,6 +13,7 @@ import shutil
 import time
 import unicodedata
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,7 @@ class Unfinished:
         """Read what the folder `data` holds of earlier commands, and create it if it does not exist.
 
         With `fresh`, or without a record, the folder is emptied first. Raises ServiceFailed if it holds a training of
-        the photos at another path, or a record that cannot be read, and OSError for a file that cannot be read.
+        the photos at another path, or a record that cannot be read.
         """
         record = data / RECORD
         wanted = cls(
@@ -161,7 +162,11 @@ def size_text(folder: Path) -> str:
 
 def _digests(files: Sequence[LocalFile]) -> dict[tuple[Role, str], str]:
     # The server stores names in this form of Unicode (see `safe_name`).
-    return {(file.role, unicodedata.normalize("NFC", file.name)): _sha256(file.path) for file in files}
+    digests = {}
+    for file in files:
+        with suppress(OSError):  # the upload leaves it out, or ends with this error
+            digests[file.role, unicodedata.normalize("NFC", file.name)] = _sha256(file.path)
+    return digests
 
 
 def _sha256(path: Path) -> str:

@@ -6,6 +6,7 @@ A row added here is a row of the page, and a case of tests/inputs/test_examples.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -50,6 +51,13 @@ def spaced(folder: Path) -> None:
     plain(folder)
     (folder / "1.jpg").rename(folder / "x:1.jpg")
     (folder / "2.jpg").rename(folder / " lead.jpg")
+
+
+def linked(folder: Path) -> None:
+    plain(folder)
+    (folder / "5.jpg").symlink_to("/nowhere/5.jpg")
+    os.mkfifo(folder / "6.jpg")
+    (folder / "again").symlink_to(folder)
 
 
 def cut_off(folder: Path) -> None:
@@ -180,6 +188,7 @@ MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
 EXAMPLES: tuple[Example, ...] = (
     Example("Photos", "four photos called .jfif", partial(plain, suffix=".jfif"), "used"),
     Example("Photos", "one photo called x:1.jpg, one that begins with a space", spaced, "used with a remark"),
+    Example("Photos", "a link to nothing, a pipe, and a link to the folder", linked, "used with a remark"),
     Example("Photos", "one photo is cut off", cut_off, "used with a remark"),
     Example("Photos", "one photo twice", twice, "used with a remark"),
     Example("Photos", "one picture of 12 x 90 pixels", small, "used with a remark"),

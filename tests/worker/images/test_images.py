@@ -18,6 +18,7 @@ from PIL import Image
 
 from splatmill_worker.errors import CaptureIncomplete
 from splatmill_worker.images import archive, decode, lens
+from splatmill_worker.images import prepare as prepare_module
 from splatmill_worker.images.load import load_view
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.scene import Camera, Lens, View
@@ -280,3 +281,8 @@ def test_the_preview_of_a_raw_photo_is_no_photo(photos: Path, tmp_path: Path) ->
     raw, cameras = result.warnings
     assert "raw photos: IMG_1.DNG and 1 more. Develop them as JPEG or TIFF" in raw
     assert "cameras of OpenDroneMap or OpenSfM in more/opensfm/reconstruction.json are not read" in cameras
+
+
+def test_a_photo_that_disappeared_is_left_out(tmp_path: Path) -> None:
+    gone = prepare_module._inspect("gone.jpg", tmp_path / "gone.jpg", None)
+    assert gone == "it cannot be read: No such file or directory"

@@ -406,7 +406,13 @@ def _filled_once(folder: Path, make: Callable[[Path], object]) -> Path:
 
 def _inspect(name: str, path: Path, sequence: str | None) -> tuple[UsablePhoto, SmallPicture] | str:
     """The photo, also at low resolution, or the reason why the file is left out."""
-    found = decoders.examine(path, name)
+    try:
+        found = decoders.examine(path, name)
+        digest = _sha256(path)
+    except OSError as error:
+        if error.errno in MACHINE_ERRORS:
+            raise
+        return f"it cannot be read: {error.strerror}"
     if isinstance(found, str):
         return found
     if found.projection is not None:
@@ -414,7 +420,7 @@ def _inspect(name: str, path: Path, sequence: str | None) -> tuple[UsablePhoto, 
     photo = UsablePhoto(
         name,
         path,
-        _sha256(path),
+        digest,
         found.width,
         found.height,
         found.exif,

@@ -20,7 +20,7 @@ from splatmill.data_sets import TRANSFORMS
 _HAN = "\u3005\u4e00-\u9fff"
 
 ENCODINGS = {
-    "cp866": ("Russian", "(?:[\u0410-\u042f\u0401]?[\u0430-\u044f\u0451]+|[\u0410-\u042f\u0401]+)"),
+    "cp866": ("Russian", "(?:[\u0410-\u042f\u0401]?[\u0430-\u044f\u0451]+|[\u0410-\u042f\u0401]{2,})"),
     "cp932": ("Japanese", f"[{_HAN}\u3041-\u30fe\uff10-\uff19\uff21-\uff3a\uff41-\uff5a]+"),
     "cp949": ("Korean", "[\uac00-\ud7a3]+"),
     "gb18030": ("Chinese, simplified", f"[{_HAN}]+"),
@@ -29,7 +29,7 @@ ENCODINGS = {
     "cp852": ("Central European", "[\u00c0-\u017f]+"),
     "cp1251": (
         "Russian, of Windows",
-        "(?:[\u0410-\u042f\u0401]?[\u0430-\u044f\u0451]+|[\u0410-\u042f\u0401]+)",
+        "(?:[\u0410-\u042f\u0401]?[\u0430-\u044f\u0451]+|[\u0410-\u042f\u0401]{2,})",
     ),
     "cp1252": ("Western European, of Windows", "[\u00c0-\u00ff\u0152-\u0178]+"),
     "cp437": ("the original one of zips", ".+"),

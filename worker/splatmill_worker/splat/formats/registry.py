@@ -78,9 +78,13 @@ def writer(path: Path) -> Writer:
 def read(path: Path) -> Contents:
     """Read the model in a file of any readable format, which the suffix tells.
 
-    Raises ModelUnreadable for a damaged file or an unknown suffix, and FileNotFoundError where there is no file.
+    Raises ModelUnreadable for a damaged file, what is no regular file, or an unknown suffix, and FileNotFoundError
+    where there is no file.
     """
-    return reader(path)(path)
+    function = reader(path)
+    if path.exists() and not path.is_file():  # a pipe would keep its reader waiting
+        raise ModelUnreadable(f"{path.name} is not a regular file.")
+    return function(path)
 
 
 def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antialiased: bool = False) -> int:
