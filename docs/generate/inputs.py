@@ -152,18 +152,25 @@ def _cameras() -> list[str]:
             ["program", "files, in either case"],
             [[program, choices(names)] for program, names in CAMERA_PROGRAMS.items()],
         ),
-        f"""Given cameras are used as they are, and are not recovered again. A data set lies in the given folder or up
-        to {MAX_DEPTH} folders down; of two side by side, none is used, and both are named. A COLMAP model is preferred
-        to the other files. Its folder is the given one or one of {choices(PLACES)} in it, where N is a number, and what
-        is in brackets may be missing. `images` is needed beside `cameras`, both as `.bin` or both as `.txt`; `points3D`
-        may be missing. Of several models, up to {colmap_model.MOST_MODELS}, the one with the most of the photos is
-        used, and a warning names the others. Text may have a byte-order mark, any line ends, and names with spaces.
+        f"""Given cameras are used as they are, and are not recovered again. A data set lies in the given folder or up to
+        {MAX_DEPTH} folders down; of two side by side, none is used, and both are named. A COLMAP model is preferred to
+        the other files, which a warning names. Its folder is the given one or one of {choices(PLACES)} in it, where N
+        is a number, and what is in brackets may be missing. `images` is needed beside `cameras`, both as `.bin` or both
+        as `.txt`; `points3D` may be missing. Of several models, up to {colmap_model.MOST_MODELS}, the one with the most
+        of the photos is used, and a warning names the others. Text may have a byte-order mark, any line ends, and names
+        with spaces.
 
         In `transforms.json`, a frame or the document has {fields}. `camera_angle_x` and `camera_angle_y` may stand for
         the focal lengths; a size that is missing is that of the photo. `transform_matrix` is from camera to world, 4 x
-        4 or 3 x 4, with OpenGL axes. The frames of `transforms_test.json` and those in `test_filenames` are held out;
-        those of `transforms_val.json` are left out. `mask_path` names the mask of a frame. Of the raw data of Polycam,
-        corrected cameras are preferred.
+        4 or 3 x 4, with OpenGL axes. `mask_path` names the mask of a frame. Of the raw data of Polycam, corrected
+        cameras are preferred, which need the photos in `keyframes/corrected_images`.
+
+        `transforms_train.json`, `transforms_test.json` and `transforms_val.json` are read, beside a `transforms.json`
+        too, and so are the lists `train_filenames`, `test_filenames` and `val_filenames` in a file: those to test with
+        are held out, and those of the validation set left out, unless they are also for training. Other files
+        `transforms*.json` are read only where there is no `transforms.json`. A photo that is named several times has
+        one camera: where the cameras agree, any of them; where they differ, the photo is left out, and both are named.
+        If those are more than {model_files.MOST_FAULTY:.0%} of the photos, the job fails.
 
         A photo is found by the name that its camera gives. Where none has it, the photo is the one that agrees in the
         last parts of its path, with `/` or `\\` between folders, in another case, form of accents or suffix, if it is

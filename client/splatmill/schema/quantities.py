@@ -1,6 +1,7 @@
-"""Durations and sizes as people write them: `90s`, `5m`, `1h30m`, `1.5GB`."""
+"""Durations, sizes, counts and lists as people write them: `90s`, `1h30m`, `1.5GB`, `1 photo`, `a, b, c and 4 more`."""
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
@@ -68,3 +69,14 @@ def format_bytes(count: float) -> str:
             return f"{count:.0f} B" if unit == "B" else f"{count:.1f} {unit}"
         count /= 1000
     return f"{count:.1f} TB"
+
+
+def counted(number: int, one: str, many: str | None = None) -> str:
+    """Return a number with its noun: `1 photo`, `12 photos`; `many` is the plural where it is not `one` with an s."""
+    return f"{number} {one if number == 1 else many or f'{one}s'}"
+
+
+def listed(names: Sequence[str], most: int = 3) -> str:
+    """Return the first names as text, with the number of the others: `a, b, c and 4 more`."""
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

@@ -160,6 +160,13 @@ def test_corrected_cameras_of_polycam_come_first(tmp_path: Path) -> None:
     check(loaded(tmp_path), {f"keyframes/corrected_images/{1700 + k}.jpg": k for k in range(COUNT)})
 
 
+def test_corrected_cameras_need_the_photos_they_are_of(tmp_path: Path) -> None:
+    polycam(tmp_path)
+    (tmp_path / "keyframes/corrected_images").rename(tmp_path / "keyframes/images")
+    with pytest.raises(ValueError, match="photos in keyframes/corrected_images, which is missing"):
+        loaded(tmp_path)
+
+
 def test_a_photo_of_polycam_without_a_pose_is_left_out(tmp_path: Path) -> None:
     polycam(tmp_path, change={3: {"fx": 60}, 4: None})
     scene = loaded(tmp_path)

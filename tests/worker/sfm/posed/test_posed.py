@@ -223,7 +223,7 @@ def test_a_colmap_model_wins_over_transforms(tmp_path: Path) -> None:
     write_transforms(tmp_path / "transforms.json", [])
     found = posed.find(tmp_path)
     assert found is not None
-    assert (found.source, len(found.notes)) == ("colmap", 1)
+    assert (found.source, len(found.warnings)) == ("colmap", 1)
 
 
 def test_a_broken_model_and_missing_photos_are_named(tmp_path: Path) -> None:

@@ -3,19 +3,20 @@ Polycam."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 
-from splatmill.data_sets import TRANSFORMS, find_cameras, walk
+from splatmill.data_sets import MODEL_FILES, Cameras, find_cameras, keyframes, walk
 from splatmill.schema.photos import PHOTO_SUFFIXES
+from splatmill.schema.quantities import listed
 from splatmill_worker.images import lens, mask_levels
 from splatmill_worker.images.decoders import mask_fault, photo_colors
 from splatmill_worker.images.masks import unfit
 from splatmill_worker.images.photo_colors import sentences
 from splatmill_worker.images.prepare import names_remark
 from splatmill_worker.scene import Scene, Source
-from splatmill_worker.sfm.posed import colmap_model, transforms
+from splatmill_worker.sfm.posed import colmap_model, parts, transforms
 from splatmill_worker.sfm.posed.files import ImageFiles
 
 POSE_FOLDERS = ("poses", "")
@@ -93,22 +94,50 @@ def find(directory: Path) -> PosedInput | None:
                         f"Photos outside {cameras.top}, where the cameras are, are not used: {len(outside)}, such as "
                         f"{outside[0]}.",
                     )
+        warnings += _unused(names, cameras)
         json_files = tuple(base / name for name in cameras.transforms)
         if cameras.models:
             models = tuple(base / folder for folder in cameras.models)
-            if json_files:
-                of = f"The COLMAP model in {models[0].relative_to(directory)} is used"
-                notes.append(f"{of}, not {', '.join(path.name for path in json_files)}.")
             return PosedInput(place, "colmap", models, (), tuple(notes), warnings)
-        plain = tuple(
-            path
-            for path in json_files
-            if path.name.lower() == "transforms.json" or not fnmatchcase(path.name.lower(), TRANSFORMS)
+        # Without a transforms.json, all files together are the data set.
+        alone = any(path.name.lower() == "transforms.json" for path in json_files)
+        used = [path for path in json_files if not alone or _belongs(path)]
+        others = [path.name for path in json_files if path not in used]
+        if others:
+            warnings += (f"Not used beside transforms.json: {listed(others)}.",)
+        blender = all(parts.of_file(path) is not None for path in used)
+        return PosedInput(
+            place, "blender" if blender else "transforms", (), tuple(used), tuple(notes), warnings
         )
-        if plain:
-            return PosedInput(place, "transforms", (), plain, tuple(notes), warnings)
-        return PosedInput(place, "blender", (), json_files, tuple(notes), warnings)
     return None
+
+
+def _belongs(path: Path) -> bool:
+    """Whether a file is read beside transforms.json: it is that file, or names a part of the data set."""
+    return path.name.lower() == "transforms.json" or parts.of_file(path) is not None
+
+
+def _unused(names: Sequence[str], cameras: Cameras) -> tuple[str, ...]:
+    """Warnings about cameras of other kinds in the data set than those that are used."""
+    inside = [name for name in names if name.startswith(cameras.top)]
+    files = {
+        name: folder if keyframes(folder := f"{name.rpartition('/')[0]}/") else name
+        for name in inside
+        if name in cameras.transforms or keyframes(f"{name.rpartition('/')[0]}/")
+    }
+    used = cameras.models[:1] or tuple(files[name] for name in cameras.transforms[:1])
+    kept = () if cameras.models else cameras.transforms
+    others = sorted({files[name] for name in files if name not in kept} - set(used))
+    warnings = []
+    if others:
+        warnings.append(f"The cameras in {used[0]} are used, not those in {listed(others)}.")
+    lower = {name.lower() for name in inside}
+    warnings += [
+        f"{folder} has its model as .bin and as .txt; the .bin files are used."
+        for folder in cameras.models
+        if {f"{folder}{name}".lower() for name in MODEL_FILES} <= lower
+    ]
+    return tuple(warnings)
 
 
 def _without_unfit_masks(scene: Scene) -> Scene:

@@ -17,6 +17,7 @@ from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
 from splatmill_worker.sfm.posed import model_files
 from splatmill_worker.sfm.posed.files import ImageFiles, missing, readings
 from splatmill_worker.sfm.posed.model_files import GivenModel, ModelPoints
+from splatmill_worker.sfm.posed.one_camera import one_for_each
 
 Integers = npt.NDArray[np.int64]
 
@@ -117,9 +118,11 @@ def scene_of_given(model: GivenModel, files: ImageFiles, notes: tuple[str, ...] 
             + (f"several of this name: {several}." if several else f"none of them{_instead(files)}.")
             + " Give the photos the names that the model uses."
         )
-    used = {view.image for view in views.values()}
-    copies, copy_warnings = files.copies(used)
+    copies, copy_warnings = files.copies({view.image for view in views.values()})
     faulty = {found[1]: fault for name, fault in model.faulty if (found := files.photo(name)) is not None}
+    views, contradictory = one_for_each(views, lambda key: f"image {key} ({model.images[key].name})")
+    faulty |= {files.photos[name]: fault for name, fault in contradictory}
+    used = {view.image for view in views.values()}
     without = [
         (name, faulty.get(path, "the COLMAP model has no camera for it"))
         for name, path in files.photos.items()

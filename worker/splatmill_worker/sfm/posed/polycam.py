@@ -6,8 +6,8 @@ y up. The rows are exchanged so that z is up, as nerfstudio does with the same f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
@@ -25,9 +25,29 @@ def document(paths: Sequence[Path], parsed: Callable[[Path], Any]) -> dict[str, 
     return {"frames": [_frame(path, parsed(path)) for path in paths]}
 
 
+def photo_folder(cameras: Path) -> str:
+    """The folder of the photos that a folder of cameras belongs to, beside it."""
+    return cameras.name.lower().replace("cameras", "images")
+
+
+def check_photos(cameras: Path, photos: Iterable[str]) -> None:
+    """Raise ValueError if no photo is in the folder that a folder of cameras belongs to, and others lie beside it.
+
+    Corrected cameras are those of undistorted photos: with the others, each would be slightly wrong.
+    """
+    folder = photo_folder(cameras)
+    parts = {part.lower() for name in photos for part in PurePosixPath(name).parts[:-1]}
+    if folder not in parts and folder.removeprefix("corrected_") in parts:
+        raise ValueError(
+            f"The cameras in keyframes/{cameras.name} are those of the photos in keyframes/{folder}, which is missing. "
+            f"Export the raw data again, or leave out {cameras.name}: the cameras in keyframes/cameras are then used."
+        )
+
+
 def _frame(path: Path, camera: Any) -> dict[str, Any]:
-    photos = path.parent.name.lower().replace("cameras", "images")
-    frame: dict[str, Any] = {"file_path": f"{path.parent.parent.name}/{photos}/{path.stem}"}
+    frame: dict[str, Any] = {
+        "file_path": f"{path.parent.parent.name}/{photo_folder(path.parent)}/{path.stem}"
+    }
     if not isinstance(camera, dict):
         return frame
     rows = [[camera.get(f"t_{row}{column}") for column in range(4)] for row in ROWS]

@@ -11,23 +11,25 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from splatmill.data_sets import keyframes
-from splatmill.schema.quantities import format_bytes
+from splatmill.schema.quantities import format_bytes, listed
 from splatmill_worker import point_file
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.images import decoders
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
-from splatmill_worker.sfm.posed import polycam
+from splatmill_worker.sfm.posed import parts, polycam
 from splatmill_worker.sfm.posed.camera_models import UnreadModel, is_fisheye
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
 from splatmill_worker.sfm.posed.files import ImageFiles, missing, readings
 from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_PARAMETER, MAX_SIDE, MOST_FAULTY
+from splatmill_worker.sfm.posed.one_camera import one_for_each
+from splatmill_worker.sfm.posed.parts import Part
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns the axes of a camera-to-world matrix from OpenGL's to OpenCV's."""
@@ -49,25 +51,31 @@ MAX_PARSED_BYTES = 200 * 2**20
 def load(
     paths: tuple[Path, ...], source: Source, files: ImageFiles, capture: Path, notes: tuple[str, ...] = ()
 ) -> Scene:
-    """The scene of the cameras in all `paths`; Blender's split is kept, and its validation set is left out.
+    """The scene of the cameras in all `paths`, divided as these say (`parts`).
 
     The files are uploads of strangers: points and masks that they name are read only when they lie in `capture`.
-    Raises ValueError, naming the file and the frame, for an invalid camera, and when no photo is among `files`.
+    Raises ValueError, naming the file and the frame, for an invalid camera and for photos with different cameras, and
+    when no photo is among `files`.
     """
-    views: dict[str, View] = {}
+    given: dict[int, View] = {}
+    where: dict[int, str] = {}
+    named: dict[Path, set[Part]] = {}
     left_out: list[tuple[str, str]] = []
     unusable: dict[str, str] = {}
-    validation: set[str] = set()
     messages = list(notes)
     warnings: list[str] = []
     points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     for path, document in _documents(paths):
-        split = _split_of(path)
-        if split == "val":
-            messages.append(f"{path.name} is not used: it is a validation set.")
-            validation |= {_called(index, frame, files) for index, frame in enumerate(document["frames"])}
+        if path.is_dir():
+            polycam.check_photos(path, files.photos)
+        part = parts.of_file(path)
+        if part == "val":
+            for frame in document["frames"]:
+                if photo := _photo(frame, files):
+                    named.setdefault(photo, set()).add(part)
             continue
-        tests = _test_names(path, document)
+        listed_in = parts.of_lists(path, document)
+        warnings += parts.unknown(path, listed_in, document["frames"])
         without = 0
         faults: list[ValueError] = []
         for index, frame in enumerate(document["frames"]):
@@ -89,8 +97,10 @@ def load(
             if view is None:
                 left_out.append((name, missing(name, files, f"{path.name} has a camera for it")))
                 continue
-            own = split or (("test" if frame["file_path"] in tests else "train") if tests else None)
-            views[view.name] = replace(view, split=own)
+            where[len(given)] = f"frame {index} of {path.name}"
+            given[len(given)] = view
+            own = {part} if part else listed_in.get(parts.plain(name), set())
+            named.setdefault(view.image, set()).update(own)
         if without == len(document["frames"]) > 0:
             raise ValueError(f"No frame of {path.name} has a transform_matrix: it places no photo.")
         if without:
@@ -101,6 +111,11 @@ def load(
         if document.get("ply_file_path"):
             points, note = _sparse_points(path.parent / _local(str(document["ply_file_path"])), capture)
             messages += [note] if note else []
+    distinct, contradictory = one_for_each(given, where.__getitem__)
+    left_out += contradictory
+    views, validation, remarks = parts.divided(distinct.values(), named)
+    left_out += [(name, parts.NOT_USED) for name in validation]
+    warnings += remarks
     if not views and unusable:
         name, reason = next(iter(unusable.items()))
         if decoders.forget_ended():
@@ -112,21 +127,22 @@ def load(
         first = f" (such as {left_out[0][0]!r})" if left_out else ""
         several = readings(left_out[0][0], files) if left_out else ""
         raise ValueError(
-            f"{', '.join(path.name for path in paths)} has {len(left_out)} cameras{first}, and the capture has "
+            f"{listed([path.name for path in paths])} has {len(left_out)} cameras{first}, and the capture has "
             + (f"several photos of this name: {several}." if several else "none of their photos.")
             + " Give the photos the names in file_path."
         )
-    used = {view.image for view in views.values()}
-    left_out += unusable.items()
-    named = {name for name, _ in left_out}
+    used = {view.image for view in views}
+    names = {view.name for view in views}
+    left_out = [(name, reason) for name, reason in (*left_out, *unusable.items()) if name not in names]
+    mentioned = {name for name, _ in left_out}
     copies, copy_warnings = files.copies(used)
     left_out += [
-        (name, "validation sets are not used" if name in validation else "no camera is given for it")
+        (name, parts.NOT_USED if named.get(path) == {"val"} else "no camera is given for it")
         for name, path in files.photos.items()
-        if path not in used and path not in copies and name not in named
+        if path not in used and path not in copies and name not in mentioned
     ]
     return Scene(
-        views=tuple(sorted(views.values(), key=lambda view: view.name)),
+        views=tuple(sorted(views, key=lambda view: view.name)),
         points=points[0],
         colors=points[1],
         source=source,
@@ -170,21 +186,6 @@ def parsed_bytes(text: bytes) -> int:
     return 2 * len(text) + 88 * (text.count(b"[") + text.count(b"{")) + 40 * text.count(b",")
 
 
-def _test_names(path: Path, document: dict[str, Any]) -> set[str]:
-    names = document.get("test_filenames", [])
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"test_filenames in {path.name} is no list of names.")
-    return set(names)
-
-
-def _split_of(path: Path) -> Literal["train", "test", "val"] | None:
-    """The split that a Blender data set names in the file name."""
-    match path.stem.lower().removeprefix("transforms").lstrip("_"):
-        case "train" | "test" | "val" as split:
-            return split
-    return None
-
-
 def _view(
     path: Path, index: int, document: dict[str, Any], frame: Any, files: ImageFiles, capture: Path
 ) -> tuple[str, View | None]:
@@ -220,6 +221,13 @@ def _view(
 def _has_no_pose(frame: Any) -> bool:
     """Whether a frame places no photo: it is null, or its matrix is missing, null or empty."""
     return frame is None or (isinstance(frame, dict) and frame.get("transform_matrix") in (None, []))
+
+
+def _photo(frame: Any, files: ImageFiles) -> Path | None:
+    """The photo of a frame, if it names one of the capture."""
+    name = frame.get("file_path") if isinstance(frame, dict) else None
+    found = files.photo(name) if isinstance(name, str) else None
+    return None if found is None else found[1]
 
 
 def _called(index: int, frame: Any, files: ImageFiles) -> str:
