@@ -91,9 +91,12 @@ def _photos() -> list[str]:
             ["in the file, by its number in H.273", "read as"],
             [*_codes("primaries", PRIMARIES), *_codes("transfer", TRANSFERS)],
         ),
-        """Colours are brought to sRGB with 8 bits per channel. A photo is read by its ICC profile, or else by its tags
-        or the EXIF mark of Adobe RGB; a video by its tags. PQ and HLG are converted by one rule, which
-        [Photographing](photographing.md#what-can-be-given) has. The report says what was converted or assumed.""",
+        """Colours are brought to sRGB with 8 bits per channel. A photo is read by its ICC profile, or else by its tags,
+        the chunks sRGB, gAMA and cHRM of PNG, or EXIF (Adobe RGB, other primaries, a power); in a PNG, cICP comes
+        first. A video is read by its tags. PQ and HLG are converted by one rule, which
+        [Photographing](photographing.md#what-can-be-given) has. CMYK and LAB are converted too. Grey floating-point
+        numbers are taken as sRGB from 0 to 1; coloured ones are refused, since they may be linear light as well. The
+        report says what was converted or assumed.""",
         "### Zips\n",
         f"""{choices(ARCHIVE_SUFFIXES)} files hold photos or a whole data set. All zips and videos of a capture together
         hold up to {archive.MAX_ENTRIES:,} files. A zip in a zip is not unpacked.
@@ -152,13 +155,13 @@ def _cameras() -> list[str]:
             ["program", "files, in either case"],
             [[program, choices(names)] for program, names in CAMERA_PROGRAMS.items()],
         ),
-        f"""Given cameras are used as they are, and are not recovered again. A data set lies in the given folder or up to
-        {MAX_DEPTH} folders down; of two side by side, none is used, and both are named. A COLMAP model is preferred to
-        the other files, which a warning names. Its folder is the given one or one of {choices(PLACES)} in it, where N
-        is a number, and what is in brackets may be missing. `images` is needed beside `cameras`, both as `.bin` or both
-        as `.txt`; `points3D` may be missing. Of several models, up to {colmap_model.MOST_MODELS}, the one with the most
-        of the photos is used, and a warning names the others. Text may have a byte-order mark, any line ends, and names
-        with spaces.
+        f"""Given cameras are used as they are, and are not recovered again. A data set lies in the given folder or up
+        to {MAX_DEPTH} folders down; of two side by side, none is used, and both are named. A COLMAP model is
+        preferred to the other files, which a warning names. Its folder is the given one or one of {choices(PLACES)}
+        in it, where N is a number, and what is in brackets may be missing. `images` is needed beside `cameras`,
+        both as `.bin` or both as `.txt`; `points3D` may be missing. Of several models, up to
+        {colmap_model.MOST_MODELS}, the one with the most of the photos is used, and a warning names the others.
+        Text may have a byte-order mark, any line ends, and names with spaces.
 
         In `transforms.json`, a frame or the document has {fields}. `camera_angle_x` and `camera_angle_y` may stand for
         the focal lengths; a size that is missing is that of the photo. `transform_matrix` is from camera to world, 4 x

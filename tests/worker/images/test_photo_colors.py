@@ -22,7 +22,7 @@ import pytest
 from PIL import Image, ImageCms
 
 from splatmill_worker.images import decode, decoders
-from splatmill_worker.images.colors import Colors, _rgb_to_xyz
+from splatmill_worker.images.colors import Colors, _rgb_to_xyz, _to_srgb
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.sfm import posed
 from tests.worker.images.test_video_frame import KR_KB, TO_BT2020, TO_P3, chart, gamma, hlg, linear, pq, yuv
@@ -221,6 +221,128 @@ def test_photos_of_ten_bits_are_read_by_their_tags(kind: str, suffix: str, tmp_p
     # The readers give 8 bits; those of PQ are steps of two levels, and the encoder of AVIF is lossy.
     assert np.abs(error * matt).mean() < (3.0 if kind == "PQ" else 2.0)
     assert [kind in warning for warning in warnings_of(images)] == ([] if kind == "sRGB" else [True])
+
+
+def with_chunks(data: bytes, **chunks: bytes) -> bytes:
+    """A PNG with chunks behind its header of 33 bytes."""
+    made = b"".join(
+        struct.pack(">I", len(body))
+        + kind.encode()
+        + body
+        + struct.pack(">I", zlib.crc32(kind.encode() + body))
+        for kind, body in chunks.items()
+    )
+    return data[:33] + made + data[33:]
+
+
+def points(*values: float) -> bytes:
+    return struct.pack(f">{len(values)}I", *(round(value * 100_000) for value in values))
+
+
+GAMMA = {power: points(1 / power) for power in (1.0, 1.8, 2.2)}
+P3_POINTS = points(0.3127, 0.329, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06)
+WIDE = (0.3457, 0.3585, 0.7347, 0.2653, 0.1596, 0.8404, 0.0366, 0.0001)
+"""ProPhoto, whose white is D50."""
+CICP_P3, SRGB_CHUNK = bytes([12, 13, 0, 1]), b"\0"
+PROFILE = b"p\0\0" + zlib.compress(ADOBE)
+
+
+@pytest.mark.parametrize(
+    ("chunks", "power", "to", "named"),
+    [
+        ({"gAMA": GAMMA[1.0]}, 1.0, np.eye(3), "sRGB, linear"),
+        ({"gAMA": GAMMA[1.8]}, 1.8, np.eye(3), "sRGB, gamma 1.8"),
+        ({"gAMA": GAMMA[2.2]}, None, np.eye(3), ""),
+        ({"gAMA": GAMMA[2.2], "cHRM": P3_POINTS}, None, TO_P3, "Display P3"),
+        ({"gAMA": GAMMA[1.0], "cHRM": P3_POINTS}, 1.0, TO_P3, "Display P3, linear"),
+        ({"cHRM": points(*WIDE)}, None, np.linalg.inv(_to_srgb(WIDE)), "primaries of its own"),
+        ({"cHRM": points(0.3, 0.3, *[0.5] * 6)}, None, np.eye(3), ""),
+        ({"gAMA": points(0)}, None, np.eye(3), ""),
+        ({"sRGB": SRGB_CHUNK, "gAMA": GAMMA[1.0]}, None, np.eye(3), ""),
+        ({"gAMA": GAMMA[1.0], "iCCP": PROFILE}, 2.2, TO_ADOBE, "Adobe RGB (1998)"),
+        ({"cICP": CICP_P3, "gAMA": GAMMA[1.0], "iCCP": PROFILE}, None, TO_P3, "Display P3"),
+    ],
+)
+def test_a_png_is_read_by_the_first_of_its_chunks(
+    chunks: dict[str, bytes], power: float | None, to: Values, named: str, tmp_path: Path
+) -> None:
+    light = (linear(chart()) @ to.T).clip(0, 1)
+    signal = gamma(light) if power is None else light ** (1 / power)
+    data = io.BytesIO()
+    Image.fromarray((signal * 255).round().astype(np.uint8)).save(data, "PNG")
+    path = tmp_path / "a.png"
+    path.write_bytes(with_chunks(data.getvalue(), **chunks))
+    # Eight bits of linear light are too few for the dark.
+    bright = chart() > (120 if power == 1.0 else 0)
+    assert np.abs((read(path) - chart()) * bright).mean() < 1.5
+    remark = f"converted to sRGB from {named}" if named else ""
+    assert decoders.photo_colors(path, "a") == remark
+
+
+def adobe_space(space: int, **tags: Any) -> Image.Exif:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA001] = space
+    exif[0x8769] = {0xA001: space, **({0xA500: tags["power"]} if "power" in tags else {})}
+    if "points" in tags:
+        exif[0x013E], exif[0x013F] = tags["points"][:2], tags["points"][2:]
+    return exif
+
+
+ADOBE_POINTS = (0.3127, 0.329, 0.64, 0.33, 0.21, 0.71, 0.15, 0.06)
+
+
+@pytest.mark.parametrize(
+    ("exif", "named"),
+    [
+        (adobe_space(2), "converted to sRGB from Adobe RGB"),
+        (adobe_space(0xFFFF, points=ADOBE_POINTS, power=2.2), "converted to sRGB from Adobe RGB"),
+        (adobe_space(1, points=ADOBE_POINTS), ""),
+        (
+            adobe_space(0xFFFF),
+            "taken as sRGB, since their EXIF says that they are in another colour space and names none",
+        ),
+    ],
+)
+@pytest.mark.parametrize("suffix", ["jpg", "webp", "tif"])
+def test_other_spaces_by_exif_alone(exif: Image.Exif, named: str, suffix: str, tmp_path: Path) -> None:
+    Image.fromarray(chart()).save(tmp_path / f"a.{suffix}", exif=exif)
+    assert decoders.photo_colors(tmp_path / f"a.{suffix}", "a") == named
+
+
+def test_the_power_of_exif(tmp_path: Path) -> None:
+    light = (linear(chart()) * 255).round().astype(np.uint8)
+    Image.fromarray(light).save(
+        tmp_path / "a.jpg", exif=adobe_space(0xFFFF, power=1.0), quality=100, subsampling=0
+    )
+    assert np.abs((read(tmp_path / "a.jpg") - chart()) * (chart() > 120)).mean() < 1.5
+
+
+def test_a_profile_of_grey_holds_with_transparent_pixels_too(tmp_path: Path) -> None:
+    grey = chart()[..., 0]
+    light = (linear(grey) ** (1 / 1.8) * 255).round().astype(np.uint8)
+    alpha = np.full_like(light, 200)
+    profile = icc(b"GRAY", "Gray Gamma 1.8", None, 1.8)
+    Image.merge("LA", [Image.fromarray(light), Image.fromarray(alpha)]).save(
+        tmp_path / "a.png", icc_profile=profile
+    )
+    found = np.asarray(decode.decode(tmp_path / "a.png"), int)
+    assert np.abs(found[..., 0] - grey.astype(int)).mean() < 1.0
+    assert (found[..., 3] == 200).all()
+
+
+def test_lab_and_cmyk_without_a_profile(tmp_path: Path) -> None:
+    photo = Image.fromarray(chart())
+    lab = ImageCms.profileToProfile(
+        photo, ImageCms.createProfile("sRGB"), ImageCms.createProfile("LAB"), outputMode="LAB"
+    )
+    assert lab is not None
+    lab.save(tmp_path / "lab.tif")
+    assert np.abs(read(tmp_path / "lab.tif") - chart()).mean() < 2.0
+    photo.convert("CMYK").save(tmp_path / "cmyk.tif")
+    assert "CMYK without an ICC profile" in decoders.photo_colors(tmp_path / "cmyk.tif", "a")
+    Image.fromarray(chart()[..., 0].astype(np.float32) / 255).save(tmp_path / "float.tif")
+    assert (read(tmp_path / "float.tif")[..., 0] == chart()[..., 0]).all()
+    assert "taken as values of sRGB" in decoders.photo_colors(tmp_path / "float.tif", "a")
 
 
 @pytest.mark.parametrize(("suffix", "codec"), [("png", "png"), ("tif", "tiff")])

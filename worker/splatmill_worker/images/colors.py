@@ -11,6 +11,7 @@ of a capture agree:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -35,19 +36,47 @@ HLG_REFERENCE = 0.75
 
 
 class Colors(NamedTuple):
-    """How the components of a picture are meant: names that are keys of _PRIMARIES and _TRANSFERS."""
+    """How the components of a picture are meant.
 
-    primaries: str
+    primaries: a key of _PRIMARIES, or the chromaticities x, y of white, red, green and blue.
+    transfer: a key of _LINEAR, or a power, such as "gamma 1.8".
+    """
+
+    primaries: str | tuple[float, ...]
     transfer: str
 
     def __str__(self) -> str:
-        return f"{self.primaries}, {self.transfer}" if self.hdr else self.primaries
+        primaries = self.primaries if isinstance(self.primaries, str) else "primaries of its own"
+        return primaries if self.transfer in ("sRGB", "gamma 2.2") else f"{primaries}, {self.transfer}"
+
+    @staticmethod
+    def of(chromaticities: Sequence[float], gamma: float) -> Colors:
+        """The colours of a picture that names x, y of white, red, green and blue, and the power from values to light.
+
+        Those of known names within rounding have the names; damaged ones, and the power 0, count as those of sRGB.
+        """
+        primaries: str | tuple[float, ...] = tuple(chromaticities)
+        for name, points in _PRIMARIES.items():
+            known = (*_D65, *points[0], *points[1], *points[2])
+            if len(primaries) == len(known) and np.allclose(chromaticities, known, rtol=0.0, atol=SAME_POINT):
+                primaries = name
+        if not isinstance(primaries, str) and not _usable(primaries):
+            primaries = "sRGB"
+        if not 0.1 <= gamma <= 10.0 or abs(gamma / SRGB_GAMMA - 1.0) <= SAME_GAMMA:
+            return Colors(primaries, "gamma 2.2" if primaries == "Adobe RGB" else "sRGB")
+        return Colors(primaries, "linear" if abs(gamma - 1.0) <= SAME_GAMMA else f"gamma {gamma:.3g}")
 
     @property
     def hdr(self) -> bool:
         """Whether white is not the largest value."""
         return self.transfer in ("HLG", "PQ")
 
+
+SAME_POINT = 0.005
+"""Difference of chromaticities that counts as rounding."""
+
+SRGB_GAMMA, SAME_GAMMA = 2.2, 0.05
+"""The power that files name for sRGB, and the relative difference of powers that is not significant, as in libpng."""
 
 SRGB = Colors("sRGB", "sRGB")
 ADOBE_RGB = Colors("Adobe RGB", "gamma 2.2")
@@ -69,6 +98,7 @@ TRANSFERS = dict.fromkeys((1, 4, 5, 6, 7, 11, 12, 13, 14, 15), "sRGB") | {
 """Names of the transfer functions of H.273. All of SDR are taken as sRGB, as players do: displays show them alike."""
 
 _D65 = (0.3127, 0.3290)
+_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 _PRIMARIES = {
     "sRGB": ((0.640, 0.330), (0.300, 0.600), (0.150, 0.060)),
     "BT.2020": ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),
@@ -88,7 +118,7 @@ def srgb_table(colors: Colors, white: float = 1.0) -> Table:
 
 def srgb(values: Values, colors: Colors) -> Values:
     """Values [...,3] from 0 to 1 of `colors`, as sRGB values from 0 to 1."""
-    light = _LINEAR[colors.transfer](values) @ _to_srgb(colors.primaries).T
+    light = _linear(values, colors.transfer) @ _to_srgb(colors.primaries).T
     luminance = light @ _rgb_to_xyz("sRGB")[1]
     least = light.min(axis=-1)
     outside = least < 0.0
@@ -96,9 +126,25 @@ def srgb(values: Values, colors: Colors) -> Values:
     light = luminance.clip(0.0)[..., None] * (1.0 - kept[..., None]) + light * kept[..., None]
     largest = light.max(axis=-1, keepdims=True)
     light = light * np.where(largest > 0.0, _limited(largest, colors.hdr) / np.maximum(largest, 1e-12), 0.0)
-    light = light.clip(0.0, 1.0)
+    return _encoded(light.clip(0.0, 1.0))
+
+
+def with_srgb_transfer(values: Values, transfer: str) -> Values:
+    """Values from 0 to 1 of a transfer function as those of sRGB's, with the same primaries."""
+    return _encoded(_linear(values, transfer).clip(0.0, 1.0))
+
+
+def _encoded(light: Values) -> Values:
     encoded: Values = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return encoded
+
+
+def _linear(values: Values, transfer: str) -> Values:
+    """The light, of white or of HDR's reference white, of values from 0 to 1."""
+    if transfer in _LINEAR:
+        return _LINEAR[transfer](values)
+    power: Values = values ** float(transfer.removeprefix("gamma "))
+    return power
 
 
 def _limited(light: Values, hdr: bool) -> Values:
@@ -141,17 +187,38 @@ _LINEAR = {
     "HLG": _from_hlg,
     "PQ": _from_pq,
 }
-"""The light, of white or of HDR's reference white, of values from 0 to 1."""
 
 
 @lru_cache
-def _rgb_to_xyz(primaries: str) -> Values:
-    """Matrix from linear RGB to CIE XYZ, with the luminance 1 for white."""
-    columns = np.array([[x / y, 1.0, (1.0 - x - y) / y] for x, y in _PRIMARIES[primaries]]).T
-    white = np.array([_D65[0] / _D65[1], 1.0, (1.0 - sum(_D65)) / _D65[1]])
-    return np.asarray(columns * np.linalg.solve(columns, white), np.float64)
+def _rgb_to_xyz(primaries: str | tuple[float, ...]) -> Values:
+    """Matrix from linear RGB to CIE XYZ, with the luminance 1 for white, which becomes D65 by Bradford's adaptation."""
+    if isinstance(primaries, str):
+        primaries = (*_D65, *(value for point in _PRIMARIES[primaries] for value in point))
+    own_white, *points = zip(primaries[::2], primaries[1::2], strict=True)
+    columns, white = np.stack([_xyz(*point) for point in points], axis=1), _xyz(*own_white)
+    matrix = columns * np.linalg.solve(columns, white)
+    gains = (_BRADFORD @ _xyz(*_D65)) / (_BRADFORD @ white)
+    return np.asarray(np.linalg.solve(_BRADFORD, gains[:, None] * (_BRADFORD @ matrix)), np.float64)
 
 
-def _to_srgb(primaries: str) -> Values:
+def _xyz(x: float, y: float) -> Values:
+    return np.array([x / y, 1.0, (1.0 - x - y) / y])
+
+
+def _usable(chromaticities: tuple[float, ...]) -> bool:
+    """Whether chromaticities are those of white and of three primaries that it can be mixed of."""
+    points = np.array(chromaticities, np.float64)
+    if points.shape != (8,) or not (np.isfinite(points) & (points > -1.0) & (points < 2.0)).all():
+        return False
+    if points[1::2].min() < 1e-5:
+        return False
+    x, y = points[2::2], points[3::2]
+    area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
+    return bool(
+        abs(area) > 1e-3 and (np.linalg.solve(np.stack([x, y, 1.0 - x - y]), _xyz(*points[:2])) > 0.0).all()
+    )
+
+
+def _to_srgb(primaries: str | tuple[float, ...]) -> Values:
     """Matrix from linear RGB with other primaries to linear sRGB."""
     return np.asarray(np.linalg.solve(_rgb_to_xyz("sRGB"), _rgb_to_xyz(primaries)), np.float64)

@@ -106,7 +106,7 @@ def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool
                 factor = _factor(image.size, want, range(MAX_REDUCTION, 0, -1))
                 if factor > 1:
                     photo = photo.reduce(factor)
-            photo = stored.srgb(photo)
+            photo = stored.srgb(photo, image.mode)
             # `image` is closed at the end of the block, so it must not be returned itself.
             return photo.copy() if photo is image else photo
 

@@ -1,13 +1,18 @@
-"""Colours of photos as sRGB: by their ICC profile, by the tags of HEIC and AVIF, or by EXIF."""
+"""Colours of photos as sRGB: by their ICC profile, by the tags of HEIC and AVIF, the chunks of PNG, or EXIF.
+
+In a PNG, the first of cICP, iCCP, sRGB, and gAMA with cHRM that is there holds, as its specification has it.
+"""
 
 from __future__ import annotations
 
 import io
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageCms, ImageFilter
@@ -18,13 +23,25 @@ from splatmill_worker.images.colors import (
     PRIMARIES,
     SIDE,
     SRGB,
+    SRGB_GAMMA,
     TRANSFERS,
     Colors,
     srgb_table,
+    with_srgb_transfer,
 )
 
 INTEROPERABILITY_IFD, INTEROPERABILITY_INDEX = 0xA005, 1
 """EXIF tags; the index is "R03" for photos in Adobe RGB."""
+
+EXIF_IFD, COLOR_SPACE, GAMMA = 0x8769, 0xA001, 0xA500
+WHITE_POINT, PRIMARY_CHROMATICITIES, TRANSFER_FUNCTION = 0x013E, 0x013F, 0x012D
+"""Tags of EXIF and TIFF for colours."""
+
+SRGB_SPACE, ADOBE_SPACE, UNCALIBRATED = 1, 2, 0xFFFF
+"""Values of COLOR_SPACE. The second is of some cameras; EXIF has the last for all spaces but sRGB."""
+
+SRGB_POINTS = (0.3127, 0.3290, 0.64, 0.33, 0.30, 0.60, 0.15, 0.06)
+"""Chromaticities of white, red, green and blue."""
 
 LIKE_SRGB = 2
 """Largest difference in grey levels of a profile from sRGB that is left as it is: about that of rounding."""
@@ -40,40 +57,71 @@ _SPACES = {"L": "GRAY", "RGB": "RGB", "RGBA": "RGB", "CMYK": "CMYK", "LAB": "Lab
 class PhotoColors:
     """What a photo says of its colours.
 
-    profile: its ICC profile; it is preferred to tags, but for those of HDR.
+    profile: its ICC profile.
     tags: the colours that its tags name.
+    assumed: why these may be other than the photo's, as a part of a sentence.
     """
 
     profile: bytes | None = None
     tags: Colors = SRGB
+    assumed: str = ""
 
     @staticmethod
     def of(image: Image.Image, exif: Image.Exif, path: Path) -> PhotoColors:
         """Of a picture that was opened from `path`; nothing is decoded. Damaged tags count as absent."""
         profile, tags = image.info.get("icc_profile"), _tags(image, path)
-        if isinstance(profile, bytes) and profile and not tags.hdr:
+        if (
+            isinstance(profile, bytes)
+            and profile
+            and not (tags is not None and (tags.hdr or image.format == "PNG"))
+        ):
             return PhotoColors(profile)
-        return PhotoColors(tags=ADOBE_RGB if tags == SRGB and _is_adobe_rgb(exif) else tags)
+        if tags is not None:
+            return PhotoColors(tags=tags)
+        if image.format == "PNG" and (named := _chunks(image)) is not None:
+            return PhotoColors(tags=named)
+        if image.mode == "F":
+            return PhotoColors(assumed="numbers from 0 to 1 taken as values of sRGB, and not as linear light")
+        named = _exif_colors(exif)
+        if named is None:
+            other = (
+                "taken as sRGB, since their EXIF says that they are in another colour space and names none"
+            )
+            return PhotoColors(assumed=other)
+        return PhotoColors(tags=named)
 
     def remark(self, mode: str) -> str:
         """How the colours of a picture of Pillow's `mode` become sRGB, as a part of a sentence; "" if they are sRGB."""
         if self.profile is None:
             if self.tags.hdr:
                 return f"converted to SDR from HDR ({self.tags})"
-            return "" if self.tags == SRGB else f"converted to sRGB from {self.tags}"
+            if mode == "CMYK":
+                return "converted to sRGB from CMYK without an ICC profile, so that they are approximate"
+            return self.assumed if self.tags == SRGB else f"converted to sRGB from {self.tags}"
         transform = _transform(self.profile, mode if mode in _SPACES else Image.getmodebase(mode))
         if transform is None:
             return "taken as sRGB, since their ICC profile is damaged or not one for photos of this kind"
         return transform[0] and f"converted to sRGB from {transform[0]}"
 
-    def srgb(self, photo: Image.Image) -> Image.Image:
-        """The photo as sRGB; of the mode RGB or RGBA, unless it is sRGB already."""
+    def srgb(self, photo: Image.Image, mode: str | None = None) -> Image.Image:
+        """The photo as sRGB; of the mode RGB or RGBA, unless it is sRGB already.
+
+        mode: that of the file, of which `photo` may have another; None: the same.
+        """
+        if photo.mode == "LAB" and not (self.profile and _transform(self.profile, "LAB")):
+            return _by_profile(_lab_profile(), photo, "LAB")
         if self.profile is not None:
-            transform = _transform(self.profile, photo.mode)
-            return _applied(transform[1], photo) if transform and transform[0] else photo
+            return _by_profile(self.profile, photo, mode or photo.mode)
         if self.tags == SRGB:
             return photo
-        return (photo if photo.mode == "RGBA" else photo.convert("RGB")).filter(_lookup(self.tags))
+        if photo.mode not in ("RGB", "RGBA"):
+            photo = photo.convert("RGB")
+        colors = self.tags
+        if not colors.hdr and colors.transfer != "sRGB":
+            # A curve has an entry for each value, which the table of colours has not.
+            photo = photo.point(_curve(colors.transfer) * 3 + list(range(256)) * (len(photo.mode) - 3))
+            colors = Colors(colors.primaries, "sRGB")
+        return photo if colors == SRGB else photo.filter(_lookup(colors))
 
 
 def sentences(remarks: Sequence[str]) -> list[str]:
@@ -82,8 +130,8 @@ def sentences(remarks: Sequence[str]) -> list[str]:
     return [f"Colours of {count} of {len(remarks)} photos: {remark}." for remark, count in counts.items()]
 
 
-def _tags(image: Image.Image, path: Path) -> Colors:
-    """The colours that the tags of HEIC, AVIF and PNG name by H.273; those of sRGB where they name none."""
+def _tags(image: Image.Image, path: Path) -> Colors | None:
+    """The colours that the tags of HEIC, AVIF and PNG name by H.273; None where they name none."""
     codes: tuple[int, int]
     if image.format == "AVIF":
         codes = guarded.avif_tags(path)
@@ -95,14 +143,78 @@ def _tags(image: Image.Image, path: Path) -> Colors:
             int(nclx.get("color_primaries", guarded.UNSPECIFIED)),
             int(nclx.get("transfer_characteristics", guarded.UNSPECIFIED)),
         )
+    if codes == (guarded.UNSPECIFIED, guarded.UNSPECIFIED):
+        return None
     return Colors(PRIMARIES.get(codes[0], "sRGB"), TRANSFERS.get(codes[1], "sRGB"))
 
 
-def _is_adobe_rgb(exif: Image.Exif) -> bool:
+def _chunks(image: Image.Image) -> Colors | None:
+    """The colours that the chunks sRGB, or else gAMA and cHRM, of a PNG name; None without any of them."""
+    if "srgb" in image.info:
+        return SRGB
+    gamma, points = image.info.get("gamma"), image.info.get("chromaticity")
+    if not gamma and points is None:
+        return None
+    return Colors.of(points or SRGB_POINTS, 1.0 / gamma if gamma else SRGB_GAMMA)
+
+
+def _exif_colors(exif: Image.Exif) -> Colors | None:
+    """The colours that EXIF, or the tags of TIFF, name: sRGB without any; None if they are others without a name."""
     try:
-        return str(exif.get_ifd(INTEROPERABILITY_IFD).get(INTEROPERABILITY_INDEX, "")).startswith("R03")
+        space = exif.get_ifd(EXIF_IFD).get(COLOR_SPACE)
+        index = str(exif.get_ifd(INTEROPERABILITY_IFD).get(INTEROPERABILITY_INDEX, ""))
+        if index.startswith("R03") or space == ADOBE_SPACE:
+            return ADOBE_RGB
+        if space == SRGB_SPACE:
+            return SRGB
+        white, points = exif.get(WHITE_POINT), exif.get(PRIMARY_CHROMATICITIES)
+        gamma = exif.get_ifd(EXIF_IFD).get(GAMMA) or _gamma_of(exif.get(TRANSFER_FUNCTION))
+        if white is not None and points is not None:
+            return Colors.of([float(value) for value in (*white, *points)], float(gamma or SRGB_GAMMA))
+        if gamma:
+            return Colors.of(SRGB_POINTS, float(gamma))
     except guarded.DECODE_ERRORS:
-        return False
+        return SRGB
+    return None if space == UNCALIBRATED else SRGB
+
+
+def _gamma_of(table: Any) -> float | None:
+    """The power of a table of TIFF from values to light, by its middle; None without a table that has one."""
+    if not isinstance(table, tuple) or len(table) < 256:
+        return None
+    # Three channels have a table each.
+    one = table[: len(table) // 3] if len(table) % 3 == 0 else table
+    light = float(one[len(one) // 2]) / 65535.0
+    return math.log(light) / math.log(0.5) if 0.0 < light < 1.0 else None
+
+
+@lru_cache(maxsize=16)
+def _curve(transfer: str) -> list[int]:
+    """The sRGB values of all values of a transfer function."""
+    values = with_srgb_transfer(np.arange(256) / 255.0, transfer)
+    return [int(value) for value in np.rint(values * 255.0)]
+
+
+@lru_cache(maxsize=1)
+def _lab_profile() -> bytes:
+    return ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
+
+
+def _by_profile(profile: bytes, photo: Image.Image, mode: str) -> Image.Image:
+    """A photo of a file of `mode`, converted by its profile where that is one for such files."""
+    transform = _transform(profile, photo.mode)
+    if transform is not None:
+        return _applied(transform[1], photo) if transform[0] else photo
+    if Image.getmodebase(mode) != "L" or photo.mode not in ("RGB", "RGBA"):
+        return photo
+    # Grey pictures with transparent pixels, and those of two values, come as RGB or RGBA.
+    grey = _transform(profile, "L")
+    if grey is None or not grey[0]:
+        return photo
+    converted = _applied(grey[1], photo.getchannel("R"))
+    if photo.mode == "RGBA":
+        converted.putalpha(photo.getchannel("A"))
+    return converted
 
 
 @lru_cache(maxsize=4)
