@@ -6,7 +6,7 @@ Cameras follow OpenCV: x right, y down, z forward, world-to-camera matrices, and
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -258,6 +258,33 @@ class Scene:
     def centers(self) -> Float:
         """The cameras' positions [views,3]."""
         return np.array([view.camera.center for view in self.views]).reshape(-1, 3)
+
+
+def without(scene: Scene, indices: Collection[int], reason: str) -> Scene:
+    """The scene without some views, whose photos are left out for `reason`; its points keep their other tracks."""
+    if not indices:
+        return scene
+    kept = np.ones(len(scene.views), bool)
+    kept[list(indices)] = False
+    left_out = [(view.name, reason) for view, keep in zip(scene.views, kept, strict=True) if not keep]
+    views = tuple(view for view, keep in zip(scene.views, kept, strict=True) if keep)
+    scene = replace(scene, views=views, left_out=(*scene.left_out, *left_out))
+    if scene.point_views is None:
+        return scene
+    offsets, seen = scene.point_views
+    of_point = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))[kept[seen]]
+    used, lengths = np.unique(of_point, return_counts=True)
+    return replace(
+        scene,
+        points=scene.points[used],
+        colors=scene.colors[used],
+        point_errors=None if scene.point_errors is None else scene.point_errors[used],
+        track_lengths=lengths.astype(np.int32),
+        point_views=PointViews(
+            np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+            (np.cumsum(kept) - 1)[seen[kept[seen]]].astype(np.int32),
+        ),
+    )
 
 
 def omissions(left_out: Sequence[tuple[str, str]]) -> list[str]:

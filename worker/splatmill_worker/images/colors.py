@@ -142,7 +142,8 @@ def _encoded(light: Values) -> Values:
 def _linear(values: Values, transfer: str) -> Values:
     """The light, of white or of HDR's reference white, of values from 0 to 1."""
     if transfer in _LINEAR:
-        return _LINEAR[transfer](values)
+        light: Values = _LINEAR[transfer](values)
+        return light
     power: Values = values ** float(transfer.removeprefix("gamma "))
     return power
 

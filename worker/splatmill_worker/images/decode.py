@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from splatmill_worker.images import guarded
+from splatmill_worker.images import guarded, transparency
 from splatmill_worker.images.photo_colors import PhotoColors
 
 Pixels = npt.NDArray[np.uint8]
@@ -56,6 +56,18 @@ def colors(path: Path, name: str) -> str:
     """
     with guarded.opened(path, name) as image:
         return PhotoColors.of(image, tags(image), path).remark(image.mode)
+
+
+def alpha(path: Path) -> transparency.Extent:
+    """The smallest and the largest alpha of a photo, which is decoded only if its header says that it has any.
+
+    Raises UnusablePicture and OSError.
+    """
+    with guarded.opened(path) as image:
+        if not (image.has_transparency_data or image.mode in ("RGBa", "La")):
+            return 255, 255
+        with guarded.room(image):
+            return transparency.extent(whole(image, path.name))
 
 
 def orientation(image: Image.Image) -> int:

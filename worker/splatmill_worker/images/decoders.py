@@ -28,7 +28,7 @@ from splatmill_worker import memory, reader_memory, settings
 from splatmill_worker.errors import DecoderNotStarted, UnusablePicture, UnusableVideo
 from splatmill_worker.images import decode as decode_here
 from splatmill_worker.images import examine as examine_here
-from splatmill_worker.images import guarded, masks, messages, video
+from splatmill_worker.images import guarded, masks, messages, transparency, video
 from splatmill_worker.images.decoder_process import (
     MAX_ARRAYS,
     PICTURE_SECONDS,
@@ -83,6 +83,7 @@ _SIZES: TypeAdapter[tuple[_Size, _Size, int]] = TypeAdapter(tuple[_Size, _Size, 
 _PICTURE: TypeAdapter[Picture | str] = TypeAdapter(Picture | str)
 _FAULT: TypeAdapter[str | None] = TypeAdapter(str | None)
 _TEXT: TypeAdapter[str] = TypeAdapter(str)
+_EXTENT: TypeAdapter[transparency.Extent] = TypeAdapter(transparency.Extent)
 _REMARKS: TypeAdapter[list[str]] = TypeAdapter(list[str])
 _LEVELS = TypeAdapter(Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=256, max_length=256)])
 
@@ -176,6 +177,11 @@ def sizes(path: Path, name: str) -> tuple[tuple[int, int], tuple[int, int], int]
 def photo_colors(path: Path, name: str) -> str:
     """Like `splatmill_worker.images.decode.colors`."""
     return call(decode_here.colors, path, name, check=_TEXT.validate_python)
+
+
+def alpha(path: Path) -> transparency.Extent:
+    """Like `splatmill_worker.images.decode.alpha`."""
+    return call(decode_here.alpha, path, check=_EXTENT.validate_python)
 
 
 def examine(path: Path, name: str) -> Picture | str:

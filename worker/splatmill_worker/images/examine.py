@@ -13,7 +13,7 @@ from pydantic import PlainValidator
 
 from splatmill.schema.photos import MIN_PHOTO_SIDE
 from splatmill_worker.errors import UnusablePicture
-from splatmill_worker.images import exif, guarded
+from splatmill_worker.images import exif, guarded, transparency
 from splatmill_worker.images.copies import SMALL_SIDE, small_grey
 from splatmill_worker.images.decode import UPRIGHT, Pixels, orientation, tags, upright_size, whole
 from splatmill_worker.images.photo_colors import PhotoColors
@@ -44,6 +44,7 @@ class Picture:
     colors: how its colours become sRGB, as `PhotoColors.remark` says it.
     projection: of a panorama, by its XMP.
     closed: whether it has the shape and the edges of a panorama of 360 by 180 degrees.
+    alpha: its smallest and largest alpha.
     small: the grey picture at low resolution, upright, of `copies.small_grey`.
     """
 
@@ -55,6 +56,7 @@ class Picture:
     small: Annotated[Pixels, PlainValidator(_small)] = field(compare=False)
     projection: str | None = None
     closed: bool = False
+    alpha: transparency.Extent = (255, 255)
 
 
 def examine(path: Path, name: str) -> Picture | str:
@@ -81,13 +83,14 @@ def examine(path: Path, name: str) -> Picture | str:
                 with guarded.room(image):
                     photo = whole(image, name)
                 closed = wide and _is_closed(photo)
+                alpha = transparency.extent(photo)
                 small = small_grey(photo)
                 small = small if turn is None else np.asarray(Image.fromarray(small).transpose(turn))
     except UnusablePicture as error:
         return error.reason + (GIVE if error.code == "not_an_image" else "")
     except OSError as error:
         return f"it cannot be read: {error}"
-    return Picture(width, height, found, several, colors, small, projection, closed)
+    return Picture(width, height, found, several, colors, small, projection, closed, alpha)
 
 
 def _is_closed(photo: Image.Image) -> bool:

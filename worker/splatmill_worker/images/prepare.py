@@ -26,6 +26,7 @@ from splatmill_worker.images import (
     mask_levels,
     overlays,
     photo_colors,
+    transparency,
     unpacked_room,
 )
 from splatmill_worker.images.copies import SmallPicture
@@ -66,6 +67,7 @@ class UsablePhoto:
     several: whether the file holds further pictures, which are not used.
     colors: how its colours become sRGB, as `PhotoColors.remark` says it.
     closed: whether it has the shape and the edges of a panorama of 360 by 180 degrees.
+    alpha: its smallest and largest alpha.
     """
 
     name: str
@@ -80,6 +82,7 @@ class UsablePhoto:
     several: bool = False
     colors: str = ""
     closed: bool = False
+    alpha: transparency.Extent = (255, 255)
 
 
 @dataclass(frozen=True)
@@ -236,6 +239,7 @@ def prepare(
         for photo, mask in zip(ordered, hidden.regions, strict=True)
     ]
     found.warnings += [*copies.warning(copied), *hidden.warnings]
+    found.warnings += transparency.remarks({photo.name: photo.alpha for photo in ordered})
     found.warnings += _panoramas([photo.name for photo in ordered if photo.closed])
     return Prepared(
         tuple(ordered),
@@ -417,6 +421,8 @@ def _inspect(name: str, path: Path, sequence: str | None) -> tuple[UsablePhoto, 
         return found
     if found.projection is not None:
         return f"it is a panorama ({found.projection} by its XMP), which no pinhole camera shows. {CUT_PANORAMAS}"
+    if transparency.is_clear(found.alpha):
+        return transparency.NOTHING
     photo = UsablePhoto(
         name,
         path,
@@ -428,6 +434,7 @@ def _inspect(name: str, path: Path, sequence: str | None) -> tuple[UsablePhoto, 
         several=found.several,
         colors=found.colors,
         closed=found.closed,
+        alpha=found.alpha,
     )
     has_tags = found.exif.make is not None or found.exif.model is not None
     return photo, SmallPicture(name, found.width, found.height, found.small, has_tags)

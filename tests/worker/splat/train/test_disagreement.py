@@ -48,6 +48,30 @@ def test_other_light_is_told_from_another_camera() -> None:
     assert reasons[views[10].name] == "wrong camera or blur"
 
 
+@pytest.mark.parametrize(("cut_out", "reason"), [(12, "not cut out"), (3, "other light")])
+def test_an_opaque_photo_among_cut_outs_is_not_blamed_for_its_light(
+    cut_out: int, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = still_life.training_views()[:16]
+    opaque = torch.full(views[0].full.rgb.shape[:2], 255, dtype=torch.uint8)
+    views = [
+        replace(view, levels={1: view.full._replace(alpha=opaque * (number >= cut_out))})
+        for number, view in enumerate(views)
+    ]
+    flat = torch.zeros(2, 2)
+    monkeypatch.setattr(
+        disagreement,
+        "glance",
+        lambda engine, made, target, behind: Glance(target, flat, flat, flat == 0.0, 9.0),
+    )
+    monkeypatch.setattr(
+        disagreement, "compared", lambda glances: [Comparison(flat, 0.0, flat > 0.0, -1.0) for _ in glances]
+    )
+    run = TrainingRun(first_engine(), plan(30), views, 1.1)
+    found = disagreement.disagreements(run, range(len(views)))
+    assert {each.reason for each in found if each.name == views[-1].name} == {reason}
+
+
 @pytest.mark.parametrize(
     ("decibels", "reason"),
     [(0.2, None), (2.2, None), (2.3, "wrong camera or blur"), (10.0, "wrong camera or blur")],

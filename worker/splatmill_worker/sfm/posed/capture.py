@@ -3,19 +3,22 @@ Polycam."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatmill.data_sets import MODEL_FILES, Cameras, find_cameras, keyframes, walk
-from splatmill.schema.photos import PHOTO_SUFFIXES
+from splatmill.schema.photos import PHOTO_FORMATS, PHOTO_SUFFIXES
 from splatmill.schema.quantities import listed
-from splatmill_worker.images import lens, mask_levels
+from splatmill_worker.errors import UnusablePicture
+from splatmill_worker.images import decoders, lens, mask_levels, transparency
 from splatmill_worker.images.decoders import mask_fault, photo_colors
 from splatmill_worker.images.masks import unfit
 from splatmill_worker.images.photo_colors import sentences
 from splatmill_worker.images.prepare import names_remark
-from splatmill_worker.scene import Scene, Source
+from splatmill_worker.scene import Scene, Source, View, without
 from splatmill_worker.sfm.posed import colmap_model, parts, transforms
 from splatmill_worker.sfm.posed.files import ImageFiles
 
@@ -54,7 +57,7 @@ class PosedInput:
             scene = colmap_model.load_largest(self.models, files, self.notes)
         else:
             scene = transforms.load(self.transforms, self.source, files, self.directory, self.notes)
-        scene = _without_unfit_masks(scene)
+        scene = _by_transparency(_without_unfit_masks(scene))
         masks = [view.mask for view in scene.views if view.mask is not None]
         unused = {name for name in files.unused_masks if files.masks[name] not in masks}
         judged = mask_levels.judged({view.name: view.mask for view in scene.views}, unused)
@@ -138,6 +141,31 @@ def _unused(names: Sequence[str], cameras: Cameras) -> tuple[str, ...]:
         if {f"{folder}{name}".lower() for name in MODEL_FILES} <= lower
     ]
     return tuple(warnings)
+
+
+def _by_transparency(scene: Scene) -> Scene:
+    """The scene without wholly transparent photos, and with a warning about opaque ones among cut-outs."""
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        alphas = list(pool.map(_alpha, scene.views))
+    clear = [index for index, alpha in enumerate(alphas) if transparency.is_clear(alpha)]
+    if clear and len(clear) == len(scene.views):
+        raise ValueError(
+            f"All {len(clear)} photos with a camera are wholly transparent, so they show nothing."
+        )
+    of = {view.name: alpha for view, alpha in zip(scene.views, alphas, strict=True)}
+    scene = without(scene, clear, transparency.NOTHING)
+    said = transparency.remarks({view.name: of[view.name] for view in scene.views})
+    return replace(scene, warnings=(*scene.warnings, *said))
+
+
+def _alpha(view: View) -> transparency.Extent:
+    """The extent of a photo; of one that does not decode, which the loading of photos names, that of an opaque one."""
+    if view.image.suffix.lower() in PHOTO_FORMATS["JPEG"]:
+        return 255, 255
+    try:
+        return decoders.alpha(view.image)
+    except (UnusablePicture, OSError):
+        return 255, 255
 
 
 def _without_unfit_masks(scene: Scene) -> Scene:

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatmill_worker.errors import Refusal
-from splatmill_worker.scene import PointViews, Scene, View
+from splatmill_worker.scene import Scene, View, without
 from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.sfm.matching import overlap, two_view
 from splatmill_worker.sfm.matching.pairs import Pair
@@ -87,7 +87,8 @@ def decided(
     )
     if 2 * len(undecided) > len(scene.views):
         raise Refusal("poses_invalid", said, advice=advice)
-    return _without(scene, undecided, f"{said} These photos are left out. {advice}")
+    scene = without(scene, undecided, "its EXIF orientation is undecided")
+    return replace(scene, warnings=(*scene.warnings, f"{said} These photos are left out. {advice}"))
 
 
 def _read(view: View, *, upright: bool) -> View:
@@ -146,29 +147,3 @@ def _explained(
     if not np.isfinite(bound):
         bound = two_view.max_error(side)
     return [int((each <= bound).sum()) for each in errors], [len(each) for each in errors]
-
-
-def _without(scene: Scene, indices: Sequence[int], why: str) -> Scene:
-    """The scene without some views, whose photos are left out with a warning; its points keep their other tracks."""
-    kept = np.ones(len(scene.views), bool)
-    kept[list(indices)] = False
-    left_out = [(scene.views[index].name, "its EXIF orientation is undecided") for index in indices]
-    scene = replace(scene, left_out=(*scene.left_out, *left_out), warnings=(*scene.warnings, why))
-    views = tuple(view for view, keep in zip(scene.views, kept, strict=True) if keep)
-    if scene.point_views is None:
-        return replace(scene, views=views)
-    offsets, seen = scene.point_views
-    of_point = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))[kept[seen]]
-    used, lengths = np.unique(of_point, return_counts=True)
-    return replace(
-        scene,
-        views=views,
-        points=scene.points[used],
-        colors=scene.colors[used],
-        point_errors=None if scene.point_errors is None else scene.point_errors[used],
-        track_lengths=lengths.astype(np.int32),
-        point_views=PointViews(
-            np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
-            (np.cumsum(kept) - 1)[seen[kept[seen]]].astype(np.int32),
-        ),
-    )

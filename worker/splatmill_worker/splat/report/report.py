@@ -35,6 +35,7 @@ ADVICE: dict[Reason | None, str] = {
     "moving things": "It shows things that no other photo shows there. Look at the picture, and mask what moved.",
     "other light": "Its light differs. Set exposure to on, or leave it out if other photos show the same places.",
     "wrong camera or blur": "Most of it disagrees. Leave it out if it is blurred or has a wrong camera.",
+    "not cut out": "It is opaque, and most of the others are cut out: cut it out too, or leave it out.",
     None: "Leave it out if it is blurred, shows something that moved, or has a wrong camera.",
 }
 """What to do about a photo that does not fit the others, by the reason that was found."""

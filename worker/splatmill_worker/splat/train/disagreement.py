@@ -12,11 +12,12 @@ from typing import Literal, NamedTuple
 
 from torch import Tensor
 
+from splatmill_worker.images.transparency import SOLID
 from splatmill_worker.splat.train.consensus import Comparison, Glance, compared, glance, small
 from splatmill_worker.splat.train.renderer import evaluation_background
 from splatmill_worker.splat.train.run import TrainingRun
 
-Reason = Literal["moving things", "other light", "wrong camera or blur"]
+Reason = Literal["moving things", "other light", "wrong camera or blur", "not cut out"]
 """What makes a photo disagree with the others."""
 
 VISITS = 10
@@ -107,17 +108,21 @@ def disagreements(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disagreement
     glances = [glance(run.engine, run.plan, target, background) for target in targets]
     found = compared(glances)
     usual = sorted(comparison.median for comparison in found)[len(found) // 2]
+    cut_out = [view.full.alpha is not None and int(view.full.alpha.min()) < SOLID for view in views]
     judged = [
-        _judged(view.name, seen, comparison, usual)
-        for view, seen, comparison in zip(views, glances, found, strict=True)
+        _judged(view.name, seen, comparison, usual, whole=not cut and 2 * sum(cut_out) > len(views))
+        for view, seen, comparison, cut in zip(views, glances, found, cut_out, strict=True)
     ]
     return tuple(sorted(judged, key=lambda each: -each.decibels))
 
 
-def _judged(name: str, seen: Glance, comparison: Comparison, usual: float) -> Disagreement:
+def _judged(name: str, seen: Glance, comparison: Comparison, usual: float, *, whole: bool) -> Disagreement:
+    """whole: whether the photo is opaque, and most of the others are cut out: their light is not what differs."""
     share = float(comparison.outliers.float().mean())
     reason: Reason | None = None
-    if seen.light >= OTHER_LIGHT:
+    if whole and (seen.light >= OTHER_LIGHT or comparison.decibels > 0.0):
+        reason = "not cut out"
+    elif seen.light >= OTHER_LIGHT:
         reason = "other light"
     elif comparison.decibels <= 0.0:
         reason = None
