@@ -176,6 +176,19 @@ def find_cameras(names: Sequence[str]) -> Cameras | None:
     return Cameras(top, tuple(transforms.get(top, ())), tuple(folders))
 
 
+def is_camera_file(name: str) -> bool:
+    """Whether a file of this name, without a folder, holds cameras or a part of them."""
+    base = name.lower()
+    return base in (*MODEL_PARTS, "points3d.bin", "points3d.txt", "database.db") or fnmatchcase(
+        base, TRANSFORMS
+    )
+
+
+def place_of_model(folder: str) -> str:
+    """The data set that a folder with a COLMAP model, with a slash at its end, belongs to."""
+    return _place(folder)[0]
+
+
 def unread_cameras(names: Sequence[str]) -> list[str]:
     """Sentences about files with cameras that are not read, among files where `find_cameras` finds none.
 

@@ -7,12 +7,21 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatmill.data_sets import Cameras, TwoDataSets, find_cameras, unread_cameras, walk
+from splatmill.data_sets import (
+    Cameras,
+    TwoDataSets,
+    find_cameras,
+    is_camera_file,
+    place_of_model,
+    unread_cameras,
+    walk,
+)
 from splatmill.errors import NothingToUpload
 from splatmill.schema.captures import Role, UnsafeName, safe_name, storable_name
 from splatmill.schema.masks import masks_beside, without_mask_folder
 from splatmill.schema.outputs import own_outputs
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES, VIDEO_SUFFIXES, unread
+from splatmill.schema.quantities import counted, listed
 
 MODEL_SUFFIXES = frozenset({".bin", ".txt"})
 MODEL_STEMS = frozenset({"cameras", "images", "points3d", "rigs", "frames"})  # in lower case
@@ -79,6 +88,25 @@ class Found:
         """Return the number of files with this role."""
         return sum(file.role is role for file in self.files)
 
+    def contents(self) -> list[str]:
+        """Return what the files are, each kind with its number."""
+        images = [_suffix(file.name) for file in self.files if file.role is Role.images]
+        videos = sum(suffix in VIDEO_SUFFIXES for suffix in images)
+        archives = sum(suffix in ARCHIVE_SUFFIXES for suffix in images)
+        kinds = {
+            "photo": len(images) - videos - archives,
+            "video": videos,
+            "zip archive": archives,
+            "mask": self.count(Role.masks),
+            "pose file": self.count(Role.poses),
+        }
+        return [counted(number, kind) for kind, number in kinds.items() if number]
+
+    @property
+    def is_one_photo(self) -> bool:
+        """Whether the files are a single photo without cameras."""
+        return self.contents() == ["1 photo"]
+
     @property
     def bytes(self) -> int:
         """The total size of the files in bytes."""
@@ -103,6 +131,7 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     root = Path(path).expanduser()
     if not root.exists():
         raise NothingToUpload(f"{root} does not exist.", "Give a folder of photos, a zip archive or a video.")
+    root, around = _around(root)
     if root.is_file():
         return _single(root)
     unreadable: dict[str, str] = {}
@@ -152,10 +181,11 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     found = Found.of(files, ignored)
     if not found.count(Role.images):
         raise NothingToUpload(found.left_out[0][1], "Rename the files.")
-    remarks = _left_out(unreadable) + unread(ignored) + ([] if poses else unread_cameras(ignored))
+    remarks = around + _left_out(unreadable) + unread(ignored) + ([] if poses else unread_cameras(ignored))
     beside = [name for name in ignored if _suffix(name) in VIDEO_SUFFIXES + ARCHIVE_SUFFIXES]
     if beside:
-        remarks.append(f"Videos and zips are not used where there are photos: {', '.join(beside)}.")
+        remarks.append(f"Videos and zips are not used where there are photos: {listed(beside)}.")
+    remarks += _cameras_beside(root, cameras)
     return replace(found, top=cameras.top, outputs=tuple(sorted(outputs)), remarks=tuple(remarks))
 
 
@@ -166,6 +196,50 @@ def _left_out(unreadable: Mapping[str, str]) -> list[str]:
     shown = "; ".join(f"{name}: {reason}" for name, reason in sorted(unreadable.items())[:MOST_NAMED])
     more = f"; and {len(unreadable) - MOST_NAMED} more" if len(unreadable) > MOST_NAMED else ""
     return [f"Left out are {shown}{more}."]
+
+
+def _around(path: Path) -> tuple[Path, list[str]]:
+    """Return the data set around a file of cameras or a folder of COLMAP models, and a remark; else the path itself.
+
+    The folder around counts only if it has photos in it, or in its folder `images`; a folder with photos of its own is
+    given as it is.
+    """
+    try:
+        if path.is_file():
+            if not is_camera_file(path.name):
+                return path, []
+            folder = path.parent.resolve()
+        else:
+            names = walk(path)
+            if any(map(_is_image, names)) or not any(
+                is_camera_file(name.rpartition("/")[2]) for name in names
+            ):
+                return path, []
+            folder = path.resolve()
+        for top in (folder, Path("/", place_of_model(f"{folder.as_posix()}/".lstrip("/")))):
+            inside = [
+                top,
+                *(each for each in top.iterdir() if each.name.lower() == "images" and each.is_dir()),
+            ]
+            if top != path.resolve() and any(_is_image(name) for each in inside for name in os.listdir(each)):
+                return top, [f"{path.name} is a part of a data set. The folder around it is taken: {top}."]
+    except OSError:
+        pass  # whoever reads the path says so
+    return path, []
+
+
+def _cameras_beside(root: Path, cameras: Cameras) -> list[str]:
+    """Return a remark about cameras beside a folder `images` that has none of its own."""
+    if cameras.transforms or cameras.models or root.resolve().name.lower() != "images":
+        return []
+    above = root.resolve().parent
+    try:
+        beside = [
+            name for name in sorted(os.listdir(above)) if name.lower() == "sparse" or is_camera_file(name)
+        ]
+    except OSError:
+        return []
+    return [f"Cameras lie beside this folder: {listed(beside)}. To use them, give {above}."] if beside else []
 
 
 def printable(name: str) -> str:

@@ -22,7 +22,7 @@ from splatmill_worker.images import archive, guarded, mask_levels, overlay, prep
 from splatmill_worker.images.colors import PRIMARIES, TRANSFERS
 from splatmill_worker.images.lens import PINHOLE_MODELS
 from splatmill_worker.scene import MIN_SHOWN
-from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam
+from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam, triangulation
 from splatmill_worker.sfm.posed.camera_models import is_panoramic
 from tests.support.inputs.example import answer
 from tests.support.inputs.table import EXAMPLES
@@ -50,10 +50,11 @@ def _introduction() -> list[str]:
         while the page is made. [Photographing for splats](photographing.md) says how to take photos, and
         [Formats](formats.md) what models hold.
 
-        PATH is a photo, a video, a zip, or a folder of photos, with or without their cameras. The command says before
-        the training, and the web page before the upload, which files are not used. What the job leaves out is in
-        `report.json` and on the page of the report; a warning there says what is probably wrong. The log has the
-        rest.""",
+        PATH is a video, a zip, or a folder of photos, with or without their cameras. For a file of cameras, such as
+        `transforms.json` or `database.db`, and for a folder of a COLMAP model in a data set, such as `sparse/0`,
+        the data set around it is taken. The command says before the training, and the web page before the upload,
+        which files are not used. What the job leaves out is in `report.json` and on the page of the report; a
+        warning there says what is probably wrong. The log has the rest.""",
     ]
 
 
@@ -211,8 +212,8 @@ def _points() -> list[str]:
         a laser scan (up to {points.MOST_LOOSE:,} of them), are used where photos show their colours; if photos show
         these hardly more often than by chance, none is used, and the log says so. With fewer than
         {points.LEAST_POINTS}, points are triangulated with the given cameras. A warning says when the cameras explain
-        less than {points.CONTRADICTED:.0%} of the matches between photos: then the poses or the intrinsics are wrong,
-        or belong to other photos.""",
+        less than {triangulation.CONTRADICTED:.0%} of the matches between photos: then the poses or the intrinsics are
+        wrong, or belong to other photos. It names another convention of axes or matrices in which they fit, if one does.""",
     ]
 
 

@@ -447,3 +447,49 @@ def test_the_shared_data_sets():
     assert "train/r_0.png" in lego[Role.images]
     assert lego[Role.poses] == ["transforms_test.json", "transforms_train.json"]
     assert len(roles(DATA / "kermit_640x480")[Role.images]) == 11
+
+
+@pytest.mark.parametrize(
+    "given",
+    ["transforms.json", "database.db", "sparse", "sparse/0", "sparse/0/cameras.txt", "sparse/0/points3D.txt"],
+)
+def test_a_part_of_a_data_set_stands_for_the_whole(tmp_path: Path, given: str) -> None:
+    whole = tree(
+        tmp_path / "2024",
+        "images/a.jpg",
+        "sparse/0/cameras.txt",
+        "sparse/0/images.txt",
+        "sparse/0/points3D.txt",
+    )
+    tree(whole, "transforms.json", "database.db")
+    found = find_files(whole / given)
+    assert found.contents() == ["1 photo", "4 pose files"]
+    assert str(whole) in found.remarks[0]
+    assert find_files(whole).remarks == ()
+
+
+def test_parts_without_photos_around_them_stay_what_they_are(tmp_path: Path) -> None:
+    tree(tmp_path / "home", "0/cameras.txt", "0/images.txt", "notes.txt")
+    with pytest.raises(NothingToUpload, match="home/0 contains no photos"):
+        find_files(tmp_path / "home/0")
+    with pytest.raises(NothingToUpload, match=r"cameras\.txt is neither"):
+        find_files(tmp_path / "home/0/cameras.txt")
+
+
+def test_cameras_beside_a_folder_of_photos_are_named(tmp_path: Path) -> None:
+    tree(tmp_path, "images/a.jpg", "sparse/0/cameras.txt", "transforms.json")
+    (said,) = find_files(tmp_path / "images").remarks
+    assert said == f"Cameras lie beside this folder: sparse, transforms.json. To use them, give {tmp_path}."
+
+
+@pytest.mark.parametrize(
+    ("names", "contents"),
+    [
+        (["a.jpg"], ["1 photo"]),
+        (["a.zip"], ["1 zip archive"]),
+        (["a.mp4", "b.MOV"], ["2 videos"]),
+        (["a.jpg", "b.jpg", "masks/a.png"], ["2 photos", "1 mask"]),
+    ],
+)
+def test_files_are_counted_by_their_kind(tmp_path: Path, names: list[str], contents: list[str]) -> None:
+    assert find_files(tree(tmp_path, *names)).contents() == contents

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from splatmill.data_sets import TwoDataSets
 from splatmill.schema import Backend, TrainOptions, known_distance
+from splatmill.schema.quantities import counted, listed
 from splatmill_worker import sfm
 from splatmill_worker.errors import Refusal
 from splatmill_worker.images import overlays
@@ -21,6 +22,7 @@ from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.placed import PlacingObserver
 from splatmill_worker.sfm.posed import zipped
 from splatmill_worker.splat.plan.plan import Kernels
+from splatmill_worker.wording import plain
 
 MOST_NEAR = 0.5
 """Share of the training views that may be left out as near copies of held-out ones."""
@@ -71,7 +73,14 @@ def posed_scene(
         except (ValueError, OSError) as error:
             raise Refusal(
                 "poses_invalid",
-                " ".join([str(error), *names_remark(capture)]),
+                " ".join(
+                    [
+                        f"The data set cannot be read: {plain(error)}."
+                        if isinstance(error, OSError)
+                        else str(error),
+                        *names_remark(capture),
+                    ]
+                ),
                 advice="Correct the poses, or remove them to have the cameras recovered from the photos.",
             ) from error
         return posed.with_points(
@@ -145,7 +154,7 @@ def honest_split(scene: Scene, options: TrainOptions) -> Split:
             "" if step == options.holdout else f" Every {step}th photo is held out, since so many are alike."
         )
         warnings.append(
-            f"{'1 photo is' if len(near) == 1 else f'{len(near)} photos are'} not trained on, since a held-out one was "
+            f"{counted(len(near), 'photo is', 'photos are')} not trained on, since a held-out one was "
             f"taken from nearly the same place, such as {original} and {copy}: the training would be shown what it is "
             f"judged by.{spaced}"
         )
@@ -170,7 +179,7 @@ def split_views(scene: Scene, options: TrainOptions) -> tuple[tuple[View, ...], 
             raise Refusal(
                 "holdout_empty",
                 f"test_views has {len(unknown)} of {len(wanted)} names that belong to no photo with a camera: "
-                f"{', '.join(unknown[:5])}{', ...' if len(unknown) > 5 else ''}.",
+                f"{listed(unknown)}.",
                 advice="Use the names of the photos in the capture, and only photos whose cameras were recovered.",
                 facts={"unknown": unknown},
             )

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatmill_worker import reader_memory
+from splatmill_worker.wording import plain
 
 STEMS = ("cameras", "images", "points3D")
 """Stems of the files that are read; COLMAP's rigs and frames repeat the poses of the images."""
@@ -106,7 +107,7 @@ def read(folder: Path) -> Arrays:
                 _READERS[suffix][stem](file) if size else _points(np.zeros(0, _POINT), array("q"), array("q"))
             )
         except (struct.error, ValueError, OverflowError) as error:
-            raise ValueError(f"{file.name} could not be read: {error}.") from error
+            raise ValueError(f"{file.name} could not be read: {plain(error)}.") from error
     return arrays
 
 
@@ -137,7 +138,7 @@ def _walk(path: Path, least: int, entry: Callable[[mmap.mmap, int], int]) -> mma
             fault = "" if at <= len(data) else "it ends before its last entry does"
             done += 1 if not fault else 0
     except (struct.error, ValueError) as error:
-        fault = str(error)
+        fault = plain(error)
     if fault:
         raise ValueError(
             f"it announces {count} entries in {len(data)} bytes, and entry {done + 1} is damaged or missing ({fault})"

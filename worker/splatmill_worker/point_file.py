@@ -9,6 +9,7 @@ import numpy.typing as npt
 from plyfile import PlyElement, PlyParseError
 
 from splatmill_worker import ply_document, reader_memory
+from splatmill_worker.wording import plain
 
 POINT_BYTES = 150
 """Bytes that reading takes a point at its peak: two copies of the position in float64, and the file."""
@@ -32,7 +33,7 @@ def read(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
         )
         points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
     except (PlyParseError, KeyError, IndexError) as error:
-        raise ValueError(str(error)) from error
+        raise ValueError(plain(error)) from error
     colors = _colors(vertex)
     finite = np.isfinite(points).all(axis=1)
     return points[finite], colors[finite]

@@ -21,9 +21,10 @@ from splatmill.cli.schema_options import with_training_options
 from splatmill.cli.servers import open_client
 from splatmill.cli.unfinished import Unfinished, size_text
 from splatmill.client import Client, JobHandle, ModelHandle
-from splatmill.errors import JobCancelled
+from splatmill.errors import JobCancelled, NothingToUpload
 from splatmill.local_capture import Found, LocalFile, find_files, printable, start_model
-from splatmill.schema import Capture, Role, TrainOptions, format_bytes
+from splatmill.schema import Capture, TrainOptions, format_bytes
+from splatmill.schema.quantities import listed
 
 DATA = ".splatmill"
 """Name of the folder for the data of a training on this machine, in the folder of its results."""
@@ -102,6 +103,11 @@ def train(
     given, start = with_start_model(given, path)
     checked = train_options(given)
     found = find_files(path)
+    if found.is_one_photo:
+        raise NothingToUpload(
+            f"{printable(found.files[0].name)} is one photo; depth cannot be recovered from a single photo.",
+            "Give a folder with 20 or more photos from different places, a video, or a zip archive.",
+        )
     if detach and server is None:
         raise typer.BadParameter(
             "--detach needs --server: without a server, the job ends with this command.",
@@ -148,17 +154,14 @@ def train(
 
 
 def _announce(found: Found) -> None:
-    photos, poses, masks = (found.count(role) for role in (Role.images, Role.poses, Role.masks))
-    extra = "".join(f", {count} {kind}" for count, kind in ((masks, "masks"), (poses, "pose files")) if count)
-    typer.echo(f"{photos} photos{extra}, {format_bytes(found.bytes)}")
+    typer.echo(f"{', '.join(found.contents())}, {format_bytes(found.bytes)}")
     if found.top:
         typer.echo(f"cameras: those in {printable(found.top)}")
     if found.ignored:
-        shown = ", ".join(map(printable, found.ignored[:5])) + (", ..." if len(found.ignored) > 5 else "")
-        typer.echo(f"ignored: {shown}")
+        typer.echo(f"ignored: {listed([printable(name) for name in found.ignored])}")
     if found.outputs:
         typer.echo(
-            f"results of an earlier training, not read as photos: {', '.join(map(printable, found.outputs))}"
+            f"results of an earlier training, not read as photos: {listed([printable(name) for name in found.outputs])}"
         )
     for sentence in found.remarks:
         typer.echo(printable(sentence), err=True)

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from os.path import splitext
 
+from splatmill.schema.quantities import listed
+
 PHOTO_FORMATS = {
     "JPEG": (".jpg", ".jpeg", ".jpe", ".jfif"),
     "PNG": (".png",),
@@ -88,8 +90,4 @@ def unread(names: Iterable[str]) -> list[str]:
     for name in names:
         if (kind := unread_kind(name)) is not None:
             found.setdefault(kind, []).append(name)
-    return [f"Not read are {kind.what}: {_some(files)}. {kind.advice}" for kind, files in found.items()]
-
-
-def _some(names: list[str]) -> str:
-    return f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else names[0]
+    return [f"Not read are {kind.what}: {listed(files, 1)}. {kind.advice}" for kind, files in found.items()]

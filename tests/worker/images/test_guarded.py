@@ -196,7 +196,7 @@ def test_the_limits_of_a_video_name_it(
         (archives.overlapping(), "overlaps"),
         (archives.with_entries(100_000), "list of files"),
         (archives.encrypted(), "encrypted"),
-        (archives.wrong_checksum(), "CRC"),
+        (archives.wrong_checksum(), "damaged or cut off"),
         (archives.packed({"a.jpg": pictures.photo()})[:-30], "not a complete zip"),
         (
             archives.packed({"a.jpg": pictures.photo()}).replace(b"a.jpg", b"\0.jpg"),

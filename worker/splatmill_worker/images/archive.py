@@ -16,7 +16,9 @@ from typing import IO, cast
 
 from splatmill_worker.errors import Cancelled, Refusal
 from splatmill_worker.images import unpacked_room, zip_names
+from splatmill_worker.images.signatures import recognised
 from splatmill_worker.settings import max_unpacked
+from splatmill_worker.wording import plain
 
 MAX_ENTRIES = 20_000
 """Files in all archives of a capture, at most."""
@@ -140,11 +142,20 @@ def unpack(
     except UnsafeArchive:
         raise
     except (*DAMAGED, RuntimeError, ValueError) as error:
-        raise UnsafeArchive(f"it is not a complete zip file ({error})") from error
+        raise UnsafeArchive(f"it is not a complete zip file ({_fault(path, error)})") from error
     except OSError as error:
         if error.errno not in _DAMAGED_ERRNOS:
             raise
-        raise UnsafeArchive(f"it is not a complete zip file ({error})") from error
+        raise UnsafeArchive(f"it is not a complete zip file ({_fault(path, error)})") from error
+
+
+def _fault(path: Path, error: Exception) -> str:
+    """Why an archive cannot be read, as a part of a sentence."""
+    if (kind := recognised(path)) not in (None, "a zip archive"):
+        return f"it is {kind}"
+    if not zipfile.is_zipfile(path):
+        return "the list of its files, at its end, is missing: it is cut off, or no zip at all"
+    return plain(error)
 
 
 class BoundedReads(io.BufferedReader):
@@ -178,6 +189,8 @@ def _list_too_long(size: int) -> UnsafeArchive:
 
 def _check_places(archive: zipfile.ZipFile) -> None:
     """Raise UnsafeArchive when two entries share bytes of the file: the trick of zip bombs that nest nothing."""
+    if not archive.infolist():
+        raise UnsafeArchive("it is an empty zip file: there is no file in it")
     placed = sorted(archive.infolist(), key=lambda entry: entry.header_offset)
     ends = [entry.header_offset for entry in placed[1:]] + [archive.start_dir]
     for entry, end in zip(placed, ends, strict=True):

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from splatmill.schema.quantities import counted
 from splatmill_worker.images.flow import sampled
 
 SMALL_SIDE = 160
@@ -134,7 +135,7 @@ def warning(originals: Sequence[tuple[str, str]]) -> list[str]:
     if not originals:
         return []
     copy, original = originals[0]
-    photos = "1 photo shows" if len(originals) == 1 else f"{len(originals)} photos show"
+    photos = counted(len(originals), "photo shows", "photos show")
     return [
         f"{photos} the same as another one and {'is' if len(originals) == 1 else 'are'} not used, such as {copy}, a "
         f"copy of {original}. The largest of each is used; the others would train what held-out photos show."

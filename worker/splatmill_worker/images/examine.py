@@ -17,6 +17,7 @@ from splatmill_worker.images import exif, guarded, transparency
 from splatmill_worker.images.copies import SMALL_SIDE, small_grey
 from splatmill_worker.images.decode import UPRIGHT, Pixels, orientation, tags, upright_size, whole
 from splatmill_worker.images.photo_colors import PhotoColors
+from splatmill_worker.wording import plain
 
 POLE_SPREAD = 0.25
 """Spread of grey levels in the first and last row of a panorama over that of a usual row, at most: they are half a
@@ -87,9 +88,9 @@ def examine(path: Path, name: str) -> Picture | str:
                 small = small_grey(photo)
                 small = small if turn is None else np.asarray(Image.fromarray(small).transpose(turn))
     except UnusablePicture as error:
-        return error.reason + (GIVE if error.code == "not_an_image" else "")
+        return error.reason + (GIVE if error.reason == guarded.UNKNOWN else "")
     except OSError as error:
-        return f"it cannot be read: {error}"
+        return f"it cannot be read: {plain(error)}"
     return Picture(width, height, found, several, colors, small, projection, closed, alpha)
 
 

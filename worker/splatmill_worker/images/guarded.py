@@ -27,6 +27,8 @@ from PIL import Image, UnidentifiedImageError
 from splatmill.schema.photos import MAX_PHOTO_PIXELS, PHOTO_FORMATS, VIDEO_FORMATS
 from splatmill_worker import memory
 from splatmill_worker.errors import UnusablePicture, UnusableVideo
+from splatmill_worker.images.signatures import recognised
+from splatmill_worker.wording import plain
 
 pillow_heif.register_heif_opener()
 
@@ -59,6 +61,9 @@ MAX_CHUNKS = 100
 
 UNSPECIFIED = 2
 """The code of H.273 for primaries, transfer function and matrix that a file does not name."""
+
+UNKNOWN = "it is not an image, or its format is not supported"
+"""Of a file whose first bytes say nothing."""
 
 _BYTES_PER_PIXEL = 4
 DECODE_ERRORS = (
@@ -122,7 +127,7 @@ def damage(name: str, what: str = "it does not decode completely") -> Iterator[N
     except DECODE_ERRORS as error:
         if isinstance(error, OSError) and error.errno is not None:
             raise  # of the operating system, not of Pillow
-        raise UnusablePicture("image_truncated", name, f"{what}: {_said(error)}") from error
+        raise UnusablePicture("image_truncated", name, f"{what}: {plain(error)}") from error
 
 
 @contextmanager
@@ -211,7 +216,7 @@ def opened_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.V
         )
     except (av.FFmpegError, ValueError) as error:
         raise UnusableVideo(
-            path.name, f"it does not decode as an MP4, MOV, MKV, WebM or AVI video ({_said(error)})"
+            path.name, f"it does not decode as an MP4, MOV, MKV, WebM or AVI video ({plain(error)})"
         ) from error
     with container:
         if not container.streams.video:
@@ -277,11 +282,9 @@ def _opened(path: Path, name: str) -> Image.Image:
             raise UnusablePicture(
                 "image_truncated", name, "it does not decode completely: parts of it are damaged or missing"
             ) from error
-        raise UnusablePicture(
-            "not_an_image",
-            name,
-            "it is not an image, or its format is not supported",
-        ) from error
+        kind = recognised(path)
+        said = UNKNOWN if kind is None else f"it is {kind}"
+        raise UnusablePicture("not_an_image", name, said) from error
 
 
 def _starts_as_avif(path: Path) -> bool:
@@ -306,10 +309,6 @@ def _check_frame(name: str, width: int, height: int) -> None:
             name,
             f"its frames have {width} x {height} pixels; at most {MAX_FRAME_PIXELS / 1e6:.0f} million are decoded",
         )
-
-
-def _said(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
 
 
 class _Room:

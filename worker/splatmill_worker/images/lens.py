@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from splatmill.schema.quantities import counted
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Camera, Lens
 
@@ -167,7 +168,7 @@ def remarks(lenses: Iterable[Lens | None]) -> list[str]:
 
 
 def _counted(lenses: Counter[Lens]) -> str:
-    photos = "1 photo" if lenses.total() == 1 else f"{lenses.total()} photos"
+    photos = counted(lenses.total(), "photo")
     return f"{photos} ({', '.join(sorted({lens.model for lens in lenses}))})"
 
 

@@ -14,6 +14,7 @@ from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import guarded
 from splatmill_worker.images.decode import decode, upright_size
 from splatmill_worker.scene import MIN_SHOWN
+from splatmill_worker.wording import plain
 
 MAX_ASPECT_ERROR = 0.02
 """Relative difference of aspect ratios up to which a mask fits its photo."""
@@ -83,7 +84,7 @@ def mask_fault(mask: Path, photo: tuple[int, int], upright: bool = True) -> str 
             raise
         return f"it cannot be read ({error.reason})"
     except OSError as error:
-        return f"it cannot be read ({error})"
+        return f"it cannot be read ({plain(error)})"
     if not abs(width / height / (photo[0] / photo[1]) - 1.0) <= MAX_ASPECT_ERROR:
         return f"its shape differs from the photo's ({width} x {height} and {photo[0]} x {photo[1]} pixels)"
     if width > MAX_SCALE * photo[0] and width * height > MIN_SCALED_PIXELS:

@@ -17,6 +17,7 @@ from splatmill.data_sets import MAX_DEPTH, unread_cameras
 from splatmill.schema.masks import masks_beside, paired, without_mask_folder
 from splatmill.schema.outputs import own_outputs
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES, unread, unread_kind
+from splatmill.schema.quantities import counted
 from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
 from splatmill_worker.images import (
     archive,
@@ -32,6 +33,7 @@ from splatmill_worker.images import (
 from splatmill_worker.images.copies import SmallPicture
 from splatmill_worker.images.masks import masks_under, unfit
 from splatmill_worker.scene import MIN_SHOWN, Overlay
+from splatmill_worker.wording import plain
 
 IGNORED_PREFIXES = (".", "__MACOSX")
 """Beginnings of the names of files and folders that are left out without mention."""
@@ -254,7 +256,7 @@ def _panoramas(names: list[str]) -> list[str]:
     """A warning about photos that look like panoramas; none where there are none."""
     if not names:
         return []
-    are = "1 photo is" if len(names) == 1 else f"{len(names)} photos are"
+    are = counted(len(names), "photo is", "photos are")
     return [
         f"{are} twice as wide as high with edges that meet, as those of 360-degree panoramas do (such as {names[0]}). "
         f"They are taken for photos of a pinhole camera, which is wrong for panoramas. {CUT_PANORAMAS}"
@@ -345,7 +347,8 @@ def _expand(
             prefix = Path(name).with_suffix("").as_posix()
             found.files += [(f"{prefix}_{p.stem.rpartition('_')[2]}.jpg", p, name) for p in pictures]
             found.opened.add(name)
-            found.notes.append(f"{len(pictures)} frames were taken from the video {name}.")
+            taken = counted(len(pictures), "frame was", "frames were")
+            found.notes.append(f"{taken} taken from the video {name}.")
             found.warnings += [remark.format(name) for remark in decoders.video_remarks(path)]
         elif (kind := unread_kind(name)) is not None:
             # Pillow would read the small preview in a raw photo.
@@ -359,7 +362,7 @@ def _expand(
     except OSError as error:
         if error.errno in MACHINE_ERRORS:
             raise
-        found.skipped.append((name, str(error)))
+        found.skipped.append((name, f"it cannot be read: {plain(error)}"))
 
 
 def unpacked(

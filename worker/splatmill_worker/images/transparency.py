@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 from PIL import Image
 
 from splatmill.schema.quantities import counted, listed
@@ -24,8 +25,8 @@ def extent(photo: Image.Image) -> Extent:
     """The extent of a decoded photo; that of an opaque one where it has no alpha."""
     if photo.mode != "RGBA":
         return 255, 255
-    low, high = photo.getchannel("A").getextrema()
-    return int(low), int(high)
+    values = np.asarray(photo.getchannel("A"))
+    return int(values.min()), int(values.max())
 
 
 def is_clear(alpha: Extent) -> bool:

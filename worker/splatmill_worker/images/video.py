@@ -22,6 +22,7 @@ from splatmill_worker.errors import Cancelled, UnusableVideo
 from splatmill_worker.images import guarded, video_frame
 from splatmill_worker.images.flow import Grey, displacement
 from splatmill_worker.images.video_times import Passed
+from splatmill_worker.wording import plain
 
 SHARPNESS_SIDE = 480
 """Pixels of the longest side of the reduced frame on which sharpness is measured."""
@@ -184,4 +185,4 @@ def _decoded(
             yield stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio, frames()
     except av.FFmpegError as error:
         if not seen:
-            raise UnusableVideo(path.name, f"it does not decode as video ({error})") from error
+            raise UnusableVideo(path.name, f"it does not decode as video ({plain(error)})") from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from splatmill.schema import KnownDistance
+from splatmill.schema.quantities import counted
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.images.prepare import Prepared, prepare
@@ -110,22 +111,26 @@ def _require_photos(prepared: Prepared) -> None:
     if count == 0:
         raise SfmFailed(
             "no_images",
-            f"None of the {len(prepared.skipped)} files is a usable photo"
-            + (
-                f", such as {prepared.skipped[0][0]}: {prepared.skipped[0][1]}" if prepared.skipped else ""
-            ).rstrip(".")
-            + ".",
+            _no_photo(prepared.skipped),
             facts,
             "Give JPEG, PNG, WebP, TIFF, HEIC or AVIF photos, a video, or a zip of photos.",
         )
     if count < checks.MIN_PHOTOS:
         raise SfmFailed(
             "too_few_images",
-            f"There {'is' if count == 1 else 'are'} {count} usable photo{'s' if count > 1 else ''}; at least "
-            f"{checks.MIN_PHOTOS} are needed.",
+            f"{counted(count, 'photo is', 'photos are')} usable; at least {checks.MIN_PHOTOS} are needed.",
             facts,
             "Take photos from different places, 20 or more for a good result.",
         )
+
+
+def _no_photo(skipped: Sequence[tuple[str, str]]) -> str:
+    if not skipped:
+        return "There is no usable photo."
+    name, reason = skipped[0]
+    if len(skipped) == 1:
+        return f"There is no usable photo. {name}: {reason.rstrip('.')}."
+    return f"None of the {len(skipped)} files is a usable photo, such as {name}: {reason.rstrip('.')}."
 
 
 def _efforts(options: SfmOptions, longest_side: int) -> list[Effort]:

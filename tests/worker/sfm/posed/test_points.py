@@ -17,10 +17,11 @@ from splatmill.schema import TrainOptions
 from splatmill_worker import synthetic
 from splatmill_worker.capture import posed_scene
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.scene import Camera, Lens, Scene, View, viewmat_of
+from splatmill_worker.scene import Camera, Float, Lens, Scene, Source, View, viewmat_of
 from splatmill_worker.sfm import posed, stereo
 from splatmill_worker.sfm.matching.overlap import by_overlap
 from splatmill_worker.sfm.options import LEAN
+from splatmill_worker.sfm.posed.conventions import FLIP
 from splatmill_worker.sfm.posed.triangulation import Triangulated, triangulate
 from splatmill_worker.splat.plan.decide import decide
 from tests.support.facts import FACTS
@@ -275,6 +276,33 @@ def test_wrong_cameras_are_named_and_the_random_start_says_why(bare: Scene, tmp_
         )
         assert plan.initial == "random"
         assert plan.reasons["initial"].startswith("The given cameras explain only")
+
+
+@pytest.mark.parametrize(
+    ("source", "named", "misread"),
+    [
+        ("transforms", "from camera to world with OpenCV axes", lambda true: FLIP @ true),
+        (
+            "transforms",
+            "from world to camera with OpenGL axes",
+            lambda true: FLIP @ np.linalg.inv(true) @ FLIP,
+        ),
+        ("transforms", "from world to camera with OpenCV axes", lambda true: FLIP @ np.linalg.inv(true)),
+        ("colmap", "from camera to world with OpenCV axes", np.linalg.inv),
+        ("transforms", "", lambda true: true[[1, 2, 0, 3]]),
+    ],
+)
+def test_another_convention_of_matrices_is_suggested(
+    bare: Scene, source: Source, named: str, misread: Callable[[Float], Float]
+) -> None:
+    views = [
+        replace(view, camera=replace(view.camera, viewmat=misread(view.camera.viewmat)))
+        for view in bare.views[:5]
+    ]
+    found = triangulate(views, LEAN, source=source)
+    assert found.agreeing < 0.5 * found.matches
+    assert found.convention == named
+    assert (found.convention_share > 0.8) == bool(named)
 
 
 def test_a_wrong_focal_length_is_named(bare: Scene, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from splatmill_worker.images import decoders
 from splatmill_worker.images.lens import lens_of, pinhole, without_distortion
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
 from splatmill_worker.sfm.posed import model_files
-from splatmill_worker.sfm.posed.files import ImageFiles, missing, readings
+from splatmill_worker.sfm.posed.files import ImageFiles, missing, none_usable, readings
 from splatmill_worker.sfm.posed.model_files import GivenModel, ModelPoints
 from splatmill_worker.sfm.posed.one_camera import one_for_each
 
@@ -103,12 +103,7 @@ def scene_of_given(model: GivenModel, files: ImageFiles, notes: tuple[str, ...] 
         except UnusablePicture as error:
             unusable[path] = (name, error.reason)
     if not views and unusable:
-        name, reason = next(iter(unusable.values()))
-        if decoders.forget_ended():
-            raise UnusablePicture("decoder_ended", name, f"no photo is left; of this one: {reason}")
-        raise ValueError(
-            f"None of the {len(unusable)} photos with a camera can be used, such as {name!r}: {reason}."
-        )
+        raise none_usable(list(unusable.values()))
     if not views:
         if not lacking:
             raise ValueError("The COLMAP model has no registered photo. Give one that has, or leave it out.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import filecmp
 import re
 import unicodedata
-from collections.abc import Callable, Set
+from collections.abc import Callable, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +16,8 @@ from splatmill.data_sets import walk
 from splatmill.schema.captures import UnsafeName, storable_name
 from splatmill.schema.masks import masks_beside, paired, without_mask_folder
 from splatmill.schema.photos import PHOTO_SUFFIXES
-from splatmill_worker.errors import UnusablePicture
+from splatmill.schema.quantities import counted
+from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.images import decoders
 
 SIZED = re.compile(r"(images|input|rgb)(_\d+)?", re.ASCII | re.IGNORECASE)
@@ -200,6 +201,18 @@ def readings(name: str, files: ImageFiles) -> str:
     """The photos that a name may refer to, as a part of a sentence, where they are several; else empty."""
     several = files.candidates(name)
     return f"it may be {several[0]} or {several[1]}; leave one of them out" if len(several) > 1 else ""
+
+
+def none_usable(unusable: Sequence[tuple[str, str]]) -> Refusal:
+    """The error where no photo that has a camera can be used, given with the reasons."""
+    name, reason = unusable[0]
+    if decoders.forget_ended():
+        return UnusablePicture("decoder_ended", name, f"no photo is left; of this one: {reason}")
+    return Refusal(
+        "no_images",
+        f"None of the {counted(len(unusable), 'photo')} with a camera can be used, such as {name!r}: {reason}.",
+        advice="Give whole photos of a format that is read, as the cameras were made for.",
+    )
 
 
 def missing(name: str, files: ImageFiles, given: str) -> str:

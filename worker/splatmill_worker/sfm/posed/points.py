@@ -18,16 +18,16 @@ import numpy as np
 
 from splatmill.files import replacing
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.scene import PointViews, Scene
+from splatmill_worker.scene import PointViews, Scene, Source
 from splatmill_worker.sfm import stereo
 from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.sfm.matching import two_view
 from splatmill_worker.sfm.options import LEAN, STANDARD
-from splatmill_worker.sfm.posed import orientation
+from splatmill_worker.sfm.posed import conventions, orientation
 from splatmill_worker.sfm.posed.evidence import Evidence, evidence_of
-from splatmill_worker.sfm.posed.triangulation import Triangulated, triangulate
+from splatmill_worker.sfm.posed.triangulation import Triangulated, contradicted, triangulate
 
-VERSION = 1
+VERSION = 2
 """Version of the method; points stored under another version are searched for anew."""
 
 LEAST_POINTS = 20
@@ -51,9 +51,6 @@ scene of one colour, all do."""
 
 LOOKED_AT = 4
 """Photos that tell whether a data set has transparent ones: this many, and less than twice as many."""
-
-CONTRADICTED = 0.5
-"""Share of the matches that the given cameras explain, below which the cameras are called wrong."""
 
 
 def with_points(
@@ -164,16 +161,18 @@ def _searched(
 ) -> Triangulated:
     """What triangulation finds, with more features where the first ones give few points."""
     views = [view for view in scene.views if view.split != "test"]
-    found = triangulate(views, LEAN, seed=seed, on_progress=on_progress, cancelled=cancelled)
-    if sum(map(len, found.tracks)) >= FEW_OBSERVATIONS * len(views) or _contradicted(found):
+    found = triangulate(
+        views, LEAN, source=scene.source, seed=seed, on_progress=on_progress, cancelled=cancelled
+    )
+    if sum(map(len, found.tracks)) >= FEW_OBSERVATIONS * len(views) or contradicted(
+        found.agreeing, found.matches
+    ):
         return found
-    again = triangulate(views, STANDARD, seed=seed, on_progress=on_progress, cancelled=cancelled)
+    again = triangulate(
+        views, STANDARD, source=scene.source, seed=seed, on_progress=on_progress, cancelled=cancelled
+    )
     spent = {stage: again.seconds[stage] + found.seconds[stage] for stage in again.seconds}
     return replace(again if len(again.points) > len(found.points) else found, seconds=spent)
-
-
-def _contradicted(found: Triangulated) -> bool:
-    return found.matches > 0 and found.agreeing < CONTRADICTED * found.matches
 
 
 def _with_triangulated(scene: Scene, found: Triangulated, cancelled: Callable[[], bool]) -> Scene:
@@ -190,7 +189,7 @@ def _with_triangulated(scene: Scene, found: Triangulated, cancelled: Callable[[]
         "matches": found.matches,
         "verified_pairs": found.pairs,
         "matches_explained_by_cameras": round(found.agreeing / max(1, found.matches), 4),
-        "cameras_contradicted": _contradicted(found),
+        "cameras_contradicted": contradicted(found.agreeing, found.matches),
         "match_error_px": None if not found.matches else round(found.disagreement, 3),
         "features_per_photo": found.features,
         "transparent_photos": found.transparent,
@@ -198,11 +197,12 @@ def _with_triangulated(scene: Scene, found: Triangulated, cancelled: Callable[[]
     }
     messages = [_triangulated_note(given, len(kept), found)]
     warnings = list(scene.warnings)
-    if _contradicted(found):
+    if contradicted(found.agreeing, found.matches):
         warnings.append(
             f"The given cameras explain only {100 * found.agreeing / found.matches:.0f} % of the {found.matches} "
             f"matches between the photos; half of them are off by {found.disagreement:.1f} pixels or more. The poses "
             "or the intrinsics are wrong: correct them, or remove them to have the cameras recovered from the photos."
+            + _suggestion(scene.source, found)
         )
     if len(kept) < LEAST_POINTS or len(kept) <= given:
         return replace(
@@ -224,6 +224,16 @@ def _with_triangulated(scene: Scene, found: Triangulated, cancelled: Callable[[]
     )
 
 
+def _suggestion(source: Source, found: Triangulated) -> str:
+    """What to do where the cameras fit the photos in another convention; else ""."""
+    if not found.convention:
+        return ""
+    return (
+        f" Read as matrices {found.convention}, they explain {100 * found.convention_share:.0f} %: "
+        f"{conventions.of_source(source)}. Convert them."
+    )
+
+
 def _triangulated_note(given: int, kept: int, found: Triangulated) -> str:
     had = "no points" if not given else f"only {given} points"
     said = f"The cameras came with {had}. "
@@ -242,7 +252,7 @@ def _failure(scene: Scene, found: Triangulated) -> str:
         return f"Half of the photos have at most {found.features:.0f} features, too few to be matched."
     if not found.matches:
         return "No two photos match, so nothing could be triangulated with the given cameras."
-    if _contradicted(found):
+    if contradicted(found.agreeing, found.matches):
         return (
             f"The given cameras explain only {100 * found.agreeing / found.matches:.0f} % of the matches between the "
             "photos, so nothing could be triangulated."
@@ -278,8 +288,9 @@ def _load(path: Path) -> Triangulated:
         values = {field.name: stored[field.name] for field in fields(Triangulated)}
         values["tracks"] = tuple(tuple(int(index) for index in track) for track in split)
         values["seconds"] = json.loads(str(stored["seconds"]))
-        for name in ("matches", "pairs", "agreeing", "disagreement", "features", "transparent"):
-            values[name] = values[name].item()
+        for name, value in values.items():
+            if isinstance(value, np.ndarray) and value.ndim == 0:
+                values[name] = value.item()
         return Triangulated(**values)
 
 

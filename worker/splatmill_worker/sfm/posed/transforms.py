@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -26,10 +26,11 @@ from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed import parts, polycam
 from splatmill_worker.sfm.posed.camera_models import UnreadModel, is_fisheye
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
-from splatmill_worker.sfm.posed.files import ImageFiles, missing, readings
+from splatmill_worker.sfm.posed.files import ImageFiles, missing, none_usable, readings
 from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_PARAMETER, MAX_SIDE, MOST_FAULTY
 from splatmill_worker.sfm.posed.one_camera import one_for_each
 from splatmill_worker.sfm.posed.parts import Part
+from splatmill_worker.wording import plain
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns the axes of a camera-to-world matrix from OpenGL's to OpenCV's."""
@@ -110,19 +111,14 @@ def load(
             )
         if document.get("ply_file_path"):
             points, note = _sparse_points(path.parent / _local(str(document["ply_file_path"])), capture)
-            messages += [note] if note else []
+            warnings += [note] if note else []
     distinct, contradictory = one_for_each(given, where.__getitem__)
     left_out += contradictory
     views, validation, remarks = parts.divided(distinct.values(), named)
     left_out += [(name, parts.NOT_USED) for name in validation]
     warnings += remarks
     if not views and unusable:
-        name, reason = next(iter(unusable.items()))
-        if decoders.forget_ended():
-            raise UnusablePicture("decoder_ended", name, f"no photo is left; of this one: {reason}")
-        raise ValueError(
-            f"None of the {len(unusable)} photos with a camera can be used, such as {name!r}: {reason}."
-        )
+        raise none_usable(list(unusable.items()))
     if not views:
         first = f" (such as {left_out[0][0]!r})" if left_out else ""
         several = readings(left_out[0][0], files) if left_out else ""
@@ -175,10 +171,8 @@ def _parsed(path: Path) -> Any:
         if parsed_bytes(text) > MAX_PARSED_BYTES:
             raise ValueError(f"its lists and objects would take {format_bytes(parsed_bytes(text))} of memory")
         return json.loads(text)
-    except RecursionError as error:
-        raise ValueError(f"{path.name} is not readable JSON: it is nested too deeply.") from error
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path.name} is not readable JSON: {error}.") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path.name} is not readable JSON: {plain(error)}.") from error
 
 
 def parsed_bytes(text: bytes) -> int:
@@ -201,13 +195,12 @@ def _view(
     relative, photo = found
     values = {**document, **frame}
     try:
-        viewmat = world_to_camera(np.array(frame["transform_matrix"], np.float64))
+        viewmat = world_to_camera(_matrix(frame["transform_matrix"]))
         cameras = [_colmap_camera(values, size) for size in _sizes(values, relative, photo)]
     except UnreadModel as error:
         raise UnreadModel(f"Frame {index} of {path.name} ({name}): {error}.", error.advice) from error
-    except (KeyError, TypeError, ValueError, ArithmeticError) as error:
-        fault = f"{error.args[0]} is missing." if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"Frame {index} of {path.name} ({name}): {fault}") from error
+    except (ValueError, ArithmeticError) as error:
+        raise ValueError(f"Frame {index} of {path.name} ({name}): {plain(error)}.") from error
     mask = files.mask(relative)
     if mask is None and isinstance(frame.get("mask_path"), str):
         beside = path.parent / _local(frame["mask_path"])
@@ -251,22 +244,28 @@ def world_to_camera(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     mirrored, or shears.
     """
     if matrix.shape not in ((4, 4), (3, 4)):
-        raise ValueError(f"transform_matrix has the shape {matrix.shape}; it must be 4 x 4 or 3 x 4.")
+        raise ValueError(f"transform_matrix has the shape {matrix.shape}; it must be 4 x 4 or 3 x 4")
     if not np.isfinite(matrix).all():
-        raise ValueError("transform_matrix has values that are not finite.")
+        raise ValueError("transform_matrix has values that are not finite")
     if not np.abs(matrix).max() <= MAX_DISTANCE:
-        raise ValueError(f"transform_matrix has values above {MAX_DISTANCE:.0e}.")
+        raise ValueError(f"transform_matrix has values above {MAX_DISTANCE:.0e}")
     rotation = matrix[:3, :3]
     determinant = float(np.linalg.det(rotation))
     if not determinant > MIN_DETERMINANT:
         raise ValueError(
             f"the rotation part of transform_matrix has the determinant {determinant:.3g}; it must be positive, "
-            "and is 1 for a rotation."
+            "and is 1 for a rotation"
         )
     rotation = rotation / np.cbrt(determinant)
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > MAX_SHEAR:
+        lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+        cosines = (matrix[:3, :3] / lengths).T @ (matrix[:3, :3] / lengths)
+        angles = np.degrees(np.arccos(np.clip([cosines[0, 1], cosines[1, 2], cosines[0, 2]], -1.0, 1.0)))
         raise ValueError(
-            "transform_matrix is not a rigid motion: its axes are not at right angles, or not equally long."
+            "transform_matrix is not a rigid motion. Its axes x, y and z are "
+            f"{', '.join(f'{length:.3g}' for length in lengths)} long and at "
+            f"{', '.join(f'{angle:.0f}' for angle in angles)} degrees to one another (xy, yz, xz); those of a camera "
+            "are equally long and at 90 degrees. Export it without scaling or shearing of single axes"
         )
     u, _, v = np.linalg.svd(rotation)
     camera_to_world = np.eye(4)
@@ -278,37 +277,58 @@ def world_to_camera(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 def _sizes(values: dict[str, Any], name: str, photo: Path) -> list[tuple[int, int]]:
     """Width and height of the camera of a frame; where w or h is missing those of the file, stored and upright."""
-    if "w" in values and "h" in values:
-        return [(int(values["w"]), int(values["h"]))]
+    width, height = (_number(values, key) for key in ("w", "h"))
+    if width is not None and height is not None:
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+            raise ValueError(f"w and h are {width:g} and {height:g} pixels; they must be 1 to {MAX_SIDE}")
+        return [(int(width), int(height))]
     stored, upright, _ = decoders.sizes(photo, name)
     return [stored] if stored == upright else [stored, upright]
+
+
+@overload
+def _number(values: dict[str, Any], key: str) -> float | None: ...
+@overload
+def _number(values: dict[str, Any], key: str, default: float) -> float: ...
+def _number(values: dict[str, Any], key: str, default: float | None = None) -> float | None:
+    """The number in a field; the default where it is missing or null. Raises ValueError for anything else."""
+    value = values.get(key)
+    if value is None:
+        return default
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{key} is {str(value)[:40]!r}, which is no number of usual size") from None
+
+
+def _matrix(rows: Any) -> npt.NDArray[np.float64]:
+    try:
+        return np.array(rows, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError("transform_matrix has other values than 4 x 4 or 3 x 4 numbers") from None
 
 
 def _colmap_camera(values: dict[str, Any], size: tuple[int, int]) -> pycolmap.Camera:
     """The camera of a frame, for a photo of this width and height."""
     width, height = size
-    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise ValueError(f"w and h are {width} and {height} pixels; they must be 1 to {MAX_SIDE}.")
-    if "fl_x" in values or "fl_y" in values:
-        fx = float(values.get("fl_x", values.get("fl_y", 0.0)))
-        fy = float(values.get("fl_y", fx))
-    elif "camera_angle_x" in values:
-        fx = 0.5 * width / math.tan(0.5 * float(values["camera_angle_x"]))
-        fy = (
-            0.5 * height / math.tan(0.5 * float(values["camera_angle_y"]))
-            if "camera_angle_y" in values
-            else fx
-        )
-    else:
-        raise ValueError("it has no focal length; give fl_x or camera_angle_x.")
-    cx, cy = float(values.get("cx", 0.5 * width)), float(values.get("cy", 0.5 * height))
-    radial = [float(values.get(f"k{order}", 0.0)) for order in range(1, 7)]
-    tangential = [float(values.get(key, 0.0)) for key in ("p1", "p2")]
+
+    def focal(length: str, angle: str, side: int) -> float | None:
+        given, seen = _number(values, length), _number(values, angle)
+        return given if given is not None or seen is None else 0.5 * side / math.tan(0.5 * seen)
+
+    horizontal = focal("fl_x", "camera_angle_x", width)
+    vertical = focal("fl_y", "camera_angle_y", height)
+    fx, fy = (horizontal, vertical) if horizontal and vertical else (horizontal or vertical or 0.0,) * 2
+    if horizontal is None and vertical is None:
+        raise ValueError("it has no focal length; give fl_x or camera_angle_x")
+    cx, cy = _number(values, "cx", 0.5 * width), _number(values, "cy", 0.5 * height)
+    radial = [_number(values, f"k{order}", 0.0) for order in range(1, 7)]
+    tangential = [_number(values, key, 0.0) for key in ("p1", "p2")]
     largest = float(np.abs([fx, fy, cx, cy, *radial, *tangential]).max())
     if not (fx > 0 and fy > 0 and largest <= MAX_PARAMETER):
         raise ValueError(
             f"the focal lengths are {fx} and {fy} pixels; they must be positive, and all intrinsics at most "
-            f"{MAX_PARAMETER:.0e}."
+            f"{MAX_PARAMETER:.0e}"
         )
     if is_fisheye(values):
         model, extra = "OPENCV_FISHEYE", radial[:4]
@@ -334,10 +354,15 @@ def _sparse_points(
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not _within(path, capture):
         return nothing, f"The points in {path.name} are not used: ply_file_path lies outside the capture."
+    if not path.is_file():
+        return (
+            nothing,
+            f"The points in {path.name}, which ply_file_path names, are not used: there is no such file.",
+        )
     try:
         found = decoders.call_once(point_file.read, path, check=_points_of, fault=_points_fault)
     except (OSError, ValueError) as error:
-        return nothing, f"The points in {path.name} are not used: {error}."
+        return nothing, f"The points in {path.name} are not used: {plain(error)}."
     return found, None
 
 

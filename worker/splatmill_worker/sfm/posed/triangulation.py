@@ -15,11 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.scene import Camera, View
+from splatmill_worker.scene import Camera, Source, View
 from splatmill_worker.sfm.callbacks import OnProgress, native_token
 from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.matching import overlap, pairs, two_view
 from splatmill_worker.sfm.options import Effort, fitted
+from splatmill_worker.sfm.posed.conventions import better
 from splatmill_worker.sfm.posed.searched import database_of, epipolar_errors, features_of, model_of
 from splatmill_worker.sfm.run import torch_threads
 
@@ -30,6 +31,10 @@ CANDIDATES = 24
 
 MIN_VIEWS_OF_TRACK = 3
 """Photos that must show a point where there are more than two: two photos alone agree by chance."""
+
+
+CONTRADICTED = 0.5
+"""Share of the matches that the given cameras explain, below which the cameras are called wrong."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,8 @@ class Triangulated:
     disagreement: median epipolar error of these matches under the given cameras, pixels of full-size photos.
     features: median number of features of a photo.
     transparent: number of photos with transparent pixels.
+    convention: where the cameras explain few matches, the one that explains most of them, of `conventions`; else "".
+    convention_share: the share of the matches that it explains.
     seconds: time by stage.
     """
 
@@ -59,13 +66,21 @@ class Triangulated:
     disagreement: float
     features: float
     transparent: int
+    convention: str
+    convention_share: float
     seconds: dict[str, float]
+
+
+def contradicted(agreeing: int, matches: int) -> bool:
+    """Whether the given cameras explain so few of the matches that they are wrong."""
+    return matches > 0 and agreeing < CONTRADICTED * matches
 
 
 def triangulate(
     views: Sequence[View],
     effort: Effort,
     *,
+    source: Source = "transforms",
     seed: int = 0,
     on_progress: OnProgress = lambda stage, done, total, note: None,
     cancelled: Callable[[], bool] = lambda: False,
@@ -75,6 +90,7 @@ def triangulate(
     Features are those of `effort`, on undistorted photos. Pairs are chosen by the overlap of the cameras and by a quick
     comparison of features.
 
+    source: of the cameras.
     on_progress: called with the stages features, matching and triangulation.
 
     Raises OSError and ValueError for photos as `load_view` does, and Cancelled.
@@ -105,6 +121,10 @@ def triangulate(
             )
             verified = [pair for pair, outcome in matched.items() if outcome.inliers >= two_view.MIN_INLIERS]
             errors = epipolar_errors(verified, cameras, features, database)
+            bound = two_view.max_error(max(max(camera.width, camera.height) for camera in cameras))
+            convention, share = "", 0.0
+            if contradicted(int((errors <= bound).sum()), len(errors)):
+                convention, share = better(source, verified, cameras, features, database, bound)
         seconds["matching"] = perf_counter() - started
         started = perf_counter()
         on_progress("triangulation", 0, len(views), "photos triangulated")
@@ -126,10 +146,12 @@ def triangulate(
         tuple(tracks),
         len(errors),
         len(verified),
-        int((errors <= two_view.max_error(side)).sum()),
+        int((errors <= bound).sum()),
         enlarged * float(np.median(errors)) if len(errors) else np.nan,
         float(np.median([len(each.scales) for each in features])),
         sum(each.transparent for each in found),
+        convention,
+        share,
         {stage: round(value, 3) for stage, value in seconds.items()},
     )
 

@@ -19,7 +19,7 @@ class Gunzip:
         try:
             piece = self._stream.decompress(self._rest, size)
         except zlib.error as error:
-            raise ValueError(f"its gzip data are damaged ({error})") from error
+            raise ValueError("its gzip data are damaged") from error
         self._rest = self._stream.unconsumed_tail
         if len(piece) < size:
             raise ValueError(f"its gzip data end after {len(piece)} of {size} bytes")
@@ -30,7 +30,7 @@ class Gunzip:
         try:
             return self._stream.decompress(self._rest, 2**16)
         except zlib.error as error:
-            raise ValueError(f"its gzip data are damaged ({error})") from error
+            raise ValueError("its gzip data are damaged") from error
 
 
 def unzstd(data: bytes, size: int) -> bytes:
@@ -42,7 +42,7 @@ def unzstd(data: bytes, size: int) -> bytes:
             piece = stream.read(size)
             more = stream.read(1)
     except zstandard.ZstdError as error:
-        raise ValueError(f"its zstd data are damaged ({error})") from error
+        raise ValueError("its zstd data are damaged") from error
     if len(piece) < size or more:
         raise ValueError(f"a stream of zstd data has {'more' if more else 'fewer'} than {size} bytes")
     return piece

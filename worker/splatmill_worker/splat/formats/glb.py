@@ -33,6 +33,7 @@ from splatmill_worker.splat.formats.contents import (
 from splatmill_worker.splat.formats.frames import turned_about_x
 from splatmill_worker.splat.formats.ply_columns import rest_notes
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
+from splatmill_worker.wording import plain
 
 EXTENSION = "KHR_gaussian_splatting"
 MAX_JSON_BYTES = 2**22
@@ -121,14 +122,6 @@ def read(path: Path) -> Contents:
         return _contents(path)
     except FileNotFoundError:
         raise
-    except KeyError as error:
-        raise ModelUnreadable(
-            f"{path.name} could not be read as a .glb: {error.args[0]!r:.100} is missing."
-        ) from error
-    except RecursionError as error:
-        raise ModelUnreadable(
-            f"{path.name} could not be read as a .glb: its JSON nests too many objects or lists."
-        ) from error
     except (
         ValueError,
         OverflowError,
@@ -137,8 +130,12 @@ def read(path: Path) -> Contents:
         IndexError,
         struct.error,
         AttributeError,
+        KeyError,
+        RecursionError,
     ) as error:
-        raise ModelUnreadable(f"{path.name} could not be read as a .glb of Gaussians: {error}.") from error
+        raise ModelUnreadable(
+            f"{path.name} could not be read as a .glb of Gaussians: {plain(error)}."
+        ) from error
 
 
 @dataclass

@@ -39,6 +39,7 @@ from splatmill_worker.splat.formats.contents import (
 )
 from splatmill_worker.splat.formats.morton import morton_order
 from splatmill_worker.splat.gaussians import REST_COEFFICIENTS, Gaussians
+from splatmill_worker.wording import plain
 
 VERSION = 2
 CENTROIDS_PER_ROW = 64
@@ -165,12 +166,8 @@ def read(path: Path) -> Contents:
         raise
     except UnusablePicture as error:
         raise ModelUnreadable(f"{path.name} cannot be read: {error.message}") from error
-    except RecursionError as error:
-        raise ModelUnreadable(
-            f"{path.name} could not be read as a SOG model: its meta.json nests too many objects or lists"
-        ) from error
-    except (*DAMAGED, OSError, ValueError, OverflowError, KeyError, TypeError) as error:
-        raise ModelUnreadable(f"{path.name} could not be read as a SOG model: {_said(error)}") from error
+    except (*DAMAGED, OSError, ValueError, OverflowError, KeyError, TypeError, RecursionError) as error:
+        raise ModelUnreadable(f"{path.name} could not be read as a SOG model: {plain(error)}") from error
 
 
 def importance(gaussians: Gaussians) -> Tensor:
@@ -401,9 +398,3 @@ def _numbers(values: Any, count: int) -> npt.NDArray[np.float64]:
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
         raise ValueError(f"its meta.json has a list without {count} finite numbers")
     return numbers
-
-
-def _said(error: Exception) -> str:
-    if isinstance(error, KeyError):
-        return f"{error.args[0]!r:.100} is missing"
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]

@@ -28,18 +28,23 @@ class Files(Protocol):
 
 
 class _Members:
-    """The members of an archive. Raises ValueError for one that is encrypted."""
+    """The members of an archive. Raises ValueError for one that is encrypted or missing."""
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
         self._archive = archive
 
     def size(self, name: str) -> int:
-        return self._archive.getinfo(name).file_size
+        return self._info(name).file_size
 
     def read(self, name: str) -> bytes:
-        if self._archive.getinfo(name).flag_bits & _ENCRYPTED:
+        if self._info(name).flag_bits & _ENCRYPTED:
             raise ValueError(f"{name[:80]} is encrypted")
         return self._archive.read(name)
+
+    def _info(self, name: str) -> zipfile.ZipInfo:
+        if name not in self._archive.NameToInfo:
+            raise ValueError(f"{name[:80]} is missing in it")
+        return self._archive.NameToInfo[name]
 
 
 class _Beside:
@@ -57,13 +62,19 @@ class _Beside:
     def _found(self, name: str) -> Path:
         if PurePosixPath(name).name != name:
             raise ValueError(f"meta.json names a file outside of its folder: {name[:80]!r}")
-        return self._path if name == "meta.json" else self._path.with_name(name)
+        if name == "meta.json":
+            return self._path
+        if not (beside := self._path.with_name(name)).is_file():
+            raise ValueError(f"{name[:80]} is missing beside it")
+        return beside
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[Files]:
     """The files of an archive, or those beside a `meta.json`. Raises ValueError, and what `zipfile` does."""
     if not zipfile.is_zipfile(path):
+        if path.is_file() and path.suffix.lower() != ".json":
+            raise ValueError("it is no zip archive, or it is cut off")
         yield _Beside(path)
         return
     bounded = BoundedReads(io.FileIO(path), MAX_LIST_BYTES, _list_too_long)

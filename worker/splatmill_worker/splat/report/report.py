@@ -15,6 +15,7 @@ from torch import Tensor
 
 from splatmill.files import atomic_write
 from splatmill.schema import ModelFrame
+from splatmill.schema.quantities import listed
 from splatmill_worker.scene import Scene
 from splatmill_worker.splat.evaluate import Renderer, Score
 from splatmill_worker.splat.machine import machine, peak_memory, versions
@@ -231,7 +232,7 @@ def _unplaced(scene: Scene) -> list[str]:
     if not scene.left_out:
         return []
     names = [name for name, _ in scene.left_out]
-    shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    shown = listed(names, 5)
     photos = len({*names, *(view.name for view in scene.views)})
     verb = "is" if len(names) == 1 else "are"
     return [f"{len(names)} of {photos} photos {verb} not used: {shown}. The report lists the reasons."]

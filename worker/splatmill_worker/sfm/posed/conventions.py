@@ -1,0 +1,71 @@
+"""Conventions of camera matrices that are confused with those of a file: which of them explains the matches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from splatmill_worker.colmap import pycolmap
+from splatmill_worker.scene import Camera, Source
+from splatmill_worker.sfm.features import Features
+from splatmill_worker.sfm.matching.pairs import Pair
+from splatmill_worker.sfm.posed.searched import epipolar_errors
+
+Float = npt.NDArray[np.float64]
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Turns axes of OpenGL (x right, y up, z backward) into those of OpenCV (x right, y down, z forward), and back."""
+
+CONVENTIONS: dict[str, dict[str, Callable[[Float], npt.NDArray[Any]]]] = {
+    "transform_matrix is from camera to world, with OpenGL axes": {
+        "from camera to world with OpenCV axes": lambda given: FLIP @ given,
+        "from world to camera with OpenGL axes": lambda given: FLIP @ np.linalg.inv(given) @ FLIP,
+        "from world to camera with OpenCV axes": lambda given: np.linalg.inv(given) @ FLIP,
+    },
+    "a COLMAP model has poses from world to camera, with OpenCV axes": {
+        "from camera to world with OpenCV axes": lambda given: np.linalg.inv(given),
+        "from world to camera with OpenGL axes": lambda given: FLIP @ given,
+        "from camera to world with OpenGL axes": lambda given: FLIP @ np.linalg.inv(given),
+    },
+}
+"""By what a file has, what else its matrices may be, and the world-to-camera matrix that they then mean, made of that
+which was read."""
+
+CLEARLY = 2.0
+"""Factor by which another convention must explain more matches than that of the file."""
+
+
+def of_source(source: Source) -> str:
+    """What the files of a source have: a key of CONVENTIONS."""
+    transforms, model = CONVENTIONS
+    return model if source == "colmap" else transforms
+
+
+def better(
+    source: Source,
+    verified: Sequence[Pair],
+    cameras: Sequence[Camera],
+    features: Sequence[Features],
+    database: pycolmap.Database,
+    bound: float,
+) -> tuple[str, float]:
+    """The convention in which the cameras explain most of the matches, and the share of these; "" and 0 where that of
+    the file is as good as any.
+
+    bound: largest epipolar error of a match that is explained, pixels.
+    """
+
+    def share(changed: Callable[[Float], npt.NDArray[Any]]) -> float:
+        read = [replace(camera, viewmat=changed(camera.viewmat)) for camera in cameras]
+        errors = epipolar_errors(verified, read, features, database, in_front=True)
+        return float((errors <= bound).mean()) if len(errors) else 0.0
+
+    shares = {name: share(changed) for name, changed in CONVENTIONS[of_source(source)].items()}
+    best = max(shares, key=lambda name: shares[name])
+    if shares[best] < 0.5 or shares[best] < CLEARLY * share(lambda given: given):
+        return "", 0.0
+    return best, shares[best]
