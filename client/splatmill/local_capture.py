@@ -114,7 +114,8 @@ class Found:
 
 
 def find_files(path: str | os.PathLike[str]) -> Found:
-    """Find the files of the capture at `path`: a photo, a video, a zip archive, a folder of photos or a posed data set.
+    """Find the files of the capture at `path`: a photo, a video, a zip archive, a folder of photos, a posed data set or
+    a part of one (`_around`).
 
     In a folder, the photos are those under `images/`, named relative to it. Without `images/`, they are all photos in
     the folder, named relative to the folder, so that `train/r_0.png` keeps its name in `transforms_train.json`. Masks

@@ -65,11 +65,12 @@ def _photos() -> list[str]:
             ["format", "suffixes"], [[name, choices(suffixes)] for name, suffixes in PHOTO_FORMATS.items()]
         ),
         f"""Suffixes count in either case. A file in a zip is recognised by its content. The EXIF orientation is
-        applied. Of a file with several pictures, the first is used. Hidden files and folders are ignored, and so are
-        {choices(prepare.IGNORED_NAMES)}. A photo is left out, with the reason, if it is damaged or cut off, has the
-        same bytes as another one, has a side under {MIN_PHOTO_SIDE} pixels, or more than
-        {MAX_PHOTO_PIXELS // 10**6} million pixels. Of photos that are copies of one another, the largest is used, and
-        what never moves in {overlay.MIN_PHOTOS} or more photos is masked
+        applied. Of a file with several pictures, the first is used. Hidden files and folders are ignored, and
+        so are {choices(prepare.IGNORED_NAMES)}. A photo is left out, with the reason, if it is damaged or cut
+        off, has the same bytes as another one, has a side under {MIN_PHOTO_SIDE} pixels, or more than
+        {MAX_PHOTO_PIXELS // 10**6} million pixels, or is wholly transparent. Opaque photos among cut-outs are
+        named in a warning, and used. Of photos that are copies of one another, the largest is used, and what
+        never moves in {overlay.MIN_PHOTOS} or more photos is masked
         ([Photographing](photographing.md#copies-near-copies-and-what-never-moves)).
 
         Photos without EXIF are taken to be of one camera for each folder and each video. Where the motion of the camera
@@ -213,7 +214,8 @@ def _points() -> list[str]:
         these hardly more often than by chance, none is used, and the log says so. With fewer than
         {points.LEAST_POINTS}, points are triangulated with the given cameras. A warning says when the cameras explain
         less than {triangulation.CONTRADICTED:.0%} of the matches between photos: then the poses or the intrinsics are
-        wrong, or belong to other photos. It names another convention of axes or matrices in which they fit, if one does.""",
+        wrong, or belong to other photos. It names another convention of axes or matrices in which they fit, if one
+        does.""",
     ]
 
 

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -183,6 +184,32 @@ def blender(folder: Path) -> None:
         transforms(folder / f"transforms_{split}.json", of)
 
 
+def with_test_set(folder: Path) -> None:
+    photos(folder / "images")
+    transforms(folder / "transforms.json")
+    transforms(folder / "transforms_test.json", frames()[:2])
+
+
+def two_cameras(numbers: Sequence[int], folder: Path) -> None:
+    photos(folder / "images")
+    again = frames()
+    for number in numbers:
+        again[number]["transform_matrix"][0][3] += 0.5
+    transforms(folder / "transforms.json", frames() + again)
+
+
+def float_tiff(folder: Path) -> None:
+    plain(folder)
+    tags = ((258, 32), (277, 3), (339, 3))
+    rows = b"".join(struct.pack("<HHII", tag, 3, 1, value) for tag, value in tags)
+    (folder / "2.tif").write_bytes(b"II*\0" + struct.pack("<IH", 8, len(tags)) + rows + bytes(4))
+
+
+def clear(folder: Path) -> None:
+    plain(folder)
+    Image.new("RGBA", (64, 48)).save(folder / "4.png")
+
+
 MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
 
 EXAMPLES: tuple[Example, ...] = (
@@ -192,6 +219,8 @@ EXAMPLES: tuple[Example, ...] = (
     Example("Photos", "one photo is cut off", cut_off, "used with a remark"),
     Example("Photos", "one photo twice", twice, "used with a remark"),
     Example("Photos", "one picture of 12 x 90 pixels", small, "used with a remark"),
+    Example("Photos", "one TIFF of floating-point numbers", float_tiff, "used with a remark"),
+    Example("Photos", "one wholly transparent photo", clear, "used with a remark"),
     Example("Photos", "raw photos beside JPEGs", with_file("IMG_1.DNG IMG_2.DNG"), "used with a remark"),
     Example("Photos", "nothing but a raw photo", alone("IMG_1.CR3"), "refused"),
     Example("Photos", "a video beside photos", with_file("walk.mp4"), "used with a remark"),
@@ -237,6 +266,11 @@ EXAMPLES: tuple[Example, ...] = (
         "Cameras", "transforms.json with a byte-order mark", with_frames(lambda of: None, "utf-8-sig"), "used"
     ),
     Example("Cameras", "one frame without a matrix", with_frames(_set(None, 5)), "used with a remark"),
+    Example("Cameras", "transforms_test.json beside transforms.json", with_test_set, "used"),
+    Example(
+        "Cameras", "one photo of twelve with two cameras", partial(two_cameras, (3,)), "used with a remark"
+    ),
+    Example("Cameras", "two photos of twelve with two cameras", partial(two_cameras, (3, 5)), "refused"),
     Example("Cameras", "one mirrored pose of twelve", with_frames(_set(MIRRORED, 5)), "used with a remark"),
     Example("Cameras", "two mirrored poses of twelve", with_frames(_set(MIRRORED, 5, 6)), "refused"),
     Example("Cameras", "a depth picture beside each photo", with_depth, "used with a remark"),

@@ -7,15 +7,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatmill.schema.quantities import counted, listed
 from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.images import decoders
 from splatmill_worker.scene import MIN_SHOWN
 
 MAX_HIDDEN = 0.5
 """Share of the pixels of all photos that masks may hide without a warning."""
-
-NAMED = 5
-"""Names in a sentence, at most."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +65,8 @@ def judged(masks: Mapping[str, Path | None], unused: Collection[str]) -> Judged:
             advice="Draw in white (255) what is trained on, and in black (0) what is hidden, or leave the masks out.",
         )
     if hidden:
-        which = "1 mask hides" if len(hidden) == 1 else f"{len(hidden)} masks hide"
-        warnings.append(f"{which} all of a photo: {_listed(hidden)}.")
+        which = counted(len(hidden), "mask hides", "masks hide")
+        warnings.append(f"{which} all of a photo: {listed(sorted(hidden))}.")
     if not shares:
         return Judged(shown_from, (), tuple(warnings))
     share = sum(shares.values()) / len(shares)
@@ -85,12 +83,8 @@ def _unused(names: Collection[str]) -> list[str]:
     """A warning about masks that belong to no photo; none where there are none."""
     if not names:
         return []
-    belong = "1 mask belongs" if len(names) == 1 else f"{len(names)} masks belong"
-    return [f"{belong} to no photo by name, and no use is made of it: {_listed(names)}."]
-
-
-def _listed(names: Collection[str]) -> str:
-    return ", ".join(sorted(names)[:NAMED]) + (", ..." if len(names) > NAMED else "")
+    belong = counted(len(names), "mask belongs", "masks belong")
+    return [f"{belong} to no photo by name, and no use is made of it: {listed(sorted(names))}."]
 
 
 def _levels(mask: Path) -> list[int] | None:
