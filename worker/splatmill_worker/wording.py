@@ -8,7 +8,7 @@ import struct
 import zipfile
 import zlib
 
-MAX_LENGTH = 200
+MAX_LENGTH = 1000
 """Characters of a message that are shown."""
 
 JSON_FAULT = "line {} column {} is no JSON: a comma or a quote is missing or too many, or the file is cut off"

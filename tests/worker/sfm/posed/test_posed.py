@@ -129,7 +129,7 @@ def test_points_are_read_from_within_the_capture_alone(tmp_path: Path) -> None:
         found = posed.find(capture)
         assert found is not None
         scene = found.load()
-        return len(scene.points), scene.notes
+        return len(scene.points), scene.warnings
 
     assert points_named("../inside.ply") == (1, ())
     for name in ("../../outside.ply", str(tmp_path / "outside.ply"), "link.ply"):
