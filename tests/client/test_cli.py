@@ -134,6 +134,15 @@ def test_a_path_with_nothing_to_train(tmp_path: Path):
     assert "contains no photos" in done.stderr
 
 
+def test_a_single_photo_is_refused_before_anything_starts(tmp_path: Path):
+    (tmp_path / "a.jpg").write_bytes(b"x")
+    for path in (tmp_path, tmp_path / "a.jpg"):
+        done = invoke("train", path, "-o", tmp_path / "out")
+        assert done.exit_code == Exit.refused
+        assert "a.jpg is one photo; depth cannot be recovered" in done.stderr
+        assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.slow
 def test_train_on_a_server(service, photos: Path, tmp_path: Path):
     out = tmp_path / "out"
