@@ -1,11 +1,11 @@
-"""The environment variables of the server, from `splatmill_server.settings.Settings`."""
+"""The environment variables of the server, from `splatmill_server.base.settings.Settings`."""
 
 from pathlib import Path
 from typing import Any
 
 from docs.generate.markdown import code, table
 
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 
 INTRODUCTION = """# The server's settings
 

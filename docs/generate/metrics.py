@@ -1,4 +1,4 @@
-"""The metrics of the service, from `splatmill_server.metrics` and `splatmill_server.scrape`."""
+"""The metrics of the service, from `splatmill_server.base.metrics` and `splatmill_server.base.scrape`."""
 
 from typing import Any
 
@@ -6,8 +6,8 @@ from docs.generate.markdown import choices, code, table
 from prometheus_client.metrics_core import Metric
 
 from splatmill.backplane.totals import TOTALS
-from splatmill_server.metrics import OF_PROCESS, SAME, SMALLEST, Metrics
-from splatmill_server.scrape import families, of_disk, of_renderer
+from splatmill_server.base.metrics import OF_PROCESS, SAME, SMALLEST, Metrics
+from splatmill_server.base.scrape import families, of_disk, of_renderer
 
 INTRODUCTION = """# Metrics
 

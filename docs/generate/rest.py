@@ -9,7 +9,7 @@ from typing import Any
 from docs.generate.markdown import choices, code, table
 
 from splatmill_server.app import create_app
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 
 INTRODUCTION = """# REST reference
 

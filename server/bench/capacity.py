@@ -46,9 +46,9 @@ from splatmill.backplane import keys, memory
 from splatmill.backplane.connection import connect
 from splatmill.backplane.storage import Storage
 from splatmill_server.app import create_app
-from splatmill_server.paging import write_cursor
+from splatmill_server.base.paging import write_cursor
+from splatmill_server.base.settings import Settings
 from splatmill_server.service import Service
-from splatmill_server.settings import Settings
 
 HERE = Path(__file__).resolve().parent
 ROWS = HERE / "results" / "capacity.jsonl"

@@ -44,7 +44,7 @@ from _rows import Row, append, lines, origin
 from splatmill.backplane import keys, leases
 from splatmill.backplane.connection import connect
 from splatmill.backplane.entries import open_queue, split_rq_id
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 
 HERE = Path(__file__).resolve().parent
 ROWS = HERE / "results" / "fleet.jsonl"

@@ -32,7 +32,7 @@ from _rows import Row, append, footer, lines, origin
 from _still_life import posed_capture
 from _up import served
 
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 
 HERE = Path(__file__).resolve().parent
 ROWS = HERE / "results" / "openapi.jsonl"

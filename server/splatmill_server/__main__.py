@@ -23,7 +23,7 @@ from splatmill.backplane.redact import redacted
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill_server.access.exposure import NeedsKey
 from splatmill_server.app import create_app
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 
 log = structlog.get_logger()
 

@@ -14,13 +14,14 @@ from starlette.routing import BaseRoute
 
 import splatmill
 from splatmill.schema import CreateJob, EventRecord, Problem
-from splatmill_server import problems, root_path
 from splatmill_server.access.cors import pages_of_others
 from splatmill_server.access.exposure import check_exposure
 from splatmill_server.access.permission import PERMITTED, is_open
 from splatmill_server.access.sessions import COOKIE
+from splatmill_server.base import problems, root_path
+from splatmill_server.base.proxies import TrustedProxies
+from splatmill_server.base.settings import Settings
 from splatmill_server.middleware import RequestMiddleware
-from splatmill_server.proxies import TrustedProxies
 from splatmill_server.routes import (
     captures,
     edits,
@@ -41,7 +42,6 @@ from splatmill_server.routes import (
 )
 from splatmill_server.routes import keys as key_routes
 from splatmill_server.service import Service
-from splatmill_server.settings import Settings
 from splatmill_server.web import pages
 
 log = structlog.get_logger()

@@ -19,14 +19,14 @@ from splatmill.schema import Problem, format_bytes
 from splatmill.schema.headers import read_integer
 from splatmill_server.access.caller import NOBODY, Caller
 from splatmill_server.access.permission import is_open
-from splatmill_server.problems import (
+from splatmill_server.base.problems import (
     ProblemError,
     ProblemResponse,
     problem_of_redis,
     problem_of_storage,
     shown_path,
 )
-from splatmill_server.root_path import HEADER, locate, location, own_path
+from splatmill_server.base.root_path import HEADER, locate, location, own_path
 from splatmill_server.service import Service
 
 log = structlog.get_logger()

@@ -23,11 +23,12 @@ from splatmill.schema import (
     Response,
     StoredKind,
 )
-from splatmill_server.filters import Filter
+from splatmill_server.access.caller import Caller
+from splatmill_server.base.filters import Filter
+from splatmill_server.base.lists import Ended, Lists, each
+from splatmill_server.base.problems import ProblemError
+from splatmill_server.base.root_path import address
 from splatmill_server.jobs.records import Jobs, read_record
-from splatmill_server.lists import Ended, Lists, each
-from splatmill_server.problems import ProblemError
-from splatmill_server.root_path import address
 
 _HEADER_BYTES = 8192
 _VERTICES = re.compile(rb"^element vertex (\d+)\s*$", re.MULTILINE)
@@ -79,6 +80,11 @@ class Models:
                 facts={"job": job.id, "state": job.state.value},
             )
         raise model_not_found(model_id)
+
+    def check_visible(self, who: Caller, model_id: str) -> None:
+        """Raise a 404 problem if another owner has the model, or the job that is to make it."""
+        if not who.admin and not who.may_see(self.owner(model_id)):
+            raise model_not_found(model_id)
 
     def owner(self, model_id: str) -> str | None:
         """Return the owner of a model, or of the job that is to make it, or None if it cannot be read.

@@ -19,31 +19,32 @@ from splatmill_server.access.authentication import Authentication
 from splatmill_server.access.keys import Keys
 from splatmill_server.access.rate import Rate
 from splatmill_server.access.sessions import Sessions
-from splatmill_server.captures.imports import Imports
+from splatmill_server.admission import Admission
+from splatmill_server.background.conversions import Conversions
+from splatmill_server.background.deliveries import Deliveries
+from splatmill_server.background.imports import Imports
+from splatmill_server.background.orbits import Orbits
+from splatmill_server.background.reaper import Reaper
+from splatmill_server.background.relisting import Relisting
+from splatmill_server.background.sweeper import Sweeper
+from splatmill_server.base.feed import Feed
+from splatmill_server.base.lists import Lists
+from splatmill_server.base.metrics import Metrics
+from splatmill_server.base.outgoing import Outgoing
+from splatmill_server.base.renderer import CountingTransport
+from splatmill_server.base.settings import Settings
 from splatmill_server.captures.partial_uploads import PartialUploads
 from splatmill_server.captures.records import Captures
-from splatmill_server.conversions import Conversions
-from splatmill_server.feed import Feed
 from splatmill_server.jobs.finished import Finished
-from splatmill_server.jobs.reaper import Reaper
 from splatmill_server.jobs.records import Jobs
-from splatmill_server.lists import Lists
-from splatmill_server.metrics import Metrics
 from splatmill_server.models import Models
-from splatmill_server.orbits import Orbits
-from splatmill_server.outgoing import Outgoing
-from splatmill_server.renderer import CountingTransport
-from splatmill_server.settings import Settings
 from splatmill_server.shares import Shares
 from splatmill_server.space.deletion import Deletion
 from splatmill_server.space.ledger import Ledger
 from splatmill_server.space.quota import Quota
-from splatmill_server.space.relisting import Relisting
 from splatmill_server.space.retention import Ages
-from splatmill_server.space.sweeper import Sweeper
 from splatmill_server.space.usage import Usage
-from splatmill_server.webhooks.deliveries import Deliveries
-from splatmill_server.webhooks.records import Webhooks
+from splatmill_server.webhooks import Webhooks
 
 CHECK_SECONDS = 5.0
 """Seconds for which a check of storage holds: everybody may request `/readyz`, and each check writes a file."""
@@ -110,6 +111,7 @@ class Service:
     reaper: Reaper
     usage: Usage
     quota: Quota
+    admission: Admission
     deletion: Deletion
     relisting: Relisting
     sweeper: Sweeper
@@ -167,6 +169,7 @@ class Service:
             reaper=Reaper(connection, jobs, metrics, settings),
             usage=usage,
             quota=quota,
+            admission=Admission(storage, captures, jobs, models, quota),
             deletion=deletion,
             relisting=Relisting(connection, storage, captures, models, settings.reaper_interval),
             sweeper=Sweeper(usage, deletion, captures, models, _ages(settings), settings.sweep_interval),

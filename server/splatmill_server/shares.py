@@ -17,9 +17,9 @@ from splatmill.backplane import layout
 from splatmill.backplane.records import FORMAT, check_format, reason, warn
 from splatmill.backplane.storage import Storage
 from splatmill.schema import CreateShare, Response, Share, SharedModel, ShareWithToken, Time
+from splatmill_server.base.problems import ProblemError
+from splatmill_server.base.root_path import address
 from splatmill_server.models import Models
-from splatmill_server.problems import ProblemError
-from splatmill_server.root_path import address
 
 MAX_SHARES = 100
 """Links to one model that have not ended."""

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Page, expect
 
-from splatmill_server.root_path import HEADER
+from splatmill_server.base.root_path import HEADER
 from tests.browser.conftest import Open, SmallModel
 from tests.support import still_life
 from tests.support.path_proxy import path_proxy

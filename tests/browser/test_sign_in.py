@@ -12,8 +12,8 @@ import redis
 from playwright.sync_api import expect
 
 from splatmill.backplane.connection import connect
-from splatmill_server.root_path import HEADER
-from splatmill_server.settings import Settings
+from splatmill_server.base.root_path import HEADER
+from splatmill_server.base.settings import Settings
 from tests.browser.conftest import Open
 from tests.support.path_proxy import path_proxy
 from tests.support.redis_server import empty_redis

@@ -1,7 +1,7 @@
 """The model with its viewer in one HTML file, opened from the disk in a real browser without network: it draws what our
 renderer draws, and asks for nothing.
 
-Does not prove the address that hands it out (tests/server/test_conversions.py).
+Does not prove the address that hands it out (tests/server/background/test_conversions.py).
 """
 
 from __future__ import annotations

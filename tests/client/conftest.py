@@ -23,7 +23,7 @@ from splatmill.backplane.row import read
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Event, Job, JobState, Problem, StateEvent
 from splatmill_server.app import create_app
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 from tests.support.redis_server import empty_redis
 from tests.support.scripted_server import Reply, ScriptedServer, scripted_server
 

@@ -1,6 +1,6 @@
 """Imports through the SDK and through `splatmill import`, against the real server and a real other one.
 
-Not proved here: how a file is fetched, and what is refused (tests/server/captures/test_imports.py, test_outgoing.py).
+Not proved here: how a file is fetched, and what is refused (tests/server/background/test_imports.py, test_outgoing.py).
 """
 
 import asyncio
@@ -14,7 +14,7 @@ from splatmill.cli.app import app
 from splatmill.cli.exits import Exit
 from splatmill.errors import InvalidRequest, NotFound
 from splatmill.schema import ImportState, Progress
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 
 DATA = b"\xff\xd8\xff a photo" * 1000
 

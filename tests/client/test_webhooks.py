@@ -1,6 +1,6 @@
 """Webhooks through the SDK, synchronous and asynchronous, and through `splatmill webhooks`, against the real server.
 
-Not proved here: what is sent and when (tests/server/webhooks/test_webhooks.py).
+Not proved here: what is sent and when (tests/server/test_webhooks.py).
 """
 
 import asyncio
@@ -15,7 +15,7 @@ from splatmill.cli.app import app
 from splatmill.errors import InvalidRequest, NotFound
 from splatmill.schema import JobState, Problem, StateEvent, WebhookEvent
 from splatmill.webhooks import AsyncWebhooks, Webhooks
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 from tests.support.waiting import wait_for
 
 

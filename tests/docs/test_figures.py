@@ -17,18 +17,18 @@ from splatmill import chunked_uploads
 from splatmill.backplane import bucket, entries, events, leases, memory, storage
 from splatmill.backplane import keys as redis_keys
 from splatmill.schema import MAX_PHOTO_PIXELS, MIN_PHOTO_SIDE, CreateJob, TrainOptions
-from splatmill_server import lists as listing
-from splatmill_server import orbits, outgoing, paging
+from splatmill_server import webhooks
 from splatmill_server.access import keys
-from splatmill_server.captures import imports, records
+from splatmill_server.background import deliveries, imports, orbits, sweeper
+from splatmill_server.base import lists as listing
+from splatmill_server.base import outgoing, paging
+from splatmill_server.base.settings import Settings
+from splatmill_server.captures import records
 from splatmill_server.jobs import estimate, restoring
 from splatmill_server.jobs import records as jobs
 from splatmill_server.routes import job_live
-from splatmill_server.settings import Settings
-from splatmill_server.space import sweeper, usage
+from splatmill_server.space import usage
 from splatmill_server.up import supervisor
-from splatmill_server.webhooks import deliveries
-from splatmill_server.webhooks import records as webhooks
 from splatmill_worker import live, settings, time_lapse
 from splatmill_worker import memory as worker_memory
 from splatmill_worker.images import archive, guarded, video

@@ -11,7 +11,7 @@ import redis
 import structlog
 
 from splatmill.backplane.connection import connect
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 from tests.support.redis_server import empty_redis
 from tests.support.served_app import Serve, ServedApp, served_app
 

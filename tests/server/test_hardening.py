@@ -15,7 +15,7 @@ from splatmill.backplane.redact import redacted
 from splatmill_server import service
 from splatmill_server.access.exposure import NeedsKey
 from splatmill_server.app import create_app
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 from tests.support.served_app import Serve, ServedApp
 
 pytestmark = pytest.mark.slow  # a server for each case

@@ -18,7 +18,7 @@ from grafana_foundation_sdk.models.dashboard import Dashboard
 from prometheus_client.parser import text_string_to_metric_families
 
 from splatmill.schema import PROBLEMS
-from splatmill_server.scrape import SERVICE_FAULTS
+from splatmill_server.base.scrape import SERVICE_FAULTS
 from tests.support.paths import ROOT
 from tests.support.programs import program
 from tests.support.served_app import ServedApp

@@ -15,8 +15,8 @@ from splatmill.backplane.storage import StorageError
 from splatmill.schema import MAX_PHOTO_PIXELS, MAX_RENDER_PIXELS, TrainOptions
 from splatmill_server import app as app_module
 from splatmill_server.app import create_app
-from splatmill_server.settings import Settings
-from splatmill_server.space import sweeper
+from splatmill_server.background import sweeper
+from splatmill_server.base.settings import Settings
 from splatmill_server.space.usage import Usage
 from tests.support.served_app import Serve, ServedApp, problem, served_app
 from tests.support.waiting import wait_for

@@ -18,8 +18,8 @@ from fastapi import FastAPI
 from splatmill.backplane import events, layout, lists, row
 from splatmill.schema import DEFAULT_OWNER, Event, JobState, StateEvent, TrainOptions
 from splatmill_server.app import create_app
+from splatmill_server.base.settings import Settings
 from splatmill_server.service import Service
-from splatmill_server.settings import Settings
 from tests.support.waiting import wait_for
 
 

@@ -15,9 +15,9 @@ from _capacity.operations import counted
 from _fleet.pipeline import SCRIPT
 from splatmill.backplane import keys
 from splatmill_server.app import create_app
+from splatmill_server.base.settings import Settings
 from splatmill_server.jobs import shrinking
 from splatmill_server.service import Service
-from splatmill_server.settings import Settings
 
 LOOK_SECONDS = 2.0
 """Seconds between two looks of the reaper while jobs end. The service takes ten by default."""

@@ -15,8 +15,8 @@ from splatmill_server.access.browsers import check_host, check_origin
 from splatmill_server.access.caller import BOOTSTRAP, KEYLESS, Caller
 from splatmill_server.access.keys import CACHE_SECONDS, Keys, digest
 from splatmill_server.access.sessions import COOKIE, Session, Sessions
-from splatmill_server.problems import ProblemError
-from splatmill_server.settings import Settings
+from splatmill_server.base.problems import ProblemError
+from splatmill_server.base.settings import Settings
 
 
 class Authentication:

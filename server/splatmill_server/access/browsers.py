@@ -15,8 +15,8 @@ from starlette.datastructures import Headers
 from starlette.types import Scope
 
 from splatmill_server.access.permission import SAFE_METHODS
-from splatmill_server.problems import ProblemError
-from splatmill_server.settings import is_loopback
+from splatmill_server.base.problems import ProblemError
+from splatmill_server.base.settings import is_loopback
 
 _PORTS = {"http": 80, "https": 443}
 

@@ -1,7 +1,7 @@
 """Refuses to serve without keys where other machines could connect."""
 
 from splatmill_server.access.keys import Keys
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 
 
 class NeedsKey(ValueError):

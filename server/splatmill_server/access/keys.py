@@ -23,7 +23,7 @@ from splatmill.backplane.records import FORMAT, check_format, reason, warn
 from splatmill.backplane.storage import Storage
 from splatmill.backplane.storage_errors import StorageBusyError, StorageStalledError
 from splatmill.schema import CreateKey, Key, KeyWithSecret, Scope, Time
-from splatmill_server.problems import ProblemError
+from splatmill_server.base.problems import ProblemError
 
 CACHE_SECONDS = 2.0
 """Seconds after which every API process knows of a change to the keys, and so the longest life of a revoked key."""

@@ -8,8 +8,8 @@ from fastapi import Depends, Request
 
 from splatmill.schema import Scope
 from splatmill_server.access.caller import Caller, Who
-from splatmill_server.problems import ProblemError
-from splatmill_server.root_path import own_path
+from splatmill_server.base.problems import ProblemError
+from splatmill_server.base.root_path import own_path
 
 _OPEN = re.compile(
     r"/|/(healthz|readyz|openapi\.json|docs)|/(jobs|models)(/[^/]*)?|/sign-in|/(page|vendor|s)/.*", re.ASCII

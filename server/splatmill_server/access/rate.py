@@ -14,7 +14,7 @@ from redis.asyncio import Redis as AsyncRedis
 
 from splatmill.backplane import keys
 from splatmill_server.access.caller import Caller
-from splatmill_server.problems import ProblemError
+from splatmill_server.base.problems import ProblemError
 
 log = structlog.get_logger()
 

@@ -11,7 +11,7 @@ from starlette.responses import Response, StreamingResponse
 
 from splatmill.backplane.storage import Entry, Storage, joined
 from splatmill.backplane.storage_errors import StorageChangedError
-from splatmill_server.problems import ProblemError
+from splatmill_server.base.problems import ProblemError
 
 _RANGE = re.compile(r"\s*bytes\s*=\s*([0-9]{0,19})-([0-9]{0,19})\s*", re.ASCII | re.IGNORECASE)
 """A single range of bytes. Some clients name the largest integer of 64 bits for the end of the file."""

@@ -12,7 +12,7 @@ from starlette.responses import Response, StreamingResponse
 from splatmill.backplane import rendering
 from splatmill.schema.headers import read_token
 from splatmill_server.access.caller import Caller
-from splatmill_server.renderer import post
+from splatmill_server.base.renderer import post
 
 _PASSED_BACK = (
     "content-type",

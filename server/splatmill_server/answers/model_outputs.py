@@ -11,7 +11,7 @@ from splatmill.schema import RenderRequest
 from splatmill_server.access.caller import Caller
 from splatmill_server.answers.files import file_response
 from splatmill_server.answers.forward import CLIENT_GONE, forward, while_connected
-from splatmill_server.conversions import format_of_key
+from splatmill_server.background.conversions import format_of_key
 from splatmill_server.service import Service
 
 

@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path, PurePosixPath
 
 from splatmill.schema import ModelCameras
-from splatmill_server.problems import ProblemError
+from splatmill_server.base.problems import ProblemError
 
 WEB = Path(__file__).parents[1] / "web"
 """Where the viewer lies: `page/viewer.js` with what it imports, and PlayCanvas in `vendor/`."""

@@ -20,7 +20,7 @@ from splatmill.backplane.fold import Fold
 from splatmill.backplane.records import UnreadableRecord, warn
 from splatmill.backplane.row import JobRow
 from splatmill.schema import EventRecord, Job, JobState, StateEvent, Time
-from splatmill_server.feed import Batch, Row, is_beyond
+from splatmill_server.base.feed import Batch, Row, is_beyond
 from splatmill_server.service import Service
 
 _ENTRY = r"\d{1,19}-\d{1,19}"

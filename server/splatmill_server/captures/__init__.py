@@ -1,1 +1,1 @@
-"""Captures: their records and files, uploads in parts, and imports from web addresses."""
+"""Captures: their records, files and uploads in parts."""

@@ -25,6 +25,7 @@ from splatmill.backplane.records import FORMAT
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import CaptureFile, Response, Role, Time
 from splatmill.schema.uploads import UPLOAD_COMPLETE, UPLOAD_OFFSET, write_boolean
+from splatmill_server.base.problems import ProblemError, problem_of_storage
 from splatmill_server.captures.records import (
     STALE_SECONDS,
     Captures,
@@ -34,7 +35,6 @@ from splatmill_server.captures.records import (
     too_large,
 )
 from splatmill_server.captures.unfinished_uploads import UnfinishedUploads
-from splatmill_server.problems import ProblemError, problem_of_storage
 
 _Key = tuple[str, str]
 """Ids of a capture and of an upload. The id of an upload alone is the same in every capture that gets the same file."""

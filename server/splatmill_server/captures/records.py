@@ -20,7 +20,6 @@ from splatmill.backplane.storage import Storage, StorageError, StorageFullError
 from splatmill.backplane.storage_errors import StorageBusyError
 from splatmill.schema import (
     DEFAULT_OWNER,
-    PHOTO_SUFFIXES,
     Capture,
     CaptureFile,
     CapturePage,
@@ -31,14 +30,14 @@ from splatmill.schema import (
     may_be_empty,
     safe_name,
 )
-from splatmill.schema.formats import is_model_file
 from splatmill.schema.tolerant import keep_readable
+from splatmill_server.access.caller import Caller
+from splatmill_server.base.filters import Filter
+from splatmill_server.base.lists import Lists, each
+from splatmill_server.base.metrics import Metrics
+from splatmill_server.base.problems import ProblemError, problem_of_storage
+from splatmill_server.base.settings import Settings
 from splatmill_server.captures.digests import Digests
-from splatmill_server.filters import Filter
-from splatmill_server.lists import Lists, each
-from splatmill_server.metrics import Metrics
-from splatmill_server.problems import ProblemError, problem_of_storage
-from splatmill_server.settings import Settings
 
 log = structlog.get_logger()
 
@@ -90,7 +89,7 @@ class Captures:
         capture = Capture(id=capture_id, name=name, owner=owner, created_at=datetime.now(UTC))
         record = json.dumps(capture.model_dump(mode="json", exclude={"files"}) | {"format": FORMAT}).encode()
         # Listed only once it is stored, so that a refused capture leaves no entry in the lists. Where storage does not
-        # tell whether it stored the record, `space.relisting` finds out.
+        # tell whether it stored the record, `background.relisting` finds out.
         try:
             made = self.storage.put_new(layout.capture_record(capture.id), record)
         except (StorageFullError, StorageBusyError):
@@ -104,7 +103,7 @@ class Captures:
         return capture, made
 
     def _list_new(self, capture: Capture) -> None:
-        """List a capture. Captures can be made and filled without Redis: `space.relisting` lists those."""
+        """List a capture. Captures can be made and filled without Redis: `background.relisting` lists those."""
         try:
             self._list([capture])
         except redis.RedisError as error:
@@ -138,6 +137,17 @@ class Captures:
                 self._recent.clear()
             self._recent[capture_id] = time.monotonic(), capture
         return capture
+
+    def check_visible(self, who: Caller, capture_id: str) -> None:
+        """Raise a 404 problem if another owner has the capture, but not if there is none."""
+        if who.admin:
+            return
+        try:
+            owner = self.recent(capture_id).owner
+        except UnreadableRecord:
+            owner = None
+        if not who.may_see(owner):
+            raise capture_not_found(capture_id)
 
     async def read(self, capture_id: str) -> Capture:
         """Return the record with all files and their digests. Raises a 404 problem."""
@@ -243,39 +253,6 @@ class Captures:
             for upload_id in self.storage.children(layout.capture_uploads(capture_id)):
                 deleted += self.storage.delete_unused(layout.upload(capture_id, upload_id), STALE_SECONDS)
         return deleted
-
-    def check_trainable(self, capture_id: str) -> None:
-        """Raise a 404 or 422 problem for a capture that certainly cannot be trained: it has no photos, or only one."""
-        self.record(capture_id)
-        images = list(self.storage.entries(layout.capture_files(capture_id, Role.images)))
-        if not images:
-            raise ProblemError(
-                "no_images",
-                "The capture holds no images.",
-                advice="Upload photos, a video or a zip archive with PUT "
-                "/v1/captures/{id}/images/{name} first.",
-            )
-        photos = all(entry.path.lower().endswith(PHOTO_SUFFIXES) for entry in images)
-        poses = self.storage.entries(layout.capture_files(capture_id, Role.poses))
-        posed = any(not is_model_file(entry.path) for entry in poses)  # a model to start from is no pose
-        if len(images) == 1 and photos and not posed:
-            raise ProblemError(
-                "too_few_images",
-                "The capture holds one photo; depth cannot be recovered from a single photo.",
-                advice="Take 20 or more photos from different positions, each overlapping the next by "
-                "two thirds.",
-                facts={"images": 1},
-            )
-
-    def check_start_file(self, capture_id: str, name: str) -> None:
-        """Raise a 404 problem if a model to start from is not among the poses of the capture."""
-        if not self.storage.exists(layout.capture_file(capture_id, Role.poses, name)):
-            raise ProblemError(
-                "file_not_found",
-                f"The model to start from, {name[:80]!r}, is not among the poses of the capture.",
-                advice="Upload it with PUT /v1/captures/{id}/poses/{name} first, or give the id of a "
-                "stored model.",
-            )
 
     async def store(
         self,

@@ -7,8 +7,8 @@ from weakref import WeakValueDictionary
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage
-from splatmill_server.lists import each
-from splatmill_server.problems import ProblemError
+from splatmill_server.base.lists import each
+from splatmill_server.base.problems import ProblemError
 
 MAX_UNFINISHED = 100
 """Uploads of one capture that may be unfinished at once. One that is left stays for a day."""

@@ -1,1 +1,1 @@
-"""Jobs: their records, logs and places in the queue, and the reaper that repairs what workers cannot."""
+"""Jobs: their records, logs, curves and places in the queue."""

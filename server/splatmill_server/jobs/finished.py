@@ -8,7 +8,7 @@ from typing import Any
 
 from splatmill.backplane import layout, lists
 from splatmill.backplane.storage import Storage
-from splatmill_server.lists import Lists
+from splatmill_server.base.lists import Lists
 
 NEWEST = 40
 """Number of the newest models that are looked at. Older ones tell of earlier versions and machines."""

@@ -1,7 +1,7 @@
 """The addresses of what belongs to a job."""
 
 from splatmill.schema import Job
-from splatmill_server.root_path import address
+from splatmill_server.base.root_path import address
 
 
 def with_links(job: Job) -> Job:

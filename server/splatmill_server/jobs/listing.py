@@ -8,11 +8,11 @@ import redis
 
 from splatmill.backplane import keys, lists
 from splatmill.schema import JobPage
-from splatmill_server.filters import JobFilter
+from splatmill_server.base.filters import JobFilter
+from splatmill_server.base.lists import Lists
 from splatmill_server.jobs.links import with_links
 from splatmill_server.jobs.queue_places import QueuePlaces
 from splatmill_server.jobs.reading import Held, read_jobs
-from splatmill_server.lists import Lists
 
 # ARGV: number of states, states, jobs. For each job: whether it may be in one of the states (in any, if none is given),
 # and the fields of its row. A verdict and a restart say more than the states do, so that such jobs are always likely.

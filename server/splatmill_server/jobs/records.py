@@ -18,19 +18,19 @@ from splatmill.backplane.fold import fold
 from splatmill.backplane.records import UnreadableRecord, check_format, reason, warn
 from splatmill.backplane.row import JobRow, Verdict
 from splatmill.backplane.storage import Storage, StorageError
-from splatmill.schema import DEFAULT_OWNER, CreateJob, Job, JobPage, JobState, Problem, StoredKind
+from splatmill.schema import DEFAULT_OWNER, CreateJob, Job, JobPage, JobState, Problem
 from splatmill.schema.tolerant import keep_readable
-from splatmill_server.filters import JobFilter
+from splatmill_server.access.caller import Caller
+from splatmill_server.base.filters import JobFilter
+from splatmill_server.base.lists import Ended, Lists
+from splatmill_server.base.metrics import Metrics
+from splatmill_server.base.problems import ProblemError
 from splatmill_server.jobs import curve as job_curve
 from splatmill_server.jobs import listing, outcome, requests, restoring, shrinking
 from splatmill_server.jobs import log as job_log
 from splatmill_server.jobs.links import with_links
 from splatmill_server.jobs.queue_places import QueuePlaces
 from splatmill_server.jobs.reading import read_jobs
-from splatmill_server.lists import Ended, Lists
-from splatmill_server.metrics import Metrics
-from splatmill_server.problems import ProblemError
-from splatmill_server.space.marks import DELETING, check_marks, mark_keys, needs_of
 
 log = structlog.get_logger()
 
@@ -61,11 +61,13 @@ class Jobs:
         owner: str,
         key: str | None = None,
         body: str = "",
-        most: int | None = None,
+        check: Callable[[], None] | None = None,
+        watched: Sequence[str] = (),
     ) -> tuple[Job, bool]:
         """Create a job; return it, and whether it is new.
 
-        most: number of unfinished jobs that the owner may have; with as many, raise a 429 problem.
+        check: raises what keeps the job from being made. It is called in the transaction that inserts the job, and
+            again if one of the keys `watched`, or the number of jobs that the owner has begun, changed meanwhile.
 
         With an `Idempotency-Key` that this owner used before, return the job of that request. `body` identifies the
         request: the same key with another body raises a 409 problem.
@@ -87,14 +89,12 @@ class Jobs:
         )
         if (known := row.read(self.connection, job_id)) is not None:
             return self._placed(known), False
-        needs = needs_of(request.capture, request.options)
 
         def insert(pipe: Any) -> None:
             nonlocal known
             known = row.read(self.connection, job_id)
-            if known is None:
-                check_marks(self.connection, self.storage, needs)
-                self._check_room(owner, most)
+            if known is None and check is not None:
+                check()
             pipe.multi()
             if known is None:
                 pipe.incr(keys.begun_jobs(owner))
@@ -105,9 +105,8 @@ class Jobs:
 
         requests.keep(self.storage, new)
         try:
-            # Of two concurrent requests with the same key, only one inserts the job. No job is inserted whose capture
-            # is being deleted.
-            self.connection.transaction(insert, keys.job(job_id), keys.begun_jobs(owner), *mark_keys(needs))
+            # Of two concurrent requests with the same key, only one inserts the job.
+            self.connection.transaction(insert, keys.job(job_id), keys.begun_jobs(owner), *watched)
         except BaseException:
             self.storage.delete(layout.watched_job(job_id))
             raise
@@ -138,6 +137,11 @@ class Jobs:
         if found is None:
             raise job_not_found(job_id)
         return found
+
+    def check_visible(self, who: Caller, job_id: str) -> None:
+        """Raise a 404 problem if another owner has the job, but not if there is none."""
+        if not who.admin and not who.may_see(self.owner(job_id)):
+            raise job_not_found(job_id)
 
     def owner(self, job_id: str) -> str | None:
         """Return the owner of a job, or None if there is no such job or its owner cannot be read."""
@@ -281,16 +285,6 @@ class Jobs:
         own = [entry.decode() for entry in cast(list[bytes], self.connection.zrange(named, 0, -1))]
         return len(own) - sum(held.state.final for held in read_jobs(self.connection, own).values())
 
-    def _check_room(self, owner: str, most: int | None) -> None:
-        """Raise a 429 problem if the owner has `most` unfinished jobs. The caller watches `begun_jobs` of the owner."""
-        if most is not None and (count := self.unfinished_of(owner)) >= most:
-            raise ProblemError(
-                "too_many_jobs",
-                f"The owner {owner!r} has {count} unfinished jobs, and its API key permits {most} at once.",
-                advice="Wait until one has ended, or cancel one with POST /v1/jobs/{id}/cancel.",
-                facts={"unfinished_jobs": count, "limit": most},
-            )
-
     def cancel(self, job_id: str) -> Job:
         """Record the request to cancel a job. The reaper then kills its process and ends the job."""
 
@@ -316,27 +310,16 @@ class Jobs:
         found = self.row(job_id)
         return self._placed(found) if _waits(found, self._job(found)) else None
 
-    def restart(self, job_id: str, *, most: int | None = None) -> Job:
+    def restart(self, job_id: str, *, check: Callable[[], None], watched: Sequence[str]) -> Job:
         """Enqueue a job that has ended as a new generation, which resumes from its checkpoint if there is one.
 
-        most: number of unfinished jobs that the owner may have; with as many, raise a 429 problem.
+        check, watched: as for `create`.
         """
-        known = self.row(job_id)
-        needs = [*needs_of(known.capture, known.options), (StoredKind.model, job_id)]
 
         def begin_generation(found: JobRow, job: Job) -> dict[str, str] | None:
             if _waits(found, job):
                 return None  # a repeated restart has no further effect
-            if not self.storage.exists(layout.capture_record(found.capture)):
-                raise ProblemError(
-                    "capture_not_found",
-                    f"The job's capture {found.capture} was deleted.",
-                    advice="Upload the photos again and create a new job.",
-                )
-            check_marks(self.connection, self.storage, needs[:-1])
-            if self.connection.get(mark_keys(needs)[-1]) == DELETING:
-                raise job_not_found(job_id)
-            self._check_room(found.owner, most)
+            check()
             moment = row.now()
             requests.keep(self.storage, requests.next_generation(found, moment, _request_id()))
             return {
@@ -348,7 +331,7 @@ class Jobs:
             }
 
         self._announce_unretired(job_id)
-        self._change(job_id, begin_generation, *mark_keys(needs), begun=keys.begun_jobs(known.owner))
+        self._change(job_id, begin_generation, *watched, begun=keys.begun_jobs(self.row(job_id).owner))
         begun = self.row(job_id)
         requests.keep(self.storage, begun)  # again: the end of the former generation may just have removed it
         queue.enqueue(self.connection, job_id, begun.generation)

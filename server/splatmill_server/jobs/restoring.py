@@ -15,10 +15,10 @@ from splatmill.backplane.records import FORMAT
 from splatmill.backplane.row import JobRow, Verdict
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Event, Job, JobState, PlanEvent, ProgressEvent, StateEvent, StoredKind
+from splatmill_server.base.lists import Ended, Lists, each
 from splatmill_server.jobs import log as job_log
 from splatmill_server.jobs import requests, shrinking
 from splatmill_server.jobs.reading import read_jobs
-from splatmill_server.lists import Ended, Lists, each
 
 log = structlog.get_logger()
 

@@ -10,9 +10,9 @@ from splatmill.schema import SHA256_HEADER, Capture, CaptureFile, CapturePage, C
 from splatmill.schema.headers import read_integer
 from splatmill.schema.uploads import UPLOAD_COMPLETE, UPLOAD_LENGTH, read_boolean
 from splatmill_server.access.caller import Who
-from splatmill_server.filters import Filter
-from splatmill_server.paging import DEFAULT_LIMIT
-from splatmill_server.problems import ProblemError
+from splatmill_server.base.filters import Filter
+from splatmill_server.base.paging import DEFAULT_LIMIT
+from splatmill_server.base.problems import ProblemError
 from splatmill_server.routes import uploads
 from splatmill_server.routes.openapi import CAPTURE_EXAMPLE, answer, example, problems
 from splatmill_server.routes.ownership import CaptureId, ListedOwner

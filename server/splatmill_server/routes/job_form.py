@@ -1,7 +1,6 @@
 """`POST /v1/jobs` with a form: uploads photos and starts a job in one request."""
 
 import unicodedata
-from contextlib import nullcontext
 
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
@@ -12,10 +11,9 @@ from starlette.requests import Request
 from splatmill.backplane import events, row
 from splatmill.schema import CaptureFile, CreateJob, Job, LogEvent, Role, storable_name
 from splatmill_server.access.caller import Caller
+from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.records import fingerprints
-from splatmill_server.problems import ProblemError
 from splatmill_server.routes.multipart import Part, read_parts
-from splatmill_server.routes.ownership import check_model
 from splatmill_server.service import Service
 from splatmill_server.space.quota import bytes_beside
 
@@ -37,10 +35,10 @@ async def create_from_form(
     try:
         files, fields, renamed = await _receive(service, who, request, capture.id)
         create = _request(capture.id, fields)
-        await run_in_threadpool(service.captures.check_trainable, capture.id)
-        await run_in_threadpool(check_start_model, service, who, create)
         described = create.described(with_capture=False) + "\n".join(fingerprints(files))
-        job, new = await run_in_threadpool(create_job_in_room, service, who, create, key, described)
+        job, new = await run_in_threadpool(
+            lambda: service.admission.create(who, create, key=key, body=described)
+        )
         kept = job.capture == capture.id
         if new:
             await run_in_threadpool(_log_renamed, service, job.id, renamed)
@@ -48,29 +46,6 @@ async def create_from_form(
     finally:
         if not kept:
             await run_in_threadpool(service.deletion.unused_capture, capture)
-
-
-def create_job_in_room(
-    service: Service, who: Caller, create: CreateJob, key: str | None, body: str, *, is_new: bool = True
-) -> tuple[Job, bool]:
-    """Create a job with room for what it will store; return it, and whether it is new. One that is not needs none."""
-    with service.quota.job(who, who.owner) if is_new else nullcontext() as keep_room:
-        job, new = service.jobs.create(
-            create, owner=who.owner, key=key, body=body, most=who.limits.unfinished_jobs
-        )
-        if new and keep_room is not None:
-            keep_room(job.id)
-    return job, new
-
-
-def check_start_model(service: Service, who: Caller, create: CreateJob) -> None:
-    """Raise a problem if the model to start from, where the request names one, is not there for the caller."""
-    options = create.options
-    if options.start_file is not None:
-        service.captures.check_start_file(create.capture, options.start_file)
-    elif options.start_model is not None:
-        check_model(service, who, options.start_model)
-        service.models.check(options.start_model)
 
 
 async def _receive(

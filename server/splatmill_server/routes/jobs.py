@@ -10,12 +10,12 @@ from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import IDEMPOTENCY_HEADER, CreateJob, Job, JobPage, JobState
 from splatmill_server.access.caller import Caller, Who
-from splatmill_server.filters import JobFilter
-from splatmill_server.paging import DEFAULT_LIMIT
-from splatmill_server.problems import ProblemError
-from splatmill_server.routes.job_form import check_start_model, create_from_form, create_job_in_room
+from splatmill_server.base.filters import JobFilter
+from splatmill_server.base.paging import DEFAULT_LIMIT
+from splatmill_server.base.problems import ProblemError
+from splatmill_server.routes.job_form import create_from_form
 from splatmill_server.routes.openapi import JOB_REQUESTS, answer, problems
-from splatmill_server.routes.ownership import JobId, ListedOwner, check_capture
+from splatmill_server.routes.ownership import JobId, ListedOwner
 from splatmill_server.routes.requests import Cursor, Limit, NamePart
 from splatmill_server.service import Service, Shared
 
@@ -110,17 +110,9 @@ async def _create_from_json(service: Service, who: Caller, body: bytes, key: str
     except ValidationError as error:
         raise RequestValidationError(_located(error)) from error
 
-    def make() -> tuple[Job, bool]:
-        # A repeated request returns its job even if the capture was deleted meanwhile.
-        known = service.jobs.id_of_key(who.owner, key) if key is not None else None
-        is_new = known is None or service.jobs.owner(known) is None
-        if is_new:
-            check_capture(service, who, create.capture)
-            service.captures.check_trainable(create.capture)
-            check_start_model(service, who, create)
-        return create_job_in_room(service, who, create, key, create.described(), is_new=is_new)
-
-    return await run_in_threadpool(make)
+    return await run_in_threadpool(
+        lambda: service.admission.create(who, create, key=key, body=create.described())
+    )
 
 
 def _located(error: ValidationError) -> list[Any]:
@@ -184,9 +176,4 @@ async def cancel_job(service: Shared, job_id: JobId) -> Job:
 )
 def restart_job(service: Shared, who: Who, job_id: JobId) -> Job:
     """Run a job that has ended again, with the same options, from its last checkpoint if there is one."""
-    if (waiting := service.jobs.waiting(job_id)) is not None:
-        return waiting
-    with service.quota.job(who, service.jobs.owner(job_id) or who.owner) as keep_room:
-        restarted = service.jobs.restart(job_id, most=who.limits.unfinished_jobs)
-        keep_room(job_id)
-    return restarted
+    return service.admission.restart(who, job_id)

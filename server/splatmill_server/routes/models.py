@@ -22,8 +22,8 @@ from splatmill_server.access.permission import needs
 from splatmill_server.answers.forward import CLIENT_GONE, forward, while_connected
 from splatmill_server.answers.model_outputs import model_file, model_in_format, rendered_by_query
 from splatmill_server.answers.single_file import single_file
-from splatmill_server.filters import Filter
-from splatmill_server.paging import DEFAULT_LIMIT
+from splatmill_server.base.filters import Filter
+from splatmill_server.base.paging import DEFAULT_LIMIT
 from splatmill_server.routes.openapi import CAMERA, RENDER_REQUESTS, answer, binary, problems
 from splatmill_server.routes.ownership import ListedOwner, ModelId
 from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit, NamePart

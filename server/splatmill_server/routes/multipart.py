@@ -11,7 +11,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import Request
 
-from splatmill_server.problems import ProblemError, body_cut_off
+from splatmill_server.base.problems import ProblemError, body_cut_off
 
 _MAX_FIELD_BYTES = 1 << 20
 

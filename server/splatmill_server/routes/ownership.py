@@ -10,57 +10,27 @@ from typing import Annotated
 from fastapi import Depends, Path, Query
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane.records import UnreadableRecord
 from splatmill_server.access.caller import Caller, Who
-from splatmill_server.captures.records import capture_not_found
-from splatmill_server.jobs.records import job_not_found
-from splatmill_server.models import model_not_found
-from splatmill_server.service import Service, Shared
+from splatmill_server.service import Shared
 
 
-def check_capture(service: Service, who: Who, capture_id: str) -> None:
-    """Raise a 404 problem if another owner has the capture; the endpoint finds out whether it exists at all."""
-    if who.admin:
-        return
-    try:
-        owner = service.captures.recent(capture_id).owner
-    except UnreadableRecord:
-        owner = None
-    if not who.may_see(owner):
-        raise capture_not_found(capture_id)
-
-
-def check_job(service: Service, who: Who, job_id: str) -> None:
-    """Raise a 404 problem if another owner has the job; the endpoint finds out whether it exists at all."""
-    if not who.admin and not who.may_see(service.jobs.owner(job_id)):
-        raise job_not_found(job_id)
-
-
-def check_model(service: Service, who: Who, model_id: str) -> None:
-    """Raise a 404 problem if another owner has the model, or the job that is to make it."""
-    if not who.admin and not who.may_see(service.models.owner(model_id)):
-        raise model_not_found(model_id)
-
-
-async def _off_the_loop(
-    check: Callable[[Service, Caller, str], None], service: Service, who: Caller, found: str
-) -> str:
+async def _off_the_loop(check: Callable[[Caller, str], None], who: Caller, found: str) -> str:
     """Check in a thread of the pool what an admin needs no check for, and return the id."""
     if not who.admin:
-        await run_in_threadpool(check, service, who, found)
+        await run_in_threadpool(check, who, found)
     return found
 
 
 async def _capture_id(
     service: Shared, who: Who, capture_id: Annotated[str, Path(description="Id of the capture.")]
 ) -> str:
-    return await _off_the_loop(check_capture, service, who, capture_id)
+    return await _off_the_loop(service.captures.check_visible, who, capture_id)
 
 
 async def _job_id(
     service: Shared, who: Who, job_id: Annotated[str, Path(description="Id of the job.")]
 ) -> str:
-    return await _off_the_loop(check_job, service, who, job_id)
+    return await _off_the_loop(service.jobs.check_visible, who, job_id)
 
 
 async def _model_id(
@@ -68,7 +38,7 @@ async def _model_id(
     who: Who,
     model_id: Annotated[str, Path(description="Id of the model, which is that of its job.")],
 ) -> str:
-    return await _off_the_loop(check_model, service, who, model_id)
+    return await _off_the_loop(service.models.check_visible, who, model_id)
 
 
 async def _listed_owner(

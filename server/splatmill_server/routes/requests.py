@@ -4,8 +4,8 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 
-from splatmill_server.paging import MAX_LIMIT
-from splatmill_server.problems import ProblemError
+from splatmill_server.base.paging import MAX_LIMIT
+from splatmill_server.base.problems import ProblemError
 
 Cursor = Annotated[
     str | None,

@@ -10,8 +10,8 @@ from splatmill_server.access.caller import Who
 from splatmill_server.access.keys import digest
 from splatmill_server.access.permission import needs
 from splatmill_server.access.sessions import COOKIE, Session
-from splatmill_server.problems import ProblemError
-from splatmill_server.root_path import address
+from splatmill_server.base.problems import ProblemError
+from splatmill_server.base.root_path import address
 from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.service import Shared
 

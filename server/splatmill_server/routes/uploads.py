@@ -23,9 +23,9 @@ from splatmill.schema.uploads import (
     write_boolean,
 )
 from splatmill_server.access.caller import Caller, Who
+from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.partial_uploads import Standing
 from splatmill_server.captures.records import STALE_SECONDS
-from splatmill_server.problems import ProblemError
 from splatmill_server.routes.openapi import Responses, answer, problems
 from splatmill_server.routes.ownership import CaptureId
 from splatmill_server.service import Service, Shared

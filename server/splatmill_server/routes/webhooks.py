@@ -8,13 +8,13 @@ from starlette.responses import Response
 
 from splatmill.schema import CreateWebhook, Delivery, DeliveryList, Webhook, WebhookList, WebhookWithSecret
 from splatmill_server.access.caller import Who
-from splatmill_server.outgoing import OutgoingError
-from splatmill_server.problems import ProblemError
+from splatmill_server.base.outgoing import OutgoingError
+from splatmill_server.base.problems import ProblemError
 from splatmill_server.routes.openapi import problems
 from splatmill_server.routes.ownership import ListedOwner
 from splatmill_server.routes.requests import JSON_ONLY
 from splatmill_server.service import Shared
-from splatmill_server.webhooks.records import webhook_not_found
+from splatmill_server.webhooks import webhook_not_found
 
 router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 

@@ -15,13 +15,15 @@ from splatmill.backplane import keys, layout, lists
 from splatmill.backplane.records import UnreadableRecord
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Capture, StoredKind
+from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.records import Captures
 from splatmill_server.jobs.records import Jobs
-from splatmill_server.problems import ProblemError
 from splatmill_server.space.holdings import Holding
 from splatmill_server.space.job_uses import JobUse, unfinished_jobs
 from splatmill_server.space.ledger import Ledger
-from splatmill_server.space.marks import DELETED, DELETING
+
+DELETING, DELETED = b"deleting", keys.DELETED
+"""Values of a mark: files are being deleted, or they are gone, unless the record was made anew under the same id."""
 
 _MARK_SECONDS = 600
 """Seconds for which a mark stays. It must outlast any creation of a job that began before the deletion did."""

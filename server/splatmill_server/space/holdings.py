@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Entry, Storage
 from splatmill.schema import DEFAULT_OWNER, StoredKind
-from splatmill_server.lists import each
+from splatmill_server.base.lists import each
 
 KINDS = {"captures": StoredKind.capture, "jobs": StoredKind.job, "models": StoredKind.model}
 """The kind of record by the name of the folder in storage that holds all records of the kind."""

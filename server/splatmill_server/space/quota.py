@@ -20,8 +20,8 @@ from splatmill.backplane.reservations import NoRoom
 from splatmill.schema import DEFAULT_OWNER, Job, Scope, StoredKind, format_bytes
 from splatmill.schema.headers import read_integer
 from splatmill_server.access.caller import Caller
+from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.records import Captures
-from splatmill_server.problems import ProblemError
 from splatmill_server.space.holdings import folder
 from splatmill_server.space.usage import Usage
 

@@ -60,7 +60,7 @@ def _mask() -> int:
 
 def _root_path(text: str) -> str:
     """Return a root path without the slash at its end. Raises UpError for a text that is none."""
-    from splatmill_server.root_path import checked
+    from splatmill_server.base.root_path import checked
 
     try:
         return checked(text)
@@ -139,7 +139,7 @@ def _check_exposure(address: str, data: Path) -> None:
     from splatmill.backplane.storage import Storage, StorageError
     from splatmill_server.access.exposure import check_exposure
     from splatmill_server.access.keys import Keys
-    from splatmill_server.settings import Settings
+    from splatmill_server.base.settings import Settings
 
     try:
         settings = Settings(data=data, host=address)

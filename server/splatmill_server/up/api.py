@@ -19,7 +19,7 @@ def main(descriptor: int) -> None:
 
         from splatmill_server.__main__ import Server, allow_open_files, configure_logging
         from splatmill_server.app import create_app
-        from splatmill_server.settings import Settings
+        from splatmill_server.base.settings import Settings
 
     allow_open_files()
     listener = socket.socket(fileno=descriptor)

@@ -9,8 +9,8 @@ from fastapi import APIRouter, Request
 from starlette.responses import FileResponse, Response
 
 from splatmill.schema import SharedModel
-from splatmill_server.problems import ProblemError
-from splatmill_server.root_path import own_path
+from splatmill_server.base.problems import ProblemError
+from splatmill_server.base.root_path import own_path
 from splatmill_server.service import Service, Shared
 from splatmill_server.web import policy
 from splatmill_server.web.tree import StaticFile, Tree

@@ -16,7 +16,7 @@ from splatmill.backplane import keys
 from splatmill.client import Client
 from splatmill_server.access.browsers import check_host, check_origin
 from splatmill_server.access.sessions import COOKIE
-from splatmill_server.problems import ProblemError
+from splatmill_server.base.problems import ProblemError
 from tests.support.redis_server import empty_redis
 from tests.support.served_app import Serve, ServedApp, problem, raw
 

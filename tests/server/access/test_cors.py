@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from splatmill_server.access.cors import EXPOSED
 from splatmill_server.access.sessions import COOKIE
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 from tests.support.served_app import Serve, ServedApp, problem
 
 APP = "https://app.example.org"

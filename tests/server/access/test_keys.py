@@ -17,7 +17,7 @@ from splatmill.backplane.storage import Storage
 from splatmill_server.access.exposure import NeedsKey
 from splatmill_server.access.keys import CACHE_SECONDS, digest
 from splatmill_server.app import create_app
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 from tests.support.served_app import Serve, ServedApp, problem, served_app, stored
 from tests.support.waiting import wait_for
 

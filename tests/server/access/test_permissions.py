@@ -15,7 +15,7 @@ import pytest
 from splatmill.backplane import layout
 from splatmill.schema import Scope
 from splatmill_server.app import create_app
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 from tests.support.served_app import Serve, ServedApp, problem
 
 OPEN = {"/healthz", "/readyz", "/openapi.json", "/docs"}

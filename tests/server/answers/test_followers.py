@@ -18,9 +18,9 @@ from starlette.datastructures import Headers
 from splatmill.backplane import events, keys
 from splatmill.backplane.connection import connect_async
 from splatmill.schema import JobState, LogEvent, ProgressEvent, StateEvent
-from splatmill_server import feed
 from splatmill_server.access.caller import Caller
-from splatmill_server.feed import Batch, Feed
+from splatmill_server.base import feed
+from splatmill_server.base.feed import Batch, Feed
 from tests.support.served_app import Serve, ServedApp, problem
 from tests.support.server_events import brief, follow
 from tests.support.waiting import wait_for

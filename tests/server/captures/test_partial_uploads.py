@@ -19,8 +19,8 @@ import pytest
 from splatmill.backplane import layout
 from splatmill.backplane.parts import EndMoved, open_part
 from splatmill.schema import SHA256_HEADER, Role
+from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures import unfinished_uploads
-from splatmill_server.problems import ProblemError
 from tests.support.bucket import bucket
 from tests.support.served_app import Serve, ServedApp, problem
 from tests.support.waiting import wait_for

@@ -13,7 +13,7 @@ import pytest
 
 from splatmill.backplane import keys, layout, queue, row
 from splatmill.schema import JobState, PlanEvent, Problem, ProgressEvent, StateEvent, storable_name
-from splatmill_server import lists
+from splatmill_server.base import lists
 from tests.support.served_app import ServedApp, problem, raw, stored
 
 PHOTO = b"\xff\xd8\xff a photo"

@@ -12,6 +12,7 @@ from splatmill.backplane import entries, keys, layout, leases, lists, queue, row
 from splatmill.schema import (
     CreateJob,
     JobState,
+    KeyLimits,
     LogEvent,
     MetricEvent,
     PlanEvent,
@@ -19,7 +20,8 @@ from splatmill.schema import (
     ProgressEvent,
     StateEvent,
 )
-from splatmill_server.problems import ProblemError
+from splatmill_server.access.caller import Caller
+from splatmill_server.base.problems import ProblemError
 from tests.support.queue_entries import take, waiting
 from tests.support.served_app import ServedApp, problem
 from tests.support.server_events import brief, follow
@@ -164,14 +166,14 @@ def test_a_single_lost_row_is_restored_at_the_second_look(app: ServedApp) -> Non
 def test_a_refused_job_leaves_no_request(app: ServedApp) -> None:
     asked = CreateJob(capture=app.capture())
     with pytest.raises(ProblemError, match="permits 0 at once"):
-        app.service.jobs.create(asked, owner="default", most=0)
+        app.service.admission.create(Caller("default", limits=KeyLimits(unfinished_jobs=0)), asked)
     assert list(app.service.storage.walk(layout.watched_jobs())) == []
 
 
 def test_those_who_ask_while_lists_are_made_are_told_to_come_again(
     app: ServedApp, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("splatmill_server.lists.LONGEST_WAIT", 0.0)
+    monkeypatch.setattr("splatmill_server.base.lists.LONGEST_WAIT", 0.0)
     job_id = app.job()
     app.redis.delete(keys.LISTED)
     app.redis.set(keys.LISTING, "another process", ex=1800)  # as seen after the clock of Redis was set back

@@ -17,9 +17,10 @@ from rq.job import JobStatus
 
 from splatmill.backplane import entries, events, keys, layout, lines, queue, row
 from splatmill.schema import CreateJob, Job, JobState, StateEvent
-from splatmill_server.problems import ProblemError
+from splatmill_server.access.caller import KEYLESS
+from splatmill_server.base.problems import ProblemError
+from splatmill_server.base.settings import Settings
 from splatmill_server.service import Service
-from splatmill_server.settings import Settings
 
 pytestmark = pytest.mark.slow
 
@@ -95,7 +96,9 @@ class Walk(RuleBasedStateMachine):
 
     @rule(job_id=jobs)
     def client_restarts(self, job_id: str) -> None:
-        job = self.attempt(self.service.jobs.restart, job_id, {"job_running"})
+        job = self.attempt(
+            lambda found: self.service.admission.restart(KEYLESS, found), job_id, {"job_running"}
+        )
         if job is not None:
             assert job.state is JobState.queued
             self.ended.pop(job_id, None)

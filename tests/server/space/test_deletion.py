@@ -11,10 +11,12 @@ import pytest
 from splatmill.backplane import keys, layout
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import CreateJob, TrainOptions
+from splatmill_server import admission
+from splatmill_server.access.caller import Caller
+from splatmill_server.base.problems import ProblemError
 from splatmill_server.jobs.records import Jobs
-from splatmill_server.problems import ProblemError
 from splatmill_server.space import deletion as deletion_module
-from splatmill_server.space import job_uses, marks
+from splatmill_server.space import job_uses
 from tests.support.served_app import Serve, ServedApp, problem, stored
 
 pytestmark = pytest.mark.slow  # a server for each case
@@ -107,7 +109,7 @@ def test_a_mark_that_is_set_while_the_job_is_inserted_makes_the_insertion_look_a
     app: ServedApp, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     capture = app.capture()
-    check = marks.check_marks
+    check = admission.check_marks
     looks = []
 
     def checked(*arguments: object) -> None:
@@ -116,9 +118,9 @@ def test_a_mark_that_is_set_while_the_job_is_inserted_makes_the_insertion_look_a
         if len(looks) == 1:
             app.redis.set(keys.deleting(f"capture/{capture}"), "deleting")
 
-    monkeypatch.setattr("splatmill_server.jobs.records.check_marks", checked)
+    monkeypatch.setattr("splatmill_server.admission.check_marks", checked)
     request = CreateJob(capture=capture)
-    assert code_of(lambda: app.service.jobs.create(request, owner="ann")) == "capture_not_found"
+    assert code_of(lambda: app.service.admission.create(Caller("ann"), request)) == "capture_not_found"
     assert looks == [1]
     assert app.redis.zcard(keys.JOBS) == 0
 
@@ -149,13 +151,13 @@ def stored_of(app: ServedApp, job_id: str) -> list[str]:
 def test_a_restarted_job_is_active_in_the_same_step(app: ServedApp, monkeypatch: pytest.MonkeyPatch) -> None:
     job_id = ended(app)
     assert app.service.jobs.active() == []
-    check = marks.check_marks
+    check = admission.check_marks
 
     def checked(*arguments: object) -> None:
         check(*arguments)  # type: ignore[arg-type]  # passed on
         app.service.jobs.active()  # the reaper retires ended jobs at any moment
 
-    monkeypatch.setattr("splatmill_server.jobs.records.check_marks", checked)
+    monkeypatch.setattr("splatmill_server.admission.check_marks", checked)
     assert app.http.post(f"/v1/jobs/{job_id}/restart").status_code == 202
     assert app.redis.smembers(keys.ACTIVE) == {job_id.encode()}
 
@@ -171,7 +173,7 @@ def test_a_model_that_an_unfinished_job_starts_from_stays(app: ServedApp) -> Non
     assert app.http.delete(f"/v1/jobs/{model}").status_code == 204
     assert stored_of(app, model) == []
     request = CreateJob(capture=app.capture(), options=TrainOptions(start=model))
-    assert code_of(lambda: app.service.jobs.create(request, owner="ann")) == "model_not_found"
+    assert code_of(lambda: app.service.admission.create(Caller("ann"), request)) == "model_not_found"
 
 
 def test_a_capture_that_is_made_again_under_its_key_can_be_trained(app: ServedApp) -> None:

@@ -14,7 +14,7 @@ import pytest
 from splatmill.backplane import keys, layout
 from splatmill.schema import KeyLimits, Scope
 from splatmill_server.access.caller import Caller
-from splatmill_server.problems import ProblemError
+from splatmill_server.base.problems import ProblemError
 from splatmill_server.space import quota as quota_module
 from splatmill_server.space import usage as usage_module
 from tests.server.space.conftest import Person, ServePeople

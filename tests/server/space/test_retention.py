@@ -10,8 +10,8 @@ import redis
 
 from splatmill.backplane import events, keys, layout
 from splatmill.schema import JobState, LogEvent, Problem, StateEvent
+from splatmill_server.background.sweeper import Sweeper
 from splatmill_server.space.retention import Ages
-from splatmill_server.space.sweeper import Sweeper
 from splatmill_server.space.usage import Usage
 from tests.server.space.conftest import Clock, Person, ServePeople, as_object_store
 from tests.support.served_app import ServedApp, stored
@@ -204,7 +204,7 @@ def test_what_is_written_to_since_the_plan_stays(people: ServedApp, monkeypatch:
 def test_a_sweep_deletes_a_bounded_number_and_the_next_one_goes_on(
     people: ServedApp, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("splatmill_server.space.sweeper.MOST", 2)
+    monkeypatch.setattr("splatmill_server.background.sweeper.MOST", 2)
     monkeypatch.setattr("splatmill_server.routes.storage.MOST", 2)
     captures = [people.capture() for _ in range(3)]
     first, second = sweep(people, days=9, captures=7), sweep(people, days=9, captures=7)

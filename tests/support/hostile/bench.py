@@ -20,7 +20,7 @@ import structlog
 
 from splatmill.backplane.connection import connect
 from splatmill.schema import TrainOptions
-from splatmill_server.settings import Settings
+from splatmill_server.base.settings import Settings
 from splatmill_worker.capture import posed_scene
 from splatmill_worker.errors import WorkerError
 from splatmill_worker.images import decoders

@@ -49,3 +49,13 @@ export function byId(id) {
   if (!found) throw new Error(`The page has no element #${id}.`);
   return /** @type {T} */ (found);
 }
+
+/** Return a button that is either pressed or not. @param {string} text @param {(on: boolean) => void} change */
+export function toggle(text, change) {
+  const button = h("button", { type: "button", "aria-pressed": "false", onclick: () => {
+    const on = button.getAttribute("aria-pressed") !== "true";
+    button.setAttribute("aria-pressed", String(on));
+    change(on);
+  } }, text);
+  return button;
+}

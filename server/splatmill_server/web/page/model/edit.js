@@ -2,10 +2,9 @@
 // the held-out photos, and makes a new model of what is left; this one is kept.
 
 import { send } from "../api.js";
-import { h } from "../dom.js";
+import { h, toggle } from "../dom.js";
 import { number } from "../format.js";
 import { noticeOf } from "../shell.js";
-import { toggle } from "./stage.js";
 
 /**
  * @import {Stage} from "./stage.js"

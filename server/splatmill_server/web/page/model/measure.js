@@ -1,11 +1,10 @@
 // Measuring: two points of the scene, the distance between them, and a known distance that gives the scene its scale.
 
 import { request, whole } from "../api.js";
-import { h } from "../dom.js";
+import { h, toggle } from "../dom.js";
 import { notify } from "../shell.js";
 import { add, length, poseOf, sub, times } from "../viewer/pose.js";
 import { readArray } from "../viewer/depth.js";
-import { toggle } from "./stage.js";
 
 /**
  * @import {Stage} from "./stage.js"

@@ -1,6 +1,6 @@
 // The viewer of the model's page with its tools: kinds of view, cameras, far background, time-lapse, measuring.
 
-import { byId, h } from "../dom.js";
+import { byId, h, toggle } from "../dom.js";
 import { bytes } from "../format.js";
 import { noticeOf } from "../shell.js";
 import { open } from "../viewer.js";
@@ -137,16 +137,6 @@ export class Stage {
     bar.style.background = GRADIENT;
     this.scale.replaceChildren(h("span", {}, this.measure.distance(near)), bar, h("span", {}, this.measure.distance(far)));
   }
-}
-
-/** @param {string} text @param {(on: boolean) => void} change */
-export function toggle(text, change) {
-  const button = h("button", { type: "button", "aria-pressed": "false", onclick: () => {
-    const on = button.getAttribute("aria-pressed") !== "true";
-    button.setAttribute("aria-pressed", String(on));
-    change(on);
-  } }, text);
-  return button;
 }
 
 /** Whether the plan of a report says that the model was trained with antialiasing. @param {any} report */

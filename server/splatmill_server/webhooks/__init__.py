@@ -1,1 +1,0 @@
-"""Webhooks: their records, and the deliveries of events."""
