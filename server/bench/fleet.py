@@ -121,7 +121,6 @@ class Fleet:
         } | {
             "REDIS_URL": url,
             "SPLATMILL_DATA": str(folder),
-            "SPLATMILL_PIPELINE": "_fleet.pipeline",
             "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
         }
         self._processes: list[subprocess.Popen[str]] = []

@@ -62,6 +62,11 @@ def umask() -> int:
     return int(_read("SPLATMILL_UMASK", parse_mask, PRIVATE))
 
 
+def pipeline() -> str:
+    """Return SPLATMILL_PIPELINE, the module whose `run` does the work of an attempt; tests of the service name one."""
+    return os.environ.get("SPLATMILL_PIPELINE") or "splatmill_worker.pipeline"
+
+
 def work_folder(job_id: str) -> Path:
     """Return the folder that the attempts at a job on this machine share."""
     return data_folder() / "work" / job_id

@@ -1,6 +1,6 @@
 """The pipeline of a simulated worker: the events and the files of a training, without one.
 
-It runs in the attempt (SPLATMILL_PIPELINE), as the engine does.
+It runs in the attempt, as the engine does.
 """
 
 import json

@@ -1,5 +1,7 @@
-"""Proves which queues a worker serves, and that one that cannot start ends with a sentence."""
+"""Proves which queues a worker serves, how it imports what attempts run, and that one that cannot start says why."""
 
+import gc
+import importlib
 import os
 import subprocess
 import sys
@@ -56,6 +58,24 @@ def test_a_process_that_is_killed_while_it_looks_for_a_gpu_is_followed(
     )
     assert absence in served_lines.gpu_absence()
     assert asked.stat().st_size == 3
+
+
+def test_no_garbage_is_collected_while_the_pipeline_is_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "made_pipeline.py").write_text("import gc\nenabled = gc.isenabled()\nrun = gc.isenabled\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("SPLATMILL_PIPELINE", "made_pipeline")
+    here: list[object] = []
+    run: object = command._pipeline()
+    assert not importlib.import_module("made_pipeline").enabled
+    assert run is gc.isenabled
+    assert gc.isenabled()
+    assert not any(each is here for each in gc.get_objects()), "it was not frozen"
+    monkeypatch.setenv("SPLATMILL_PIPELINE", "no_such_pipeline")
+    with pytest.raises(ModuleNotFoundError):
+        command._pipeline()
+    assert gc.isenabled()
 
 
 @pytest.mark.slow

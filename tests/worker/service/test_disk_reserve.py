@@ -59,6 +59,7 @@ from splatmill.backplane.connection import connect
 from splatmill_worker.service import disk_reserve
 from splatmill_worker.service.attempt import start_attempt
 from splatmill_worker.service.run_attempt import run_attempt
+from tests.support import standin
 url, entry, checkpoint, full_at = sys.argv[1:]
 real = disk_reserve._free_bytes
 
@@ -67,7 +68,7 @@ def free(folder):
     return 1000 if step >= int(full_at) else real(folder)
 
 disk_reserve.CHECK_SECONDS, disk_reserve._free_bytes = 0.05, free
-run_attempt(start_attempt(connect(url), entry, entry), can_retry=True)
+run_attempt(start_attempt(connect(url), entry, entry), lambda: standin.run, can_retry=True)
 """
 """Runs an attempt, whose disk becomes full when the stand-in has stored a step."""
 

@@ -11,6 +11,7 @@ from _capacity.operations import counted
 
 from splatmill.backplane import keys, leases, lines, queue, workers
 from splatmill_worker.service import recovery
+from splatmill_worker.service.command import _pipeline
 from splatmill_worker.service.rq_worker import AttemptWorker
 from tests.support.jobs import write_row
 from tests.support.queue_entries import take, waiting
@@ -41,7 +42,7 @@ def test_a_start_takes_the_same_round_trips_beside_many_workers_as_beside_few(
     for numbers in (range(2), range(2, 40)):
         for number in numbers:
             running(connection, number)
-        this = AttemptWorker(connection)
+        this = AttemptWorker(connection, _pipeline)
         with counted() as operations:
             recovery.requeue_orphans(this)
         counts.append(operations.round_trips)
@@ -53,14 +54,14 @@ def test_only_what_the_dead_held_is_requeued(connection: redis.Redis) -> None:
     for number in range(3):
         running(connection, number)
     connection.delete("rq:worker:worker1")  # silent until its record expired
-    recovery.requeue_orphans(AttemptWorker(connection))
+    recovery.requeue_orphans(AttemptWorker(connection, _pipeline))
     assert waiting(connection) == 1
     assert {lease.entry for lease in leases.held(connection)} == {"job00000-1", "job00002-1"}
     assert connection.smembers("rq:workers") == {b"rq:worker:worker0", b"rq:worker:worker2"}
 
 
 def test_one_worker_cleans_the_lists_for_all(connection: redis.Redis) -> None:
-    first, second = AttemptWorker(connection), AttemptWorker(connection)
+    first, second = AttemptWorker(connection, _pipeline), AttemptWorker(connection, _pipeline)
     first.clean_registries()
     connection.sadd("rq:workers:train", "rq:worker:ghost")
     second.clean_registries()

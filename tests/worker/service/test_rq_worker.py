@@ -260,8 +260,10 @@ def test_a_job_for_a_gpu_waits_for_a_worker_that_has_one(
     environment = dict(os.environ) | STANDIN
     environment |= {"SPLATMILL_DATA": str(tmp_path / "data"), "SPLATMILL_STORAGE": storage.url}
     code = "import sys; from splatmill.backplane.connection import connect; "
-    code += "from splatmill_worker.service.rq_worker import AttemptWorker; "
-    code += "AttemptWorker(connect(sys.argv[1]), ('gpu',)).work(burst=True)"
+    code += (
+        "from splatmill_worker.service.rq_worker import AttemptWorker; from tests.support import standin; "
+    )
+    code += "AttemptWorker(connect(sys.argv[1]), lambda: standin.run, ('gpu',)).work(burst=True)"
     subprocess.run([sys.executable, "-c", code, redis_server.url], env=environment, check=True, timeout=60)
     assert read_job(connection, "job00001").state == "succeeded"
 

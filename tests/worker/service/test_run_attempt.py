@@ -6,8 +6,6 @@ That a list of files that end decoding processes reaches another machine.
 Does not prove what happens to the processes: tests/service does.
 """
 
-import gc
-import importlib
 import json
 import logging
 import os
@@ -15,6 +13,7 @@ import shutil
 import sys
 import threading
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 import redis
@@ -24,8 +23,10 @@ from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage, StorageError
 from splatmill.schema import Role
 from splatmill_worker.errors import UnusablePicture
+from splatmill_worker.images import decoders
 from splatmill_worker.service import run_attempt as module
 from splatmill_worker.service.attempt import Attempt, start_attempt
+from splatmill_worker.service.command import _pipeline
 from splatmill_worker.service.disk_reserve import DiskWatch
 from splatmill_worker.service.job_folder import ENDED, JobFolder
 from splatmill_worker.service.lock import JobLock
@@ -53,7 +54,7 @@ def test_a_transient_failure_is_raised_while_it_can_be_retried(
     refused: Attempt, connection: redis.Redis
 ) -> None:
     with pytest.raises(StorageError):
-        run_attempt(refused, can_retry=True)
+        run_attempt(refused, _pipeline, can_retry=True)
     job = read_job(connection, JOB)
     assert (job.state, job.attempt, job.problem) == ("queued", 1, None)
     assert any("tried again" in message for message in messages(connection, JOB))
@@ -62,7 +63,7 @@ def test_a_transient_failure_is_raised_while_it_can_be_retried(
 def test_a_transient_failure_without_retries_left_is_the_jobs_problem(
     refused: Attempt, connection: redis.Redis
 ) -> None:
-    run_attempt(refused, can_retry=False)
+    run_attempt(refused, _pipeline, can_retry=False)
     job = read_job(connection, JOB)
     assert job.state == "failed"
     assert job.problem is not None
@@ -83,7 +84,7 @@ def lost(connection: redis.Redis, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_job_that_redis_has_lost_begins_once_it_is_restored(lost: Attempt, connection: redis.Redis) -> None:
     restored = threading.Timer(0.3, write_row, (connection, JOB))
     restored.start()
-    run_attempt(lost, can_retry=False)
+    run_attempt(lost, _pipeline, can_retry=False)
     restored.join()
     job = read_job(connection, JOB)
     assert job.attempt == lost.number
@@ -97,13 +98,13 @@ def test_a_job_that_is_not_restored_goes_back_to_the_queue(
     monkeypatch.setattr(module, "RESTORE_SECONDS", 0.0)
     monkeypatch.setattr(os, "_exit", sys.exit)
     with pytest.raises(SystemExit) as ended:
-        run_attempt(lost, can_retry=False)
+        run_attempt(lost, _pipeline, can_retry=False)
     assert ended.value.code == HANDED_BACK_STATUS
 
 
 def test_a_job_that_was_deleted_does_not_begin(lost: Attempt, tmp_path: Path) -> None:
     Storage((tmp_path / "storage").as_uri()).delete(layout.watched_job(JOB))
-    run_attempt(lost, can_retry=False)
+    run_attempt(lost, _pipeline, can_retry=False)
     assert lost.lock.holder() is None
 
 
@@ -117,51 +118,30 @@ def test_photos_reach_structure_from_motion_from_another_file_system(
         Image.new("RGB", (64, 48), 3 * (grey,)).save(tmp_path / "plain.png")
         elsewhere.put(layout.capture_file(CAPTURE, Role.images, f"{grey}.png"), tmp_path / "plain.png")
     write_row(connection, JOB)
-    run_attempt(start_attempt(connection, f"{JOB}-1", "token"), can_retry=False)
+    run_attempt(start_attempt(connection, f"{JOB}-1", "token"), _pipeline, can_retry=False)
     problem = read_job(connection, JOB).problem
     assert problem is not None
     assert (problem.code, problem.facts["photos"]) == ("sfm_no_features", 4), problem.detail
 
 
-def test_no_garbage_is_collected_while_the_pipeline_is_imported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "made_pipeline.py").write_text("import gc\nenabled = gc.isenabled()\nrun = gc.isenabled\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(module, "PIPELINE", "made_pipeline")
-    here: list[object] = []
-    run: object = module._pipeline()
-    assert not importlib.import_module("made_pipeline").enabled
-    assert run is gc.isenabled
-    assert gc.isenabled()
-    assert not any(each is here for each in gc.get_objects()), "it was not frozen"
-    monkeypatch.setattr(module, "PIPELINE", "no_such_pipeline")
-    with pytest.raises(ModuleNotFoundError):
-        module._pipeline()
-    assert gc.isenabled()
-
-
 def test_the_files_that_end_decoders_are_known_to_an_attempt_on_another_machine(
-    remote: Storage, room: Room, connection: redis.Redis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    remote: Storage, room: Room, connection: redis.Redis, tmp_path: Path
 ) -> None:
     """Also when they are to be tried again: the list that an earlier attempt stored is replaced."""
-    (tmp_path / "ended_pipeline.py").write_text(
-        "from splatmill_worker.errors import UnusablePicture\n"
-        "from splatmill_worker.images import decoders\n"
-        "def run(capture, *arguments, **others):\n"
-        "    if not decoders.forget_ended():\n"
-        "        decoders._active._ended.add('capture/images/a.jpg', 'it was ended twice')\n"
-        "    raise UnusablePicture('decoder_ended', 'a.jpg', 'it was ended twice')\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(module, "PIPELINE", "ended_pipeline")
+
+    def ended(*arguments: object, **others: object) -> NoReturn:
+        if not decoders.forget_ended():
+            assert decoders._active is not None
+            decoders._active._ended.add("capture/images/a.jpg", "it was ended twice")
+        raise UnusablePicture("decoder_ended", "a.jpg", "it was ended twice")
+
     row = write_row(connection, JOB)
     attempt = Attempt(connection, JOB, 1, 1, JobLock(connection, JOB, "token"))
     for stored in ({"capture/images/a.jpg": "it was ended twice"}, {}):
         folder, disk, outbox = JobFolder(remote, JOB, CAPTURE), DiskWatch(), Outbox(attempt)
         try:
             with pytest.raises(UnusablePicture):
-                module._train(attempt, row, folder, room, disk, outbox)
+                module._train(attempt, lambda: ended, row, folder, room, disk, outbox)
         finally:
             outbox.close()
             disk.close()

@@ -1,9 +1,11 @@
 """Starts the queue worker: `python -m splatmill_worker train`."""
 
+import importlib
 import logging
 import os
 import sys
 import time
+from typing import cast
 
 import redis
 
@@ -11,9 +13,11 @@ from splatmill.backplane import keys, log_lines
 from splatmill.backplane.connection import connect
 from splatmill.backplane.private_files import exposure
 from splatmill.backplane.redact import redacted
+from splatmill.garbage import uncollected
 from splatmill_worker import settings
 from splatmill_worker.service.attempt_limits import Limits
 from splatmill_worker.service.rq_worker import STOP_GRACE, AttemptWorker
+from splatmill_worker.service.run_attempt import Pipeline
 from splatmill_worker.service.served_lines import served_lines
 
 REDIS_WAIT = 60.0
@@ -62,5 +66,11 @@ def serve(stop_grace: float | None, queues: str | None = None) -> int:
                 return 1
             time.sleep(0.05)
     grace = STOP_GRACE if stop_grace is None else stop_grace
-    AttemptWorker(connection, served, grace, limits).work()
+    AttemptWorker(connection, _pipeline, served, grace, limits).work()
     return 0
+
+
+def _pipeline() -> Pipeline:
+    """Import what attempts run. What it imports stays, and is never garbage."""
+    with uncollected():
+        return cast(Pipeline, importlib.import_module(settings.pipeline()).run)

@@ -45,7 +45,7 @@ from splatmill_worker.service.process_exit import (
     ProcessExit,
     oom_kill_count,
 )
-from splatmill_worker.service.run_attempt import run_attempt
+from splatmill_worker.service.run_attempt import LoadPipeline, run_attempt
 from splatmill_worker.service.saved_progress import SavedProgress
 
 STOP_GRACE = 50.0
@@ -73,19 +73,23 @@ class AttemptEntry(entries.QueueEntry):
     runs, and entries of servers that know the function by another name still run.
 
     attempt: the attempt at the job, set in its process before it runs.
+    load: returns the pipeline that the attempt runs, set with it.
     """
 
     attempt: Attempt | None = None
+    load: LoadPipeline | None = None
 
     def func(self, *args: object, **kwargs: object) -> None:
         """Run the attempt. RQ calls this in place of the named function, with the entry's arguments."""
         assert self.attempt is not None
-        run_attempt(self.attempt, can_retry=self.should_retry)
+        assert self.load is not None
+        run_attempt(self.attempt, self.load, can_retry=self.should_retry)
 
 
 class AttemptWorker(Worker):
     """A worker that runs one attempt at a time.
 
+    load: returns the pipeline that its attempts run.
     served: the lines that it takes entries from.
     stop_grace: seconds that an attempt has to save its state when the worker is told to stop.
     limits: how long an attempt may run, and how much memory it may use.
@@ -96,6 +100,7 @@ class AttemptWorker(Worker):
     def __init__(
         self,
         connection: redis.Redis,
+        load: LoadPipeline,
         served: Sequence[Line] = ("any", "cpu"),
         stop_grace: float = STOP_GRACE,
         limits: Limits | None = None,
@@ -111,6 +116,7 @@ class AttemptWorker(Worker):
             job_monitoring_interval=entries.MONITORING_INTERVAL,
         )
         log_lines.bind(worker=self.name)
+        self._load = load
         self._served = tuple(served)
         self._grace = stop_grace
         self._limits = limits or Limits()
@@ -367,6 +373,7 @@ class AttemptWorker(Worker):
         assert self._lock is not None
         assert isinstance(job, AttemptEntry)
         try:
+            job.load = self._load
             job.attempt = start_attempt(self.connection, job.id, self._lock.token)
             log_lines.bind(attempt=job.attempt.number)
             self.log.info("Worker %s: attempt %d at %s begins", self.name, job.attempt.number, job.id)

@@ -4,7 +4,6 @@ It runs in a process of its own (see rq_worker). Each failure becomes a named pr
 retried. When the process is killed, its parent reports the failure.
 """
 
-import importlib
 import logging
 import os
 import time
@@ -22,7 +21,6 @@ from splatmill.backplane.fold import fold
 from splatmill.backplane.published import is_published
 from splatmill.backplane.row import JobRow
 from splatmill.backplane.storage import Storage, StorageError
-from splatmill.garbage import uncollected
 from splatmill.schema import (
     CamerasEvent,
     Event,
@@ -48,9 +46,6 @@ from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, UNREPORTED
 from splatmill_worker.service.redis_patience import PATIENCE, patiently
 from splatmill_worker.service.room import Room
 from splatmill_worker.settings import storage_url
-
-PIPELINE = os.environ.get("SPLATMILL_PIPELINE", "splatmill_worker.pipeline")
-"""The module whose `run` does the work; tests of the service name another one."""
 
 RETRY_SECONDS = 5.0
 """Seconds between a transient failure and the end of its attempt, after which the queue tries again."""
@@ -96,6 +91,9 @@ class Pipeline(Protocol):
     ) -> PipelineResult: ...
 
 
+LoadPipeline = Callable[[], Pipeline]
+"""Returns the pipeline, which is imported in the process of the attempt only: numpy and torch start threads."""
+
 log = logging.getLogger("splatmill_worker")
 """Its lines go to the log of the job."""
 
@@ -103,9 +101,10 @@ own_log = logging.getLogger("splatmill.attempt")
 """Its lines go to the log of the worker alone."""
 
 
-def run_attempt(attempt: Attempt, can_retry: bool) -> None:
+def run_attempt(attempt: Attempt, load: LoadPipeline, *, can_retry: bool) -> None:
     """Run an attempt to the end, in a process forked for it.
 
+    load: returns what does the work.
     can_retry: whether the queue tries again when this raises.
 
     Reports the job's final state, or exits the process with HANDED_BACK_STATUS, WITHDRAWN_STATUS, or, if Redis fails
@@ -120,7 +119,7 @@ def run_attempt(attempt: Attempt, can_retry: bool) -> None:
     if row is not None:
         outbox = Outbox(attempt)
         try:
-            _run(attempt, row, outbox, can_retry)
+            _run(attempt, load, row, outbox, can_retry)
         except HandedBack:
             outbox.flush(FLUSH_SECONDS)
             os._exit(HANDED_BACK_STATUS)
@@ -163,7 +162,7 @@ def _restored_row(attempt: Attempt) -> JobRow | None:
     return rows.read(attempt.connection, attempt.job_id)
 
 
-def _run(attempt: Attempt, row: JobRow, outbox: Outbox, can_retry: bool) -> None:
+def _run(attempt: Attempt, load: LoadPipeline, row: JobRow, outbox: Outbox, can_retry: bool) -> None:
     handler = _LogEventHandler(outbox)
     log.addHandler(handler)
     log.setLevel(logging.INFO)
@@ -171,7 +170,7 @@ def _run(attempt: Attempt, row: JobRow, outbox: Outbox, can_retry: bool) -> None
         outbox.put(StateEvent(state=JobState.preparing))
         storage = Storage(storage_url())
         if not is_published(storage, attempt.job_id, attempt.generation):
-            _train_and_publish(attempt, row, storage, outbox)
+            _train_and_publish(attempt, load, row, storage, outbox)
         outbox.put(StateEvent(state=JobState.succeeded))
     except Exception as error:  # the one place where a failure of a job becomes a problem
         if hand_back.requested():
@@ -181,12 +180,14 @@ def _run(attempt: Attempt, row: JobRow, outbox: Outbox, can_retry: bool) -> None
         log.removeHandler(handler)
 
 
-def _train_and_publish(attempt: Attempt, row: JobRow, storage: Storage, outbox: Outbox) -> None:
+def _train_and_publish(
+    attempt: Attempt, load: LoadPipeline, row: JobRow, storage: Storage, outbox: Outbox
+) -> None:
     folder = JobFolder(storage, attempt.job_id, row.capture)
     room = Room(attempt.connection, row.owner, attempt.job_id)
     disk = DiskWatch()
     try:
-        _train(attempt, row, folder, room, disk, outbox)
+        _train(attempt, load, row, folder, room, disk, outbox)
     except Exception as error:
         # Native code reports a full disk in many ways; the watch knows better.
         if disk.error is not None and not hand_back.requested():
@@ -204,7 +205,13 @@ def _train_and_publish(attempt: Attempt, row: JobRow, storage: Storage, outbox: 
 
 
 def _train(
-    attempt: Attempt, row: JobRow, folder: JobFolder, room: Room, disk: DiskWatch, outbox: Outbox
+    attempt: Attempt,
+    load: LoadPipeline,
+    row: JobRow,
+    folder: JobFolder,
+    room: Room,
+    disk: DiskWatch,
+    outbox: Outbox,
 ) -> None:
     """Stage the capture and run the pipeline to its end. Raises HandedBack, DiskReserveReached and its errors."""
     if disk.error is not None:
@@ -234,7 +241,7 @@ def _train(
             decoders.confined([folder.path], folder.run / ENDED, stopped),
             unpacked_room.claimed_by(room.unpack),
         ):
-            result = _pipeline()(
+            result = load()(
                 folder.capture,
                 folder.run,
                 row.options,
@@ -254,12 +261,6 @@ def _train(
     mirror.close(copy=ended_early)
     if ended_early:
         raise HandedBack if disk.error is None or hand_back.requested() else disk.error
-
-
-def _pipeline() -> Pipeline:
-    """Import the pipeline. What it imports stays, and is never garbage."""
-    with uncollected():
-        return cast(Pipeline, importlib.import_module(PIPELINE).run)
 
 
 def _forward(event: Event, folder: JobFolder, room: Room, outbox: Outbox) -> None:
