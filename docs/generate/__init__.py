@@ -1,4 +1,4 @@
-"""The pages that are made from the program each time the documentation is built; one of them is committed.
+"""The pages that are made from the program each time the documentation is built; some of them are committed.
 
 One module per page. Each has a function `page()` that returns the page as Markdown.
 """
@@ -15,6 +15,7 @@ from docs.generate import (
     metrics,
     python_errors,
     rest,
+    rooms,
     settings,
 )
 
@@ -30,18 +31,22 @@ PAGES = {
     "settings.md": settings.page,
 }
 
-COMMITTED = {"inputs.md": inputs.page}
-"""Pages beside those written by hand, which are committed because the README leads to them. A test compares them."""
+COMMITTED = {
+    "docs/inputs.md": inputs.page,
+    "ARCHITECTURE.md": rooms.architecture,
+    "MAP.md": rooms.modules,
+}
+"""Pages that are committed because people read them in the repository. Tests compare them."""
 
 
 def write_pages(folder: Path) -> None:
-    """Write every generated page into `folder`, and the committed ones beside it.
+    """Write every generated page into `folder`, and the committed ones to their places.
 
     A page whose text has not changed keeps its time stamp.
     """
     folder.mkdir(exist_ok=True)
     places = {folder / name: page for name, page in PAGES.items()}
-    places |= {folder.parent / name: page for name, page in COMMITTED.items()}
+    places |= {rooms.ROOT / name: page for name, page in COMMITTED.items()}
     for path, page in places.items():
         text = page()
         if not path.is_file() or path.read_text() != text:

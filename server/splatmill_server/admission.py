@@ -45,9 +45,9 @@ class Admission:
         Raises problems for a capture that is not there (404) or cannot be trained (422), a model to start from that is
         not there (404) or not finished (409), too many unfinished jobs (429), and a quota that is used up (507).
         """
-        known = self.jobs.id_of_key(who.owner, key) if key is not None else None
+        known = self.jobs.get_id_of_key(who.owner, key) if key is not None else None
         # A repeated request returns its job even if the capture was deleted meanwhile.
-        is_new = known is None or self.jobs.owner(known) is None
+        is_new = known is None or self.jobs.get_owner(known) is None
         if is_new:
             self.captures.check_visible(who, request.capture)
             self._check_trainable(request.capture)
@@ -74,8 +74,8 @@ class Admission:
         """
         if (waiting := self.jobs.waiting(job_id)) is not None:
             return waiting
-        with self.quota.job(who, self.jobs.owner(job_id) or who.owner) as keep_room:
-            row = self.jobs.row(job_id)
+        with self.quota.job(who, self.jobs.get_owner(job_id) or who.owner) as keep_room:
+            row = self.jobs.get_row(job_id)
             needs = needs_of(row.capture, row.options)
             own_mark = mark_keys([(StoredKind.model, job_id)])[0]
 
@@ -97,7 +97,7 @@ class Admission:
 
     def _check_trainable(self, capture_id: str) -> None:
         """Raise a 404 or 422 problem for a capture that certainly cannot be trained: it has no photos, or only one."""
-        self.captures.record(capture_id)
+        self.captures.get(capture_id)
         images = list(self.storage.entries(layout.capture_files(capture_id, Role.images)))
         if not images:
             raise ProblemError(
@@ -137,7 +137,7 @@ class Admission:
     def _check_number(self, who: Caller, owner: str) -> None:
         """Raise a 429 problem if the owner has as many unfinished jobs as the key of the caller permits."""
         most = who.limits.unfinished_jobs
-        if most is not None and (count := self.jobs.unfinished_of(owner)) >= most:
+        if most is not None and (count := self.jobs.count_unfinished(owner)) >= most:
             raise ProblemError(
                 "too_many_jobs",
                 f"The owner {owner!r} has {count} unfinished jobs, and its API key permits {most} at once.",

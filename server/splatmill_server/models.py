@@ -1,4 +1,7 @@
-"""Finished models. They are read from storage, so each stays available while Redis is away; only lists need Redis."""
+"""Finished models: their files, their cameras and their lists.
+
+They are read from storage, so each stays available while Redis is away; only lists need Redis.
+"""
 
 import json
 import re
@@ -83,10 +86,10 @@ class Models:
 
     def check_visible(self, who: Caller, model_id: str) -> None:
         """Raise a 404 problem if another owner has the model, or the job that is to make it."""
-        if not who.admin and not who.may_see(self.owner(model_id)):
+        if not who.admin and not who.may_see(self.get_owner(model_id)):
             raise model_not_found(model_id)
 
-    def owner(self, model_id: str) -> str | None:
+    def get_owner(self, model_id: str) -> str | None:
         """Return the owner of a model, or of the job that is to make it, or None if it cannot be read.
 
         The record in storage comes first, so that models can be read while Redis cannot be reached.
@@ -96,7 +99,7 @@ class Models:
         try:
             return read_record(self.storage, model_id).owner
         except (FileNotFoundError, UnreadableRecord):
-            return self.jobs.owner(model_id)
+            return self.jobs.get_owner(model_id)
 
     def get(self, model_id: str) -> Model:
         """Return a model with its files. Raises 404 and 409 problems, and 500 if its files cannot be read."""
@@ -140,7 +143,7 @@ class Models:
             links=_links(model_id),
         )
 
-    def page(self, cursor: str | None, limit: int, wanted: Filter | None = None) -> ModelPage:
+    def list(self, cursor: str | None, limit: int, wanted: Filter | None = None) -> ModelPage:
         """Return a page of the models that `wanted` admits, the newest first. Raises the problems of `Lists.page`."""
         wanted = wanted or Filter()
         names, narrowed = [lists.name("models", owner=wanted.owner)], wanted.name is not None
@@ -229,7 +232,7 @@ class Models:
             warn(f"model {model_id} is not listed", str(error))
             return None
 
-    def file(self, model_id: str, name: str) -> Entry:
+    def get_file(self, model_id: str, name: str) -> Entry:
         """Return the entry of a file of a model. Raises 404 and 409 problems."""
         self.check(model_id)
         known = layout.model_media_type(name) is not None
@@ -243,9 +246,9 @@ class Models:
             )
         return entry
 
-    def cameras(self, model_id: str) -> ModelCameras:
+    def get_cameras(self, model_id: str) -> ModelCameras:
         """Return the cameras of the capture in the coordinates of the model."""
-        self.file(model_id, "cameras.json")
+        self.get_file(model_id, "cameras.json")
         stored = self.storage.get(layout.model_file(model_id, "cameras.json"))
         try:
             return ModelCameras.model_validate_json(stored)

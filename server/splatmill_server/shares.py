@@ -1,4 +1,6 @@
-"""Links to models for people without a key. Nobody finds a link who was not given it, and it shows one model only.
+"""Links to models for people without a key: makes, opens and revokes them.
+
+Nobody finds a link who was not given it, and it shows one model only.
 
 The token is `<model>-<share>-<32 hex digits>`: model and share find its record without a search, and the hex digits are
 128 random bits. Only its digest is stored. A link ends when it expires, when it is revoked, and with its model.
@@ -9,6 +11,7 @@ import hmac
 import json
 import re
 import secrets
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 
 from pydantic import ValidationError
@@ -98,7 +101,7 @@ class Shares:
         self._store(share)
         return ShareWithToken(**share.public().model_dump(), token=token, path=address(f"/s/{token}"))
 
-    def of_model(self, model_id: str) -> list[Share]:
+    def list(self, model_id: str) -> list[Share]:
         """Return the links to a model, newest first, those that have ended too."""
         self.models.check(model_id)
         found = sorted(self._stored(model_id), key=lambda share: (share.created_at, share.id), reverse=True)
@@ -117,7 +120,7 @@ class Shares:
         if share.revoked_at is None:
             self._store(share.model_copy(update={"revoked_at": datetime.now(UTC)}))
 
-    def open(self, token: str) -> StoredShare:
+    def get(self, token: str) -> StoredShare:
         """Return the link of a token. Raises a 404 problem for none, and a 410 problem for one that has ended."""
         match = _TOKEN.fullmatch(token)
         share = self._load(layout.share_record(match[1], match[2])) if match else None
@@ -137,14 +140,14 @@ class Shares:
         self.models.check(share.model)
         return share
 
-    def model(self, share: StoredShare) -> SharedModel:
+    def get_model(self, share: StoredShare) -> SharedModel:
         """Return what somebody with the link may know of the model."""
         model = self.models.get(share.model)
         files = [file for file in model.files if file.name not in HIDDEN_FILES]
         known = model.model_dump(exclude={"files"})
         return SharedModel.model_validate(known | {"files": files, "expires_at": share.expires_at})
 
-    def _stored(self, model_id: str) -> list[StoredShare]:
+    def _stored(self, model_id: str) -> Sequence[StoredShare]:
         entries = self.storage.entries(layout.shares_of(model_id))
         return [share for entry in entries if (share := self._load(entry.path)) is not None]
 

@@ -11,7 +11,7 @@ import json
 import math
 import secrets
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 
@@ -108,7 +108,7 @@ class Webhooks:
             return self._create(request, owner)
 
     def _create(self, request: CreateWebhook, owner: str) -> WebhookWithSecret:
-        if len(self.of_owner(owner)) >= MAX_WEBHOOKS:
+        if len(self.list(owner)) >= MAX_WEBHOOKS:
             raise ProblemError(
                 "too_many_requests",
                 f"There are {MAX_WEBHOOKS} webhooks, and no more are accepted for one owner.",
@@ -126,14 +126,14 @@ class Webhooks:
         self._write(record)
         return _with_secret(record)
 
-    def of_owner(self, owner: str | None) -> list[WebhookRecord]:
+    def list(self, owner: str | None) -> list[WebhookRecord]:
         """Return the webhooks of an owner, or of all (None), oldest first."""
         ids = self.storage.children(layout.webhooks())
-        found = [record for webhook_id in ids if (record := self.read(webhook_id)) is not None]
+        found = [record for webhook_id in ids if (record := self.get_or_none(webhook_id)) is not None]
         mine = [record for record in found if owner is None or record.owner == owner]
         return sorted(mine, key=lambda record: record.created_at)
 
-    def read(self, webhook_id: str) -> WebhookRecord | None:
+    def get_or_none(self, webhook_id: str) -> WebhookRecord | None:
         """Return a webhook, or None if there is none, or none that can be read."""
         path = layout.webhook_record(webhook_id)
         try:
@@ -146,7 +146,7 @@ class Webhooks:
 
     def get(self, webhook_id: str) -> WebhookRecord:
         """Return a webhook. Raises a 404 problem."""
-        found = self.read(webhook_id) if layout.is_id(webhook_id) else None
+        found = self.get_or_none(webhook_id) if layout.is_id(webhook_id) else None
         if found is None:
             raise webhook_not_found(webhook_id)
         return found
@@ -177,20 +177,22 @@ class Webhooks:
     def disable(self, webhook_id: str, reason: str) -> None:
         """Send nothing to a webhook any more."""
         with exclusive(self.connection, "webhook", webhook_id):
-            record = self.read(webhook_id)
+            record = self.get_or_none(webhook_id)
             if record is not None and record.disabled_at is None:
                 log.warning("webhook disabled", webhook=webhook_id, reason=reason)
                 now = datetime.now(UTC)
                 self._write(record.model_copy(update={"disabled_at": now, "disabled_reason": reason}))
 
-    def deliveries(self, webhook_id: str) -> list[Delivery]:
+    def list_deliveries(self, webhook_id: str) -> Sequence[Delivery]:
         """Return the deliveries of a webhook, newest first. Those that are over are kept for KEPT_DAYS."""
         entries = self.storage.entries(layout.deliveries(webhook_id))
         ids = [entry.path.rsplit("/", 1)[-1].removesuffix(".json") for entry in entries]
-        found = [record.public() for name in ids if (record := self.delivery(webhook_id, name)) is not None]
+        found = [
+            record.public() for name in ids if (record := self.get_delivery(webhook_id, name)) is not None
+        ]
         return sorted(found, key=lambda record: record.created_at, reverse=True)
 
-    def delivery(self, webhook_id: str, delivery_id: str) -> DeliveryRecord | None:
+    def get_delivery(self, webhook_id: str, delivery_id: str) -> DeliveryRecord | None:
         """Return a delivery, or None if there is none, or none that can be read."""
         path = layout.delivery_record(webhook_id, delivery_id)
         try:
@@ -203,7 +205,7 @@ class Webhooks:
 
     def repeat(self, webhook_id: str, delivery_id: str) -> Delivery:
         """Send a delivery that is over once more, with the same message id. Raises a 404 problem."""
-        found = self.delivery(webhook_id, delivery_id) if layout.is_id(delivery_id) else None
+        found = self.get_delivery(webhook_id, delivery_id) if layout.is_id(delivery_id) else None
         if found is not None and found.state is not DeliveryState.pending:
             with exclusive(self.connection, "delivery", f"{webhook_id}.{delivery_id}"):
                 found = self._repeated(webhook_id, delivery_id)
@@ -217,16 +219,16 @@ class Webhooks:
 
     def _repeated(self, webhook_id: str, delivery_id: str) -> DeliveryRecord | None:
         """Make a delivery that is over pending again, unless another request has."""
-        found = self.delivery(webhook_id, delivery_id)
+        found = self.get_delivery(webhook_id, delivery_id)
         if found is not None and found.state is not DeliveryState.pending:
             now = datetime.now(UTC)
             update = {"state": DeliveryState.pending, "next_at": now, "tries": 0, "reason": None}
             found = found.model_copy(update=update)
-            self.write_delivery(found)
+            self.save_delivery(found)
             self.mark(found)
         return found
 
-    def write_delivery(self, record: DeliveryRecord) -> None:
+    def save_delivery(self, record: DeliveryRecord) -> None:
         """Store a delivery, unless its webhook was deleted."""
         if self.storage.exists(layout.webhook_record(record.webhook)):
             path = layout.delivery_record(record.webhook, record.id)
@@ -242,13 +244,13 @@ class Webhooks:
         ended = job.finished_at or datetime.now(UTC)
         if ended < datetime.now(UTC) - timedelta(days=KEPT_DAYS):
             return  # the record of its delivery may be gone, and without it the end would be sent twice
-        for webhook in self.of_owner(job.owner):
+        for webhook in self.list(job.owner):
             if event not in webhook.events or webhook.disabled_at is not None:
                 continue
             if ended < webhook.created_at:
                 continue
             delivery_id = hashlib.sha256(f"{webhook.id} {job.id} {generation}".encode()).hexdigest()[:24]
-            known = self.delivery(webhook.id, delivery_id)
+            known = self.get_delivery(webhook.id, delivery_id)
             if known is None:
                 now = datetime.now(UTC)
                 payload = WebhookPayload(type=event, timestamp=ended, data=job)
@@ -266,7 +268,7 @@ class Webhooks:
                 path = layout.delivery_record(webhook.id, delivery_id)
                 if not self.storage.put_new(path, known.model_dump_json(exclude_none=True).encode()):
                     known = (
-                        self.delivery(webhook.id, delivery_id) or known
+                        self.get_delivery(webhook.id, delivery_id) or known
                     )  # another process has just made it
             if known.state is DeliveryState.pending and not known.attempts:
                 self.mark(known)  # the process that made it may have died before it did
@@ -277,7 +279,7 @@ class Webhooks:
         for webhook_id in self.storage.children(layout.webhooks()):
             for entry in self.storage.entries(layout.deliveries(webhook_id)):
                 name = entry.path.rsplit("/", 1)[-1].removesuffix(".json")
-                found = self.delivery(webhook_id, name) if entry.modified.timestamp() < before else None
+                found = self.get_delivery(webhook_id, name) if entry.modified.timestamp() < before else None
                 if found is not None and found.state is not DeliveryState.pending:
                     self.storage.delete(entry.path)
                     deleted += 1

@@ -10,6 +10,7 @@ import re
 from pathlib import Path
 
 import pytest
+from docs.generate import COMMITTED
 from docs.generate import PAGES as GENERATED
 from typer.main import get_command
 
@@ -23,7 +24,14 @@ from tests.support.paths import ROOT
 PAGES = [
     *(
         ROOT / name
-        for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")
+        for name in (
+            "README.md",
+            "ARCHITECTURE.md",
+            "MAP.md",
+            "CONTRIBUTING.md",
+            "CHANGELOG.md",
+            "SECURITY.md",
+        )
     ),
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted(page for page in (ROOT / "worker").rglob("*.md") if "build" not in page.parts),
@@ -79,6 +87,11 @@ def test_the_readme_lists_its_prerequisites_and_commands() -> None:
     text = (ROOT / "README.md").read_text()
     for needed in ("make demo", "make test", "make docs", "Python >= 3.11", "C++17"):
         assert needed in text
+
+
+@pytest.mark.parametrize("name", ["ARCHITECTURE.md", "MAP.md"])
+def test_the_map_is_that_of_the_modules_and_of_the_import_contracts(name: str) -> None:
+    assert (ROOT / name).read_text() == COMMITTED[name](), "`make docs` writes the page; commit it."
 
 
 def test_the_paths_in_the_architecture_exist() -> None:

@@ -200,10 +200,10 @@ def hurry(app: ServedApp, made: Any) -> None:
     """Make the next attempt of the only delivery due now."""
     service = app.service.webhooks
     [shown] = log(app, made)
-    found = service.delivery(made["id"], shown["id"])
+    found = service.get_delivery(made["id"], shown["id"])
     assert found is not None
     found = found.model_copy(update={"next_at": datetime.now(UTC) - timedelta(seconds=1)})
-    service.write_delivery(found)
+    service.save_delivery(found)
     service.mark(found)
 
 
@@ -463,4 +463,4 @@ def test_a_webhook_that_is_deleted_while_it_is_changed_stays_deleted(
             app.service.storage.delete(layout.webhook_record(made["id"]))
         with pytest.raises(ProblemError, match="no webhook"):
             change.result(20)
-    assert service.of_owner(None) == []
+    assert service.list(None) == []

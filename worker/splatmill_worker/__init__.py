@@ -1,0 +1,1 @@
+"""The worker: the engine, the queue worker and the renderer."""

@@ -36,14 +36,14 @@ class Authentication:
         if given is not None and (known := self._of_bootstrap(digest(given))) is not None:
             return known
         await self._keys.current()
-        if given is not None and (key := self._keys.find(given)) is not None:
+        if given is not None and (key := self._keys.get_by_secret(given)) is not None:
             return Caller.of(key)
         if self._bootstrap is None and self._settings.local and not self._keys.any():
             check_host(scope, headers, self._settings.host, self._settings.own_names)
             check_origin(scope, headers, self._settings.own_names, self._settings.cors, required=False)
             return KEYLESS
         cookie = session_cookie(headers)
-        if given is None and cookie and (session := await self._sessions.find(cookie)) is not None:
+        if given is None and cookie and (session := await self._sessions.get(cookie)) is not None:
             known = self._of_session(session)
             if known is not None:
                 check_origin(scope, headers, self._settings.own_names, required=True)
@@ -81,7 +81,7 @@ class Authentication:
         """Return the caller of a session whose secret is still valid, or None."""
         if session.key_id is None:
             return self._of_bootstrap(session.secret)
-        key = self._keys.with_secret(session.key_id, session.secret)
+        key = self._keys.get_if_valid(session.key_id, session.secret)
         return Caller.of(key) if key is not None else None
 
 

@@ -1,4 +1,6 @@
-"""The keys of the API. They are stored hashed in storage, one file a key; no other code writes there.
+"""The keys of the API: makes, finds, rotates and revokes them.
+
+They are stored hashed in storage, one file a key; no other code writes there.
 
 A secret is `smk_<id>_<64 hex digits>`: the beginning makes a leaked secret recognisable, the id finds its record
 without a search. The hex digits are 256 random bits, so a plain SHA-256 protects them: the slow hashes that protect
@@ -130,17 +132,17 @@ class Keys:
         """Return whether there are keys, readable or not, as of the last reading."""
         return bool(self._known)
 
-    def find(self, secret: str) -> StoredKey | None:
+    def get_by_secret(self, secret: str) -> StoredKey | None:
         """Return the key that a secret belongs to, as of the last reading, or None."""
         match = _SECRET.fullmatch(secret)
-        return self.with_secret(match[1], digest(secret)) if match else None
+        return self.get_if_valid(match[1], digest(secret)) if match else None
 
-    def with_secret(self, key_id: str, sha256: str) -> StoredKey | None:
+    def get_if_valid(self, key_id: str, sha256: str) -> StoredKey | None:
         """Return the key with this id if a secret with this digest is valid, as of the last reading, or None."""
         _, key = self._known.get(key_id, ("", None))
         return key if key is not None and key.accepts(sha256) else None
 
-    def page(self) -> list[Key]:
+    def list(self) -> list[Key]:
         """Return all keys, the oldest first."""
         self.read()
         found = [key for _, key in self._known.values() if key is not None]

@@ -36,7 +36,7 @@ class Session:
 
 
 class Sessions:
-    """Makes, finds and ends sessions. Raises redis.RedisError if Redis cannot be reached.
+    """Makes, gets and deletes sessions. Raises redis.RedisError if Redis cannot be reached.
 
     seconds: how long a session lasts.
     timeout: seconds to wait for a reply of Redis.
@@ -47,19 +47,19 @@ class Sessions:
         self.seconds = seconds
         self._timeout = timeout
 
-    async def begin(self, session: Session) -> str:
+    async def create(self, session: Session) -> str:
         """Store a session and return its cookie, of 256 random bits."""
         cookie = secrets.token_hex(32)
         record = json.dumps(asdict(session))
         await self._reply(self._connection.set(keys.session(digest(cookie)), record, ex=self.seconds))
         return cookie
 
-    async def find(self, cookie: str) -> Session | None:
+    async def get(self, cookie: str) -> Session | None:
         """Return the session of a cookie, or None."""
         record = await self._reply(self._connection.get(keys.session(digest(cookie))))
         return Session(**json.loads(record)) if record is not None else None
 
-    async def end(self, cookie: str) -> None:
+    async def delete(self, cookie: str) -> None:
         """Forget a session, if there is one."""
         await self._reply(self._connection.delete(keys.session(digest(cookie))))
 

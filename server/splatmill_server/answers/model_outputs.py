@@ -17,7 +17,7 @@ from splatmill_server.service import Service
 
 async def model_file(service: Service, model_id: str, name: str, request: Request) -> Response:
     """Return a file of a model, or the range of it that the request names."""
-    entry = await run_in_threadpool(service.models.file, model_id, name)
+    entry = await run_in_threadpool(service.models.get_file, model_id, name)
     download = f"{model_id}.ply" if name == "model.ply" else None
     media_type = layout.model_media_type(name) or "application/octet-stream"
     return await file_response(request, service.storage, entry.path, media_type, download_name=download)
@@ -31,7 +31,7 @@ async def model_in_format(
     who: the caller; None for somebody with a link.
     """
     form = format_of_key(key)
-    path = await while_connected(request, service.conversions.path(model_id, form, who))
+    path = await while_connected(request, service.conversions.get_path(model_id, form, who))
     if path is None:
         return Response(status_code=CLIENT_GONE)
     name = f"{model_id}{form.suffix}"
@@ -51,5 +51,5 @@ async def rendered_by_query(service: Service, model_id: str, request: Request) -
     path, seconds = rendering.render_path(model_id), service.settings.render_timeout
     visited = None
     if not request.state.caller.owner:
-        visited = await run_in_threadpool(service.models.owner, model_id) or ""
+        visited = await run_in_threadpool(service.models.get_owner, model_id) or ""
     return await forward(service.renderer, request, path, body, seconds, visited=visited)

@@ -91,7 +91,7 @@ class Conversions:
             )
         return ModelDownloads(formats=formats, psnr=model.psnr)
 
-    async def path(self, model_id: str, form: ModelFormat, who: Caller | None = None) -> str:
+    async def get_path(self, model_id: str, form: ModelFormat, who: Caller | None = None) -> str:
         """Return the path of the model in a format, which is made if it is not there.
 
         who: the caller; None for somebody with a link.
@@ -137,7 +137,7 @@ class Conversions:
             await asyncio.sleep(POLL_SECONDS)
 
     async def _make(self, model_id: str, form: ModelFormat) -> None:
-        owner = await run_in_threadpool(self._models.owner, model_id) or DEFAULT_OWNER
+        owner = await run_in_threadpool(self._models.get_owner, model_id) or DEFAULT_OWNER
         async with self._quota.storing(None, owner, model_id, RECORD_BYTES) as room:
             await self._convert(model_id, form, owner, room)
 
@@ -199,7 +199,7 @@ class Conversions:
         return (entry, record) if entry is not None and fits else None
 
     def _ply(self, model_id: str) -> Entry:
-        return self._models.file(model_id, "model.ply")
+        return self._models.get_file(model_id, "model.ply")
 
 
 def format_of_key(key: str) -> ModelFormat:

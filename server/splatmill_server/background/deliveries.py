@@ -147,7 +147,7 @@ class Deliveries:
         running = {webhook_id for webhook_id, _ in [*self._running]}
         self._owners = {name: owner for name, owner in self._owners.items() if name in waiting | running}
         for webhook_id in waiting - self._owners.keys():
-            found = self.webhooks.read(webhook_id)
+            found = self.webhooks.get_or_none(webhook_id)
             self._owners[webhook_id] = found.owner if found is not None else ""
 
     async def _work(self, key: tuple[str, str], mark: str) -> None:
@@ -170,16 +170,16 @@ class Deliveries:
 
     async def _attempt(self, key: tuple[str, str], mark: str) -> None:
         """Make the attempt that a mark announces, unless another process has made it, and remove the mark."""
-        webhook = await run_in_threadpool(self.webhooks.read, key[0])
-        found = await run_in_threadpool(self.webhooks.delivery, *key)
+        webhook = await run_in_threadpool(self.webhooks.get_or_none, key[0])
+        found = await run_in_threadpool(self.webhooks.get_delivery, *key)
         if webhook is not None and found is not None and found.state is DeliveryState.pending:
             assert found.next_at is not None
             if found.next_at <= datetime.now(UTC):
                 found = _counted(found)
                 # Before it is sent: an attempt that cannot be counted is not made, or it would be made for ever.
-                await run_in_threadpool(self.webhooks.write_delivery, found)
+                await run_in_threadpool(self.webhooks.save_delivery, found)
                 found = await self._send(webhook, found)
-                await run_in_threadpool(self.webhooks.write_delivery, found)
+                await run_in_threadpool(self.webhooks.save_delivery, found)
                 result = "retried" if found.state is DeliveryState.pending else found.state.value
                 self.metrics.webhook_attempts.labels(result).inc()
             if found.state is DeliveryState.pending:

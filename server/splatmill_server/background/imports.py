@@ -106,7 +106,7 @@ class Imports:
 
         Raises problems for an address that is refused (422), and for too many imports (429), and those of a capture.
         """
-        await run_in_threadpool(self.captures.record, capture_id)
+        await run_in_threadpool(self.captures.get, capture_id)
         try:
             await self.outgoing.check(request.url)
         except (AddressRefused, NoAnswer) as error:
@@ -154,9 +154,9 @@ class Imports:
             )
         return found
 
-    def of_capture(self, capture_id: str) -> list[Import]:
+    def list(self, capture_id: str) -> list[Import]:
         """Return the imports of a capture, newest first."""
-        self.captures.record(capture_id)
+        self.captures.get(capture_id)
         entries = self.storage.entries(layout.capture_imports(capture_id))
         names = [entry.path.rsplit("/", 1)[-1].removesuffix(".json") for entry in entries]
         found = [record for name in names if (record := self._read(capture_id, name)) is not None]
@@ -169,7 +169,7 @@ class Imports:
     def _owner(self, name: str) -> str:
         """Return the owner of an import, by the name of its mark; "" if its capture was deleted."""
         try:
-            return self.captures.recent(name.partition(".")[0]).owner or DEFAULT_OWNER
+            return self.captures.get_recent(name.partition(".")[0]).owner or DEFAULT_OWNER
         except (ProblemError, UnreadableRecord):
             return ""
 
@@ -238,7 +238,7 @@ class Imports:
             async with self.quota.upload(
                 None, found.capture, answer.size, beside=bytes_beside(found.name)
             ) as arrival:
-                file, new = await self.captures.store(
+                file, new = await self.captures.save_file(
                     found.capture,
                     found.role,
                     found.name,

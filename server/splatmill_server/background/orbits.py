@@ -126,7 +126,7 @@ class Orbits:
         return made
 
     def _accept(self, model_id: str, request: OrbitRequest, who: Caller) -> Orbit:
-        ply = self._models.file(model_id, "model.ply")
+        ply = self._models.get_file(model_id, "model.ply")
         if self._renderer is None:
             raise no_renderer()
         orbit_id = _id_of(ply.etag, request)
@@ -181,7 +181,7 @@ class Orbits:
             )
         return found
 
-    def video(self, model_id: str, orbit_id: str) -> str:
+    def get_video_path(self, model_id: str, orbit_id: str) -> str:
         """Return the path of a video in storage. Raises the problems of `get`, and a 409 problem if it is not whole."""
         found = self.get(model_id, orbit_id)
         if found.state is not OrbitState.succeeded:
@@ -308,7 +308,7 @@ class Orbits:
             await answer.aclose()
 
     def _owner(self, model_id: str) -> str:
-        return self._models.owner(model_id) or DEFAULT_OWNER
+        return self._models.get_owner(model_id) or DEFAULT_OWNER
 
     def _read(self, model_id: str, orbit_id: str) -> Orbit | None:
         path = layout.orbit_record(model_id, orbit_id)

@@ -80,7 +80,7 @@ class Reaper:
         self._restore()
         if self.leases.run():
             lines.sort(self.connection)
-        rows = {entries.rq_id(row.id, row.generation): row for row in self.jobs.active()}
+        rows = {entries.rq_id(row.id, row.generation): row for row in self.jobs.list_active()}
         states = dict(
             zip(
                 rows,
@@ -116,7 +116,7 @@ class Reaper:
             if time.monotonic() - self._looked_at < _LOST_SECONDS:
                 return
             self._looked_at = time.monotonic()
-            missing = set(restoring.without_row(self.connection, requests.names(self.jobs.storage)))
+            missing = set(restoring.without_row(self.connection, requests.list_ids(self.jobs.storage)))
         except ProblemError:
             return  # another process makes the lists
         except StorageError as error:

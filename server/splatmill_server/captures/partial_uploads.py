@@ -96,7 +96,7 @@ class PartialUploads:
     def _create(
         self, capture_id: str, role: Role, name: str, length: int | None, sha256: str | None
     ) -> Standing | CaptureFile:
-        self.captures.record(capture_id)
+        self.captures.get(capture_id)
         taken = self.captures.digests.of(capture_id, role, name)
         if taken is not None and sha256 is not None:
             if taken != sha256:
@@ -296,10 +296,10 @@ class PartialUploads:
         """Delete what was written into a capture that was deleted meanwhile. Raises its 404 problem."""
         if not self.storage.exists(layout.capture_record(capture_id)):
             self.storage.delete_prefix(layout.capture(capture_id))
-            self.captures.record(capture_id)
+            self.captures.get(capture_id)
 
     def _existing(self, capture_id: str, upload_id: str) -> UploadRecord:
-        self.captures.record(capture_id)
+        self.captures.get(capture_id)
         record = self._record(capture_id, upload_id) if layout.is_id(upload_id) else None
         if record is None:
             raise self._gone(capture_id, upload_id)
@@ -308,7 +308,7 @@ class PartialUploads:
     def _gone(self, capture_id: str, upload_id: str) -> ProblemError:
         """Return the problem of an upload that is not there, or not any more: a deletion takes the capture first."""
         try:
-            self.captures.record(capture_id)
+            self.captures.get(capture_id)
         except ProblemError as problem:
             return problem
         return ProblemError(

@@ -82,7 +82,7 @@ class Captures:
             ids = [_id_of_key(owner, key, number) for number in range(_IDS_OF_KEY)]
             for known in ids:
                 if self.storage.exists(layout.capture_record(known)):
-                    found = self.record(known)
+                    found = self.get(known)
                     self._list_new(found)  # whoever made it may have been killed before that
                     return found, False
             capture_id = next((known for known in ids if not self._is_leftover(known)), capture_id)
@@ -98,7 +98,7 @@ class Captures:
             self.unlisted = True
             raise
         if not made:
-            capture = self.record(capture_id)
+            capture = self.get(capture_id)
         self._list_new(capture)
         return capture, made
 
@@ -116,7 +116,7 @@ class Captures:
         found = any(True for _ in self.storage.entries(layout.capture(capture_id)))
         return found and not self.storage.exists(layout.capture_record(capture_id))
 
-    def record(self, capture_id: str) -> Capture:
+    def get(self, capture_id: str) -> Capture:
         """Return the record without the files. Raises a 404 problem, and UnreadableRecord."""
         if layout.is_id(capture_id):
             try:
@@ -125,14 +125,14 @@ class Captures:
                 pass
         raise capture_not_found(capture_id)
 
-    def recent(self, capture_id: str) -> Capture:
-        """Return the record as it was at most some seconds ago. Raises as `record` does.
+    def get_recent(self, capture_id: str) -> Capture:
+        """Return the record as it was at most some seconds ago. Raises as `get` does.
 
         Nothing in a record changes; the capture may have been deleted since.
         """
         read_at, capture = self._recent.get(capture_id, (float("-inf"), None))
         if capture is None or time.monotonic() - read_at > _RECENT_SECONDS:
-            capture = self.record(capture_id)
+            capture = self.get(capture_id)
             if len(self._recent) >= _COUNTED_CAPTURES:
                 self._recent.clear()
             self._recent[capture_id] = time.monotonic(), capture
@@ -143,20 +143,20 @@ class Captures:
         if who.admin:
             return
         try:
-            owner = self.recent(capture_id).owner
+            owner = self.get_recent(capture_id).owner
         except UnreadableRecord:
             owner = None
         if not who.may_see(owner):
             raise capture_not_found(capture_id)
 
-    async def read(self, capture_id: str) -> Capture:
+    async def get_with_files(self, capture_id: str) -> Capture:
         """Return the record with all files and their digests. Raises a 404 problem."""
-        capture = await run_in_threadpool(self.record, capture_id)
+        capture = await run_in_threadpool(self.get, capture_id)
         folder = layout.capture_files(capture_id)
         found = await run_in_threadpool(lambda: list(self.storage.entries(folder)))
         return capture.model_copy(update={"files": await self.digests.of_all(capture, found)})
 
-    def page(self, cursor: str | None, limit: int, wanted: Filter | None = None) -> CapturePage:
+    def list(self, cursor: str | None, limit: int, wanted: Filter | None = None) -> CapturePage:
         """Return a page of the captures that `wanted` admits, newest first. Raises the problems of `Lists.page`."""
         wanted = wanted or Filter()
 
@@ -232,7 +232,7 @@ class Captures:
     def delete(self, capture_id: str) -> None:
         """Delete a capture and its files. The record goes first, so that no incomplete capture is visible."""
         try:
-            owner = self.record(capture_id).owner
+            owner = self.get(capture_id).owner
         except UnreadableRecord:
             owner = None
         self._recent.pop(capture_id, None)
@@ -254,7 +254,7 @@ class Captures:
                 deleted += self.storage.delete_unused(layout.upload(capture_id, upload_id), STALE_SECONDS)
         return deleted
 
-    async def store(
+    async def save_file(
         self,
         capture_id: str,
         role: Role,
@@ -273,7 +273,7 @@ class Captures:
         """
         name = sent_name(name)
         try:
-            return await self._store(capture_id, role, name, chunks, announced_sha256, announced_size)
+            return await self._save_file(capture_id, role, name, chunks, announced_sha256, announced_size)
         except ProblemError as error:
             raise error.about_file(f"{role.value}/{name}") from error
         except StorageError as error:
@@ -291,7 +291,7 @@ class Captures:
             named = ProblemError(problem.code, problem.detail, advice=problem.advice, facts=problem.facts)
             raise named.about_file(f"{role.value}/{name}") from error
 
-    async def _store(
+    async def _save_file(
         self,
         capture_id: str,
         role: Role,
@@ -365,7 +365,7 @@ class Captures:
             self._recent.pop(capture_id, None)
             self.storage.delete_prefix(layout.capture(capture_id))
             raise capture_not_found(capture_id)
-        capture = self.recent(capture_id)
+        capture = self.get_recent(capture_id)
         self.digests.remember(capture, file)
         self.metrics.uploaded.inc(file.size)
         self.metrics.files.inc()
@@ -387,7 +387,7 @@ class Captures:
         A file may be larger than the limit (413), or than what the disk has left (507). `held` is the number of its
         bytes that are stored already.
         """
-        counted = (capture_id, self.recent(capture_id).created_at)
+        counted = (capture_id, self.get_recent(capture_id).created_at)
         limit = self.settings.max_files_per_capture
         if counted not in self._counts:
             if len(self._counts) >= _COUNTED_CAPTURES:

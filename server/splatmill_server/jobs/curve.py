@@ -13,7 +13,7 @@ from splatmill.backplane.storage import Storage
 from splatmill.schema import CurveRow
 
 
-def read(connection: redis.Redis, storage: Storage, job_id: str) -> list[CurveRow]:
+def get(connection: redis.Redis, storage: Storage, job_id: str) -> list[CurveRow]:
     """Return the curve of a job by step: that of storage where Redis has shrunk or lost the job, then that of Redis."""
     fresh = events.read_curve(connection, job_id)
     with connection.pipeline(transaction=False) as pipe:
@@ -23,10 +23,10 @@ def read(connection: redis.Redis, storage: Storage, job_id: str) -> list[CurveRo
     return fresh if known and not shrunk else events.joined([*_stored(storage, job_id), *fresh])
 
 
-def store(connection: redis.Redis, storage: Storage, job_id: str) -> None:
+def save(connection: redis.Redis, storage: Storage, job_id: str) -> None:
     """Store the curve of a job that has ended. Raises StorageError, and redis.RedisError."""
     path = layout.job_curve(job_id)
-    if not (rows := read(connection, storage, job_id)):
+    if not (rows := get(connection, storage, job_id)):
         return
     storage.put(path, "".join(f"{row.model_dump_json(exclude_none=True)}\n" for row in rows).encode())
     if not connection.exists(keys.job(job_id)):

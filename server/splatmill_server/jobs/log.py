@@ -18,7 +18,7 @@ from splatmill.schema import Job, LogEvent, LogLine
 from splatmill.schema.tolerant import keep_readable
 
 
-def read(connection: redis.Redis, storage: Storage, job_id: str) -> list[LogLine]:
+def get(connection: redis.Redis, storage: Storage, job_id: str) -> list[LogLine]:
     """Return the log lines of all attempts at a job, oldest first.
 
     They are read from Redis, and from storage where Redis has shrunk or lost the job.
@@ -41,12 +41,12 @@ def read(connection: redis.Redis, storage: Storage, job_id: str) -> list[LogLine
     return [line for line in earlier if not fresh or line.at < fresh[0].at] + fresh
 
 
-def store(connection: redis.Redis, storage: Storage, job: Job, generation: int) -> None:
+def save(connection: redis.Redis, storage: Storage, job: Job, generation: int) -> None:
     """Store the log of a job that has ended. Raises StorageError, and redis.RedisError."""
     path = layout.job_log(job.id)
     ended = job.model_dump(mode="json", exclude_none=True)
     head = json.dumps({"format": FORMAT, "generation": generation, "job": ended})
-    lines = [line.model_dump_json() for line in read(connection, storage, job.id)]
+    lines = [line.model_dump_json() for line in get(connection, storage, job.id)]
     storage.put(path, "\n".join([head, *lines, ""]).encode())
     if not connection.exists(keys.job(job.id)):
         storage.delete(path)  # the job was deleted meanwhile
@@ -60,7 +60,7 @@ class StoredEnd:
     generation: int
 
 
-def stored_end(storage: Storage, job_id: str) -> StoredEnd | None:
+def get_stored_end(storage: Storage, job_id: str) -> StoredEnd | None:
     """Return a job as it ended, from the file of its log, or None."""
     end = _stored(storage, job_id)[0]
     return end if end is not None and end.job.state.final else None

@@ -1,4 +1,4 @@
-"""Job records. No other code writes job rows.
+"""The records of jobs: makes, restarts, cancels, ends and deletes them. No other code writes job rows.
 
 Each change is one optimistic transaction on the row, and on the states stream if the change depends on it, so that
 API processes and workers never overwrite each other's changes.
@@ -103,7 +103,7 @@ class Jobs:
                 lists.put_job(pipe, job_id, created, owner, request.capture, lists.UNFINISHED)
                 pipe.sadd(keys.ACTIVE, job_id)
 
-        requests.keep(self.storage, new)
+        requests.save(self.storage, new)
         try:
             # Of two concurrent requests with the same key, only one inserts the job.
             self.connection.transaction(insert, keys.job(job_id), keys.begun_jobs(owner), *watched)
@@ -118,12 +118,12 @@ class Jobs:
         log.info("job created", job=job_id, capture=request.capture)
         return self._placed(new), True
 
-    def id_of_key(self, owner: str, key: str) -> str | None:
+    def get_id_of_key(self, owner: str, key: str) -> str | None:
         """Return the id of the job that the owner first used an `Idempotency-Key` for, or None."""
         stored = cast(bytes | None, self.connection.get(keys.idempotency(_digest(owner, key))))
         return cast(str, json.loads(stored)["job"]) if stored else None
 
-    def row(self, job_id: str) -> JobRow:
+    def get_row(self, job_id: str) -> JobRow:
         """Return the row of a job. Raises a 404 problem if Redis has none, and a 500 problem if it is not readable."""
         try:
             found = row.read(self.connection, job_id) if layout.is_id(job_id) else None
@@ -140,17 +140,17 @@ class Jobs:
 
     def check_visible(self, who: Caller, job_id: str) -> None:
         """Raise a 404 problem if another owner has the job, but not if there is none."""
-        if not who.admin and not who.may_see(self.owner(job_id)):
+        if not who.admin and not who.may_see(self.get_owner(job_id)):
             raise job_not_found(job_id)
 
-    def owner(self, job_id: str) -> str | None:
+    def get_owner(self, job_id: str) -> str | None:
         """Return the owner of a job, or None if there is no such job or its owner cannot be read."""
         if not layout.is_id(job_id):
             return None
         known, owner = self._owners([job_id])[0]
         if known:
             return owner
-        stored = self.stored(job_id)
+        stored = self.get_stored(job_id)
         return stored.owner if stored is not None else None
 
     def _owners(self, job_ids: Sequence[str]) -> list[tuple[bool, str]]:
@@ -168,11 +168,11 @@ class Jobs:
         """Return the job as clients see it. A job that has ended is read from storage if Redis has lost it."""
         if layout.is_id(job_id) and (held := read_jobs(self.connection, [job_id]).get(job_id)) is not None:
             return self._places.fill([(with_links(held.job()), held.row.generation)])[0]
-        if (stored := self.stored(job_id)) is not None:
+        if (stored := self.get_stored(job_id)) is not None:
             return stored
-        return self._placed(self.row(job_id))  # raises what is wrong with the row, or that there is none
+        return self._placed(self.get_row(job_id))  # raises what is wrong with the row, or that there is none
 
-    def stored(self, job_id: str) -> Job | None:
+    def get_stored(self, job_id: str) -> Job | None:
         """Return an ended job from storage: from the `job.json` of its model or the file of its log, or None."""
         if not layout.is_id(job_id):
             return None
@@ -182,10 +182,10 @@ class Jobs:
             pass
         except UnreadableRecord as error:
             warn(layout.job_record(job_id), str(error))
-        ended = job_log.stored_end(self.storage, job_id)
+        ended = job_log.get_stored_end(self.storage, job_id)
         return with_links(ended.job) if ended is not None else None
 
-    def page(self, cursor: str | None, limit: int, wanted: JobFilter | None = None) -> JobPage:
+    def list(self, cursor: str | None, limit: int, wanted: JobFilter | None = None) -> JobPage:
         """Return a page of the jobs that `wanted` admits, newest first (see `Lists.page`)."""
         return listing.page(self.connection, self.lists, self._places, cursor, limit, wanted or JobFilter())
 
@@ -197,7 +197,7 @@ class Jobs:
         """Restore those of these unfinished jobs that Redis has lost, and return their number."""
         return restoring.restore_unfinished(self.connection, self.storage, job_ids)
 
-    def active(self) -> list[JobRow]:
+    def list_active(self) -> Sequence[JobRow]:
         """Return the rows of all unfinished jobs, and retire those that have ended.
 
         A job whose row is not readable stays active, but is left out.
@@ -224,8 +224,8 @@ class Jobs:
             if (known := row.read(self.connection, job_id)) is not None and (
                 job := self._job(known)
             ).state.final:
-                job_log.store(self.connection, self.storage, job, known.generation)
-                job_curve.store(self.connection, self.storage, job_id)
+                job_log.save(self.connection, self.storage, job, known.generation)
+                job_curve.save(self.connection, self.storage, job_id)
                 if (
                     job.state is JobState.succeeded
                     and self.connection.zscore(lists.name("models"), job_id) is None
@@ -257,7 +257,7 @@ class Jobs:
         self.connection.transaction(remove, keys.job(job_id), keys.states(job_id))
         if retired is not None:
             try:
-                requests.forget(self.connection, self.storage, retired)
+                requests.delete(self.connection, self.storage, retired)
             except StorageError as error:  # what is left says nothing: the log in storage tells of the end
                 log.warning("the request of an ended job cannot be deleted", job=job_id, error=str(error))
 
@@ -277,9 +277,9 @@ class Jobs:
     def _announce_unretired(self, job_id: str) -> None:
         """Announce the end of a job that has ended so recently that it still counts as active."""
         if self.connection.sismember(keys.ACTIVE, job_id):
-            self._announce_end(self.row(job_id))
+            self._announce_end(self.get_row(job_id))
 
-    def unfinished_of(self, owner: str) -> int:
+    def count_unfinished(self, owner: str) -> int:
         """Return the number of unfinished jobs of an owner. A job whose row is not readable is one of them."""
         named = lists.name("jobs", owner=owner, group=lists.UNFINISHED)
         own = [entry.decode() for entry in cast(list[bytes], self.connection.zrange(named, 0, -1))]
@@ -307,7 +307,7 @@ class Jobs:
 
         Raises 404 problems, and a 409 problem for a job that runs.
         """
-        found = self.row(job_id)
+        found = self.get_row(job_id)
         return self._placed(found) if _waits(found, self._job(found)) else None
 
     def restart(self, job_id: str, *, check: Callable[[], None], watched: Sequence[str]) -> Job:
@@ -321,7 +321,7 @@ class Jobs:
                 return None  # a repeated restart has no further effect
             check()
             moment = row.now()
-            requests.keep(self.storage, requests.next_generation(found, moment, _request_id()))
+            requests.save(self.storage, requests.next_generation(found, moment, _request_id()))
             return {
                 "generation": str(found.generation + 1),
                 "queued_at": moment.isoformat(),
@@ -331,23 +331,23 @@ class Jobs:
             }
 
         self._announce_unretired(job_id)
-        self._change(job_id, begin_generation, *watched, begun=keys.begun_jobs(self.row(job_id).owner))
-        begun = self.row(job_id)
-        requests.keep(self.storage, begun)  # again: the end of the former generation may just have removed it
+        self._change(job_id, begin_generation, *watched, begun=keys.begun_jobs(self.get_row(job_id).owner))
+        begun = self.get_row(job_id)
+        requests.save(self.storage, begun)  # again: the end of the former generation may just have removed it
         queue.enqueue(self.connection, job_id, begun.generation)
         log.info("job restarted", job=job_id, generation=begun.generation)
         return self._placed(begun)
 
     def delete(self, job_id: str) -> None:
         """Delete a job that has ended, its work files and its model. Raises 404 and 409 problems."""
-        owner, capture = self.owner(job_id), None
+        owner, capture = self.get_owner(job_id), None
         found: JobRow | None = None
         try:
-            found = self.row(job_id)
+            found = self.get_row(job_id)
         except ProblemError as error:
             if error.problem.code == "job_corrupt":
                 self._withdraw_unreadable(job_id)
-            elif (ended := self.stored(job_id)) is None:
+            elif (ended := self.get_stored(job_id)) is None:
                 raise
             else:
                 capture = ended.capture
@@ -436,7 +436,7 @@ class Jobs:
         """
 
         def apply(pipe: Any) -> None:
-            found = self.row(job_id)
+            found = self.get_row(job_id)
             changes = decide(found, self._job(found))
             begins = changes is not None and "generation" in changes
             states = events.read_states(self.connection, job_id) if begins else []
@@ -460,7 +460,7 @@ class Jobs:
 
         seen = [keys.job(job_id), keys.states(job_id), *watched, *([begun] if begun is not None else [])]
         self.connection.transaction(apply, *seen)
-        return self._placed(self.row(job_id))
+        return self._placed(self.get_row(job_id))
 
     def _claim_key(self, owner: str, key: str, body: str, job_id: str) -> str:
         name = keys.idempotency(_digest(owner, key))

@@ -15,7 +15,7 @@ from splatmill.backplane.row import JobRow
 from splatmill.backplane.storage import Storage
 
 
-def keep(storage: Storage, begun: JobRow) -> None:
+def save(storage: Storage, begun: JobRow) -> None:
     """Store the row of a job that begins. Raises StorageError."""
     storage.put(layout.watched_job(begun.id), begun.model_dump_json(exclude_none=True).encode())
 
@@ -26,7 +26,7 @@ def next_generation(found: JobRow, moment: datetime, request: str | None) -> Job
     return found.model_copy(update=changes | {"cancel_requested_at": None, "verdict": None})
 
 
-def read(storage: Storage, job_id: str) -> JobRow | None:
+def get(storage: Storage, job_id: str) -> JobRow | None:
     """Return the row of an unfinished job, or None if there is none that can be read."""
     path = layout.watched_job(job_id)
     try:
@@ -38,14 +38,14 @@ def read(storage: Storage, job_id: str) -> JobRow | None:
         return None
 
 
-def names(storage: Storage) -> list[str]:
+def list_ids(storage: Storage) -> list[str]:
     """Return the ids of all jobs whose rows are stored."""
     paths = (entry.path.rpartition("/")[2] for entry in storage.walk(layout.watched_jobs()))
     found = (path.removesuffix(".json") for path in paths if path.endswith(".json"))
     return sorted(job_id for job_id in found if layout.is_id(job_id))
 
 
-def forget(connection: redis.Redis, storage: Storage, ended: JobRow) -> None:
+def delete(connection: redis.Redis, storage: Storage, ended: JobRow) -> None:
     """Delete the row of a job whose end is stored, unless it was restarted meanwhile."""
     storage.delete(layout.watched_job(ended.id))
     try:
@@ -53,4 +53,4 @@ def forget(connection: redis.Redis, storage: Storage, ended: JobRow) -> None:
     except UnreadableRecord:
         return
     if found is not None and found.generation != ended.generation:
-        keep(storage, found)
+        save(storage, found)

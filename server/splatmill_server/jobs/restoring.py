@@ -35,7 +35,7 @@ def make_lists(connection: redis.Redis, storage: Storage, listed: Lists, succeed
     """
     lists.clear(connection, "jobs")
     count = _list_rows(connection, storage, succeeded)
-    unfinished = requests.names(storage)
+    unfinished = requests.list_ids(storage)
     for start in range(0, len(unfinished), _BATCH):
         count += restore_unfinished(connection, storage, unfinished[start : start + _BATCH])
     ended = storage.children(layout.jobs())
@@ -80,8 +80,8 @@ def restore_unfinished(connection: redis.Redis, storage: Storage, job_ids: Seque
 
 def _unfinished(storage: Storage, job_id: str) -> JobRow | None:
     """Return the row of an unfinished job, or None if its generation has ended and only the request was left."""
-    found = requests.read(storage, job_id)
-    ended = job_log.stored_end(storage, job_id) if found is not None else None
+    found = requests.get(storage, job_id)
+    ended = job_log.get_stored_end(storage, job_id) if found is not None else None
     if found is not None and ended is not None and ended.generation >= found.generation:
         storage.delete(layout.watched_job(job_id))
         return None
@@ -106,7 +106,7 @@ def _list_rows(connection: redis.Redis, storage: Storage, succeeded: dict[str, E
             pipe.execute()
         for found in held.values():
             if not found.state.final:  # an earlier version stored no requests
-                requests.keep(storage, found.row)
+                requests.save(storage, found.row)
         count += len(held)
     return count
 
@@ -121,7 +121,9 @@ def _restore_ended(
     """Restore those of the jobs that have ended and have no row, and return their number."""
     missing = [job_id for job_id in without_row(connection, job_ids) if layout.is_id(job_id)]
     ends = [
-        end for end in each(lambda job_id: job_log.stored_end(storage, job_id), missing) if end is not None
+        end
+        for end in each(lambda job_id: job_log.get_stored_end(storage, job_id), missing)
+        if end is not None
     ]
     with connection.pipeline() as pipe:
         added = lists.Additions()

@@ -61,7 +61,7 @@ async def create_capture(
     response.headers["Location"] = f"/v1/captures/{capture.id}"
     if not new:
         response.status_code = 200
-        return await service.captures.read(capture.id)
+        return await service.captures.get_with_files(capture.id)
     return capture
 
 
@@ -74,7 +74,7 @@ def list_captures(
     name: NamePart = None,
 ) -> CapturePage:
     """List captures, newest first, without their files."""
-    return service.captures.page(cursor, limit, Filter(owner, name))
+    return service.captures.list(cursor, limit, Filter(owner, name))
 
 
 @router.get(
@@ -83,7 +83,7 @@ def list_captures(
 )
 async def get_capture(service: Shared, capture_id: CaptureId) -> Capture:
     """Get a capture with its files and their digests."""
-    return await service.captures.read(capture_id)
+    return await service.captures.get_with_files(capture_id)
 
 
 @router.delete("/{capture_id}", status_code=204, responses=problems("capture_not_found", "capture_in_use"))
@@ -174,7 +174,7 @@ async def put_file(
         beside=bytes_beside(name),
         is_stored=lambda: service.captures.digests.of(capture_id, role, name) is not None,
     ) as arrival:
-        file, new = await service.captures.store(
+        file, new = await service.captures.save_file(
             capture_id,
             role,
             name,

@@ -52,7 +52,7 @@ async def edit_model(
     model = await run_in_threadpool(service.models.get, model_id)
     if body.preview:
         return await _edit(service, model_id, request, body, None)
-    owner = await run_in_threadpool(service.models.owner, model_id) or who.owner
+    owner = await run_in_threadpool(service.models.get_owner, model_id) or who.owner
     # An edit only leaves out Gaussians.
     async with service.quota.storing(who, owner, secrets.token_hex(8), model.bytes) as room:
         return await _edit(service, model_id, request, body, room)

@@ -42,7 +42,7 @@ async def import_file(
     request: Annotated[CreateImport, Body(examples=[{"url": "https://example.org/kitchen.zip"}])],
 ) -> Import:
     """Fetch a file of the capture from an address. It is fetched in the background; `Location` tells how far it is."""
-    owner = (await run_in_threadpool(service.captures.recent, capture_id)).owner
+    owner = (await run_in_threadpool(service.captures.get_recent, capture_id)).owner
     size = RECORD_BYTES + len(json.dumps(request.url))
     async with service.quota.storing(who, owner, capture_id, size) as room:
         made = await service.imports.create(capture_id, request)
@@ -54,7 +54,7 @@ async def import_file(
 @router.get("/{capture_id}/imports", responses=problems("capture_not_found"))
 def list_imports(service: Shared, capture_id: CaptureId) -> ImportList:
     """List the imports of a capture, newest first."""
-    return ImportList(imports=service.imports.of_capture(capture_id))
+    return ImportList(imports=service.imports.list(capture_id))
 
 
 @router.get("/{capture_id}/imports/{import_id}", responses=problems("capture_not_found", "import_not_found"))
@@ -62,5 +62,5 @@ def get_import(
     service: Shared, capture_id: CaptureId, import_id: Annotated[str, Path(description="Id of the import.")]
 ) -> Import:
     """Get an import: its state, the bytes received, and the file or the problem at its end."""
-    service.captures.record(capture_id)
+    service.captures.get(capture_id)
     return service.imports.get(capture_id, import_id)

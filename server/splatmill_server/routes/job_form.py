@@ -91,7 +91,7 @@ async def _store(service: Service, who: Caller, capture_id: str, part: Part, fil
     if not filename:
         raise ProblemError("name_invalid", f"A file among the {part.name} of the form has no file name.")
     async with service.quota.upload(who, capture_id, None, beside=bytes_beside(filename)) as arrival:
-        file, new = await service.captures.store(
+        file, new = await service.captures.save_file(
             capture_id, Role(part.name), filename, arrival.counted(part.chunks)
         )
         arrival.stored = file.size if new else 0

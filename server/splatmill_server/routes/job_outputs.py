@@ -67,9 +67,9 @@ async def follow_events(
         )
     headers = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
     try:
-        row = await run_in_threadpool(service.jobs.row, job_id)
+        row = await run_in_threadpool(service.jobs.get_row, job_id)
     except ProblemError:
-        job = await run_in_threadpool(service.jobs.stored, job_id)
+        job = await run_in_threadpool(service.jobs.get_stored, job_id)
         if job is None:
             raise
         if last_event_id:
@@ -103,7 +103,7 @@ def get_logs(
 ) -> Response:
     """Get the log lines of all attempts at a job, oldest first. They are kept when the job has ended."""
     service.jobs.get(job_id)
-    lines = job_log.read(service.redis, service.storage, job_id)
+    lines = job_log.get(service.redis, service.storage, job_id)
     if form == "text":
         headers = {"Content-Disposition": f'attachment; filename="{job_id}.log"'}
         return PlainTextResponse(job_log.text(lines), headers=headers)
@@ -114,7 +114,7 @@ def get_logs(
 def get_curve(service: Shared, job_id: JobId) -> Curve:
     """Get the error against run time that was measured so far, from the first measurement on."""
     service.jobs.get(job_id)
-    if rows := job_curve.read(service.redis, service.storage, job_id):
+    if rows := job_curve.get(service.redis, service.storage, job_id):
         return Curve(rows=rows)
     report = _report(service, job_id)
     return Curve(rows=report.curve if report is not None else [])

@@ -136,7 +136,7 @@ def list_jobs(
 ) -> JobPage:
     """List jobs, newest first. A page of a filtered list may hold fewer than `limit` although it has a `cursor`."""
     states = frozenset(state) if state else None
-    return service.jobs.page(cursor, limit, JobFilter(owner, name, capture, states))
+    return service.jobs.list(cursor, limit, JobFilter(owner, name, capture, states))
 
 
 @router.get("/{job_id}", responses=problems("job_not_found"))
@@ -160,7 +160,7 @@ async def cancel_job(service: Shared, job_id: JobId) -> Job:
     job = await run_in_threadpool(service.jobs.cancel, job_id)
     if not job.state.final:
         # The first step is taken here, so that a job that waits in the queue is cancelled in this response.
-        row = await run_in_threadpool(service.jobs.row, job_id)
+        row = await run_in_threadpool(service.jobs.get_row, job_id)
         await run_in_threadpool(service.reaper.cancel, row)
         service.reaper.wake()
         job = await run_in_threadpool(service.jobs.get, job_id)

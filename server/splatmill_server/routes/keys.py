@@ -40,7 +40,7 @@ def create_key(
 @needs(Scope.admin)
 def list_keys(service: Shared) -> KeyList:
     """List the keys, the oldest first, without their secrets."""
-    return KeyList(keys=service.keys.page())
+    return KeyList(keys=service.keys.list())
 
 
 @router.get("/keys/{key_id}", responses=problems("key_not_found"))
@@ -83,5 +83,5 @@ def get_me(service: Shared, who: Who) -> Me:
         key_name=who.key_name,
         scopes=[s for s in Scope if s in who.scopes or (s is not Scope.metrics and who.has(s))],
         limits=who.limits,
-        use=Use(unfinished_jobs=service.jobs.unfinished_of(who.owner)),
+        use=Use(unfinished_jobs=service.jobs.count_unfinished(who.owner)),
     )

@@ -81,7 +81,7 @@ def list_models(
     name: NamePart = None,
 ) -> ModelPage:
     """List finished models, newest first."""
-    return service.models.page(cursor, limit, Filter(owner, name))
+    return service.models.list(cursor, limit, Filter(owner, name))
 
 
 @router.get("/{model_id}", responses=problems("model_not_found", "model_not_ready", "model_corrupt"))
@@ -128,13 +128,13 @@ def get_formats(service: Shared, model_id: ModelId) -> ModelDownloads:
 )
 async def download_html(service: Shared, who: Who, model_id: ModelId, request: Request) -> Response:
     """Download a model with its viewer in one HTML file, which needs no server and sends no request."""
-    path = await while_connected(request, service.conversions.path(model_id, DOWNLOADS["sog"], who))
+    path = await while_connected(request, service.conversions.get_path(model_id, DOWNLOADS["sog"], who))
     if path is None:
         return Response(status_code=CLIENT_GONE)
 
     def made() -> bytes:
         model = service.models.get(model_id)
-        cameras = service.models.cameras(model_id)
+        cameras = service.models.get_cameras(model_id)
         antialias = service.models.antialias(model_id)
         return single_file(model.name or model_id, service.storage.get(path), cameras, antialias)
 
@@ -183,7 +183,7 @@ async def download(
 )
 def get_cameras(service: Shared, model_id: ModelId) -> ModelCameras:
     """Get the cameras of the photos in the coordinates of the model; `split` marks the held-out ones."""
-    return service.models.cameras(model_id)
+    return service.models.get_cameras(model_id)
 
 
 @router.post(

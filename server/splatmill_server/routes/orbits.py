@@ -91,5 +91,5 @@ async def get_orbit_video(
     service: Shared, model_id: ModelId, orbit_id: OrbitId, request: Request
 ) -> Response:
     """Download an orbit video (MP4)."""
-    path = await run_in_threadpool(service.orbits.video, model_id, orbit_id)
+    path = await run_in_threadpool(service.orbits.get_video_path, model_id, orbit_id)
     return await file_response(request, service.storage, path, "video/mp4")

@@ -39,7 +39,7 @@ async def begin_session(service: Shared, who: Who, request: Request) -> Response
             advice="Send the header 'Authorization: Bearer KEY'. A server without keys needs no session.",
         )
     check_origin(request.scope, request.headers, service.settings.own_names, required=False)
-    cookie = await service.sessions.begin(Session(who.key_id, digest(given)))
+    cookie = await service.sessions.create(Session(who.key_id, digest(given)))
     secure = request.url.scheme == "https" or request.headers.get("origin", "").startswith("https://")
     response = Response(status_code=204, headers={"Cache-Control": "no-store"})
     response.set_cookie(
@@ -61,7 +61,7 @@ async def begin_session(service: Shared, who: Who, request: Request) -> Response
 async def end_session(service: Shared, request: Request) -> Response:
     """End the session of the cookie, if there is one."""
     if (cookie := session_cookie(request.headers)) is not None:
-        await service.sessions.end(cookie)
+        await service.sessions.delete(cookie)
     response = Response(status_code=204)
     response.delete_cookie(COOKIE, path=address("/"), httponly=True, samesite="strict")
     return response

@@ -27,7 +27,7 @@ LIMITS = KeyLimits(requests_per_minute=600)
 async def _share(
     service: Shared, request: Request, token: Annotated[str, Path(description="Token of the link.")]
 ) -> StoredShare:
-    share = await run_in_threadpool(service.shares.open, token)
+    share = await run_in_threadpool(service.shares.get, token)
     visitor = Caller("", f"share-{share.model}-{share.id}", f"link {share.id}", frozenset(), LIMITS)
     request.state.caller = visitor  # for the access log, which does not show the token
     await service.rate.admit(visitor)
@@ -44,7 +44,7 @@ OpenShare = Annotated[StoredShare, Depends(_share)]
 )
 def get_shared_model(service: Shared, share: OpenShare) -> SharedModel:
     """Get the model that a link shows."""
-    return service.shares.model(share)
+    return service.shares.get_model(share)
 
 
 @router.head("/files/{name:path}", include_in_schema=False)
@@ -127,7 +127,7 @@ async def download_shared(
 )
 def get_shared_cameras(service: Shared, share: OpenShare) -> ModelCameras:
     """Get the cameras of the photos in the coordinates of the model that a link shows."""
-    return service.models.cameras(share.model)
+    return service.models.get_cameras(share.model)
 
 
 @router.get(

@@ -43,7 +43,7 @@ def create_share(
 @router.get("", responses=problems("model_not_found", "model_not_ready"))
 def list_shares(service: Shared, model_id: ModelId) -> ShareList:
     """List the links to a model, newest first, also those that have ended, without their tokens."""
-    return ShareList(shares=service.shares.of_model(model_id))
+    return ShareList(shares=service.shares.list(model_id))
 
 
 @router.delete(

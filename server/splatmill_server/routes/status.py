@@ -198,7 +198,7 @@ def _seen_by(service: Service, who: Caller, worker: WorkerInfo, number: int) -> 
     """Return what the caller may know of a worker: not its machine, which its name begins with, nor others' jobs."""
     if who.admin:
         return worker
-    job = worker.job if worker.job is not None and who.may_see(service.jobs.owner(worker.job)) else None
+    job = worker.job if worker.job is not None and who.may_see(service.jobs.get_owner(worker.job)) else None
     return worker.model_copy(update={"name": f"worker-{number}", "job": job})
 
 

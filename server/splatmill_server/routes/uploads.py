@@ -67,7 +67,7 @@ async def begin(
 ) -> Response:
     """Begin an upload, with the first bytes if the request has a body; answer with its address."""
     with _limits_on_413(service):
-        owner = (await run_in_threadpool(service.captures.recent, capture_id)).owner
+        owner = (await run_in_threadpool(service.captures.get_recent, capture_id)).owner
         async with service.quota.storing(who, owner, capture_id, RECORD_BYTES) as room:
             found = await service.partial_uploads.create(capture_id, role, name, read_integer(length), digest)
             room.stored = len(found.record.model_dump_json().encode()) if isinstance(found, Standing) else 0
@@ -102,7 +102,7 @@ async def begin(
 @router.options("/{capture_id}/{role}/{name:path}", status_code=204, responses=problems("capture_not_found"))
 def get_upload_limits(service: Shared, capture_id: CaptureId, role: Role, name: str) -> Response:
     """Tell that files can be uploaded in several requests, and the limits."""
-    service.captures.record(capture_id)
+    service.captures.get(capture_id)
     headers = {"Accept-Patch": PARTIAL_UPLOAD, "Allow": "PUT, OPTIONS", UPLOAD_LIMIT: _limits(service)}
     return Response(status_code=204, headers=headers)
 

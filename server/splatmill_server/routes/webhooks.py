@@ -65,7 +65,7 @@ async def create_webhook(
 @router.get("", responses=problems())
 def list_webhooks(service: Shared, owner: ListedOwner) -> WebhookList:
     """List the webhooks, the oldest first, without their secrets."""
-    return WebhookList(webhooks=[record.public() for record in service.webhooks.of_owner(owner)])
+    return WebhookList(webhooks=[record.public() for record in service.webhooks.list(owner)])
 
 
 @router.get("/{webhook_id}", responses=problems("webhook_not_found"))
@@ -97,7 +97,7 @@ def enable_webhook(service: Shared, webhook_id: WebhookId) -> Webhook:
 @router.get("/{webhook_id}/deliveries", responses=problems("webhook_not_found"))
 def list_deliveries(service: Shared, webhook_id: WebhookId) -> DeliveryList:
     """List the deliveries of a webhook, newest first, with every attempt. They are kept for 30 days."""
-    return DeliveryList(deliveries=service.webhooks.deliveries(webhook_id))
+    return DeliveryList(deliveries=[*service.webhooks.list_deliveries(webhook_id)])
 
 
 @router.post(

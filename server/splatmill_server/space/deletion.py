@@ -69,7 +69,7 @@ class Deletion:
         Raises problems for a job that does not exist (404), that has not ended (409), or whose model another unfinished
         job starts from (409).
         """
-        owner = self.jobs.owner(job_id)
+        owner = self.jobs.get_owner(job_id)
         model = Holding(kind=StoredKind.model, id=job_id).key
         with self._marked(model) as mark:
             use = self._user(model)
@@ -153,7 +153,7 @@ class Deletion:
 
     def _owner(self, capture_id: str) -> str | None:
         try:
-            return self.captures.record(capture_id).owner
+            return self.captures.get(capture_id).owner
         except UnreadableRecord:
             return None
 

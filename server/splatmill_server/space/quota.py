@@ -79,7 +79,7 @@ class Quota:
 
         capture_id: the capture whose owner gets the bytes; without one, they are the caller's.
         """
-        owner = self.captures.record(capture_id).owner if capture_id is not None else who.owner
+        owner = self.captures.get(capture_id).owner if capture_id is not None else who.owner
         limit = self.limit(who, owner)
         if limit is None:
             return
@@ -205,7 +205,7 @@ class Quota:
         Raises a 404 problem without a capture, and a 507 problem where the quota does not suffice.
         """
         try:
-            owner = (await run_in_threadpool(self.captures.recent, capture_id)).owner
+            owner = (await run_in_threadpool(self.captures.get_recent, capture_id)).owner
         except ProblemError as error:
             raise (error.about_file(file) if file is not None else error) from error
         limit = await run_in_threadpool(self._begin, who, owner)

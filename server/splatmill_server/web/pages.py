@@ -119,7 +119,7 @@ def _shared(service: Service, request: Request, token: str, *, embedded: bool) -
     """Return the page of a link, whose status says whether the link is valid; the page says it to people."""
     status, head = 200, ""
     try:
-        model = service.shares.model(service.shares.open(token))
+        model = service.shares.get_model(service.shares.get(token))
         head = _poster(str(request.base_url), token, model)
     except ProblemError as error:
         status = error.problem.status

@@ -76,7 +76,7 @@ def test_a_request_is_followed_to_its_job(serve: Serve, lines: CapturingLogger) 
     app.service.reaper.tick()
     app.http.post(f"/v1/jobs/{job_id}/restart", headers={"X-Request-ID": "bob-8"}).raise_for_status()
     assert request_of(app.redis, job_id) == "bob-8"
-    kept = job_requests.read(app.service.storage, job_id)
+    kept = job_requests.get(app.service.storage, job_id)
     assert kept is not None
     assert kept.request == "bob-8", "it is restored with the job"
 

@@ -61,7 +61,7 @@ def all_pages(page: Page) -> tuple[list[str], int]:
 
 def jobs(service: Service, wanted: JobFilter | None = None) -> Page:
     def page(cursor: str | None) -> tuple[list[str], str | None]:
-        found = service.jobs.page(cursor, PAGE, wanted)
+        found = service.jobs.list(cursor, PAGE, wanted)
         return [job.id for job in found.jobs], found.cursor
 
     return page
@@ -69,7 +69,7 @@ def jobs(service: Service, wanted: JobFilter | None = None) -> Page:
 
 def captures(service: Service, wanted: Filter | None = None) -> Page:
     def page(cursor: str | None) -> tuple[list[str], str | None]:
-        found = service.captures.page(cursor, PAGE, wanted)
+        found = service.captures.list(cursor, PAGE, wanted)
         return [capture.id for capture in found.captures], found.cursor
 
     return page
@@ -77,7 +77,7 @@ def captures(service: Service, wanted: Filter | None = None) -> Page:
 
 def models(service: Service, wanted: Filter | None = None) -> Page:
     def page(cursor: str | None) -> tuple[list[str], str | None]:
-        found = service.models.page(cursor, PAGE, wanted)
+        found = service.models.list(cursor, PAGE, wanted)
         return [model.id for model in found.models], found.cursor
 
     return page
@@ -164,7 +164,7 @@ def test_the_reaper_takes_the_same_round_trips_for_many_jobs_as_for_few(
     service.lists.ensure(0.0)
     service.redis.delete(keys.RESTORED)
     service.reaper.tick()  # puts the queued jobs into the queue, and notes the ended ones
-    assert len(service.jobs.active()) == len(records.queued)
+    assert len(service.jobs.list_active()) == len(records.queued)
     with counted() as operations:
         service.reaper.tick()
     assert operations.round_trips <= 14

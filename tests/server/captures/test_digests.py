@@ -142,7 +142,7 @@ def test_a_manifest_that_is_damaged_or_of_another_capture_is_not_believed(
 ) -> None:
     app = serve()
     capture_id = upload(app, 3)
-    created = app.service.captures.record(capture_id).created_at.isoformat()
+    created = app.service.captures.get(capture_id).created_at.isoformat()
     path = layout.capture_manifest(capture_id)
     app.service.storage.put(path, damage.replace(b"CREATED", created.encode()))
     assert look(serve(), capture_id) == {name: EXPECTED[name] for name in list(EXPECTED)[:3]}

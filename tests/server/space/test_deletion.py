@@ -150,12 +150,12 @@ def stored_of(app: ServedApp, job_id: str) -> list[str]:
 
 def test_a_restarted_job_is_active_in_the_same_step(app: ServedApp, monkeypatch: pytest.MonkeyPatch) -> None:
     job_id = ended(app)
-    assert app.service.jobs.active() == []
+    assert app.service.jobs.list_active() == []
     check = admission.check_marks
 
     def checked(*arguments: object) -> None:
         check(*arguments)  # type: ignore[arg-type]  # passed on
-        app.service.jobs.active()  # the reaper retires ended jobs at any moment
+        app.service.jobs.list_active()  # the reaper retires ended jobs at any moment
 
     monkeypatch.setattr("splatmill_server.admission.check_marks", checked)
     assert app.http.post(f"/v1/jobs/{job_id}/restart").status_code == 202

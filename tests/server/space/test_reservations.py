@@ -155,7 +155,7 @@ def test_jobs_and_restarts_reserve_room_until_they_end(app: ServedApp) -> None:
     assert ledger.bytes_of("default") <= (ann.limit or 0)
     app.begin(jobs[0])
     app.finish(jobs[0])
-    app.service.jobs.active()  # which the reaper does
+    app.service.jobs.list_active()  # which the reaper does
     app.service.usage.scan()
     assert ledger.bytes_of("default") <= 2 * JOB_ROOM + in_storage(app)
     ann.limit = ledger.bytes_of("default")

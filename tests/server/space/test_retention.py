@@ -26,7 +26,7 @@ def failed(app: ServedApp, capture: str) -> str:
     app.begin(job_id)
     problem = Problem.of("sfm_failed", "The cameras could not be recovered.")
     app.say(job_id, StateEvent(state=JobState.failed, problem=problem))
-    app.service.jobs.active()  # the reaper retires it
+    app.service.jobs.list_active()  # the reaper retires it
     return job_id
 
 
@@ -34,7 +34,7 @@ def succeeded(app: ServedApp, capture: str) -> str:
     job_id = app.job(capture)
     app.begin(job_id)
     app.finish(job_id)
-    app.service.jobs.active()
+    app.service.jobs.list_active()
     return job_id
 
 
@@ -119,7 +119,7 @@ def test_a_job_without_any_file_leaves_too(people: ServedApp) -> None:
     job_id = people.job(people.capture())
     people.http.post(f"/v1/jobs/{job_id}/cancel")
     people.service.reaper.tick()
-    people.service.jobs.active()
+    people.service.jobs.list_active()
     people.service.storage.delete_prefix(layout.job(job_id))
     assert people.state(job_id) == "cancelled"
     assert sweep(people, days=8, failed_jobs=7) == [("job", job_id)]
