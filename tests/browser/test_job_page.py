@@ -260,7 +260,7 @@ def test_a_lost_connection_is_shown_and_the_page_goes_on_where_it_was(
 def test_an_answer_that_breaks_off_is_told_as_a_lost_connection(page: Page) -> None:
     page.goto("/jobs")
     told = page.evaluate("""async () => {
-      const { whole } = await import(new URL("api.js", document.querySelector("script[type=module]").src));
+      const { whole } = await import(new URL("../api.js", document.querySelector("script[type=module]").src));
       const cut = () => new Response(new ReadableStream({ start: (it) => it.error(new TypeError("network error")) }));
       const kinds = [cut().json(), cut().arrayBuffer(), new Response("{").json()];
       return Promise.all(kinds.map((body) => whole(body).catch((error) => error.code ?? error.name)));
@@ -287,7 +287,7 @@ def test_a_job_that_is_not_there_says_so(page: Page, visit: Any) -> None:
 
 COURSE = """async (records) => {
   const script = document.querySelector('script[type=module]').src;
-  const { Course } = await import(new URL('job/course.js', script));
+  const { Course } = await import(new URL('course.js', script));
   const course = new Course();
   for (const [seconds, event, attempt = 1] of records) {
     course.apply({ event, attempt, at: new Date(1e12 + 1000 * seconds).toISOString() });

@@ -162,8 +162,8 @@ SENTENCES: list[tuple[str, Callable[[], str]]] = [
     ("web", lambda: f"at most {100 * live.SHARE:.0f} % of the time that the job is watched"),
     ("web", lambda: f"stops making snapshots {job_live.WATCH_SECONDS:.0f} seconds after"),
     ("web", lambda: f"up to {edit.MOST_PHOTOS} held-out photos"),
-    ("web", lambda: f"Files over {script('new/one_file.js', 'PIECE') // MIB} MB go in pieces"),
-    ("web", lambda: f"Up to {word(script('new/sending.js', 'CONCURRENT'))} files are sent at once"),
+    ("web", lambda: f"Files over {script('new/upload/one_file.js', 'PIECE') // MIB} MB go in pieces"),
+    ("web", lambda: f"Up to {word(script('new/upload/sending.js', 'CONCURRENT'))} files are sent at once"),
     (
         "report",
         lambda: (

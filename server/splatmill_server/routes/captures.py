@@ -13,10 +13,10 @@ from splatmill_server.access.caller import Who
 from splatmill_server.base.filters import Filter
 from splatmill_server.base.paging import DEFAULT_LIMIT
 from splatmill_server.base.problems import ProblemError
+from splatmill_server.requests.ownership import CaptureId, ListedOwner
+from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Limit, NamePart
 from splatmill_server.routes import uploads
 from splatmill_server.routes.openapi import CAPTURE_EXAMPLE, answer, example, problems
-from splatmill_server.routes.ownership import CaptureId, ListedOwner
-from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit, NamePart
 from splatmill_server.service import Shared
 from splatmill_server.space.quota import CAPTURE_BYTES, bytes_beside
 

@@ -15,10 +15,10 @@ from splatmill_server.answers.forward import CLIENT_GONE, client_of, while_conne
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.renderer import post
 from splatmill_server.edits import store_edited
+from splatmill_server.requests.ownership import ModelId
+from splatmill_server.requests.parameters import JSON_ONLY
 from splatmill_server.routes.models import RENDER_PROBLEMS
 from splatmill_server.routes.openapi import answer, problems
-from splatmill_server.routes.ownership import ModelId
-from splatmill_server.routes.requests import JSON_ONLY
 from splatmill_server.service import Service, Shared
 from splatmill_server.space.quota import Arrival
 

@@ -7,8 +7,8 @@ from fastapi import APIRouter, Body
 from splatmill.schema import Estimate, EstimateJob, Scope
 from splatmill_server.access.permission import needs
 from splatmill_server.jobs.estimate import estimate
+from splatmill_server.requests.parameters import JSON_ONLY
 from splatmill_server.routes.openapi import problems
-from splatmill_server.routes.requests import JSON_ONLY
 from splatmill_server.service import Shared
 
 router = APIRouter(tags=["jobs"])

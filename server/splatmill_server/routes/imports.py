@@ -9,9 +9,9 @@ from starlette.responses import Response
 
 from splatmill.schema import CreateImport, Import, ImportList
 from splatmill_server.access.caller import Who
+from splatmill_server.requests.ownership import CaptureId
+from splatmill_server.requests.parameters import JSON_ONLY
 from splatmill_server.routes.openapi import problems
-from splatmill_server.routes.ownership import CaptureId
-from splatmill_server.routes.requests import JSON_ONLY
 from splatmill_server.service import Shared
 from splatmill_server.space.quota import RECORD_BYTES
 

@@ -13,7 +13,7 @@ from splatmill.schema import CaptureFile, CreateJob, Job, LogEvent, Role, storab
 from splatmill_server.access.caller import Caller
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.records import fingerprints
-from splatmill_server.routes.multipart import Part, read_parts
+from splatmill_server.requests.multipart import Part, read_parts
 from splatmill_server.service import Service
 from splatmill_server.space.quota import bytes_beside
 

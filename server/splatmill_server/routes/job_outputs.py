@@ -17,8 +17,8 @@ from splatmill_server.answers.sse import Follower, Position, event_stream, store
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.jobs import curve as job_curve
 from splatmill_server.jobs import log as job_log
+from splatmill_server.requests.ownership import JobId
 from splatmill_server.routes.openapi import answer, binary, problems
-from splatmill_server.routes.ownership import JobId
 from splatmill_server.service import Service, Shared
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])

@@ -13,10 +13,10 @@ from splatmill_server.access.caller import Caller, Who
 from splatmill_server.base.filters import JobFilter
 from splatmill_server.base.paging import DEFAULT_LIMIT
 from splatmill_server.base.problems import ProblemError
+from splatmill_server.requests.ownership import JobId, ListedOwner
+from splatmill_server.requests.parameters import Cursor, Limit, NamePart
 from splatmill_server.routes.job_form import create_from_form
 from splatmill_server.routes.openapi import JOB_REQUESTS, answer, problems
-from splatmill_server.routes.ownership import JobId, ListedOwner
-from splatmill_server.routes.requests import Cursor, Limit, NamePart
 from splatmill_server.service import Service, Shared
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])

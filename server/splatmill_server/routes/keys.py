@@ -8,8 +8,8 @@ from starlette.responses import Response
 from splatmill.schema import CreateKey, Key, KeyList, KeyWithSecret, Me, RotateKey, Scope, Use
 from splatmill_server.access.caller import Who
 from splatmill_server.access.permission import needs
+from splatmill_server.requests.parameters import JSON_ONLY
 from splatmill_server.routes.openapi import problems
-from splatmill_server.routes.requests import JSON_ONLY
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1", tags=["keys"])

@@ -24,9 +24,9 @@ from splatmill_server.answers.model_outputs import model_file, model_in_format, 
 from splatmill_server.answers.single_file import single_file
 from splatmill_server.base.filters import Filter
 from splatmill_server.base.paging import DEFAULT_LIMIT
+from splatmill_server.requests.ownership import ListedOwner, ModelId
+from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Limit, NamePart
 from splatmill_server.routes.openapi import CAMERA, RENDER_REQUESTS, answer, binary, problems
-from splatmill_server.routes.ownership import ListedOwner, ModelId
-from splatmill_server.routes.requests import JSON_ONLY, Cursor, Limit, NamePart
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/models", tags=["models"])

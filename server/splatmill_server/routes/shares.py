@@ -6,9 +6,9 @@ from fastapi import APIRouter, Body, Path
 from starlette.responses import Response
 
 from splatmill.schema import CreateShare, ShareList, ShareWithToken
+from splatmill_server.requests.ownership import ModelId
+from splatmill_server.requests.parameters import JSON_ONLY
 from splatmill_server.routes.openapi import problems
-from splatmill_server.routes.ownership import ModelId
-from splatmill_server.routes.requests import JSON_ONLY
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/models/{model_id}/shares", tags=["shares"])

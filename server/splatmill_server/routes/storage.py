@@ -7,8 +7,8 @@ from fastapi import APIRouter, Query
 from splatmill.schema import PlannedDeletion, StorageUse
 from splatmill_server.access.caller import Caller, Who
 from splatmill_server.background.sweeper import MOST
+from splatmill_server.requests.ownership import ListedOwner
 from splatmill_server.routes.openapi import problems
-from splatmill_server.routes.ownership import ListedOwner
 from splatmill_server.service import Service, Shared
 from splatmill_server.space.ledger import NOBODY
 from splatmill_server.space.retention import expiry, plan

@@ -26,8 +26,8 @@ from splatmill_server.access.caller import Caller, Who
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.partial_uploads import Standing
 from splatmill_server.captures.records import STALE_SECONDS
+from splatmill_server.requests.ownership import CaptureId
 from splatmill_server.routes.openapi import Responses, answer, problems
-from splatmill_server.routes.ownership import CaptureId
 from splatmill_server.service import Service, Shared
 from splatmill_server.space.quota import RECORD_BYTES, bytes_beside
 

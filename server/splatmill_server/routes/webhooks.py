@@ -10,9 +10,9 @@ from splatmill.schema import CreateWebhook, Delivery, DeliveryList, Webhook, Web
 from splatmill_server.access.caller import Who
 from splatmill_server.base.outgoing import OutgoingError
 from splatmill_server.base.problems import ProblemError
+from splatmill_server.requests.ownership import ListedOwner
+from splatmill_server.requests.parameters import JSON_ONLY
 from splatmill_server.routes.openapi import problems
-from splatmill_server.routes.ownership import ListedOwner
-from splatmill_server.routes.requests import JSON_ONLY
 from splatmill_server.service import Shared
 from splatmill_server.webhooks import webhook_not_found
 

@@ -33,37 +33,37 @@ _METHODS = ["GET", "HEAD"]
 @router.api_route("/", methods=_METHODS)
 def new_page(request: Request) -> Response:
     """The page that takes photos and starts a job."""
-    return page(request, "new.html")
+    return page(request, "new/new.html")
 
 
 @router.api_route("/jobs", methods=_METHODS)
 def jobs_page(request: Request) -> Response:
     """The list of jobs."""
-    return page(request, "jobs.html")
+    return page(request, "lists/jobs.html")
 
 
 @router.api_route("/jobs/{job_id}", methods=_METHODS)
 def job_page(request: Request, job_id: str) -> Response:
     """One job, live."""
-    return page(request, "job.html")
+    return page(request, "job/job.html")
 
 
 @router.api_route("/models", methods=_METHODS)
 def models_page(request: Request) -> Response:
     """The list of models and what storage they use."""
-    return page(request, "models.html")
+    return page(request, "lists/models.html")
 
 
 @router.api_route("/models/{model_id}", methods=_METHODS)
 def model_page(request: Request, model_id: str) -> Response:
     """One model in the viewer."""
-    return page(request, "model.html")
+    return page(request, "model/model.html")
 
 
 @router.api_route("/sign-in", methods=_METHODS)
 def sign_in_page(request: Request) -> Response:
     """The page that exchanges a key for a session."""
-    return page(request, "sign-in.html")
+    return page(request, "sign-in/sign-in.html")
 
 
 @router.api_route("/s/{token}", methods=_METHODS)
@@ -123,7 +123,9 @@ def _shared(service: Service, request: Request, token: str, *, embedded: bool) -
         head = _poster(str(request.base_url), token, model)
     except ProblemError as error:
         status = error.problem.status
-    shown = page(request, "embed.html" if embedded else "share.html", embedded=embedded, head=head)
+    shown = page(
+        request, "share/embed.html" if embedded else "share/share.html", embedded=embedded, head=head
+    )
     shown.status_code = status
     shown.headers["X-Robots-Tag"] = "noindex"
     return shown

@@ -12,7 +12,7 @@
  * @import {Source} from "./viewer/source.js"
  * @import {Line, ShownCamera} from "./viewer/overlay.js"
  */
-import { Pictures } from "./pictures_view.js";
+import { Pictures } from "./viewer/pictures_view.js";
 import { Controls, HELP } from "./viewer/controls.js";
 import { ViewerError } from "./viewer/errors.js";
 import { Overlay } from "./viewer/overlay.js";

@@ -4,7 +4,7 @@ import { h } from "../dom.js";
 import { decibels } from "../format.js";
 
 /**
- * @import {Shown} from "../model.js"
+ * @import {Shown} from "./model.js"
  * @import {Stage} from "./stage.js"
  */
 

@@ -6,7 +6,7 @@ import { h } from "../dom.js";
 import { bytes } from "../format.js";
 import { noticeOf } from "../shell.js";
 
-/** @import {Shown} from "../model.js" */
+/** @import {Shown} from "./model.js" */
 
 /**
  * A row of the table.

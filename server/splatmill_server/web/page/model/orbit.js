@@ -5,7 +5,7 @@ import { h } from "../dom.js";
 import { bytes } from "../format.js";
 import { noticeOf } from "../shell.js";
 
-/** @import {Shown} from "../model.js" */
+/** @import {Shown} from "./model.js" */
 
 const SIZES = { "640 x 480": [640, 480], "960 x 720": [960, 720], "1280 x 720": [1280, 720] };
 

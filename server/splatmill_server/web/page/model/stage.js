@@ -11,7 +11,7 @@ import { Measure } from "./measure.js";
 import { timeLapse } from "./time_lapse.js";
 
 /**
- * @import {Shown} from "../model.js"
+ * @import {Shown} from "./model.js"
  * @import {View} from "../viewer.js"
  */
 

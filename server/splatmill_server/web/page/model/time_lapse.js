@@ -5,7 +5,7 @@ import { number, seconds } from "../format.js";
 import { notify } from "../shell.js";
 
 /**
- * @import {Shown} from "../model.js"
+ * @import {Shown} from "./model.js"
  * @import {Stage} from "./stage.js"
  */
 

@@ -3,7 +3,7 @@
 import { bytes, number, seconds } from "../format.js";
 import { byId } from "../dom.js";
 
-/** @param {import("./sending.js").State} state */
+/** @param {import("./upload/sending.js").State} state */
 export function showProgress(state) {
   const bar = /** @type {HTMLProgressElement} */ (byId("sent"));
   bar.max = Math.max(1, state.total);

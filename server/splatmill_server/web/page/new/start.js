@@ -6,7 +6,7 @@ import { byId } from "../dom.js";
 import { number } from "../format.js";
 import { showProgress } from "./progress.js";
 import { forget, remember, unique } from "./remembered.js";
-import { Sending } from "./sending.js";
+import { Sending } from "./upload/sending.js";
 
 /** @typedef {import("./items.js").Item} Item */
 /** @typedef {import("./items.js").Held} Held */

@@ -1,18 +1,18 @@
 // The page at `/`: photos in, a job out.
 
-import { Problem, each, get, send } from "./api.js";
-import { byId, h } from "./dom.js";
-import { ago, bytes, number } from "./format.js";
-import { estimateOf } from "./new/estimate.js";
-import { Gallery } from "./new/gallery.js";
-import { chosen, dropped } from "./new/given.js";
-import { Items } from "./new/items.js";
-import { suffix } from "./new/kinds.js";
-import { Looking } from "./new/looking.js";
-import { OptionsForm } from "./new/options.js";
-import { Start } from "./new/start.js";
-import { forget, recall } from "./new/remembered.js";
-import { noticeOf, notify, startShell } from "./shell.js";
+import { Problem, each, get, send } from "../api.js";
+import { byId, h } from "../dom.js";
+import { ago, bytes, number } from "../format.js";
+import { estimateOf } from "./estimate.js";
+import { Gallery } from "./gallery.js";
+import { chosen, dropped } from "./given.js";
+import { Items } from "./items.js";
+import { suffix } from "./kinds.js";
+import { Looking } from "./looking.js";
+import { OptionsForm } from "./options.js";
+import { Start } from "./start.js";
+import { forget, recall } from "./remembered.js";
+import { noticeOf, notify, startShell } from "../shell.js";
 
 /** Captures that are listed. */
 const LISTED = 9;
@@ -116,7 +116,7 @@ function wireTools() {
   });
 }
 
-/** @param {import("./new/given.js").Given[]} given */
+/** @param {import("./given.js").Given[]} given */
 function take(given) {
   if (!given.length) return notify("Nothing was found in what you dropped.", "warning");
   if (start.busy) return notify("Files are being sent. Pause first to give more.", "warning");
@@ -133,7 +133,7 @@ function take(given) {
   redraw();
 }
 
-/** @param {import("./new/look.js").Looked} looked */
+/** @param {import("./look.js").Looked} looked */
 function onLooked(looked) {
   const item = items.all.find(({ id }) => id === looked.id);
   if (!item) return; // removed meanwhile
@@ -145,7 +145,7 @@ function onLooked(looked) {
   redrawSoon();
 }
 
-/** @param {import("./new/items.js").Item} item */
+/** @param {import("./items.js").Item} item */
 function toggle(item) {
   item.left = !item.left;
   redraw();
@@ -232,7 +232,7 @@ function showProblem(problem) {
 async function showPhone() {
   const place = byId("phone-help");
   try {
-    const { phoneHelp } = await import("./new/phone.js");
+    const { phoneHelp } = await import("./phone.js");
     place.replaceChildren(await phoneHelp(new URL(location.pathname + location.search, location.origin), info.local ?? null, caller?.key_name !== "no key"));
   } catch (error) {
     place.replaceChildren(h("p", {}, `Open ${location.href} on the phone. The code cannot be drawn: ${error instanceof Error ? error.message : error}`));

@@ -2,10 +2,10 @@
  * The view without WebGL: pictures of a stored model by the server's renderer, `GET /v1/models/{id}/render`. While the
  * camera moves they are small; when it rests, one of full size follows. One request is in flight at a time.
  *
- * @import {Pose} from "./viewer/pose.js"
+ * @import {Pose} from "./pose.js"
  */
-import { matrixOf } from "./viewer/pose.js";
-import { depthColors, readArray } from "./viewer/depth.js";
+import { matrixOf } from "./pose.js";
+import { depthColors, readArray } from "./depth.js";
 
 /** Longer side of a picture while the camera moves, and most for one at rest, pixels. */
 const MOVING = 320;

@@ -1,9 +1,9 @@
 // A shared model in the viewer: what the page of a link and its frame have in common.
 
-import { at, pathOfPage } from "./address.js";
-import { Problem, get } from "./api.js";
-import { byId, h } from "./dom.js";
-import { noticeOf } from "./shell.js";
+import { at, pathOfPage } from "../address.js";
+import { Problem, get } from "../api.js";
+import { byId, h } from "../dom.js";
+import { noticeOf } from "../shell.js";
 
 /** The address of the model that this page's link shows; below it are the same addresses as of a model of one's own. */
 export const address = at(`${pathOfPage().split("/").slice(0, 3).join("/")}/model`);
@@ -38,7 +38,7 @@ async function view(box, model, name) {
   if (still) box.append(still);
   try {
     const cameras = has("cameras.json") ? (await get(`${address}/cameras`)).cameras : [];
-    const { open } = await import("./viewer.js");
+    const { open } = await import("../viewer.js");
     const shown = await open(box, { url: `${address}/files/model.ply`, model: address, cameras: cameras.map((/** @type {any} */ found) => found.camera), label: name });
     // The picture stays until the first frame, and for good where neither WebGL nor a renderer is there.
     shown.addEventListener("frame", () => still?.remove(), { once: true });

@@ -1,11 +1,11 @@
 // The list of models with their pictures, and what they occupy in storage.
 
-import { get, modelAddress, send } from "./api.js";
-import { append, byId, h } from "./dom.js";
-import { ago, bytes, decibels, moment, number } from "./format.js";
+import { get, modelAddress, send } from "../api.js";
+import { append, byId, h } from "../dom.js";
+import { ago, bytes, decibels, moment, number } from "../format.js";
 import { listing } from "./listing.js";
-import { openSharing } from "./sharing.js";
-import { confirmAction, notify, startShell } from "./shell.js";
+import { openSharing } from "../sharing.js";
+import { confirmAction, notify, startShell } from "../shell.js";
 
 /** @param {any} model */
 function entry(model) {

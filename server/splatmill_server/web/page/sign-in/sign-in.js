@@ -1,9 +1,9 @@
 // Exchanges an API key for the cookie of a session, which scripts cannot read, and leads back to where the reader was.
 
-import { at } from "./address.js";
-import { Problem, request } from "./api.js";
-import { byId } from "./dom.js";
-import { startShell } from "./shell.js";
+import { at } from "../address.js";
+import { Problem, request } from "../api.js";
+import { byId } from "../dom.js";
+import { startShell } from "../shell.js";
 
 const form = byId("form");
 const key = /** @type {HTMLInputElement} */ (byId("key"));

@@ -1,6 +1,6 @@
 // The upload of all files of a capture: several at a time, repeated after breaks, paused and continued.
 
-import { Problem } from "../api.js";
+import { Problem } from "../../api.js";
 import { sendFile } from "./one_file.js";
 
 /** Files that are sent at once. */

@@ -1,11 +1,11 @@
 // The page of a link: one model, for somebody without a key.
 
-import { get } from "./api.js";
-import { byId, h } from "./dom.js";
-import { bytes, decibels, moment, number } from "./format.js";
-import { copy } from "./sharing.js";
+import { get } from "../api.js";
+import { byId, h } from "../dom.js";
+import { bytes, decibels, moment, number } from "../format.js";
+import { copy } from "../sharing.js";
 import { address, showShared } from "./shared_model.js";
-import { startShell } from "./shell.js";
+import { startShell } from "../shell.js";
 
 const KINDS = /** @type {Record<string, string>} */ ({
   "report.html": "Report",

@@ -1,18 +1,18 @@
 // The page of a job: its course live, from the events of the server, and what may be done with it.
 
-import { Problem, follow, get, idOfPage, send } from "./api.js";
-import { ErrorChart } from "./chart.js";
-import { byId, h } from "./dom.js";
-import { bytes, decibels, moment, number, seconds } from "./format.js";
-import { FINAL, badgeKind, badgeText } from "./job_states.js";
-import { confirmAction, noticeOf, notify, startShell } from "./shell.js";
-import { Course } from "./job/course.js";
-import { LiveScene } from "./job/live_scene.js";
-import { showLog, warningsOf } from "./job/log.js";
-import { kindsOf, photoParts } from "./job/photos.js";
-import { planParts } from "./job/plan.js";
-import { showTimeline } from "./job/timeline.js";
-import { Watching } from "./job/watching.js";
+import { Problem, follow, get, idOfPage, send } from "../api.js";
+import { ErrorChart } from "../chart.js";
+import { byId, h } from "../dom.js";
+import { bytes, decibels, moment, number, seconds } from "../format.js";
+import { FINAL, badgeKind, badgeText } from "../job_states.js";
+import { confirmAction, noticeOf, notify, startShell } from "../shell.js";
+import { Course } from "./course.js";
+import { LiveScene } from "./live_scene.js";
+import { showLog, warningsOf } from "./log.js";
+import { kindsOf, photoParts } from "./photos.js";
+import { planParts } from "./plan.js";
+import { showTimeline } from "./timeline.js";
+import { Watching } from "./watching.js";
 
 /** Milliseconds between two questions for the place in the queue. */
 const QUEUE_MS = 3000;

@@ -1,7 +1,7 @@
 // A list that is filtered, loaded page by page, and keeps its filters in the page's address.
 
-import { get } from "./api.js";
-import { byId } from "./dom.js";
+import { get } from "../api.js";
+import { byId } from "../dom.js";
 
 const TYPING_MS = 250; // a pause in typing after which the list is asked for again
 
@@ -10,7 +10,7 @@ const TYPING_MS = 250; // a pause in typing after which the list is asked for ag
  * @param {object} list
  * @param {"jobs" | "models"} list.noun
  * @param {number} list.limit records of a page
- * @param {(filters: Record<string, string>) => import("./api.js").Query} list.query what the server is asked for
+ * @param {(filters: Record<string, string>) => import("../api.js").Query} list.query what the server is asked for
  * @param {(record: any) => HTMLElement} list.entry returns the entry of a record, an `<li>`
  * @param {() => (Node | string)} list.empty what to say where there is nothing at all
  * @returns {Promise<{reload: () => Promise<void>, remove: (id: string) => void, update: (record: any) => void, records: () => any[]}>}

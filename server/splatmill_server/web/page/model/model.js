@@ -1,16 +1,16 @@
 // The page of one model: the viewer with its tools, the comparison with held-out photos, downloads, orbit video, cameras.
 
-import { at } from "./address.js";
-import { get, idOfPage, modelAddress, request } from "./api.js";
-import { byId, h } from "./dom.js";
-import { ago, bytes, decibels, number } from "./format.js";
-import { showCompare } from "./model/compare.js";
-import { showCameras } from "./model/cameras.js";
-import { showDownloads } from "./model/downloads.js";
-import { showOrbit } from "./model/orbit.js";
-import { Stage } from "./model/stage.js";
-import { openSharing } from "./sharing.js";
-import { confirmAction, noticeOf, startShell } from "./shell.js";
+import { at } from "../address.js";
+import { get, idOfPage, modelAddress, request } from "../api.js";
+import { byId, h } from "../dom.js";
+import { ago, bytes, decibels, number } from "../format.js";
+import { showCompare } from "./compare.js";
+import { showCameras } from "./cameras.js";
+import { showDownloads } from "./downloads.js";
+import { showOrbit } from "./orbit.js";
+import { Stage } from "./stage.js";
+import { openSharing } from "../sharing.js";
+import { confirmAction, noticeOf, startShell } from "../shell.js";
 
 /**
  * What the parts of the page know of the model.

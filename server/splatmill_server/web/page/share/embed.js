@@ -1,6 +1,6 @@
 // The frame of a link for pages of others: the viewer alone, and a way to the link's own page.
 
-import { byId, h } from "./dom.js";
+import { byId, h } from "../dom.js";
 import { showShared } from "./shared_model.js";
 
 if (await showShared()) {

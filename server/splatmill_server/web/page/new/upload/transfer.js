@@ -1,7 +1,7 @@
 // One request that sends bytes, with progress. `fetch` tells nothing of the bytes sent, so this is an XMLHttpRequest.
 
-import { at } from "../address.js";
-import { Problem } from "../api.js";
+import { at } from "../../address.js";
+import { Problem } from "../../api.js";
 
 /**
  * @typedef {object} Answer

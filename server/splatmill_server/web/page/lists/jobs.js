@@ -1,11 +1,11 @@
 // The list of jobs: state and progress of each, cancel, delete.
 
-import { get, send } from "./api.js";
-import { h } from "./dom.js";
-import { ago, moment, seconds } from "./format.js";
-import { FINAL, RUNNING, badgeKind, badgeText } from "./job_states.js";
+import { get, send } from "../api.js";
+import { h } from "../dom.js";
+import { ago, moment, seconds } from "../format.js";
+import { FINAL, RUNNING, badgeKind, badgeText } from "../job_states.js";
 import { listing } from "./listing.js";
-import { confirmAction, notify, startShell } from "./shell.js";
+import { confirmAction, notify, startShell } from "../shell.js";
 
 const REFRESH_MS = 4000; // between two looks at the jobs that are not finished, while the page is seen
 
