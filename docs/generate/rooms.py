@@ -1,9 +1,9 @@
 """The map of the modules, from their first sentences, and the rooms of ARCHITECTURE.md, from the import contracts."""
 
-import ast
 import re
 import tomllib
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -103,10 +103,10 @@ def _shown(path: Path) -> str:
 def _sentence(path: Path) -> str:
     """The first sentence of a module, or of a package."""
     source = path / "__init__.py" if path.is_dir() else path
-    text = ast.get_docstring(ast.parse(source.read_text()))
-    if text is None:
+    found = re.match(r'"""(.+?)(?:\n\n|""")', source.read_text(), re.S)
+    if found is None:
         raise ValueError(f"{source} does not begin with a sentence that says what it is for.")
-    return re.split(r"(?<=\.) (?=[A-Z`])", " ".join(text.partition("\n\n")[0].split()), maxsplit=1)[0]
+    return re.split(r"(?<=\.) (?=[A-Z`])", " ".join(found[1].split()), maxsplit=1)[0]
 
 
 def _floors(package: str) -> list[list[str]]:
@@ -117,6 +117,7 @@ def _floors(package: str) -> list[list[str]]:
     return []
 
 
+@cache
 def _read_contracts() -> Sequence[dict[str, Any]]:
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
     contracts: Sequence[dict[str, Any]] = settings["tool"]["importlinter"]["contracts"]

@@ -22,17 +22,7 @@ from tests.support.markdown import blocks, without_blocks
 from tests.support.paths import ROOT
 
 PAGES = [
-    *(
-        ROOT / name
-        for name in (
-            "README.md",
-            "ARCHITECTURE.md",
-            "MAP.md",
-            "CONTRIBUTING.md",
-            "CHANGELOG.md",
-            "SECURITY.md",
-        )
-    ),
+    *sorted(ROOT.glob("*.md")),
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted(page for page in (ROOT / "worker").rglob("*.md") if "build" not in page.parts),
 ]
