@@ -142,7 +142,7 @@ def test_storage_that_cannot_be_opened_is_said_so(tmp_path: Path) -> None:
 
 def test_importing_the_server_runs_nothing() -> None:
     root = Path(app_module.__file__).parent
-    assert (root / "jobs" / "reaper.py").is_file()
+    assert (root / "background" / "reaper.py").is_file()
     for path in root.rglob("*.py"):
         for node in ast.parse(path.read_text()).body:
             if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
