@@ -1,8 +1,9 @@
 """What all tests share.
 
-Threads of the kernels sleep soon at barriers, as they do in the worker's own processes. Test processes that run side by
-side divide the cores between them. No garbage is looked for while tests are collected. A umask that a command sets in
-the process of its test is taken back.
+Hypothesis draws the same values in every run, whatever else its process has imported. Threads of the kernels sleep
+soon at barriers, as they do in the worker's own processes. Test processes that run side by side divide the cores
+between them. No garbage is looked for while tests are collected. A umask that a command sets in the process of its test
+is taken back.
 """
 
 import gc
@@ -10,6 +11,8 @@ import os
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import settings
+from hypothesis.internal.conjecture import providers
 
 from splatmill_worker.__main__ import SPIN_COUNT
 
@@ -17,6 +20,12 @@ os.environ.setdefault("GOMP_SPINCOUNT", SPIN_COUNT)
 processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if processes > 1:
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // processes)))
+
+settings.register_profile("repeatable", derandomize=True)
+settings.load_profile("repeatable")
+# It also draws numbers that stand in the source of the modules that are loaded. Which these are depends on the tests
+# that ran before in the same process.
+vars(providers)["_get_local_constants"] = type(providers._local_constants)
 
 # Collecting the tests makes millions of objects, and all of them stay: to look through them takes a third of the time.
 gc.disable()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -138,6 +139,26 @@ def alpha_error(case: Case, exact: Projected) -> Tensor:
     q = 11.0
     error = torch.sqrt(q * stiffest) * pixels + q / 2 * (2 * coordinate / z + 16 * EPS) + ALPHA_ERROR
     return torch.where(seen, error, 0.0)
+
+
+def record_error(p: Projected) -> Tensor:
+    """How far the logarithm of an alpha by a kernel's record may be from that by the conic [N] that it is made of.
+
+    inf where the conic has lost its determinant by rounding: a form that is not positive definite draws nothing that
+    could be compared.
+
+    With k = a c / (a c - b^2), no term of q = d^T C d <= Q = 2 ln 255 exceeds k Q inside the ellipse. The record raises
+    a c - b^2 to 6e-8 a c, which adds 2 eps k of q at most. u = ux dx + uy dy has four roundings of its two terms, which
+    move u^2 by 16 eps sqrt(k) Q, and v = vy dy has four. An edge of the box is rounded by 2 eps (|centre| + extent);
+    q grows there by 2 Q / extent for each pixel. The functions and the sum of the exponent add ALPHA_ERROR.
+    """
+    a, b, c = p.conics.double().unbind(1)
+    det = a * c - b * b
+    k = torch.where(det > 0, a * c / det, torch.inf)
+    seen = (p.extents > 0).all(1)
+    off = torch.where(seen[:, None], p.means2d.double().abs() / p.extents.double(), 0.0).amax(1)
+    q = 2 * math.log(1 / ALPHA_MIN)
+    return EPS * q * (k + 8 * torch.sqrt(k) + 4 + 2 * (1 + off)) + ALPHA_ERROR
 
 
 @dataclass(frozen=True)
