@@ -214,6 +214,7 @@ def _rate(fleet: Fleet, api: Api, connection: redis.Redis, jobs: int) -> Row:
     with counted() as shrinking:
         api.shrink()
     shrunk_cpu = time.process_time() - cpu
+    api.require_none_failed()
     return {
         "jobs": jobs,
         "seconds": seconds,
@@ -250,7 +251,12 @@ def _training(fleet: Fleet, api: Api, connection: redis.Redis, folder: Path, sec
     over = folder / "over"
     capture, idle = api.capture(over), meter.look(connection)
     api.create(capture, jobs)
-    _until(lambda: connection.zcard(leases.key()) == jobs and _under_way(connection))
+
+    def begun() -> bool:
+        api.require_none_failed()
+        return connection.zcard(leases.key()) == jobs and _under_way(connection)
+
+    _until(begun)
     time.sleep(1.0)  # for streams of more than one entry
     found = _window(fleet, connection, seconds)
     entry = _entry_bytes(connection)

@@ -6,6 +6,8 @@ Does not prove what they are worth: `bench train` measures that.
 from __future__ import annotations
 
 import importlib
+import inspect
+import pkgutil
 from typing import Any
 
 import pytest
@@ -40,6 +42,13 @@ def test_every_replaced_function_is_there_and_comes_back(instead: Any, switches:
     assert "cleaned" in switches
     before = probe.grown, pipeline.train
     for switch in switches.values():
+        for name, ours in switch.instead.items():
+            theirs = inspect.signature(pkgutil.resolve_name(name)).parameters.values()
+            positional = [each.name for each in theirs if each.kind is not each.KEYWORD_ONLY]
+            named = {each.name: None for each in theirs if each.kind is each.KEYWORD_ONLY}
+            inspect.signature(getattr(instead, ours)).bind(
+                *positional, **named
+            )  # or TypeError: it is called alike
         with instead.applied(switch.instead):
             pass
     with instead.applied(switches["probe-of-the-start"].instead):

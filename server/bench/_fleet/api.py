@@ -75,6 +75,17 @@ class Api:
 
         return asyncio.run(ask())
 
+    def require_none_failed(self) -> None:
+        """Raise RuntimeError with the problem of a job that has failed: what it cost says nothing."""
+
+        async def ask() -> None:
+            async with self._client() as http:
+                answer = await http.get("/v1/jobs", params={"state": "failed", "limit": 1})
+            for job in answer.raise_for_status().json()["jobs"]:
+                raise RuntimeError(f"The job {job['id']} of the fleet has failed: {job['problem']['detail']}")
+
+        asyncio.run(ask())
+
     def shrink(self) -> None:
         """Shrink the streams of all jobs that have ended, as the reaper does after a minute."""
         redis = self.service.redis

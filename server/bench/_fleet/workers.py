@@ -15,9 +15,10 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 from uuid import uuid4
 
 from _capacity.operations import Operations, counted
@@ -113,7 +114,7 @@ def main(count: int) -> None:
     answers, sys.stdout = sys.stdout, sys.stderr  # RQ logs to the standard output
     threading.stack_size(_STACK_BYTES)
     logging.disable(logging.INFO)
-    decoders.confined = _nothing_to_decode  # type: ignore[assignment]  # no photos, so no processes that decode them
+    decoders.confined = _nothing_to_decode  # no photos, so no processes that decode them
     with counted() as operations:
         workers = [SimulatedWorker(os.environ["REDIS_URL"]) for _ in range(count)]
         born = [threading.Event() for _ in workers]
@@ -127,8 +128,10 @@ def main(count: int) -> None:
 
 
 @contextmanager
-def _nothing_to_decode(*arguments: object) -> Iterator[None]:
-    yield
+def _nothing_to_decode(
+    read: list[Path], ended: Path | None = None, cancelled: Callable[[], bool] = lambda: False
+) -> Iterator[decoders.Decoders]:
+    yield cast(decoders.Decoders, None)  # an attempt does not use it
 
 
 def _work(worker: SimulatedWorker, born: threading.Event) -> None:

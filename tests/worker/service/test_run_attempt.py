@@ -13,7 +13,7 @@ import shutil
 import sys
 import threading
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import pytest
 import redis
@@ -35,6 +35,21 @@ from splatmill_worker.service.process_exit import HANDED_BACK_STATUS
 from splatmill_worker.service.room import Room
 from splatmill_worker.service.run_attempt import run_attempt
 from tests.support.jobs import CAPTURE, messages, read_job, write_row
+
+if TYPE_CHECKING:
+    import _fleet.pipeline
+    import _soak.pipeline
+
+    import splatmill_worker.pipeline
+    from tests.support import standin
+
+    # What an attempt may be told to run has to take what it passes: mypy compares them here.
+    PIPELINES: list[module.Pipeline] = [
+        splatmill_worker.pipeline.run,
+        _fleet.pipeline.run,
+        _soak.pipeline.run,
+        standin.run,
+    ]
 
 JOB = "job00001"
 
