@@ -174,7 +174,7 @@ class AsyncJobHandle:
     async def watch(self) -> float:
         """Ask the job for snapshots of its scene, and return for how many seconds it makes them without being asked.
 
-        While it does, events announce the snapshots. Raises Conflict for a job that has ended.
+        While it does, events announce the snapshots. A job that has ended makes none: 0.
         """
         response = await self.connection.request("POST", f"/v1/jobs/{self.id}/watch", repeatable=True)
         return read_answer(Watch, response).seconds

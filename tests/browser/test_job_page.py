@@ -31,6 +31,61 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
 """
 
 
+class Relay:
+    """Passes connections on to a service, until they are cut."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.open: list[socket.socket] = []
+        self.refuses = False
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.listener.getsockname()[1]}"
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                near, _ = self.listener.accept()
+                if self.refuses:
+                    near.close()
+                    continue
+                far = socket.create_connection(("127.0.0.1", self.port))
+                self.open += [near, far]
+                for one, other in ((near, far), (far, near)):
+                    threading.Thread(target=self._pass, args=(one, other), daemon=True).start()
+
+    def _pass(self, one: socket.socket, other: socket.socket) -> None:
+        with suppress(OSError):
+            while data := one.recv(65536):
+                other.sendall(data)
+        one.close()
+        other.close()
+
+    def cut(self) -> None:
+        """End all connections, and refuse others until `mend`."""
+        self.refuses = True
+        for each in self.open:
+            with suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+        self.open.clear()
+
+    def mend(self) -> None:
+        self.refuses = False
+
+
+@pytest.fixture
+def relay(service: Up) -> Iterator[Relay]:
+    port = service.http.base_url.port
+    assert port is not None
+    relay = Relay(port)
+    yield relay
+    relay.cut()
+    relay.listener.close()
+
+
 @pytest.fixture(scope="module")
 def capture(service: Up, tmp_path_factory: pytest.TempPathFactory) -> str:
     """The still life with its cameras, and one photo without a camera."""
@@ -115,7 +170,7 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
 
 
 def test_a_queued_job_says_its_place_and_a_job_is_cancelled_by_keyboard(
-    service: Up, capture: str, open_window: Open
+    service: Up, capture: str, relay: Relay, open_window: Open
 ) -> None:
     running, waiting = (submit(service, capture, time_budget="60s") for _ in range(2))
     visit = open_window(service)
@@ -130,6 +185,14 @@ def test_a_queued_job_says_its_place_and_a_job_is_cancelled_by_keyboard(
     expect(dialog).to_be_hidden()
     assert not service.job(waiting)["cancel_requested"]
 
+    # Another window loses the connection. When it is back, the job is deleted.
+    cut_off = open_window(relay.address)
+    cut_off.watched.allow("Failed to load resource")
+    cut_off.page.clock.install()
+    cut_off.page.goto(f"/jobs/{waiting}")
+    expect(cut_off.page.locator("#outcome")).to_contain_text("begin")
+    relay.cut()
+
     # Without WebGL, the newest preview is shown.
     page.goto(f"/jobs/{running}")
     picture = page.get_by_role("img", name="The scene in training")
@@ -143,9 +206,17 @@ def test_a_queued_job_says_its_place_and_a_job_is_cancelled_by_keyboard(
         expect(page.get_by_role("button", name="Restart")).to_be_visible()
         assert service.job(job_id)["state"] == "cancelled"
 
+    service.http.delete(f"/v1/jobs/{waiting}").raise_for_status()
+    relay.mend()
+    expect(cut_off.page.locator("#outcome")).to_contain_text(waiting, timeout=60_000)
+    expect(cut_off.page.get_by_role("button", name="Cancel")).to_have_count(0)
+    asked: list[str] = []
+    cut_off.page.on("request", lambda request: asked.append(request.url))
+    cut_off.page.clock.run_for(30_000)
+    assert asked == [], "the page asks no more for what is deleted"
+
 
 def test_a_failed_job_says_why_and_what_to_do(service: Up, visit: Visit) -> None:
-    visit.watched.allow(r"status of 409.*/watch")  # the repeated job may have failed before it is watched
     page = visit.page
     capture = service.http.post("/v1/captures", json={"name": "two photos"}).json()["id"]
     body = io.BytesIO()
@@ -173,61 +244,6 @@ def test_a_failed_job_says_why_and_what_to_do(service: Up, visit: Visit) -> None
     repeated = service.job(page.url.rpartition("/")[2])
     assert repeated["id"] != job_id
     assert repeated["options"] == service.job(job_id)["options"]
-
-
-class Relay:
-    """Passes connections on to a service, until they are cut."""
-
-    def __init__(self, port: int) -> None:
-        self.port = port
-        self.listener = socket.create_server(("127.0.0.1", 0))
-        self.open: list[socket.socket] = []
-        self.refuses = False
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    @property
-    def address(self) -> str:
-        return f"http://127.0.0.1:{self.listener.getsockname()[1]}"
-
-    def _accept(self) -> None:
-        with suppress(OSError):
-            while True:
-                near, _ = self.listener.accept()
-                if self.refuses:
-                    near.close()
-                    continue
-                far = socket.create_connection(("127.0.0.1", self.port))
-                self.open += [near, far]
-                for one, other in ((near, far), (far, near)):
-                    threading.Thread(target=self._pass, args=(one, other), daemon=True).start()
-
-    def _pass(self, one: socket.socket, other: socket.socket) -> None:
-        with suppress(OSError):
-            while data := one.recv(65536):
-                other.sendall(data)
-        one.close()
-        other.close()
-
-    def cut(self) -> None:
-        """End all connections, and refuse others until `mend`."""
-        self.refuses = True
-        for each in self.open:
-            with suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
-        self.open.clear()
-
-    def mend(self) -> None:
-        self.refuses = False
-
-
-@pytest.fixture
-def relay(service: Up) -> Iterator[Relay]:
-    port = service.http.base_url.port
-    assert port is not None
-    relay = Relay(port)
-    yield relay
-    relay.cut()
-    relay.listener.close()
 
 
 def test_a_lost_connection_is_shown_and_the_page_goes_on_where_it_was(

@@ -52,5 +52,6 @@ class Watch(Response):
     """The response to a request to watch a job."""
 
     seconds: float = Field(
-        description="For how long the job makes snapshots; ask again before, for as long as somebody looks."
+        description="For how long the job makes snapshots; ask again before, for as long as somebody looks. 0 for a "
+        "job that has ended."
     )

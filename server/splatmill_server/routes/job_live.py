@@ -40,21 +40,16 @@ async def get_job_cameras(service: Shared, job_id: JobId, request: Request) -> R
     return await file_response(request, service.storage, path, "application/json")
 
 
-@router.post("/watch", responses=problems("job_not_found", "job_finished"))
+@router.post("/watch", responses=problems("job_not_found"))
 @needs(Scope.read)
 def watch_job(service: Shared, job_id: JobId) -> Watch:
     """Ask a job for snapshots of its scene in training. It makes them until the seconds of the answer are over.
 
-    Nothing of the job changes, and its training clock stands still while a snapshot is made.
+    A job that has ended makes none: the seconds are 0. Nothing of the job changes, and its training clock stands still
+    while a snapshot is made.
     """
-    job = service.jobs.get(job_id)
-    if job.state.final:
-        raise ProblemError(
-            "job_finished",
-            f"The job has already ended as {job.state.value}, so nothing of it changes.",
-            advice="Open its model, if it has one.",
-            facts={"state": job.state.value},
-        )
+    if service.jobs.get(job_id).state.final:
+        return Watch(seconds=0.0)  # no error: who watches a job cannot know that it is about to end
     service.redis.set(keys.watched(job_id), b"1", px=round(WATCH_SECONDS * 1000))
     return Watch(seconds=WATCH_SECONDS)
 

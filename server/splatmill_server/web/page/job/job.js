@@ -93,7 +93,9 @@ async function refresh() {
     if (!(error instanceof Problem)) throw error;
     if (error.status !== 404) notify(error);
     else if (error.code === "job_not_found") {
+      job = null; // nothing is asked for or shown any more
       stream.close();
+      byId("actions").replaceChildren();
       byId("outcome").replaceChildren(noticeOf(error));
     }
   }
@@ -193,7 +195,7 @@ function showState() {
   byId("curve-card").hidden = early && !course.rows.length;
   for (const name of ["watch", "watch-hint"]) byId(name).closest(name === "watch" ? "label" : "p")?.toggleAttribute("hidden", over);
   showSeconds();
-  if (course.state === "queued") setTimeout(() => { if (course.state === "queued") refresh(); }, QUEUE_MS);
+  if (course.state === "queued") setTimeout(() => { if (job && course.state === "queued") refresh(); }, QUEUE_MS);
 }
 
 /** A message that says the same is left alone: screen readers would read it out again. */

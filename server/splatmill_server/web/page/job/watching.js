@@ -31,10 +31,12 @@ export class Watching {
     this.asking = true;
     let wait = 5;
     try {
-      wait = EARLY * (await send("POST", this.address)).seconds;
+      const { seconds } = await send("POST", this.address);
+      if (!seconds) return; // it has ended
+      wait = EARLY * seconds;
     } catch (error) {
       if (!(error instanceof Problem)) throw error;
-      if (error.status === 404 || error.status === 409 || error.status === 403) return; // it has ended
+      if (error.status === 404 || error.status === 403) return; // it is deleted, or the session is another owner's
     } finally {
       this.asking = false;
     }

@@ -1,6 +1,6 @@
 // The list of jobs: state and progress of each, cancel, delete.
 
-import { get, send } from "../api.js";
+import { Problem, get, send } from "../api.js";
 import { h } from "../dom.js";
 import { ago, moment, seconds } from "../format.js";
 import { FINAL, RUNNING, badgeKind, badgeText } from "../job_states.js";
@@ -85,8 +85,10 @@ async function refresh() {
   for (const { id } of open) {
     try {
       list.update(await get(`/v1/jobs/${id}`));
-    } catch {
-      // Deleted by somebody else, or the server is away for a moment; the next look tells.
+    } catch (error) {
+      if (!(error instanceof Problem)) throw error;
+      if (error.code === "job_not_found") list.remove(id); // somebody else has deleted it
+      // Otherwise the server is away for a moment, and is asked again.
     }
   }
 }

@@ -112,11 +112,12 @@ export async function listing({ noun, limit, query, entry, empty }) {
     remove(id) {
       const known = shown.get(id);
       if (!known) return;
+      const left = known.element.contains(document.activeElement); // the focus has to go on to another entry
       const beside = known.element.nextElementSibling ?? known.element.previousElementSibling;
       known.element.remove();
       shown.delete(id);
       say();
-      (/** @type {HTMLElement | null} */ (beside?.querySelector("a")) ?? byId("main")).focus();
+      if (left) (/** @type {HTMLElement | null} */ (beside?.querySelector("a")) ?? byId("main")).focus();
     },
   };
 }

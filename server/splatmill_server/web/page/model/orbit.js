@@ -41,9 +41,9 @@ export async function showOrbit(section, { model, address, background }) {
 
   /** Show how far a video is until it is whole, and then the video. @param {any} orbit */
   async function follow(orbit) {
-    let stopped = false;
+    const stopping = new AbortController();
     stop.onclick = async () => {
-      stopped = true;
+      stopping.abort(); // a question under way could come after the deletion
       try {
         await request("DELETE", orbit.links.self);
       } catch (error) {
@@ -53,21 +53,22 @@ export async function showOrbit(section, { model, address, background }) {
     make.disabled = true;
     stop.hidden = bar.hidden = false;
     try {
-      while (!stopped && !["succeeded", "failed"].includes(orbit.state)) {
+      while (!stopping.signal.aborted && !["succeeded", "failed"].includes(orbit.state)) {
         bar.max = orbit.frames;
         bar.value = orbit.frames_done;
         state.textContent = `${orbit.frames_done} of ${orbit.frames} frames are rendered. The server goes on if this page is closed.`;
         await new Promise((resolve) => setTimeout(resolve, LOOK_MS));
-        if (!stopped) orbit = await get(orbit.links.self);
+        if (!stopping.signal.aborted) orbit = await get(orbit.links.self, {}, stopping.signal);
       }
+      const stopped = stopping.signal.aborted;
       state.textContent = stopped ? "Stopped." : orbit.state === "failed" ? orbit.problem.detail : "";
       if (!stopped && orbit.state === "succeeded") {
         play(orbit);
         await list();
       }
     } catch (error) {
-      state.textContent = stopped ? "Stopped." : "";
-      if (!stopped) throw error;
+      state.textContent = stopping.signal.aborted ? "Stopped." : "";
+      if (!stopping.signal.aborted) throw error;
     } finally {
       make.disabled = false;
       stop.hidden = bar.hidden = true;
