@@ -21,7 +21,7 @@ REDIS ?= $(shell command -v redis-server valkey-server | head -n 1)
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: help install demo quick test redis fresh coverage check wheels docs screenshots pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
+.PHONY: help install demo quick test redis fresh coverage check mutants wheels docs screenshots pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -51,12 +51,15 @@ fresh: ## make a bare Debian, and run `make demo` and `make test` there (as root
 coverage: $(VENV)/.installed-dev ## run all tests and print their coverage, which takes a good deal longer
 	$(PYTEST) --cov $(PYTEST_ARGS)
 
-check: $(VENV)/.installed-dev ## ruff, mypy, import rules, TypeScript over the web page
+check: mutants ## ruff, mypy, import rules, TypeScript over the web page, the list of mutations
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python server/web/packages.py check
+
+mutants: $(VENV)/.installed-dev ## check the list of mutations of the kernels (`worker/mutations/run.py` tries them, for hours)
+	$(BIN)/python worker/mutations/check.py
 
 wheels: $(VENV)/.installed-dev ## build the wheels and source distributions of the three parts into dist/
 	for part in client server worker; do $(BIN)/python -m build --no-isolation --outdir dist $$part || exit 1; done

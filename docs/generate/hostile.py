@@ -1,8 +1,11 @@
 """The list of hostile inputs, each with the answer that the real server or worker gives while the page is made."""
 
+from collections.abc import Callable
+
 from docs.generate.markdown import table
 
 from tests.support.hostile.bench import Answer, bench
+from tests.support.hostile.entry import Hostile
 from tests.support.hostile.table import HOSTILE
 
 INTRODUCTION = f"""# Hostile inputs
@@ -19,11 +22,20 @@ does not.
 
 def page() -> str:
     """The page of hostile inputs."""
-    parts = [INTRODUCTION]
     with bench() as real:
-        for area in dict.fromkeys(entry.area for entry in HOSTILE):
-            rows = [[entry.what, _shown(entry.give(real))] for entry in HOSTILE if entry.area == area]
-            parts += [f"## {area}\n", table(["input", "answer"], rows)]
+        return _page(lambda entry: entry.give(real))
+
+
+def expected_page() -> str:
+    """The same with the kind and the part of each answer that the list expects; nothing is given to the program."""
+    return _page(lambda entry: Answer(entry.kind, entry.said))
+
+
+def _page(answer: Callable[[Hostile], Answer]) -> str:
+    parts = [INTRODUCTION]
+    for area in dict.fromkeys(entry.area for entry in HOSTILE):
+        rows = [[entry.what, _shown(answer(entry))] for entry in HOSTILE if entry.area == area]
+        parts += [f"## {area}\n", table(["input", "answer"], rows)]
     return "\n".join(parts)
 
 

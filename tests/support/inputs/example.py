@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -47,8 +48,12 @@ class Answer:
     said: tuple[str, ...]
 
 
+@cache
 def answer(make: Callable[[Path], object]) -> Answer:
-    """Return the messages about the input that `make` makes in a folder, before cameras are recovered and trained."""
+    """Return the messages about the input that `make` makes in a folder, before cameras are recovered and trained.
+
+    They are kept: the page of inputs and the test of each answer ask for the same.
+    """
     with tempfile.TemporaryDirectory(prefix="splatmill-example-") as name:
         root = Path(name)
         given, capture, work = (root / part for part in ("photos", "capture", "work"))
