@@ -108,49 +108,11 @@ def kept(command: Command, said: str) -> None:
     assert "The same command goes on" in said
 
 
-def goes_on(command: Command) -> None:
-    """Check that the same command goes on where it was stopped, and leaves the model alone."""
-    code, said = command.run()
-    assert code == 0, said
-    assert "going on with the training that was stopped" in said
-    first, *others = command.diary()
-    assert first["from"] == 0
-    assert others
-    assert all(attempt["from"] >= 5 for attempt in others)
-    assert not any(attempt["overlap"] for attempt in command.diary())
-    assert (command.out / "model.ply").is_file()
-    assert not command.data.exists()
-    assert not (command.out / ".splatmill.lock").exists()
-
-
 @pytest.mark.slow
-def test_the_same_command_goes_on_after_a_kill(command: Command) -> None:
-    code, _ = command.interrupted(signal.SIGKILL)
-    assert code == -signal.SIGKILL
-    goes_on(command)
-
-
-@pytest.mark.slow
-def test_a_stopped_training_is_kept_from_one_of_other_photos_and_the_same_command_goes_on(
-    command: Command, tmp_path: Path
-) -> None:
-    code, said = command.interrupted(signal.SIGTERM)
-    assert code == Exit.cancelled
-    kept(command, said)
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "0.jpg").write_text("photo 0")
-    code, said = command.run(photos=other)
-    assert code == Exit.no_service
-    assert f"{command.data} holds an unfinished training of other photos, {command.photos}" in said
-    assert "--fresh" in said
-    goes_on(command)
-
-
-@pytest.mark.slow
-def test_a_second_command_is_refused_and_a_second_ctrl_c_loses_only_what_follows_the_last_checkpoint(
+def test_only_the_same_command_goes_on_and_a_second_ctrl_c_loses_only_what_follows_the_last_checkpoint(
     tmp_path: Path,
 ) -> None:
+    """A second command is refused while the first one runs, and one with other photos is refused after it."""
     # The step after the fifth is one call of native code, which cannot save its state.
     command = Command(tmp_path, do="native", at=6)
     with command.start() as process:
@@ -170,15 +132,28 @@ def test_a_second_command_is_refused_and_a_second_ctrl_c_loses_only_what_follows
         said += process.stdout.read()
     assert process.returncode == Exit.cancelled, said
     command.script["do"] = "nothing"
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "0.jpg").write_text("photo 0")
+    code, said = command.run(photos=other)
+    assert code == Exit.no_service
+    assert f"{command.data} holds an unfinished training of other photos, {command.photos}" in said
+    assert "--fresh" in said
     code, said = command.run()
     assert code == 0, said
-    assert command.diary()[-1]["from"] == 5
+    assert "going on with the training that was stopped" in said
+    assert [attempt["from"] for attempt in command.diary()] == [0, 5]
+    assert (command.out / "model.ply").is_file()
+    assert not command.data.exists()
+    assert not (command.out / ".splatmill.lock").exists()
 
 
 @pytest.mark.slow
 def test_other_options_train_on_the_same_capture_and_the_first_ones_go_on_later(command: Command) -> None:
-    command.interrupted(signal.SIGINT, options=("--seed", "1"))
-    code, said = command.interrupted(signal.SIGINT, options=("--seed", "2"))
+    """The first command is killed, the second one stopped."""
+    code, _ = command.interrupted(signal.SIGKILL, options=("--seed", "1"))
+    assert code == -signal.SIGKILL
+    code, said = command.interrupted(signal.SIGTERM, options=("--seed", "2"))
     assert code == Exit.cancelled, said
     kept(command, said)
     one, two = command.jobs()
@@ -189,6 +164,7 @@ def test_other_options_train_on_the_same_capture_and_the_first_ones_go_on_later(
     code, said = command.run("--seed", "1")
     assert code == 0, said
     assert command.diary()[-1]["from"] >= 5
+    assert not any(attempt["overlap"] for attempt in command.diary())
     assert not command.data.exists()
 
 

@@ -5,6 +5,8 @@ Does not prove binary models; tests/worker/sfm/posed does.
 
 from __future__ import annotations
 
+import codecs
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,31 +14,21 @@ import pytest
 
 from splatmill_worker.scene import Scene
 from splatmill_worker.sfm import posed
-from tests.inputs.conftest import PLAIN_WITH_CAMERAS, Build, Train
-from tests.support.command_line import spawn
+from tests.inputs.conftest import Build
+from tests.support.posed_sets import FLIP
 
 pytestmark = pytest.mark.slow
 
 
-def test_names_with_spaces_are_read_and_written_again(built: Build, trained: Train, tmp_path: Path) -> None:
+def test_names_with_spaces_have_the_cameras_of_plain_ones(built: Build) -> None:
     folder = built("colmap-text-spaces")
-    # The photos that are held out of the plain still life: its names sort in the order of their numbers.
-    held_out = [
-        option for number in range(1, 31, 8) for option in ("--test-views", f"my photo ({number}).jpg")
-    ]
-    result = trained(folder, *held_out)
-    assert result.report["facts"]["source"] == "colmap"
-    assert result.psnr > PLAIN_WITH_CAMERAS - 0.5
-    again = tmp_path / "again"
-    said, warned = spawn("cameras", result.folder, "-o", again, "--format", "colmap-text").communicate(
-        timeout=120
-    )
-    assert str(again / "sparse/0/images.txt") in said
-    assert "names with spaces (30)" in warned
-    (again / "images").symlink_to(folder / "images")
-    assert {view.name for view in loaded(again).views} == {
-        path.name for path in (folder / "images").iterdir()
-    }
+    right = {view.name: view.camera.viewmat for view in loaded(built("posed-text-variants") / "bom").views}
+    views = {view.name: view.camera.viewmat for view in loaded(folder).views}
+    assert views.keys() == {f"my photo ({number}).jpg" for number in range(1, 31)}
+    for number in range(1, 31):
+        np.testing.assert_allclose(
+            views[f"my photo ({number}).jpg"], right[f"still_{number:04d}.jpg"], atol=1e-9
+        )
 
 
 def test_the_larger_of_two_models_is_used_and_named(built: Build) -> None:
@@ -47,11 +39,16 @@ def test_the_larger_of_two_models_is_used_and_named(built: Build) -> None:
     assert "sparse/0 has 4 of the photos" in warning
 
 
-def test_text_with_a_byte_order_mark_trains_with_its_cameras(built: Build, trained: Train) -> None:
-    result = trained(built("posed-text-variants") / "bom")
-    assert result.report["facts"]["source"] == "transforms"
-    assert len(result.report["views"]) == 30
-    assert result.psnr > PLAIN_WITH_CAMERAS - 0.5
+def test_text_with_a_byte_order_mark_has_its_cameras(built: Build) -> None:
+    folder = built("posed-text-variants") / "bom"
+    text = (folder / "transforms.json").read_bytes()
+    assert text.startswith(codecs.BOM_UTF8)
+    poses = {Path(row["file_path"]).name: row["transform_matrix"] for row in json.loads(text[3:])["frames"]}
+    views = {view.name: view.camera.viewmat for view in loaded(folder).views}
+    assert views.keys() == poses.keys()
+    for name, pose in poses.items():
+        # The file has OpenGL's axes, and from the camera to the world.
+        np.testing.assert_allclose(np.linalg.inv(views[name]), np.array(pose) @ FLIP, atol=1e-9)
 
 
 @pytest.mark.parametrize(("kind", "count"), [("case", 30), ("images-2-4", 30), ("null-frame", 29)])

@@ -11,40 +11,32 @@ from pathlib import Path
 
 import pytest
 
-from tests.inputs.conftest import PLAIN_WITHOUT_CAMERAS, Build, Train
+from splatmill.local_capture import find_files
+from splatmill.schema import Role
+from splatmill_worker.images.prepare import prepare
+from tests.inputs.conftest import Build
 from tests.support.command_line import spawn
 
 pytestmark = pytest.mark.slow
 
 
-def test_the_results_of_the_first_run_are_no_photos_of_the_second(
-    built: Build, trained: Train, tmp_path: Path
+def test_photos_under_bad_names_train_and_the_results_among_them_are_no_photos(
+    built: Build, tmp_path: Path
 ) -> None:
     folder = tmp_path / "photos"
     shutil.copytree(built("output-among-photos"), folder)
-    options = ("--image-size", "320", "--steps", "10")
-    _, said = spawn("train", folder, "-o", folder / "splat", *options).communicate(timeout=600)
-    assert (folder / "splat/preview.jpg").is_file(), said
-    second = trained(folder)
-    assert len(second.report["views"]) == 30
-    assert "results of an earlier training, not read as photos: splat/" in second.output
-    assert second.psnr > PLAIN_WITHOUT_CAMERAS - 0.5
-
-
-def test_photos_called_jfif_train(built: Build, trained: Train) -> None:
-    result = trained(built("picture-kinds") / "jfif")
-    assert len(result.report["views"]) == 30
-    assert result.psnr > PLAIN_WITHOUT_CAMERAS - 0.5
-
-
-def test_photos_under_bad_names_are_renamed_and_said(built: Build, trained: Train, tmp_path: Path) -> None:
-    folder = os.fsencode(tmp_path / "photos")
-    shutil.copytree(built("output-among-photos"), os.fsdecode(folder))
-    names = sorted(os.listdir(folder))
+    names = sorted(os.listdir(os.fsencode(folder)))
     for bad, name in zip([b"x:1.jpg", b" lead.jpg", b"caf\xe9.jpg"], names[3::8], strict=False):
-        os.rename(os.path.join(folder, name), os.path.join(folder, bad))
-    result = trained(Path(os.fsdecode(folder)), "--image-size", "160", "--steps", "10")
-    assert len(result.report["views"]) == 30
-    assert all(
-        f"renamed: {name}" in result.output for name in ("'x:1.jpg'", "' lead.jpg'", "'caf\\udce9.jpg'")
-    )
+        os.rename(os.path.join(os.fsencode(folder), name), os.path.join(os.fsencode(folder), bad))
+    options = ("--image-size", "160", "--steps", "10", "-v")
+    told, said = spawn("train", folder, "-o", folder / "splat", *options).communicate(timeout=600)
+    for name in ("'x:1.jpg'", "' lead.jpg'", "'caf\\udce9.jpg'"):
+        assert f"renamed: {name}" in told + said
+    assert (folder / "splat/preview.jpg").is_file(), said
+    again = find_files(folder)
+    assert again.count(Role.images) == 30
+    assert any(Path(path).parts[0] == "splat" for path in again.outputs)
+
+
+def test_photos_called_jfif_are_used(built: Build, tmp_path: Path) -> None:
+    assert len(prepare(built("picture-kinds") / "jfif", None, tmp_path).photos) == 30

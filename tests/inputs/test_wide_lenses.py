@@ -1,4 +1,4 @@
-"""A fisheye of 180 degrees trains as a pinhole cut out of its middle does; panoramas are refused by name."""
+"""Panoramas are refused by name. Of a fisheye, tests/worker/images/test_lens.py proves the middle that is used."""
 
 from __future__ import annotations
 
@@ -8,20 +8,7 @@ import pytest
 
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.sfm import posed
-from tests.inputs.conftest import Build, Train
-
-CROPPED = 28.1
-"""Held-out PSNR in dB of photos of a pinhole of 100 degrees, after 600 steps."""
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_a_fisheye_of_180_degrees_trains_as_its_middle(built: Build, trained: Train) -> None:
-    result = trained(built("wide-fisheye"), "--steps", "600")
-    assert result.psnr > CROPPED - 0.5
-    (warning,) = (each for each in result.report["warnings"] if "OPENCV_FISHEYE" in each)
-    assert "100 by 84 degrees" in warning
-    assert not any("light" in each for each in result.report["warnings"])
+from tests.inputs.conftest import Build
 
 
 @pytest.mark.slow

@@ -60,13 +60,13 @@ def test_no_pair_that_reaches_a_pixel_is_missing(name: str, backend: str) -> Non
         got = run(case, op)
     tiles = len(want.bins.offsets) - 1
     assert len(got.bins.offsets) - 1 == tiles
+    error = alpha_error(case, want.projected)
     for tile in range(tiles):
         mine = got.bins.ids[got.bins.offsets[tile] : got.bins.offsets[tile + 1]].cpu().long()
         theirs = want.bins.ids[want.bins.offsets[tile] : want.bins.offsets[tile + 1]].long()
         missing = set(theirs.tolist()) - set(mine.tolist())
         extra = set(mine.tolist()) - set(theirs.tolist())
         # A pair may differ only where the ellipse touches the tile within the error of alpha; such a pair is dim.
-        error = alpha_error(case, want.projected)
         for i in missing | extra:
             assert peak(want.projected, i, tile, case.width) <= (1 / 255) * (1 + 2 * float(error[i]) + 2e-4)
         depth = got.projected.depths.detach().cpu()[mine]

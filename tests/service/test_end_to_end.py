@@ -113,14 +113,13 @@ def test_posed_photos_become_a_model_whose_views_match_them(
     assert film.content[4:8] == b"ftyp"
 
 
-@pytest.mark.parametrize("points", ["empty", "missing"])
 def test_a_colmap_model_without_points_trains(
-    true_service: Up, photos: tuple[Path, dict[str, Camera]], points: str
+    true_service: Up, photos: tuple[Path, dict[str, Camera]]
 ) -> None:
     """COLMAP's own recipe for known poses: cameras.txt, images.txt, and an empty points3D.txt."""
     up, (folder, cameras) = true_service, photos
     capture = upload(up, folder)
-    files = colmap_model(cameras) | ({"points3D.txt": b""} if points == "empty" else {})
+    files = colmap_model(cameras) | {"points3D.txt": b""}
     for name, content in files.items():
         answer = up.http.put(f"/v1/captures/{capture}/poses/sparse/0/{name}", content=content)
         assert answer.status_code == 201, answer.text

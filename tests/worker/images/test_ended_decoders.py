@@ -1,7 +1,7 @@
 """Decoding processes that are ended at any moment, and answers of one that a file has taken over.
 
 A kill of the kernel for want of memory, of an operator or of a fault in a library are one SIGKILL here. Each moment is
-met exactly; `tests/service/test_ended_children.py` ends processes at random ones.
+met exactly; `tests/service/test_soak.py` ends a process of a true job at a random one.
 """
 
 from __future__ import annotations

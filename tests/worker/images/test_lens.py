@@ -1,7 +1,7 @@
 """Proves that undistorted photos show what the equations of each lens say, no wider than a pinhole holds, and nothing
 beyond the rays that the lens sees; and that lenses of usual width keep their pinhole.
 
-Does not prove what training gains: tests/inputs/test_wide_lenses.py does.
+Does not prove what training gains.
 """
 
 import math

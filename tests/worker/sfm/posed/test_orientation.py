@@ -1,7 +1,7 @@
 """Proves in which way photos with an EXIF orientation are read where cameras are given: by the size of the camera, and
 where that fits both ways, by the matches; and that nothing is guessed where these do not decide.
 
-Does not prove what training gains: tests/inputs/test_orientation.py does.
+Does not prove what training gains.
 """
 
 import json
