@@ -8,6 +8,7 @@ within rounding of a decision (the order of depths, the near plane, the bounds o
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -25,7 +26,7 @@ from tests.support.kernels.bounds import within
 from tests.support.kernels.cases import GROUPS, Case
 from tests.support.kernels.exact import exact_of
 from tests.support.kernels.fuzz import cases, inputs, reordered, rolled, same_bits, sure
-from tests.support.kernels.proof import peak, record_error, run, use
+from tests.support.kernels.proof import EPS, conditioning, peak, record_error, run, use
 from tests.support.kernels.units import IMAGES
 
 RATES = Rates(1.6e-4, 5e-3, 1e-3, 5e-2, 2.5e-3, 1.25e-4)
@@ -98,6 +99,10 @@ def test_fuzz_images_and_gradients_are_the_definitions(build: str, case: Case) -
         for k in GROUPS:
             error = gradients[k].double() - known.gradients[k]
             within(f"fused, gradient to {k}", "fuzz", error, known.units.fused[k])
+        # The separate ops pass conics on, whose numbers move by sqrt(3) eps each (`units`). Where that may take the
+        # determinant to 0, there is no Gaussian, and no unit.
+        if float(conditioning(known.want.projected).max()) * 4 * math.sqrt(3) * EPS >= 1:
+            return
         chain = run(case, "cpu")
         for label, got, other in zip(IMAGES, (chain.color, chain.alpha, chain.depth), want, strict=True):
             off = (got.detach().double() - other.detach()).abs()

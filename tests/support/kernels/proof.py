@@ -141,20 +141,27 @@ def alpha_error(case: Case, exact: Projected) -> Tensor:
     return torch.where(seen, error, 0.0)
 
 
+def conditioning(p: Projected) -> Tensor:
+    """a c / (a c - b^2) of each conic [N]: how many roundings of its determinant one of its numbers is.
+
+    inf where rounding has taken the determinant to 0 or below: such a form draws nothing that could be compared. 1 for
+    what is culled.
+    """
+    a, b, c = p.conics.detach().double().unbind(1)
+    det = a * c - b * b
+    seen = (p.extents > 0).all(1)
+    return torch.where(seen, torch.where(det > 0, a * c / det, torch.inf), 1.0)
+
+
 def record_error(p: Projected) -> Tensor:
     """How far the logarithm of an alpha by a kernel's record may be from that by the conic [N] that it is made of.
-
-    inf where the conic has lost its determinant by rounding: a form that is not positive definite draws nothing that
-    could be compared.
 
     With k = a c / (a c - b^2), no term of q = d^T C d <= Q = 2 ln 255 exceeds k Q inside the ellipse. The record raises
     a c - b^2 to 6e-8 a c, which adds 2 eps k of q at most. u = ux dx + uy dy has four roundings of its two terms, which
     move u^2 by 16 eps sqrt(k) Q, and v = vy dy has four. An edge of the box is rounded by 2 eps (|centre| + extent);
     q grows there by 2 Q / extent for each pixel. The functions and the sum of the exponent add ALPHA_ERROR.
     """
-    a, b, c = p.conics.double().unbind(1)
-    det = a * c - b * b
-    k = torch.where(det > 0, a * c / det, torch.inf)
+    k = conditioning(p)
     seen = (p.extents > 0).all(1)
     off = torch.where(seen[:, None], p.means2d.double().abs() / p.extents.double(), 0.0).amax(1)
     q = 2 * math.log(1 / ALPHA_MIN)
