@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import importlib
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
-from _functions.library import errors, load, measure
-from _functions.spans import FUNCTIONS, NEAR_0, Function, bits_at, place, runs, value
-from _functions.tolerances import ALPHA_ERROR, EXP2_ERROR
-from _rows import HERE
+from _studies.functions.library import errors, load, measure
+from _studies.functions.spans import FUNCTIONS, NEAR_0, Function, bits_at, place, runs, value
+from _studies.functions.tolerances import ALPHA_ERROR, EXP2_ERROR
 
 from splatmill_worker.kernels.cpu import isa
 from tests.support.paths import ROOT
@@ -39,12 +39,18 @@ def test_what_is_counted_is_right() -> None:
 
 
 @pytest.mark.slow
-def test_the_quick_form_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
-    before = sorted((HERE / "results").glob("functions*"))
-    assert bench.main(["--stride", "1000003"]) == 0
+def test_the_quick_form_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert (
+        bench.STUDY.main(["--stride", "1000003", "--dry", "--only", *isa.ISAS, "--out", str(tmp_path)]) == 0
+    )
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == len(FUNCTIONS) * len(isa.supported()) + len(isa.ISAS) - len(isa.supported())
-    assert sorted((HERE / "results").glob("functions*")) == before
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_part_of_the_floats_is_not_stored() -> None:
+    with pytest.raises(SystemExit, match="--dry"):
+        bench.STUDY.main(["--stride", "1000003"])
 
 
 def test_every_float_has_one_place() -> None:
@@ -70,7 +76,7 @@ def test_parts_are_the_whole_span(function: Function) -> None:
 
 @pytest.mark.parametrize("function", FUNCTIONS, ids=lambda f: f.name)
 def test_the_rows_are_of_every_float(function: Function) -> None:
-    rows = [row for row in bench.read("functions") if row["function"] == function.name and "arguments" in row]
+    rows = [row for row in bench.STUDY.rows() if row["function"] == function.name and "arguments" in row]
     assert {"avx2", "baseline"} <= {row["build"] for row in rows}
     for row in rows:
         assert row["count"] == function.span.count
@@ -81,14 +87,13 @@ def test_the_rows_are_of_every_float(function: Function) -> None:
 
 
 def test_the_comparison_is_exact_enough() -> None:
-    rows = [row for row in bench.read("functions") if "samples" in row]
+    rows = [row for row in bench.STUDY.rows() if "samples" in row]
     assert [row["function"] for row in rows] == [function.name for function in FUNCTIONS]
     assert all(row["samples"] > 1000 and row["ulp"] < 1e-8 for row in rows)
 
 
-def test_the_report_and_the_page_are_made_from_rows() -> None:
-    rows = bench.read("functions")
-    assert bench.table(rows) == (HERE / "functions.md").read_text()
+def test_the_page_of_the_documentation_is_made_from_rows() -> None:
+    rows = bench.STUDY.rows()
     page = (ROOT / "docs" / "numerics.md").read_text()
     assert "\n".join(bench.summary(rows)) in page
     assert f"{1e6 * EXP2_ERROR:.1f}·10⁻⁶ of {1e6 * ALPHA_ERROR:.1f}·10⁻⁶" in page

@@ -6,9 +6,7 @@ Not proven here: the builds of the variants, which take minutes to compile, and 
 
 from __future__ import annotations
 
-import argparse
 import importlib
-import json
 import os
 import re
 import subprocess
@@ -17,9 +15,9 @@ from pathlib import Path
 import _scenes
 import pytest
 import torch
-from _precision import formats
-from _precision.builds import _held, using
-from _precision.variants import BY_NAME, EXACT, PLAIN, STORAGE, VARIANTS, Variant
+from _studies.precision import formats
+from _studies.precision.builds import _held, using
+from _studies.precision.variants import BY_NAME, PLAIN, STORAGE, VARIANTS, Variant
 
 from splatmill_worker.kernels.cpu import engine, isa
 from splatmill_worker.kernels.cpu.step import Step
@@ -170,12 +168,25 @@ def test_a_small_run_measures_and_reports(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(bench, "COUNTS", (300,))
     monkeypatch.setattr(bench, "AFTER", (1, 300))
     monkeypatch.setattr(bench._scenes, "fox", lambda *_: None)
-    files = argparse.Namespace(
-        work=tmp_path, rows=tmp_path / "rows.jsonl", report=tmp_path, parts=bench.PARTS,
-        scenes=[str(tmp_path / "tiny")], steps=20, size=48, seeds=1, rounds=2, views=1, threads=[1],
-    )  # fmt: skip
-    bench.measured(files, [PLAIN], {PLAIN.name: engine, EXACT.name: engine})
-    rows = [json.loads(line) for line in files.rows.read_text().splitlines()]
+    monkeypatch.setattr(bench, "VARIANTS", [PLAIN])
+    monkeypatch.setattr(bench, "compiled", lambda variants, _: {v.name: engine for v in variants})
+    files = ["--work", str(tmp_path), "--out", str(tmp_path), "--scenes", str(tmp_path / "tiny")]
+    small = [
+        "--steps",
+        "20",
+        "--size",
+        "48",
+        "--seeds",
+        "1",
+        "--rounds",
+        "2",
+        "--views",
+        "1",
+        "--threads",
+        "1",
+    ]
+    assert bench.STUDY.main([*files, *small]) == 0
+    rows = bench.STUDY.rows(tmp_path)
     for row in rows:
         if row["kind"] == "decay":
             assert row["share"] == pytest.approx(row["exact"], rel=1e-4)
@@ -189,10 +200,7 @@ def test_a_small_run_measures_and_reports(tmp_path: Path, monkeypatch: pytest.Mo
     assert [r["kind"] for r in rows if r["kind"] != "decay"] == ["error", "time", "training"]
     assert rows[-1]["outcome"] == "trained"
     assert rows[-1]["steps"] == 20
-    files.parts = ["training"]
-    bench.measured(files, [PLAIN], {PLAIN.name: engine})
-    again = [json.loads(line) for line in files.rows.read_text().splitlines()]
-    assert sum(r["kind"] == "training" for r in again) == 1
-    assert bench.main(["--plot-only", "--rows", str(files.rows), "--report", str(tmp_path)]) == 0
+    assert bench.STUDY.main([*files, *small, "--only", "training"]) == 0
+    assert bench.STUDY.rows(tmp_path) == rows, "a training that has a row is not repeated"
     assert (tmp_path / "figures" / "precision.png").stat().st_size > 10_000
     assert "| float32, dB |" in (tmp_path / "precision.md").read_text()

@@ -6,14 +6,13 @@ Not proven here: the figures themselves, which are in worker/bench/results.
 from __future__ import annotations
 
 import importlib
-from pathlib import Path
 
 import pytest
 import torch
-from _functions.tolerances import U
-from _stability import scenes
-from _stability.conditioning import Problem, state
-from _stability.engines import CHAIN, CONIC, FUSED, engines
+from _studies.functions.tolerances import U
+from _studies.stability import scenes
+from _studies.stability.conditioning import Problem, state
+from _studies.stability.engines import CHAIN, CONIC, FUSED, engines
 
 bench = importlib.import_module("stability")
 
@@ -79,12 +78,6 @@ def test_undecided_pixels_have_no_weight(beside: Problem) -> None:
 
 @pytest.mark.slow
 def test_the_definition_is_that_of_50_digits() -> None:
-    from _stability.oracle import compare
+    from _studies.stability.oracle import compare
 
     assert max(compare(1.0, watched=1).values()) < 1e-6
-
-
-def test_the_report_is_made_from_rows() -> None:
-    rows = bench.read("stability")
-    text = bench.table(rows)
-    assert text == (Path(bench.__file__).parent / "stability.md").read_text()

@@ -7,17 +7,16 @@ Not proven here: the figures of its report, and that a real scene's largest eige
 from __future__ import annotations
 
 import importlib
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from _stability import scenes
-from _stiffness import exact, mean_square, needles
-from _stiffness.curvature import LIMIT, Metric, Objective, Shot, joined, product, start
-from _stiffness.lanczos import largest
+from _studies.stability import scenes
+from _studies.stiffness import exact, mean_square, needles
+from _studies.stiffness.curvature import LIMIT, Metric, Objective, Shot, joined, product, start
+from _studies.stiffness.lanczos import largest
 
 from splatmill_worker.kernels.cpu.loss import photo_stats
 from splatmill_worker.kernels.records import Rates
@@ -143,7 +142,6 @@ def test_needles_condition_grows_with_the_fourth_power_and_their_largest_eigenva
 
 @pytest.mark.slow
 def test_a_small_run_of_every_part_leaves_rows_and_a_report(tmp_path: Path) -> None:
-    path = tmp_path / "rows.jsonl"
     small = [
         "--scenes",
         "synthetic",
@@ -158,21 +156,15 @@ def test_a_small_run_of_every_part_leaves_rows_and_a_report(tmp_path: Path) -> N
         "--shares",
         "0.5",
     ]
-    parts = [word for part in ("curvature", "products", "runs") for word in ("--part", part)]
-    assert bench.main([*parts, *small, "--results", str(path)]) == 0
-    rows = {row["part"]: row for row in map(json.loads, path.read_text().splitlines())}
+    parts = ["--only", "curvature", "products", "runs"]
+    assert bench.STUDY.main([*parts, *small, "--out", str(tmp_path)]) == 0
+    rows = {row["part"]: row for row in bench.STUDY.rows(tmp_path)}
     assert set(rows) == {"curvature", "products", "runs"}
     assert rows["curvature"]["ratio"] > 0
     assert rows["curvature"]["error"] < rows["curvature"]["ratio"]
     assert sum(rows["curvature"]["groups"].values()) == pytest.approx(1.0)
     assert rows["runs"]["outcome"] == "trained"
     assert rows["runs"]["refused"] == 0
-    text = path.with_suffix(".md").read_text()
+    text = (tmp_path / "stiffness.md").read_text()
     assert f"{rows['runs']['psnr']:.2f}" in text
-    assert path.with_suffix(".png").stat().st_size > 10_000
-
-
-def test_the_report_is_made_from_rows() -> None:
-    folder = Path(bench.__file__).parent
-    rows = bench.report.latest(bench.lines(folder / "results" / "stiffness.jsonl"))
-    assert bench.report.document(rows) == (folder / "stiffness.md").read_text()
+    assert (tmp_path / "figures" / "stiffness.png").stat().st_size > 10_000

@@ -10,7 +10,7 @@ from functools import cache
 
 import pytest
 import torch
-from _stability.roundings import inexact_exponential
+from _studies.stability.roundings import inexact_exponential
 from torch import Tensor
 
 from splatmill_worker.kernels import ops

@@ -11,11 +11,11 @@ import re
 from typing import Any
 
 import pytest
-from _functions import tolerances
-from _functions.estimates import ESTIMATE_BOUNDS
-from _functions.library import errors, load, measure
-from _functions.spans import FUNCTIONS, Function, place, place_of
 from _rows import read
+from _studies.functions import tolerances
+from _studies.functions.estimates import ESTIMATE_BOUNDS
+from _studies.functions.library import errors, load, measure
+from _studies.functions.spans import FUNCTIONS, Function, place, place_of
 
 from splatmill_worker.kernels.cpu import isa
 from tests.support.paths import ROOT

@@ -99,7 +99,7 @@ def test_it_imports_nothing_that_a_bare_machine_lacks() -> None:
     program = f"""
 import sys
 sys.path.insert(0, {str(BENCH)!r})
-import gpu, _gpu.passes, _gpu.errors, _stability.conditioning, _stability.scenes
+import gpu, _gpu.passes, _gpu.errors, _studies.stability.conditioning, _studies.stability.scenes
 import splatmill_worker.kernels.gpu.step, splatmill_worker.kernels.ops
 for name in ("psutil", "PIL", "pycolmap", "redis", "splatmill", "splatmill_worker.kernels.cpu"):
     assert name not in sys.modules, name

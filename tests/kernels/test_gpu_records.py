@@ -15,9 +15,9 @@ pytest.importorskip(
     "triton", reason="Triton comes with torch's GPU builds; pip install triton to prove the kernels here"
 )
 
-from _stability import scenes
-from _stability.conditioning import Problem, Values, state
-from _stability.engines import chain, fused, fused_gpu
+from _studies.stability import scenes
+from _studies.stability.conditioning import Problem, Values, state
+from _studies.stability.engines import chain, fused, fused_gpu
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.gpu import bin as gpu_bin
@@ -35,7 +35,7 @@ pytestmark = [
 ]
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 LIMIT = 4.0
-"""Units of conditioning (`_stability.conditioning`) that an engine which trains may be off for any Gaussian; 2.6 is the
+"""Units of conditioning (`_studies.stability.conditioning`) that an engine which trains may be off; 2.6 is the
 most that was measured (worker/bench/stability.md)."""
 
 

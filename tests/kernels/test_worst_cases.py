@@ -11,9 +11,9 @@ from functools import cache
 from typing import Any
 
 import pytest
-from _stability.conditioning import Problem
-from _stability.engines import CHAIN, engines
-from _stability.search import posed, ratios
+from _studies.stability.conditioning import Problem
+from _studies.stability.engines import CHAIN, engines
+from _studies.stability.search import posed, ratios
 
 pytestmark = pytest.mark.slow
 
@@ -34,7 +34,7 @@ def problem(name: str) -> Problem:
     return posed(bench.scene_of(PINS[name]), DRAWS)
 
 
-@pytest.mark.parametrize("engine", bench.compared(RUNNING))
+@pytest.mark.parametrize("engine", bench.COMPARED)
 @pytest.mark.parametrize("name", PINS)
 def test_a_worst_input_is_no_worse_than_measured(name: str, engine: str) -> None:
     row = PINS[name]

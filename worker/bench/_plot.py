@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import statistics
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 
@@ -20,6 +22,7 @@ COLORS = {
     "reference float32": "#e08e2b",
     "reference float64": "#7a5c1e",
 }
+CYCLE = ["#1b6ca8", "#e08e2b", "#2e8b57", "#7a5c1e", "#8e44ad", "#c0392b", "#555555"]
 LOSER = "#c0392b"
 WINNER = "#2d2d2d"
 LETTERS_PER_INCH = 18.0
@@ -39,9 +42,26 @@ plt.rcParams.update(
 )
 
 
-def axes(columns: int, *, height: float = 4.0, width: float = 5.4) -> tuple[Figure, list[Axes]]:
-    figure, made = plt.subplots(1, columns, figsize=(width * columns, height), squeeze=False)
-    return figure, list(made[0])
+def axes(
+    columns: int, lines: int = 1, *, height: float = 4.0, width: float = 5.4, **shared: Any
+) -> tuple[Figure, list[Axes]]:
+    """A figure of panels, line after line; `height` is that of all lines."""
+    figure, made = plt.subplots(lines, columns, figsize=(width * columns, height), squeeze=False, **shared)
+    return figure, list(made.flat)
+
+
+def name(panel: Axes, x: str = "", y: str = "", title: str = "", *, log: str = "", size: float = 10) -> None:
+    """Labels and title of a panel; `log`: its logarithmic axes, x, y or xy."""
+    for axis in log:
+        getattr(panel, f"set_{axis}scale")("log")
+    for put, text in ((panel.set_xlabel, x), (panel.set_ylabel, y), (panel.set_title, title)):
+        if text:
+            put(text, fontsize=size)
+
+
+def middles(panel: Axes, found: dict[float, list[float]], style: str = "-", **look: Any) -> None:
+    """A line through the medians of the values at each place."""
+    panel.plot(list(found), [statistics.median(x) for x in found.values()], style, **look)
 
 
 def save(figure: Figure, path: Path, footer: str) -> None:

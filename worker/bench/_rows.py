@@ -74,14 +74,19 @@ def worked() -> float:
     return float(sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0))
 
 
-def write(name: str, rows: list[Row]) -> Path:
-    """Replace results/NAME.jsonl by `rows`, each with its origin, which a row that was read keeps; returns the path."""
-    path = HERE / "results" / f"{name}.jsonl"
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(
-        "".join(json.dumps(row if "commit" in row else {**row, **origin()}) + "\n" for row in rows)
+def write(name: str, rows: list[Row]) -> None:
+    """Replace results/NAME.jsonl by `rows`, each with its origin, which a row that was read keeps."""
+    replace(
+        HERE / "results" / f"{name}.jsonl", [row if "commit" in row else {**row, **origin()} for row in rows]
     )
-    return path
+
+
+def replace(path: Path, rows: Iterable[Row]) -> None:
+    """Replace a file by `rows`. An interrupted write leaves the file as it was."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    part.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    part.replace(path)
 
 
 def append(path: Path, row: Row) -> None:
@@ -102,7 +107,17 @@ def lines(path: Path) -> list[Row]:
 
 
 def read(name: str) -> list[Row]:
-    return [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
+    return lines(HERE / "results" / f"{name}.jsonl")
+
+
+def of(rows: Iterable[Row], **wanted: object) -> list[Row]:
+    """The rows whose fields have the given values."""
+    return [row for row in rows if all(row.get(name) == value for name, value in wanted.items())]
+
+
+def distinct(rows: Iterable[Row], name: str) -> list[Any]:
+    """The values of a field, each once, in order."""
+    return list(dict.fromkeys(row[name] for row in rows))
 
 
 def build(name: str) -> AbstractContextManager[None]:

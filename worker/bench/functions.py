@@ -1,30 +1,32 @@
-# ruff: noqa: E501  (prose and rows of Markdown tables are as long as they are)
-"""`bench functions`: the error of every elementary function of the CPU kernels, at every float that occurs.
+# ruff: noqa: E501  (heads of tables and sentences are as long as they are)
+"""The error of every elementary function of the CPU kernels, at every float that occurs.
 
-    splatmill bench functions                  # every build that this processor runs: 20 CPU seconds each
-    splatmill bench functions --build avx2     # one build; the rows of the others stay
-    splatmill bench functions --stride 1021    # one input in 1021, printed only
-    splatmill bench functions --plot-only
+    splatmill bench functions                          # every build that this processor runs: 20 CPU seconds each
+    splatmill bench functions --only avx2              # one build; the rows of the others stay
+    splatmill bench functions --stride 1021 --dry      # one input in 1021, printed only
 
-The kernels' headers are compiled into a small library for each instruction set, with the kernels' flags, and compared with
-float64. Expected before the first run, from the comments of the headers: exp within 1.2 ulp, log2 and reciprocal within
-2, reciprocal_sqrt within 3, sqrt correctly rounded, and a relative error of 2^x below 2.7e-6.
+The kernels' headers are compiled into a small library for each instruction set, with the kernels' flags, and compared
+with float64. Expected before the first run, from the comments of the headers: exp within 1.2 ulp, log2 and reciprocal
+within 2, reciprocal_sqrt within 3, sqrt correctly rounded, and a relative error of 2^x below 2.7e-6.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
-import json
-from collections.abc import Iterable, Sequence
+import sys
+from collections.abc import Iterable, Iterator
+from functools import partial
 from typing import Any
 
 import _plot
-from _functions.estimates import ESTIMATE_BOUNDS
-from _functions.library import load, measure
-from _functions.spans import BINS, FUNCTIONS, Function, place_of, value
-from _rows import HERE, Row, footer, origin, read
-from matplotlib import pyplot as plt
+from _page import Column, of_rows, table
+from _rows import Row, of
+from _studies.functions.estimates import ESTIMATE_BOUNDS
+from _studies.functions.library import load, measure
+from _studies.functions.spans import BINS, FUNCTIONS, Function, place_of, value
+from _studies.study import Study
+from matplotlib.figure import Figure
 
 from splatmill_worker.kernels.cpu import isa
 
@@ -35,8 +37,26 @@ SAMPLES = 1000
 """Arguments of each function at which the float64 value is compared with 50 decimal digits."""
 
 
-def oracle(build: str, function: Function, worst: Iterable[int]) -> Row:
-    """How far the float64 value is from 50 digits, in ulp of float32: over a sample, and where the largest errors were found."""
+def of_build(build: str, options: argparse.Namespace) -> Iterator[Row]:
+    """Rows of all functions; a build that this processor cannot run has a row that says so, unless it has others."""
+    if options.stride > 1 and not options.dry:
+        raise SystemExit("The rows are of every float: with --stride, give --dry too.")
+    if build in isa.supported():
+        yield from (measure(build, function, options.stride) for function in FUNCTIONS)
+    elif not of(options.known, build=build):
+        yield {"bench": "functions", "function": "", "build": build, "outcome": "not on this processor"}
+
+
+def oracle(options: argparse.Namespace) -> Iterator[Row]:
+    """The float64 values at a sample of arguments and where the largest errors are."""
+    for function in FUNCTIONS:
+        rows = measured(of(options.known, function=function.name))
+        at = [row[f"{figure}_bits"] for row in rows for figure in ("ulp", "relative", "absolute")]
+        yield compared(isa.supported()[0], function, at)
+
+
+def compared(build: str, function: Function, worst: Iterable[int]) -> Row:
+    """How far the float64 value is from 50 digits, in ulp of float32: over a sample, and at the floats of some bits."""
     mpmath: Any = importlib.import_module("mpmath")
     library = load(build)
     exact = {
@@ -47,11 +67,10 @@ def oracle(build: str, function: Function, worst: Iterable[int]) -> Row:
         "reciprocal_sqrt": lambda x: 1 / mpmath.sqrt(x),
         "sqrt": mpmath.sqrt,
     }[function.name]
-    places = {place_of(bits) for bits in worst}
-    places |= {first for first, _ in function.span.parts(SAMPLES)}
+    places = {place_of(bits) for bits in worst} | {first for first, _ in function.span.parts(SAMPLES)}
     largest = 0.0
     with mpmath.workdps(50):
-        for x in (value(at) for at in places):
+        for x in map(value, places):
             want = exact(mpmath.mpf(x))
             if want:
                 ulp = mpmath.mpf(2) ** (mpmath.frexp(want)[1] - 24)
@@ -61,130 +80,83 @@ def oracle(build: str, function: Function, worst: Iterable[int]) -> Row:
     }  # fmt: skip
 
 
-def float_of(bits: int) -> float:
-    """The float of these bits."""
-    return value(place_of(bits))
+def measured(rows: Iterable[Row]) -> list[Row]:
+    """The rows of measured builds, in the order of the instruction sets."""
+    return sorted((row for row in rows if "arguments" in row), key=lambda row: isa.ISAS.index(row["build"]))
 
 
-def run(builds: Sequence[str], stride: int = 1) -> list[Row]:
-    """Rows of all functions; a build that this processor cannot run has a row that says so."""
-    rows: list[Row] = []
-    for build in builds:
-        if build not in isa.supported():
-            rows.append(
-                {"bench": "functions", "function": "", "build": build, "outcome": "not on this processor"}
-            )
-            print(f"{build}: not on this processor", flush=True)
-            continue
-        for function in FUNCTIONS:
-            row = measure(build, function, stride)
-            rows.append(row)
-            other = f", {row['unlike']} of the floats in {row['octaves']} differ" if "octaves" in row else ""
-            print(
-                f"{build:9} {function.name:16} {row['arguments']:16} {row['count']:>11,} inputs: {row['ulp']:.3f} ulp at "
-                f"{float_of(row['ulp_bits']):.9g}, relative {row['relative']:.2e}, absolute {row['absolute']:.2e}{other}",
-                flush=True,
-            )
-    return rows
-
-
-def written(rows: list[Row], name: str = "functions") -> None:
-    """Replace the rows of the builds in `rows`, and keep those of others: no processor need run them all."""
-    builds = [row["build"] for row in rows if "outcome" not in row]
-    path = HERE / "results" / f"{name}.jsonl"
-    before = read(name) if path.exists() else []
-    known = [row for row in before if row["build"] not in builds]
-    known += [{**row, **origin()} for row in rows if row["build"] not in {old["build"] for old in known}]
-    order = [*isa.ISAS, ORACLE]
-    known.sort(key=lambda row: order.index(row["build"]))
-    path.parent.mkdir(exist_ok=True)
-    path.write_text("".join(json.dumps(row) + "\n" for row in known))
-
-
-def draw(rows: list[Row]) -> None:
+def draw(rows: list[Row]) -> Figure:
     """The largest error over each part of the arguments, by function and instruction set."""
-    figure, panels = plt.subplots(2, 3, figsize=(15, 7))
-    for panel, function in zip(panels.flat, FUNCTIONS, strict=True):
+    figure, panels = _plot.axes(3, 2, width=5, height=7)
+    for panel, function in zip(panels, FUNCTIONS, strict=True):
         edges = [value(first) for first, _ in function.span.parts(BINS)] + [function.span.intervals[-1][1]]
-        for row in rows:
-            if row["function"] == function.name and "bins" in row:
-                panel.stairs(
-                    row["bins"], edges, baseline=None, label=row["build"], color=_plot.COLORS[f"cpu {row['build']}"], lw=1.3
-                )  # fmt: skip
+        for row in measured(of(rows, function=function.name)):
+            color = _plot.COLORS[f"cpu {row['build']}"]
+            panel.stairs(row["bins"], edges, baseline=None, label=row["build"], color=color, lw=1.3)
         panel.axhline(0.5, color="#999999", lw=0.8, ls=":")
         panel.set_ylim(0, 1.1 * panel.dataLim.y1)
-        panel.set_title(f"{function.name}: {function.exact}", fontsize=10)
-        panel.set_xlabel("x", fontsize=9)
+        _plot.name(panel, title=f"{function.name}: {function.exact}")
+        _plot.name(panel, "x", size=9)
         panel.legend(fontsize=8)
-    for line in panels:
-        line[0].set_ylabel("largest error, ulp", fontsize=9)
-    _plot.save(figure, HERE / "figures" / "functions.png", footer(rows))
+    for panel in panels[::3]:
+        _plot.name(panel, y="largest error, ulp", size=9)
+    return figure
 
 
-def table(rows: list[Row]) -> str:
-    """The report."""
-    measured = [row for row in rows if "arguments" in row]
-    checked = [row for row in rows if "samples" in row]
-    absent = [row["build"] for row in rows if "outcome" in row]
-    most = max(row["ulp"] for row in measured if row["function"] != "exp2_of_alpha")
-    alpha = [row for row in measured if row["function"] == "exp2_of_alpha"]
-    lines = [
-        "# Errors of the kernels' functions", "",
+def outcome(rows: list[Row]) -> str:
+    most = max(row["ulp"] for row in measured(rows) if row["function"] != "exp2_of_alpha")
+    alpha = measured(of(rows, function="exp2_of_alpha"))
+    return (
         f"At every float that occurs as an argument, every function of the CPU kernels is within {most:.2f} ulp, "
         f"except the 2^x of compositing, which is a polynomial of degree 4 by choice: its relative error is at most {max(r['relative'] for r in alpha):.2e}, "
-        f"or {max(r['ulp'] for r in alpha):.1f} ulp.", "",
-        "One ulp is the distance of neighbouring floats at the exact value, so 0.5 is the least that a largest error can be. Denormal numbers are "
-        "flushed to 0, as in every kernel. `rounded` is the share of results that are the nearest float; `mean` is the mean relative error with its "
-        "sign.", "",
-        "These are all arguments that occur. `exp` holds its own within the limits; alpha is at least 1/255, and so is the opacity whose "
-        "logarithm is taken. Nearer to 0 than 2^-30, e^x and 2^x have the same result for every x, and nothing is counted. "
-        "For the last three, the errors in [1, 4) are those of all octaves: the results at 4^k x were compared with those at x, and `unlike` of them differ by "
-        "more than the power of 2 that they should. "
-        "`round_small` and `floor` are exact, and sums, products, quotients and `sqrt` are rounded correctly by IEEE 754.", "",
-        "| function | arguments | build | counted | octaves compared | unlike | largest, ulp | at | rms, ulp | rounded | largest relative | mean | largest absolute |",
-        "|---" * 13 + "|",
-        *(
-            f"| `{r['function']}` | {r['arguments']} | {r['build']} | {r['count']:,} | {r.get('octaves', '')} | {r.get('unlike', '')} | {r['ulp']:.3f} | "
-            f"{float_of(r['ulp_bits']):.9g} | {r['rms_ulp']:.3f} | {100 * r['rounded']:.1f} % | {r['relative']:.2e} | {r['mean_relative']:+.1e} | "
-            f"{r['absolute']:.1e} |"
-            for function in FUNCTIONS for r in measured if r["function"] == function.name
-        ), "",
+        f"or {max(r['ulp'] for r in alpha):.1f} ulp."
+    )
+
+
+def errors(rows: list[Row]) -> str:
+    columns: list[Column] = [
+        ("function", "`{function}`"), ("arguments", "{arguments}"), ("build", "{build}"), ("counted", "{count:,}"),
+        ("octaves compared", lambda row: row.get("octaves", "")), ("unlike", lambda row: row.get("unlike", "")), ("largest, ulp", "{ulp:.3f}"),
+        ("at", lambda row: f"{value(place_of(row['ulp_bits'])):.9g}"), ("rms, ulp", "{rms_ulp:.3f}"),
+        ("rounded", lambda row: f"{100 * row['rounded']:.1f} %"), ("largest relative", "{relative:.2e}"), ("mean", "{mean_relative:+.1e}"),
+        ("largest absolute", "{absolute:.1e}"),
     ]  # fmt: skip
-    if absent:
-        lines += [
-            f"Not measured, because the processor lacks it: {', '.join(absent)}. AVX-512 has the operations of AVX2 in wider registers, with the same "
-            "results bit for bit, but for the estimates that `reciprocal` and `reciprocal_sqrt` start from.", "",
-        ]  # fmt: skip
-    lines += [
-        "Estimates differ from one processor to the next. By the error that manufacturers document for them, the results are within:", "",
-        "| function | build | ulp |", "|---|---|---|",
-        *(f"| `{name}` | {build} | {bound:.2f} |" for (name, build), bound in ESTIMATE_BOUNDS.items()), "",
-        "## How exact the comparison is", "",
-        "The exact value is the C library's in float64. Its distance from 50 decimal digits (mpmath), at a sample of arguments and at every argument "
-        "of a largest error above:", "",
-        "| function | arguments | ulp of float32 |", "|---|---|---|",
-        *(f"| `{r['function']}` | {r['samples']:,} | {r['ulp']:.0e} |" for r in checked), "",
-        "![Largest error against the argument](figures/functions.png)", "",
-        f"Generated by `splatmill bench functions`. {footer(rows)}", "",
-    ]  # fmt: skip
-    return "\n".join(lines)
+    return of_rows(columns, [r for f in FUNCTIONS for r in measured(of(rows, function=f.name))])
+
+
+def absent(rows: list[Row]) -> str:
+    builds = {row["build"] for row in rows if "outcome" in row} - {row["build"] for row in measured(rows)}
+    return (
+        f"Not measured, because the processor lacks it: {', '.join(sorted(builds))}. AVX-512 has the operations of AVX2 in wider registers, with the same "
+        "results bit for bit, but for the estimates that `reciprocal` and `reciprocal_sqrt` start from."
+        if builds
+        else ""
+    )
+
+
+def bounds(_: list[Row]) -> str:
+    cells = [[f"`{name}`", build, f"{bound:.2f}"] for (name, build), bound in ESTIMATE_BOUNDS.items()]
+    return table("function|build|ulp", cells)
+
+
+def exactness(rows: list[Row]) -> str:
+    columns: list[Column] = [
+        ("function", "`{function}`"),
+        ("arguments", "{samples:,}"),
+        ("ulp of float32", "{ulp:.0e}"),
+    ]
+    return of_rows(columns, [row for row in rows if "samples" in row])
 
 
 def summary(rows: list[Row]) -> list[str]:
     """The table of docs/numerics.md: the largest errors, in ulp, over all arguments that occur."""
-    builds = [
-        build for build in isa.ISAS if any(row["build"] == build and "arguments" in row for row in rows)
-    ]
+    builds = list(dict.fromkeys(row["build"] for row in measured(rows)))
     lines = [
         f"| function | used for | {' | '.join(builds)} | on any processor |",
         "| --- " * (3 + len(builds)) + "|",
     ]
     for function in FUNCTIONS:
-        found = {
-            row["build"]: row["ulp"]
-            for row in rows
-            if row["function"] == function.name and "arguments" in row
-        }
+        found = {row["build"]: row["ulp"] for row in measured(of(rows, function=function.name))}
         documented = [bound for (name, _), bound in ESTIMATE_BOUNDS.items() if name == function.name]
         cells = [*(found[build] for build in builds), max([*found.values(), *documented])]
         lines.append(
@@ -193,33 +165,15 @@ def summary(rows: list[Row]) -> list[str]:
     return lines
 
 
-def main(argv: list[str]) -> int:
-    parser = argparse.ArgumentParser(
-        prog="bench functions", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--build", choices=isa.ISAS, action="append", help="only this instruction set")
-    parser.add_argument("--stride", type=int, help="only every so many-th input, printed and not written")
-    parser.add_argument("--plot-only", action="store_true", help="figure and table from the rows there are")
-    options = parser.parse_args(argv)
-    builds = options.build or isa.ISAS
-    if options.stride:
-        run(builds, options.stride)
-        return 0
-    if not options.plot_only:
-        rows = run(builds)
-        first = isa.supported()[0]
-        for function in FUNCTIONS:
-            mine = [row for row in rows if row["function"] == function.name]
-            at = [row[f"{figure}_bits"] for row in mine for figure in ("ulp", "relative", "absolute")]
-            rows.append(oracle(first, function, at))
-        written(rows)
-    rows = read("functions")
-    draw(rows)
-    (HERE / "functions.md").write_text(table(rows))
-    return 0
-
+STUDY = Study(
+    name="functions",
+    about=__doc__,
+    cases={build: partial(of_build, build) for build in isa.ISAS} | {ORACLE: oracle},
+    key=("function", "build"),
+    blocks={"outcome": outcome, "functions": errors, "absent": absent, "bounds": bounds, "oracle": exactness},
+    figures={"functions": draw},
+    options={"stride": {"type": int, "default": 1, "help": "only every so many-th input, for --dry"}},
+)
 
 if __name__ == "__main__":
-    import sys
-
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(STUDY.main(sys.argv[1:]))

@@ -1,13 +1,11 @@
-# ruff: noqa: E501  (prose and rows of Markdown tables are as long as they are)
-"""`bench stability`: the error of every engine in units of what rounding its inputs already does, along stiff axes.
+# ruff: noqa: E501  (prose is as long as it is)
+"""The error of every engine in units of what rounding its inputs already does, along stiff axes.
 
     splatmill bench stability                       # all axes, the oracle, figures and table: under 10 minutes
-    splatmill bench stability --axis beside         # one axis, printed only
-    splatmill bench stability --axis beside_tiny --update    # one axis in place of its rows, and what is drawn from them
-    splatmill bench stability --plot-only
+    splatmill bench stability --only beside --dry   # one axis, printed only
 
-An error of 1 unit is what any algorithm has that reads float32 (`_stability/conditioning.py`). Expected before the first
-run: a flat line near 1 for the fused step, and growth with the axis ratio for all that assembles the conic.
+An error of 1 unit is what any algorithm has that reads float32 (`_studies/stability/conditioning.py`). Expected before
+the first run: a flat line near 1 for the fused step, and growth with the axis ratio for all that assembles the conic.
 """
 
 from __future__ import annotations
@@ -15,24 +13,29 @@ from __future__ import annotations
 import argparse
 import math
 import os
-from collections.abc import Iterable
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import _plot
 import torch
-from _rows import HERE, Row, footer, read, write
-from _stability.conditioning import Problem, state
-from _stability.engines import CHAIN, CONIC, FUSED, GPU, Engine, engines
-from _stability.formulas import FORMULAS
-from _stability.reasons import HIDDEN, REASONS, UNIT
-from _stability.scenes import AXES, GROUPS, Axis
-from matplotlib import pyplot as plt
+from _page import table
+from _rows import Row, distinct, of
+from _studies.functions.tolerances import EXP2_ERROR, U
+from _studies.stability.conditioning import Problem, state
+from _studies.stability.engines import CHAIN, CONIC, FUSED, GPU, Engine, engines
+from _studies.stability.formulas import FORMULAS
+from _studies.stability.scenes import AXES, GROUPS, Axis
+from _studies.study import Study
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from torch import Tensor
 
 LIMIT = 4.0
 """Units that an engine which trains should stay within."""
 
 ORACLE_RATIOS = (1.0, 1e3, 1e6)
+NEEDLES = [axis for axis in AXES if axis.name in ("axis_ratio", "beside")]
 
 
 def measure(problem: Problem, engine: Engine) -> list[Row]:
@@ -41,7 +44,8 @@ def measure(problem: Problem, engine: Engine) -> list[Row]:
     blank = (problem.exact.image == 0).all(2)
     off = (got.image.double() - problem.exact.image).abs().amax(2)
     counted = ~problem.undecided & ~blank
-    image: Row = {"quantity": "image", **figures(off[counted], _image_units(problem, counted))}
+    units = [x.image.amax(2)[counted] for x in (problem.designed, problem.unit)]
+    image: Row = {"quantity": "image", **figures(off[counted], units)}
     image["undecided"] = int(problem.undecided.sum())
     image["flips"] = int((problem.undecided & (off > 16 * problem.designed.image.amax(2))).sum())
     image["drawn where nothing is"] = int((blank & ~problem.undecided & (off > 0)).sum())
@@ -53,7 +57,7 @@ def measure(problem: Problem, engine: Engine) -> list[Row]:
         row["size"] = float(want.norm())
         if k != "pose":
             each = [_lengths(error) / _lengths(u) for u in units]
-            row |= {"gaussian": _worst(each[0]), "gaussian_median": _median(each[0])}
+            row |= {"gaussian": _worst(each[0]), "gaussian_median": float(each[0].median())}
             row |= {"gaussian_inputs": _worst(each[1]), "gaussian_explained": _worst(each[2])}
         rows.append(row)
     return rows
@@ -63,21 +67,17 @@ def figures(error: Tensor, units: list[Tensor]) -> Row:
     """Ratios of errors to the units with and without the error of 2^x, and the plain sizes of both."""
     designed, inputs = units
     if not len(error):
-        return {"max": 0.0, "p999": 0.0, "median": 0.0, "norm": 0.0, "inputs": 0.0, "error": 0.0, "unit": 0.0}
+        return dict.fromkeys(("max", "p999", "median", "norm", "inputs", "error", "unit"), 0.0)
     ratio = error / designed
     return {
         "max": _worst(ratio),
         "p999": float(ratio.sort().values[math.ceil(0.999 * len(ratio)) - 1]),
-        "median": _median(ratio),
+        "median": float(ratio.median()),
         "norm": float(error.norm() / designed.norm()),
         "inputs": _worst(error / inputs),
         "error": float(error.norm()),
         "unit": float(designed.norm()),
     }
-
-
-def _image_units(problem: Problem, counted: Tensor) -> list[Tensor]:
-    return [x.image.amax(2)[counted] for x in (problem.designed, problem.unit)]
 
 
 def _lengths(x: Tensor) -> Tensor:
@@ -87,19 +87,19 @@ def _lengths(x: Tensor) -> Tensor:
 
 def _worst(x: Tensor) -> float:
     """The largest value; infinity where one is not a number, so that it cannot hide."""
-    return float(torch.nan_to_num(x, nan=math.inf, posinf=math.inf).max()) if len(x) else 0.0
+    return float(torch.nan_to_num(x, nan=math.inf, posinf=math.inf).max())
 
 
-def _median(x: Tensor) -> float:
-    return float(x.median()) if len(x) else 0.0
-
-
-def sweep(axis: Axis, seeds: int, draws: int, running: dict[str, Engine]) -> Iterable[Row]:
+def sweep(axis: Axis, options: argparse.Namespace) -> Iterable[Row | str]:
     """Rows of one axis: for every value and engine, the worst scene's figures of each quantity."""
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # before Triton is imported
+    running = engines()
+    if axis.tiny and GPU not in running:
+        print("Triton is not installed: without the GPU's step.", file=sys.stderr)
     for value in axis.values:
         worst: dict[tuple[str, str], Row] = {}
-        for seed in range(1 if axis.dear else seeds):
-            problem = state(axis.make(value, seed), draws, seed)
+        for seed in range(1 if axis.dear else options.seeds):
+            problem = state(axis.make(value, seed), options.draws, seed)
             for name, engine in running.items():
                 if name == GPU and not axis.tiny:
                     continue
@@ -111,9 +111,9 @@ def sweep(axis: Axis, seeds: int, draws: int, running: dict[str, Engine]) -> Ite
             yield {"bench": "stability", "axis": axis.name, "value": value, "engine": name, **row}
 
 
-def oracle() -> Iterable[Row]:
+def oracle(_: argparse.Namespace) -> Iterable[Row]:
     """How far the float64 reference is from 50 digits, in the same units."""
-    from _stability.oracle import compare
+    from _studies.stability.oracle import compare
 
     for ratio in ORACLE_RATIOS:
         for quantity, worst in compare(ratio).items():
@@ -123,7 +123,7 @@ def oracle() -> Iterable[Row]:
             }  # fmt: skip
 
 
-def formulas() -> Iterable[Row]:
+def formulas(_: argparse.Namespace) -> Iterable[Row]:
     for axis in FORMULAS:
         for value in axis.values:
             for name, (error, used) in axis.errors(value).items():
@@ -142,27 +142,27 @@ def per_gaussian(rows: Iterable[Row], figure: str = "gaussian") -> dict[float, f
     return found
 
 
+def engine_names(rows: list[Row]) -> list[str]:
+    return distinct((r for r in rows if r["axis"] in {a.name for a in AXES}), "engine")
+
+
+# ---- figures
+
+
 def draw_axis(panel: Axes, axis: Axis, rows: list[Row], names: list[str]) -> None:
     """The worst Gaussian's gradient error in units, of each engine."""
     for i, name in enumerate(names):
-        mine = [r for r in rows if r["axis"] == axis.name and r["engine"] == name]
-        for field, style, label in (
-            ("gaussian", "-", name),
-            ("gaussian_explained", ":", "... with the difference"),
-        ):
-            if not mine or (field == "gaussian_explained" and name != names[0]):
-                continue
-            xs, ys = zip(*sorted(per_gaussian(mine, field).items()), strict=True)
+        mine = of(rows, axis=axis.name, engine=name)
+        lines = [("gaussian", "-", name), ("gaussian_explained", ":", "... with the difference")]
+        for figure, style, label in lines[: 1 + (i == 0)] if mine else []:
+            xs, ys = zip(*sorted(per_gaussian(mine, figure).items()), strict=True)
             shown = [min(max(y, 1e-1), 1e6) for y in ys]
             panel.plot(
                 xs, shown, style, marker="osv^D"[i % 5], markersize=4, color=color(name), label=label, lw=1.5
             )
     panel.axhspan(1e-1, LIMIT, color="#2e8b57", alpha=0.08)
-    panel.set_yscale("log")
-    if axis.log:
-        panel.set_xscale("log")
+    _plot.name(panel, axis.label, log="yx" if axis.log else "y", size=9)
     panel.set_ylim(1e-1, 1e6)
-    panel.set_xlabel(axis.label, fontsize=9)
 
 
 def color(name: str) -> str:
@@ -171,175 +171,151 @@ def color(name: str) -> str:
     return {CHAIN: "#7a5c1e", CONIC: _plot.LOSER}.get(name, _plot.COLORS["gpu"])
 
 
-def draw(rows: list[Row]) -> None:
-    """All axes in one figure, and the two of needles in another."""
-    names = engine_names(rows)
-    for file, axes, columns in (
-        ("stability", AXES, 3),
-        ("stability_axis_ratio", [a for a in AXES if a.name in ("axis_ratio", "beside")], 2),
-    ):
-        lines = -(-len(axes) // columns)
-        drawn, panels = plt.subplots(lines, columns, figsize=(5 * columns, 3.2 * lines + 0.5), squeeze=False)
-        for panel in panels.flat[len(axes) :]:
-            panel.axis("off")
-        for axis, panel in zip(axes, panels.flat, strict=False):
-            draw_axis(panel, axis, rows, names)
-        for line in panels:
-            line[0].set_ylabel("worst Gaussian's gradient,\nerror / (condition x roundoff)", fontsize=9)
-        panels.flat[0].legend(fontsize=8)
-        _plot.save(drawn, HERE / "figures" / f"{file}.png", footer(rows))
-    drawn, beside = _plot.axes(len(FORMULAS), width=4.2)
-    for formula, panel in zip(FORMULAS, beside, strict=True):
-        mine = [r for r in rows if r["axis"] == f"formula: {formula.name}"]
-        for name in dict.fromkeys(r["engine"] for r in mine):
-            points = [(r["value"], max(r["error"], 1e-9)) for r in mine if r["engine"] == name]
-            used = next(r["used"] for r in mine if r["engine"] == name)
-            panel.plot(*zip(*points, strict=True), color=_plot.WINNER if used else _plot.LOSER, label=name)
-        panel.set_yscale("log")
-        if formula.log:
-            panel.set_xscale("log")
-        panel.set_xlabel(formula.label)
+def draw_axes(axes: Sequence[Axis], columns: int, rows: list[Row]) -> Figure:
+    lines = -(-len(axes) // columns)
+    drawn, panels = _plot.axes(columns, lines, width=5, height=3.2 * lines + 0.5)
+    for panel in panels[len(axes) :]:
+        panel.axis("off")
+    for axis, panel in zip(axes, panels, strict=False):
+        draw_axis(panel, axis, rows, engine_names(rows))
+    for panel in panels[::columns]:
+        _plot.name(panel, y="worst Gaussian's gradient,\nerror / (condition x roundoff)", size=9)
+    panels[0].legend(fontsize=8)
+    return drawn
+
+
+def draw_formulas(rows: list[Row]) -> Figure:
+    drawn, panels = _plot.axes(len(FORMULAS), width=4.2)
+    for formula, panel in zip(FORMULAS, panels, strict=True):
+        mine = of(rows, axis=f"formula: {formula.name}")
+        for name in distinct(mine, "engine"):
+            found = of(mine, engine=name)
+            points = [(r["value"], max(r["error"], 1e-9)) for r in found]
+            tint = _plot.WINNER if found[0]["used"] else _plot.LOSER
+            panel.plot(*zip(*points, strict=True), color=tint, label=name)
+        _plot.name(panel, formula.label, log="yx" if formula.log else "y")
         panel.legend(fontsize=8)
-    _plot.save(drawn, HERE / "figures" / "stability_formulas.png", footer(rows))
+    return drawn
 
 
-def engine_names(rows: list[Row]) -> list[str]:
-    return list(dict.fromkeys(r["engine"] for r in rows if r["axis"] in {a.name for a in AXES}))
+# ---- blocks of the page
 
 
 def short(x: float) -> str:
     return "0" if x == 0 else f"{x:.1f}" if x < 100 else f"{x:.0e}"
 
 
-def table(rows: list[Row]) -> str:
-    """The report: first what can be checked, then every axis, then where an engine leaves the limit and why."""
-    mine = [r for r in rows if r["axis"] in {a.name for a in AXES}]
+def outcome(rows: list[Row]) -> str:
     names = engine_names(rows)
+    fused = [n for n in names if n.startswith(FUSED)]
 
-    def worst(name: str, axes: Iterable[Axis]) -> float:
-        return max(
-            max(per_gaussian(r for r in mine if r["engine"] == name and r["axis"] == a.name).values())
-            for a in axes
+    def worst(engines: list[str], axes: Iterable[Axis]) -> str:
+        return short(
+            max(max(per_gaussian(of(rows, engine=n, axis=a.name)).values()) for n in engines for a in axes)
         )
 
-    needles = [a for a in AXES if a.name in ("axis_ratio", "beside")]
-    fused = [n for n in names if n.startswith(FUSED)]
-    head = (
+    text = (
         f"On needles of axis ratio 1 to 1e6, on the image and beside it, the gradient that the fused CPU step gives to the worst"
-        f" Gaussian is off by at most {short(max(worst(n, needles) for n in fused))} times what rounding its inputs to float32 "
-        f"changes it by; with a conic of three float32 numbers (separate ops) it is {short(worst(CHAIN, needles))} times, and "
-        f"with all of the reference in float32 {short(worst(CONIC, needles))} times."
+        f" Gaussian is off by at most {worst(fused, NEEDLES)} times what rounding its inputs to float32 "
+        f"changes it by; with a conic of three float32 numbers (separate ops) it is {worst([CHAIN], NEEDLES)} times, and "
+        f"with all of the reference in float32 {worst([CONIC], NEEDLES)} times."
     )
     if GPU in names:
         tiny = [a for a in AXES if a.tiny]
-        head += (
-            f" On images of 96 x 32 pixels, which Triton's interpreter can do, the GPU's step is off by at most {short(worst(GPU, tiny))} times, "
-            f"the CPU's by {short(max(worst(n, tiny) for n in fused))} times and the separate ops by {short(worst(CHAIN, tiny))} times."
+        text += (
+            f" On images of 96 x 32 pixels, which Triton's interpreter can do, the GPU's step is off by at most {worst([GPU], tiny)} times, "
+            f"the CPU's by {worst(fused, tiny)} times and the separate ops by {worst([CHAIN], tiny)} times."
         )
-    lines = ["# Error against conditioning", "", head, "", UNIT, "",
-             f"Limit: {LIMIT:g} units. Columns: the worst pixel; the worst and the median Gaussian over all groups of gradients, by the norm "
-             "of its error over the norm of its units; the norm of all Gaussians' errors over that of their units; the worst single "
-             "entry; the pose; then the worst Gaussian again, against the rounding of the inputs alone, and with the rounding of the difference explained below. "
-             "Each is the worst along the axis, and `over at` lists the values where the worst Gaussian leaves the limit.", "",
-             "| axis | engine | pixel | pixel, p99.9 | Gaussian | median | norm | entry | pose | Gaussian, inputs only | Gaussian, with the difference | over at |",
-             "|---|---|---|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    return text
+
+
+def unit(_: list[Row]) -> str:
+    return f"""\
+**The unit.** Every input (parameters, camera, the image's gradient) is moved at random by the unit roundoff of float32, 2^-24, in the
+root mean square; the root mean square change of an output over eight such draws, in float64, is its condition number times
+the unit roundoff. To it are added, as squares, the change by an error of {EXP2_ERROR:.1e} of every 2^x, which is what the kernels' polynomial has
+by design ({EXP2_ERROR / U:.0f} roundoffs, `functions.md`), and half an ulp of the output. An error of 1 is a backward stable algorithm's; a condition
+number that is itself large does not show here, because no algorithm can do better."""
+
+
+def along_axes(rows: list[Row]) -> str:
+    lines = []
     for axis in AXES:
-        for name in names:
-            part = [r for r in mine if (r["axis"], r["engine"]) == (axis.name, name)]
-            image = [r for r in part if r["quantity"] == "image"]
-            groups = [r for r in part if r["quantity"] in GROUPS]
+        for name in engine_names(rows):
+            part = of(rows, axis=axis.name, engine=name)
             if not part:
                 continue
-            poses = [r["max"] for r in part if r["quantity"] == "pose"]
+            kinds = {
+                "image": of(part, quantity="image"),
+                "pose": of(part, quantity="pose"),
+                "": [r for r in part if r["quantity"] in GROUPS],
+            }
+            figures = [
+                ("image", "max"), ("image", "p999"), ("", "gaussian"), ("", "gaussian_median"), ("", "norm"), ("", "max"),
+                ("pose", "max"), ("", "gaussian_inputs"), ("", "gaussian_explained"),
+            ]  # fmt: skip
+            cells = [
+                short(max(r[figure] for r in kinds[kind])) if kinds[kind] else "" for kind, figure in figures
+            ]
             over = [f"{v:g}" for v, y in sorted(per_gaussian(part).items()) if y > LIMIT]
-            lines.append(
-                f"| {axis.label} | {name} | {short(max(r['max'] for r in image))} | {short(max(r['p999'] for r in image))} | "
-                f"{short(max(r['gaussian'] for r in groups))} | {short(max(r['gaussian_median'] for r in groups))} | "
-                f"{short(max(r['norm'] for r in groups))} | {short(max(r['max'] for r in groups))} | "
-                f"{short(max(poses)) if poses else ''} | "
-                f"{short(max(r['gaussian_inputs'] for r in groups))} | "
-                f"{short(max(r['gaussian_explained'] for r in groups))} | {', '.join(over)} |"
-            )
-    lines += ["", "## Why a line is not flat", ""]
-    lines += [HIDDEN, ""]
-    lines += [f"- **{axis.label}.** {REASONS[axis.name]}" for axis in AXES if axis.name in REASONS]
-    lines += ["", "## Decisions", "",
-              "Pixels whose decision (1/255, 0.999, the end of the list) lies within the reach of rounding have no unit: the image jumps "
-              "there. They get no weight in the gradients and are counted here: as undecided, as flipped (wrong by more than 16 "
-              "units), and, among all others, as drawn where the exact image has nothing.", "",
-              "| axis | undecided | " + " | ".join(f"{n}: flipped" for n in names) + " | "
-              + " | ".join(f"{n}: drawn where nothing is" for n in names if n in (CHAIN, CONIC)) + " |",
-              "|---" * (2 + len(names) + sum(n in (CHAIN, CONIC) for n in names)) + "|"]  # fmt: skip
+            lines.append([axis.label, name, *cells, ", ".join(over)])
+    head = "axis|engine|pixel|pixel, p99.9|Gaussian|median|norm|entry|pose|Gaussian, inputs only|Gaussian, with the difference|over at"
+    return table(head, lines)
+
+
+def decisions(rows: list[Row]) -> str:
+    names = engine_names(rows)
+    loose = [n for n in names if n in (CHAIN, CONIC)]
+    lines = []
     for axis in AXES:
-        image = [r for r in mine if r["axis"] == axis.name and r["quantity"] == "image"]
+        image = of(rows, axis=axis.name, quantity="image")
 
-        def total(field: str, name: str, image: list[Row] = image) -> int | str:
-            counts = [r[field] for r in image if r["engine"] == name]
-            return sum(counts) if counts else ""
+        def total(name: str, field: str, image: list[Row] = image) -> int | str:
+            mine = of(image, engine=name)
+            return sum(r[field] for r in mine) if mine else ""
 
-        cells = [total("undecided", names[0]), *(total("flips", n) for n in names)]
-        cells += [total("drawn where nothing is", n) for n in names if n in (CHAIN, CONIC)]
-        lines.append(f"| {axis.label} | " + " | ".join(str(c) for c in cells) + " |")
-    lines += ["", "## How exact the definition is", "",
-              "Twenty Gaussians in 12 x 12 pixels in 50 decimal digits (mpmath): the worst difference of the float64 reference, in the same "
-              "units. What is far below 1 does not show in the figures above.", "",
-              "| axis ratio | " + " | ".join(("image", *GROUPS)) + " |", "|---" * (2 + len(GROUPS)) + "|"]  # fmt: skip
+        cells = [total(names[0], "undecided"), *(total(n, "flips") for n in names)]
+        lines.append([axis.label, *cells, *(total(n, "drawn where nothing is") for n in loose)])
+    head = ["axis", "undecided", *(f"{n}: flipped" for n in names)]
+    return table("|".join([*head, *(f"{n}: drawn where nothing is" for n in loose)]), lines)
+
+
+def definition(rows: list[Row]) -> str:
+    lines = []
     for ratio in ORACLE_RATIOS:
-        found = {r["quantity"]: r["max"] for r in rows if r["axis"] == "oracle" and r["value"] == ratio}
+        found = {r["quantity"]: r["max"] for r in of(rows, axis="oracle", value=ratio)}
         if found:
-            lines.append(f"| {ratio:g} | " + " | ".join(f"{found[k]:.0e}" for k in ("image", *GROUPS)) + " |")
-    lines += ["", "![All axes](figures/stability.png)", "", "Formulas that the kernels use (black) and that they avoid (red):", "",
-              "![Formulas](figures/stability_formulas.png)", "", f"Generated by `splatmill bench stability`. {footer(rows)}", ""]  # fmt: skip
-    return "\n".join(lines)
+            lines.append([f"{ratio:g}", *(f"{found[k]:.0e}" for k in ("image", *GROUPS))])
+    return table("|".join(("axis ratio", "image", *GROUPS)), lines)
 
 
-def main(argv: list[str]) -> int:
-    parser = argparse.ArgumentParser(
-        prog="bench stability", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, default=2, help="scenes per point, where a scene takes little")
-    parser.add_argument("--draws", type=int, default=8, help="changes of the inputs per scene")
-    parser.add_argument(
-        "--axis", choices=[a.name for a in AXES], action="append", help="only these, no files"
-    )
-    parser.add_argument(
-        "--update",
-        action="store_true",
-        help="with --axis: replace the rows of these axes, and draw all again",
-    )
-    parser.add_argument("--plot-only", action="store_true", help="figures and table from the rows there are")
-    options = parser.parse_args(argv)
-    if not options.plot_only:
-        os.environ.setdefault("TRITON_INTERPRET", "1")  # before Triton is imported
-        running = engines()
-        if GPU not in running:
-            print("Triton is not installed: without the GPU's step.")
-        rows: list[Row] = []
-        for axis in AXES:
-            if options.axis and axis.name not in options.axis:
-                continue
-            for row in sweep(axis, options.seeds, options.draws, running):
-                rows.append(row)
-                if row["quantity"] in ("image", "means", "log_scales"):
-                    print(
-                        f"{axis.name:12} {row['value']:<8g} {row['engine']:22} {row['quantity']:10} "
-                        f"entry {short(row['max']):8} Gaussian {short(row.get('gaussian', 0.0)):8}",
-                        flush=True,
-                    )
-        if options.axis and not options.update:
-            return 0
-        if options.axis:
-            rows = [*(row for row in read("stability") if row["axis"] not in options.axis), *rows]
-        else:
-            rows += [*oracle(), *formulas()]
-        write("stability", rows)
-    rows = read("stability")
-    draw(rows)
-    (HERE / "stability.md").write_text(table(rows))
-    return 0
-
+CASES: dict[str, Callable[[argparse.Namespace], Iterable[Row | str]]] = {
+    **{axis.name: partial(sweep, axis) for axis in AXES},
+    "oracle": oracle,
+    "formulas": formulas,
+}
+STUDY = Study(
+    name="stability",
+    about=__doc__,
+    cases=CASES,
+    key=("axis", "value", "engine", "quantity"),
+    blocks={
+        "outcome": outcome,
+        "unit": unit,
+        "axes": along_axes,
+        "decisions": decisions,
+        "oracle": definition,
+    },
+    figures={
+        "stability": partial(draw_axes, AXES, 3),
+        "stability_axis_ratio": partial(draw_axes, NEEDLES, 2),
+        "stability_formulas": draw_formulas,
+    },
+    options={
+        "seeds": {"type": int, "default": 2, "help": "scenes per point, where a scene takes little"},
+        "draws": {"type": int, "default": 8, "help": "changes of the inputs per scene"},
+    },
+)
 
 if __name__ == "__main__":
-    import sys
-
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(STUDY.main(sys.argv[1:]))

@@ -135,10 +135,8 @@ def copy_tree(copy: Copy) -> None:
     shutil.rmtree(copy.work / "tests", ignore_errors=True)
     tests = [p for folder in ("kernels", "support") for p in (ROOT / "tests" / folder).rglob("*.py")]
     bench = ROOT / "worker" / "bench"
-    shared = [
-        *(bench / "_stability").glob("*.py"), *(bench / "_functions").glob("*.*"), bench / "_rows.py",
-        bench / "results" / "functions.jsonl",
-    ]  # fmt: skip
+    studies = [p for p in (bench / "_studies").rglob("*") if p.suffix in (".py", ".cpp", ".hpp", ".cmake")]
+    shared = [*studies, bench / "_rows.py", bench / "results" / "functions.jsonl"]
     for path in (*kernels, *tests, *shared, ROOT / "pyproject.toml", ROOT / "tests/conftest.py"):
         copied(copy, path, path.read_text())
     cmake = ROOT / "worker" / "CMakeLists.txt"

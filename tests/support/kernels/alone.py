@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import torch
-from _stability.roundings import (
+from _studies.stability.roundings import (
     TINY,
     U,
     inexact_exponential,

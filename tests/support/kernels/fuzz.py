@@ -11,8 +11,8 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import torch
-from _stability.extremes import FAMILIES, LENS, SPLAT, decided, several
-from _stability.scenes import Scene
+from _studies.stability.extremes import FAMILIES, LENS, SPLAT, decided, several
+from _studies.stability.scenes import Scene
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from torch import Tensor

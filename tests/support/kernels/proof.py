@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
-from _functions.tolerances import ALPHA_ERROR
+from _studies.functions.tolerances import ALPHA_ERROR
 from torch import Tensor
 
 from splatmill_worker.kernels import ops

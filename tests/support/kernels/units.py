@@ -1,9 +1,9 @@
 """How far an engine may be from the definition, value by value: the effect of the roundings that it must or may make.
 
 The unit of an output is the root mean square of its change, in float64, by rounding the inputs, by the error of 2^x, by
-the rounding of what lies behind a splat (`_stability.roundings`), and, for the separate ops, by rounding what they pass
-to one another: a needle is known no better from three rounded numbers of a conic. Each of the four is measured alone,
-over a few draws.
+the rounding of what lies behind a splat (`_studies.stability.roundings`), and, for the separate ops, by rounding what
+they pass to one another: a needle is known no better from three rounded numbers of a conic. Each of the four is
+measured alone, over a few draws.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from _functions.tolerances import U
-from _stability.roundings import TINY, inexact_exponential, rounded_remainders, rounded_up_or_down
+from _studies.functions.tolerances import U
+from _studies.stability.roundings import TINY, inexact_exponential, rounded_remainders, rounded_up_or_down
 from torch import Tensor
 
 from splatmill_worker.kernels import ops

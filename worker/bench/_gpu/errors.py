@@ -96,10 +96,10 @@ def needles(place: Place) -> Iterator[Row]:
 
     1 is what no algorithm that reads rounded inputs can be asked to go below; see `bench stability` for the unit.
     """
-    from _stability.conditioning import state
-    from _stability.scenes import cloud as few
-    from _stability.scenes import needles as on_the_image
-    from _stability.scenes import needles_beside
+    from _studies.stability.conditioning import state
+    from _studies.stability.scenes import cloud as few
+    from _studies.stability.scenes import needles as on_the_image
+    from _studies.stability.scenes import needles_beside
 
     from splatmill_worker.kernels.gpu.step import Step
 

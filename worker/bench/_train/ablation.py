@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from _page import table
 from _rows import Row
 
 from _train.configurations import CONFIGURATIONS, DEFAULT, TAKEN_OUT
-from _train.markdown import table
 from _train.rows import Pair, compared, disturbed, grouped, lonely, once, whole
 from _train.spread import Spread
 

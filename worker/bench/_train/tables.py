@@ -5,12 +5,12 @@ from __future__ import annotations
 from itertools import pairwise
 from pathlib import Path
 
+from _page import beside, section, table
 from _rows import Row, footer
 
 from _train import bare
 from _train.ablation import ablation
 from _train.configurations import DEFAULT
-from _train.markdown import beside, section, table
 from _train.rows import QUIET, by_time, disturbed, failed, grouped, latest_default, once, whole
 from _train.spread import Spread, seconds_to
 

@@ -232,7 +232,7 @@ SPLATMILL_INLINE Float sqrt(Float x) {
 }
 
 // 1 / x within 2.8 ulp for normal x well inside the range: an estimate and one Newton step, 4 to 5 times a division's throughput.
-// The bound is by the documented error of AVX2's estimate (worker/bench/_functions/estimates.py); AVX-512's is smaller.
+// The bound is by the documented error of AVX2's estimate (worker/bench/_studies/functions/estimates.py); AVX-512's is smaller.
 // Not for x = 0 or infinity (gives NaN): use `/` there.
 SPLATMILL_INLINE Float reciprocal(Float x) {
 #if defined(__AVX512F__)

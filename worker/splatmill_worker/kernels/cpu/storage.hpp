@@ -1,5 +1,5 @@
 // The formats in which memory holds harmonics, Adam's moments and projected records, and the constants that trade exactness for
-// time. `bench precision` compiles builds of its own with other ones, by the definitions SPLATMILL_* (worker/bench/_precision).
+// time. `bench precision` compiles builds of its own with other ones, by the definitions SPLATMILL_* (worker/bench/_studies/precision).
 #pragma once
 
 #include <cstddef>

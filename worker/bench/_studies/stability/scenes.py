@@ -39,9 +39,13 @@ class Scene:
     width: int
     height: int
 
+    def arrays(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """The five parameter groups."""
+        return self.means, self.log_scales, self.quats, self.logit_opacities, self.sh
+
     def groups(self, dtype: torch.dtype) -> list[Tensor]:
         """Copies of the five parameter groups."""
-        return [getattr(self, name).to(dtype, copy=True) for name in GROUPS]
+        return [x.to(dtype, copy=True) for x in self.arrays()]
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Scene:
         """The scene with every array replaced by `change` of it."""

@@ -18,7 +18,7 @@ import torch
 
 from .spans import BINS, Function, runs
 
-WORKER = Path(__file__).resolve().parents[2]
+WORKER = Path(__file__).resolve().parents[3]
 BUILD = WORKER / "build" / "functions"
 
 

@@ -12,10 +12,10 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from _functions.tolerances import EXP2_ERROR
-from _functions.tolerances import U as U  # the unit of what is below: others take it from here
 from torch import Tensor
 
+from _studies.functions.tolerances import EXP2_ERROR
+from _studies.functions.tolerances import U as U  # the unit of what is below: others take it from here
 from splatmill_worker.kernels.records import Projected
 
 TINY = 2.0**-126

@@ -12,7 +12,7 @@
 namespace splatmill {
 namespace {
 
-// What is kept of many inputs. _functions/library.py declares the same fields.
+// What is kept of many inputs. _studies/functions/library.py declares the same fields.
 struct Errors {
   int64_t count, rounded;  // inputs; results that are the exact value's nearest float
   double ulp, relative, absolute;              // largest errors

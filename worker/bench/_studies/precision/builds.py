@@ -15,8 +15,8 @@ from unittest import mock
 from _rows import HERE, running
 from torch import Tensor
 
-from _precision import formats
-from _precision.variants import BY_NAME, FLOAT32, Variant
+from _studies.precision import formats
+from _studies.precision.variants import BY_NAME, FLOAT32, Variant
 from splatmill_worker.kernels.cpu import blocks, isa
 from splatmill_worker.kernels.cpu.step import Step
 

@@ -16,9 +16,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
-from _functions.tolerances import ALPHA_ERROR, U
 from torch import Tensor
 
+from _studies.functions.tolerances import ALPHA_ERROR, U
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Bins, Projected
 
@@ -105,7 +105,7 @@ def state(scene: Scene, draws: int, seed: int = 0, exponents: float = 0.0) -> Pr
 
     def project(x: Scene) -> Projected:
         with torch.no_grad():
-            return ops.project(*_groups(x), x.viewmat, x.K, w, h, degree=3, backend="reference")
+            return ops.project(*x.arrays(), x.viewmat, x.K, w, h, degree=3, backend="reference")
 
     def changed_scene() -> Scene:
         found = scene.mapped(moved)
@@ -185,10 +185,6 @@ def state(scene: Scene, draws: int, seed: int = 0, exponents: float = 0.0) -> Pr
     exact["image"] = image
     all_three = {k: x + by_difference[k] for k, x in both.items()}
     return Problem(scene, weights, undecided, values, unit(by_inputs), unit(both), unit(all_three))
-
-
-def _groups(x: Scene) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    return x.means, x.log_scales, x.quats, x.logit_opacities, x.sh
 
 
 SAFETY = 8.0

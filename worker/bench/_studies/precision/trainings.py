@@ -13,9 +13,9 @@ from _train.child import located
 from _train.run import held_out, measure
 from _train.scenes import Scene as Capture
 
-from _precision.builds import using
-from _precision.measure import Modules
-from _precision.variants import Variant
+from _studies.precision.builds import using
+from _studies.precision.measure import Modules
+from _studies.precision.variants import Variant
 from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.splat.formats import ply

@@ -13,9 +13,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from _functions.tolerances import U
 from torch import Tensor
 
+from _studies.functions.tolerances import U
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import Projected
 
@@ -242,18 +242,22 @@ FAMILIES = {
 }
 
 
+def projected(scene: Scene) -> Projected:
+    """What the definition projects the Gaussians to."""
+    with torch.no_grad():
+        return ops.project(
+            *scene.arrays(), scene.viewmat, scene.K, scene.width, scene.height,
+            degree=3, near=NEAR, backend="reference",
+        )  # fmt: skip
+
+
 def decided(scene: Scene) -> bool:
     """Whether something is drawn, and no decision beside those at pixels lies within the reach of rounding.
 
     These are the order of depths, the near plane, and the bounds of x/z and y/z, where the image or its gradient jumps
     as a whole. (The thresholds of alpha are decided for each pixel: `Problem.undecided`.)
     """
-    with torch.no_grad():
-        p: Projected = ops.project(
-            scene.means, scene.log_scales, scene.quats, scene.logit_opacities, scene.sh, scene.viewmat, scene.K,
-            scene.width, scene.height, degree=3, near=NEAR, backend="reference",
-        )  # fmt: skip
-    if not (p.extents > 0).any():
+    if not (projected(scene).extents > 0).any():
         return False
     W, t = scene.viewmat[:3, :3], scene.viewmat[:3, 3]
     points = scene.means @ W.T + t

@@ -13,8 +13,8 @@ from _rows import Row
 from _scenes import Scene
 from torch import Tensor
 
-from _precision.builds import using
-from _precision.variants import EXACT, PLAIN, Variant
+from _studies.precision.builds import using
+from _studies.precision.variants import EXACT, PLAIN, Variant
 from splatmill_worker.kernels.cpu.loss import photo_stats
 from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.kernels.records import BETA2, GROUPS, Rates

@@ -1,0 +1,85 @@
+"""Proves the runner of the studies: pages are made from their rows, a row replaces that of the same measurement, a dry
+run writes nothing, and what is left out is reported.
+
+Not proven here: what each study measures (the other files of this folder), and figures.
+"""
+
+from __future__ import annotations
+
+import importlib
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from _page import END, filled
+from _rows import HERE, Row
+from _studies.study import Study
+
+STUDIES = ("stability", "worst", "functions", "stiffness", "precision")
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_a_page_is_made_from_its_rows(name: str) -> None:
+    study = importlib.import_module(name).STUDY
+    assert study.page(study.rows()) == (HERE / f"{name}.md").read_text()
+
+
+def test_pages_name_the_constants_that_their_figures_show() -> None:
+    stability, worst = (importlib.import_module(name) for name in ("stability", "worst"))
+    assert f"\nLimit: {stability.LIMIT:g} units." in (HERE / "stability.md").read_text()
+    page = (HERE / "worst.md").read_text()
+    assert f"## What is above {worst.LIMIT:g} units" in page
+    assert f"over {worst.FINAL} changes of the input" in page
+
+
+def test_a_page_without_a_place_for_a_block_is_an_error() -> None:
+    page = f"one\n<!-- from rows: a -->\nold\n{END}\ntwo\n"
+    assert filled(page, {"a": "new"}) == page.replace("old", "new")
+    for broken in (page.replace(": a", ": b"), page.replace(END, "")):
+        with pytest.raises(ValueError, match="no place for 'a'"):
+            filled(broken, {"a": "new"})
+
+
+@pytest.fixture
+def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Study:
+    (tmp_path / "squares.md").write_text(
+        f"<!-- from rows: sum -->\n{END}\n<!-- from rows: footer -->\n{END}\n"
+    )
+    monkeypatch.setattr("_studies.study.HERE", tmp_path)
+
+    def two(options: Namespace) -> list[Row | str]:
+        return [
+            {"x": 2, "square": options.power + len(options.known)},
+            "The third is left out: it is not here.",
+        ]
+
+    return Study(
+        name="squares",
+        about=None,
+        cases={"one": lambda _: [{"x": 1, "square": 1}], "two": two},
+        key=("x",),
+        blocks={"sum": lambda rows: str([row["square"] for row in rows])},
+        figures={},
+        options={"power": {"type": int, "default": 4}},
+    )
+
+
+def test_a_row_replaces_that_of_the_same_measurement(study: Study, tmp_path: Path, capsys: Any) -> None:
+    out = ["--out", str(tmp_path)]
+    assert study.main(out) == 1
+    assert "The third is left out" in capsys.readouterr().err
+    assert study.main([*out, "--only", "one"]) == 0
+    assert study.main([*out, "--only", "two", "--power", "7"]) == 1
+    assert [row["square"] for row in study.rows(tmp_path)] == [1, 9]
+    assert study.place(tmp_path).read_text().count("\n") == 2
+    assert (tmp_path / "squares.md").read_text().startswith("<!-- from rows: sum -->\n[1, 9]\n")
+    assert all(row["commit"] for row in study.rows(tmp_path))
+
+
+def test_a_dry_run_writes_nothing(study: Study, tmp_path: Path, capsys: Any) -> None:
+    before = (tmp_path / "squares.md").read_text()
+    assert study.main(["--out", str(tmp_path), "--dry", "--only", "one"]) == 0
+    assert capsys.readouterr().out == '{"x": 1, "square": 1}\n'
+    assert [path.name for path in tmp_path.iterdir()] == ["squares.md"]
+    assert (tmp_path / "squares.md").read_text() == before

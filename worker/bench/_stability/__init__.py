@@ -1,1 +1,0 @@
-"""Parts of `bench stability`: scenes along axes, their conditioning, the engines, and the oracle."""

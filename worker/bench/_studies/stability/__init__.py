@@ -1,0 +1,1 @@
+"""Scenes along axes, their conditioning, the engines, and the oracle."""
