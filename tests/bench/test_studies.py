@@ -16,13 +16,18 @@ from _page import END, filled
 from _rows import HERE, Row
 from _studies.study import Study
 
-STUDIES = ("stability", "worst", "functions", "stiffness", "precision")
+STUDIES = [
+    *((name, "STUDY") for name in ("stability", "worst", "functions", "stiffness", "precision")),
+    *((name, "STUDY") for name in ("kernels", "sfm", "formats", "live")),
+    ("kernels", "SIZES"),
+    ("sfm", "GROWTH"),
+]
 
 
-@pytest.mark.parametrize("name", STUDIES)
-def test_a_page_is_made_from_its_rows(name: str) -> None:
-    study = importlib.import_module(name).STUDY
-    assert study.page(study.rows()) == (HERE / f"{name}.md").read_text()
+@pytest.mark.parametrize(("module", "name"), STUDIES)
+def test_a_page_is_made_from_its_rows(module: str, name: str) -> None:
+    study = getattr(importlib.import_module(module), name)
+    assert study.page(study.rows()) == (HERE / f"{study.name}.md").read_text()
 
 
 def test_pages_name_the_constants_that_their_figures_show() -> None:

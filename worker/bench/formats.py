@@ -2,11 +2,10 @@
 
     splatmill bench formats                          # the still life and fox, 3000 steps each: about five minutes
     splatmill bench formats --scenes fox --steps 600
-    splatmill bench formats --plot-only
 
 Each scene is trained once, at 480 pixels with every 8th photo held out. Its model is written in every format, read
 back, and compared with the held-out photos, as the renderer does for downloads. Seconds are CPU seconds of one thread,
-since other programs disturb them less. Rows go to results/formats.jsonl, the table to formats.md.
+since other programs disturb them less.
 
 Expected before it was measured: .glb without loss; .spz at an eighth of the bytes for 0.2 dB; .compressed.ply at a
 fourth for 0.2 dB; .sog at a fourteenth for 0.4 dB, more where few steps leave much noise in the harmonics.
@@ -18,10 +17,13 @@ import argparse
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
+import _page
 import torch
-from _rows import HERE, Row, append, footer, lines, origin
+from _rows import HERE, Row, distinct, footer
+from _studies.study import Study
 from _train import scenes
 from _train.child import prepared
 from _train.run import rounded
@@ -39,44 +41,23 @@ CACHE = HERE.parent / "build" / "bench"
 MODEL = "bench000formats0"
 
 
-def main(argv: list[str]) -> int:
-    """Measure the scenes that were asked for, and write the table."""
-    parser = argparse.ArgumentParser(
-        prog="splatmill bench formats",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--scenes", nargs="+", default=["synthetic", "fox"])
-    parser.add_argument("--steps", type=int, default=3000)
-    parser.add_argument("--work", type=Path, default=CACHE, help="where recovered cameras are kept")
-    parser.add_argument("--results", type=Path, default=HERE / "results" / "formats.jsonl")
-    parser.add_argument("--plot-only", action="store_true", help="write the table of the rows that are there")
-    asked = parser.parse_args(argv)
-    if not asked.plot_only:
-        for name in asked.scenes:
-            try:
-                scene = scenes.named(name, asked.work)
-            except (ValueError, FileNotFoundError) as error:
-                print(error, file=sys.stderr)
-                continue
-            measure(scene, asked.steps, asked.work, asked.results)
-    found = lines(asked.results)
-    if not found:
-        print(f"There are no rows in {asked.results}.", file=sys.stderr)
-        return 1
-    own = asked.results.parent == HERE / "results"
-    table = HERE / "formats.md" if own else asked.results.with_suffix(".md")
-    table.write_text(document(found))
-    print(f"Table: {table}")
-    return 0
+def measured(options: argparse.Namespace) -> Iterator[Row | str]:
+    """The rows of the scenes that were asked for."""
+    for name in options.scenes:
+        try:
+            scene = scenes.named(name, options.work)
+        except (ValueError, FileNotFoundError) as error:
+            yield str(error)
+            continue
+        yield from measure(scene, options.steps, options.work)
 
 
-def measure(scene: scenes.Scene, steps: int, work: Path, results: Path) -> None:
-    """Train a scene and append a row for each format, or one that says why there are none."""
+def measure(scene: scenes.Scene, steps: int, work: Path) -> Iterator[Row]:
+    """Train a scene and yield a row for each format, or one that says why there are none."""
     row: Row = {"bench": "formats", "scene": scene.name, "asked_steps": steps}
     ready = prepared(scene, work)
     if "failure" in ready:
-        append(results, row | {"outcome": f"failed: {ready['failure']}"} | origin())
+        yield row | {"outcome": f"failed: {ready['failure']}"}
         return
     with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
         workdir = Path(folder)
@@ -85,18 +66,12 @@ def measure(scene: scenes.Scene, steps: int, work: Path, results: Path) -> None:
         try:
             outcome = pipeline.run(scene.folder, workdir, options, _quiet, lambda: False)
         except Refusal as failure:
-            append(results, row | {"outcome": f"failed: {failure}"} | origin())
+            yield row | {"outcome": f"failed: {failure}"}
             return
         storage = _stored(outcome.out, workdir / "storage")
         torch.set_num_threads(1)
         for key in DOWNLOADS:
-            found = row | {"outcome": "written"} | _written(storage, key, workdir)
-            append(results, rounded(found) | origin())
-            print(
-                f"{scene.name} {key}: {found['bytes']:,} bytes, {found['psnr']:.2f} dB, "
-                f"{found['write_seconds']:.2f} and {found['read_seconds']:.2f} s",
-                flush=True,
-            )
+            yield rounded(row | {"outcome": "written"} | _written(storage, key, workdir))
 
 
 def _written(storage: Storage, key: str, folder: Path) -> Row:
@@ -141,30 +116,44 @@ def _quiet(_: Event) -> None:
     """Ignore an event."""
 
 
-def document(rows: list[Row]) -> str:
-    """The table of the newest row of each scene and format."""
-    parts = [
-        "| scene | format | bytes | smaller | held-out PSNR | loss | SSIM | seconds to write | to read | read by |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    newest = {(row["scene"], row.get("format")): row for row in rows}
-    for (scene, key), row in newest.items():
-        if row["outcome"] != "written" or key is None:
-            parts.append(f"| {scene} | {row['outcome']} |" + " |" * 8)
-            continue
-        plain, form = newest[scene, "ply"], DOWNLOADS[key]
-        parts.append(
-            f"| {scene}, {row['gaussians']:,} Gaussians | `{form.suffix}` | {row['bytes']:,} "
-            f"| {plain['bytes'] / row['bytes']:.1f}x | {row['psnr']:.2f} dB | {plain['psnr'] - row['psnr']:.2f} dB "
-            f"| {row['ssim']:.3f} | {row['write_seconds']:.2f} | {row['read_seconds']:.2f} "
-            f"| {', '.join(form.readers)} |"
-        )
-    shown = list(newest.values())
-    steps = ", ".join(dict.fromkeys(str(row["asked_steps"]) for row in shown))
-    parts += [
-        "",
-        f"Made by `splatmill bench formats` after {steps} steps at 480 pixels; CPU seconds of one thread.",
-        footer(shown),
-        "",
-    ]
-    return "\n".join(parts)
+def table(rows: list[Row]) -> str:
+    """The table of each scene and format."""
+    written = {(row["scene"], row.get("format")): row for row in rows}
+
+    def cell(row: Row) -> list[object]:
+        key = row.get("format")
+        if key is None:
+            return [row["scene"], row["outcome"], *[""] * 8]
+        plain, form = written[row["scene"], "ply"], DOWNLOADS[key]
+        return [
+            f"{row['scene']}, {row['gaussians']:,} Gaussians", f"`{form.suffix}`", f"{row['bytes']:,}",
+            f"{plain['bytes'] / row['bytes']:.1f}x", f"{row['psnr']:.2f} dB", f"{plain['psnr'] - row['psnr']:.2f} dB",
+            f"{row['ssim']:.3f}", f"{row['write_seconds']:.2f}", f"{row['read_seconds']:.2f}", ", ".join(form.readers),
+        ]  # fmt: skip
+
+    head = "scene|format|bytes|smaller|held-out PSNR|loss|SSIM|seconds to write|to read|read by"
+    return _page.table(head, map(cell, rows))
+
+
+def made(rows: list[Row]) -> str:
+    steps = ", ".join(map(str, distinct(rows, "asked_steps")))
+    text = f"Made by `splatmill bench formats` after {steps} steps at 480 pixels; CPU seconds of one thread."
+    return f"{text}\n{footer(rows)}"
+
+
+STUDY = Study(
+    name="formats",
+    about=__doc__,
+    cases={"formats": measured},
+    key=("scene", "format"),
+    blocks={"formats": table, "footer": made},
+    figures={},
+    options={
+        "scenes": {"nargs": "+", "default": ["synthetic", "fox"]},
+        "steps": {"type": int, "default": 3000},
+        "work": {"type": Path, "default": CACHE, "help": "where recovered cameras are kept"},
+    },
+)
+
+if __name__ == "__main__":
+    sys.exit(STUDY.main(sys.argv[1:]))

@@ -1,5 +1,5 @@
 # ruff: noqa: E501  (rows of Markdown tables are as long as they are)
-"""`bench kernels`: error against time of rendering and differentiating, the speed table, and (`--sizes`) growth with size.
+"""Error against time of rendering and differentiating, the speed table, and (`--sizes`) growth with size.
 
 Times are medians of wall seconds over views and rounds; errors are against the float64 reference. The machine's own peaks are
 probed in the same run: float32 multiply-adds by a matrix product, bandwidth by a copy that no cache holds.
@@ -13,25 +13,28 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import _plot
 import numpy as np
 import torch
-from _rows import HERE, Row, build, footer, read, write
+from _page import Column, of_rows, table
+from _rows import HERE, Row, build, distinct, footer, of
 from _scenes import Scene, cloud, fox
+from _studies.study import Study
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from splatmill_worker.kernels import cpu, ops
 from splatmill_worker.kernels.cpu import isa
 from splatmill_worker.kernels.cpu.loss import photo_stats
 from splatmill_worker.kernels.cpu.step import Step
-from splatmill_worker.kernels.records import Rates
+from splatmill_worker.kernels.records import GROUPS, Rates
 
-STILL = Rates(
-    0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-)  # everything is computed and written, nothing moves: each round is the same work
+STILL = Rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""Everything is computed and written, nothing moves: each round is the same work."""
+
 THREADS = (1, 2)
 MULTIPLIES = {"forward": 11, "backward": 24}
 """Vector multiplications and fused multiply-adds for a block of sixteen pixels and one Gaussian that touches it, counted
@@ -75,6 +78,15 @@ def _timed(call: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
+def named(table: str, scene: Scene, backend: str, threads: int, seconds: float) -> Row:
+    """The fields that rows of times share."""
+    v = scene.views[0]
+    return {
+        "bench": "kernels", "table": table, "scene": scene.name, "gaussians": scene.count, "width": v.width,
+        "height": v.height, "backend": backend, "threads": threads, "ms": 1e3 * seconds,
+    }  # fmt: skip
+
+
 # ---- the speed table
 
 
@@ -99,18 +111,15 @@ def step_row(scene: Scene, build_name: str, threads: int, rounds: int) -> Row:
         for v in scene.views:
             step.forward(v.viewmat, v.K, v.width, v.height, degree=3)
             blocks.append(cpu.engine.count_blocks(step._frame))
-    view = scene.views[0]
     names = ("project", "bin", "forward", "backward", "update", "loss and rest")
     middle = [statistics.median(p[i] for p in phases) for i in range(len(names))]
-    return {
-        "bench": "kernels", "table": "step", "scene": scene.name, "gaussians": scene.count, "width": view.width,
-        "height": view.height, "backend": f"cpu {build_name}", "threads": threads, "ms": 1e3 * statistics.median(walls),
+    return named("step", scene, f"cpu {build_name}", threads, statistics.median(walls)) | {
         "ms_by_pass": {k: 1e3 * s for k, s in zip(names, middle, strict=True)},
         "pairs": statistics.mean(pairs),
         "blocks": {k: statistics.mean(b[i] for b in blocks) for i, k in enumerate(MULTIPLIES)},
         "forward_pairs_per_s": statistics.mean(pairs) / middle[2],
         "backward_pairs_per_s": statistics.mean(pairs) / middle[3],
-    }  # fmt: skip
+    }
 
 
 def render_row(scene: Scene, build_name: str, threads: int, rounds: int) -> Row:
@@ -119,11 +128,8 @@ def render_row(scene: Scene, build_name: str, threads: int, rounds: int) -> Row:
         v = scene.views[0]
         seconds = median_seconds(lambda: step.forward(v.viewmat, v.K, v.width, v.height, degree=3), rounds)
         seen = step.visibility
-    return {
-        "bench": "kernels", "table": "render", "scene": scene.name, "gaussians": scene.count, "width": v.width,
-        "height": v.height, "backend": f"cpu {build_name}", "threads": threads, "ms": 1e3 * seconds, "pairs": seen.pairs,
-        "visible": seen.visible,
-    }  # fmt: skip
+    row = named("render", scene, f"cpu {build_name}", threads, seconds)
+    return row | {"pairs": seen.pairs, "visible": seen.visible}
 
 
 def memory_row(kind: str) -> Row:
@@ -166,179 +172,123 @@ def measure_memory(kind: str) -> None:
 # ---- error against time
 
 
-def draw_and_differentiate(
-    scene: Scene, backend: ops.Backend, dtype: torch.dtype
-) -> tuple[torch.Tensor, list[torch.Tensor]]:
+Drawn = tuple[torch.Tensor, list[torch.Tensor]]
+"""The image of one view, and the gradients to the five groups."""
+
+
+def draw_and_differentiate(scene: Scene, backend: ops.Backend, dtype: torch.dtype) -> Drawn:
     """The image of one view and the gradients of a fixed weighted sum of it, by the ops one after another."""
     v = scene.views[0]
     leaves = [x.to(dtype).requires_grad_() for x in scene.groups]
     means, log_scales, quats, logit_opacities, sh = leaves
-    viewmat, K = v.viewmat.to(dtype), v.K.to(dtype)
     p = ops.project(
-        means,
-        log_scales,
-        quats,
-        logit_opacities,
-        sh,
-        viewmat,
-        K,
-        v.width,
-        v.height,
-        degree=3,
-        backend=backend,
-    )
-    color, _, _ = ops.composite(
-        p, ops.bin(p, v.width, v.height, backend=backend), v.width, v.height, backend=backend
-    )
+        means, log_scales, quats, logit_opacities, sh, v.viewmat.to(dtype), v.K.to(dtype), v.width, v.height,
+        degree=3, backend=backend,
+    )  # fmt: skip
+    bins = ops.bin(p, v.width, v.height, backend=backend)
+    color, _, _ = ops.composite(p, bins, v.width, v.height, backend=backend)
     weights = (v.photo.to(dtype) / 255 - 0.5) / (v.width * v.height)
     gradients = torch.autograd.grad((color * weights).sum(), leaves)
     return color.detach(), list(gradients)
 
 
-def fused(scene: Scene, step: Step) -> tuple[torch.Tensor, list[torch.Tensor]]:
+def fused(scene: Scene, step: Step) -> Drawn:
     v = scene.views[0]
     color, _, _ = step.forward(v.viewmat, v.K, v.width, v.height, degree=3)
     weights = (v.photo.float() / 255 - 0.5) / (v.width * v.height)
     return color, list(step.gradients(weights).values())
 
 
-def precision_rows(scene: Scene, rounds: int) -> list[Row]:
-    want: tuple[torch.Tensor, list[torch.Tensor]] = (torch.zeros(0), [])
+def precision_rows(scene: Scene, rounds: int) -> Iterator[Row]:
+    """The float64 definition, and what each build and backend differs from it by."""
 
-    def define() -> None:
-        nonlocal want
-        want = draw_and_differentiate(scene, "reference", torch.float64)
+    def once(dtype: torch.dtype) -> tuple[float, Drawn]:
+        start = time.perf_counter()
+        got = draw_and_differentiate(scene, "reference", dtype)
+        return time.perf_counter() - start, got
 
-    v = scene.views[0]
-    rows: list[Row] = []
-
-    def add(name: str, threads: int, seconds: float, got: tuple[torch.Tensor, list[torch.Tensor]]) -> None:
-        color, gradients = got
-        rows.append(
-            {
-                "bench": "kernels", "table": "precision", "scene": scene.name, "gaussians": scene.count, "width": v.width,
-                "height": v.height, "backend": name, "threads": threads, "ms": 1e3 * seconds,
-                "image_error": float((color.double() - want[0]).abs().mean()),
-                "gradient_errors": {
-                    k: float((a.double() - b).norm() / b.norm())
-                    for k, a, b in zip(("means", "log_scales", "quats", "logit_opacities", "sh"), gradients, want[1], strict=True)
-                    # Of round Gaussians the quaternions' gradient is 0: even float64 has only its rounding.
-                    if float(b.norm()) > 1e-9 * float(want[1][1].norm())
-                },
-            }
-        )  # fmt: skip
-
-    seconds = _timed(define)
-    rows.append(
-        {
-            "bench": "kernels", "table": "precision", "scene": scene.name, "gaussians": scene.count, "width": v.width,
-            "height": v.height, "backend": "reference float64", "threads": 2, "ms": 1e3 * seconds, "image_error": 0.0,
-            "gradient_errors": {},
+    def row(name: str, threads: int, seconds: float, got: Drawn) -> Row:
+        largest = float(exact[1][1].norm())
+        return named("precision", scene, name, threads, seconds) | {
+            "image_error": float((got[0].double() - exact[0]).abs().mean()),
+            # Of round Gaussians the quaternions' gradient is 0: even float64 has only its rounding.
+            "gradient_errors": {
+                k: float((a.double() - b).norm() / b.norm())
+                for k, a, b in zip(GROUPS, got[1], exact[1], strict=True)
+                if float(b.norm()) > 1e-9 * largest
+            },
         }
-    )  # fmt: skip
-    slow: list[tuple[torch.Tensor, list[torch.Tensor]]] = []
-    seconds = _timed(lambda: slow.append(draw_and_differentiate(scene, "reference", torch.float32)))
-    add("reference float32", 2, seconds, slow[0])
+
+    seconds, exact = once(torch.float64)
+    yield row("reference float64", 2, seconds, exact) | {"gradient_errors": {}}
+    yield row("reference float32", 2, *once(torch.float32))
     before = torch.get_num_threads()
     for name in isa.supported():
         with build(name):
             for threads in THREADS:
                 torch.set_num_threads(threads)
-                got = draw_and_differentiate(scene, "cpu", torch.float32)
-                add(
-                    f"cpu {name}",
-                    threads,
-                    median_seconds(lambda: draw_and_differentiate(scene, "cpu", torch.float32), rounds),
-                    got,
-                )
+                by_ops = partial(draw_and_differentiate, scene, "cpu", torch.float32)
+                yield row(f"cpu {name}", threads, median_seconds(by_ops, rounds), by_ops())
                 step = Step(*scene.groups, threads=threads)
-                image, gradients = fused(scene, step)
-                kept = image.clone(), gradients
-                add(
-                    f"cpu {name} fused",
-                    threads,
-                    median_seconds(partial(fused, scene, step), rounds),
-                    kept,
-                )
+                seconds = median_seconds(partial(fused, scene, step), rounds)
+                yield row(f"cpu {name} fused", threads, seconds, fused(scene, step))
     torch.set_num_threads(before)
-    return rows
 
 
-def precision_figure(rows: list[Row]) -> None:
-    mine = [r for r in rows if r["table"] == "precision"]
-    scenes = list(dict.fromkeys(r["scene"] for r in mine))
+def precision_figure(rows: list[Row]) -> Figure:
+    mine = of(rows, table="precision")
     figure, (*panels, key) = _plot.axes(3, width=5.2, height=4.8)
-    markers = dict(zip(scenes, "osD^v", strict=False))
-    labelled: set[str] = set()
+    markers = dict(zip(distinct(mine, "scene"), "osD^v", strict=False))
     for panel, title in zip(
         panels, ("image: mean absolute error", "gradient: worst group's error / norm"), strict=True
     ):
         for r in mine:
-            base = r["backend"].removesuffix(" fused")
+            color = _plot.COLORS[r["backend"].removesuffix(" fused")]
             error = (
                 r["image_error"] if panel is panels[0] else max(r["gradient_errors"].values(), default=0.0)
             )
             if error == 0.0:
-                panel.axvline(r["ms"], color=_plot.COLORS[base], lw=0.8, ls=":", alpha=0.7)
+                panel.axvline(r["ms"], color=color, lw=0.8, ls=":", alpha=0.7)
                 continue
-            face = _plot.COLORS[base] if r["backend"].endswith("fused") else "none"
-            panel.plot(
-                r["ms"],
-                error,
-                markers[r["scene"]],
-                color=_plot.COLORS[base],
-                mfc=face,
-                ms=8 if r["threads"] == 2 else 5,
-            )
-            labelled.add(base)
-        panel.set_xscale("log")
-        panel.set_yscale("log")
-        panel.set_xlabel("milliseconds: render and differentiate one view")
-        panel.set_title(title, fontsize=10)
-    line = Line2D
-    handles = [
-        line([], [], ls="", marker="o", color=_plot.COLORS[b], label=b)
-        for b in dict.fromkeys(r["backend"].removesuffix(" fused") for r in mine)
+            face = color if r["backend"].endswith("fused") else "none"
+            size = 8 if r["threads"] == 2 else 5
+            panel.plot(r["ms"], error, markers[r["scene"]], color=color, mfc=face, ms=size)
+        _plot.name(panel, "milliseconds: render and differentiate one view", title=title, log="xy")
+    dot, gray = partial(Line2D, [], [], ls="", marker="o"), "#555555"
+    bases = dict.fromkeys(r["backend"].removesuffix(" fused") for r in mine)
+    handles = [dot(color=_plot.COLORS[base], label=base) for base in bases]
+    handles += [Line2D([], [], ls="", marker=m, color=gray, mfc="none", label=s) for s, m in markers.items()]
+    handles += [
+        dot(color=gray, label="filled: fused step; open: op by op"),
+        dot(ms=4, color=gray, mfc="none", label="small: 1 thread; large: 2"),
     ]
+    exact = _plot.COLORS["reference float64"]
+    handles.append(Line2D([], [], ls=":", color=exact, label="time of the float64 definition (error 0)"))
     key.axis("off")
-    shapes = [line([], [], ls="", marker=m, color="#555555", mfc="none", label=s) for s, m in markers.items()]
-    shapes += [
-        line([], [], ls="", marker="o", color="#555555", label="filled: fused step; open: op by op"),
-        line([], [], ls="", marker="o", ms=4, color="#555555", mfc="none", label="small: 1 thread; large: 2"),
-        line(
-            [],
-            [],
-            ls=":",
-            color=_plot.COLORS["reference float64"],
-            label="time of the float64 definition (error 0)",
-        ),
-    ]
-    key.legend(handles=[*handles, *shapes], fontsize=9, loc="center left")
-    _plot.save(figure, HERE / "figures" / "kernels_precision.png", footer(rows))
+    key.legend(handles=handles, fontsize=9, loc="center left")
+    return figure
 
 
 # ---- growth with size
 
 
-def size_rows(rounds: int) -> list[Row]:
-    rows = []
-    best = isa.supported()[0]
+def size_rows(options: argparse.Namespace) -> Iterator[Row]:
+    best, rounds = isa.supported()[0], options.rounds
+
+    def row(axis: str, value: int, scene: Scene, threads: int = 2) -> Row:
+        found = step_row(scene, best, threads, rounds)
+        render = sum(found["ms_by_pass"][k] for k in ("project", "bin", "forward"))
+        return found | {"table": "sizes", "axis": axis, "value": value, "render_ms": render}
+
     for n in (1_000, 10_000, 100_000, 300_000, 1_000_000):
-        rows.append(_size_row("Gaussians", n, cloud(n, 1920, 1080), best, 2, rounds))
+        yield row("Gaussians", n, cloud(n, 1920, 1080))
     for width in (240, 480, 960, 1920, 3840):
         height = width * 9 // 16
-        rows.append(_size_row("pixels", width * height, cloud(100_000, width, height), best, 2, rounds))
+        yield row("pixels", width * height, cloud(100_000, width, height))
     cores = torch.get_num_threads()
     for threads in sorted({1, 2, cores, *(2**k for k in range(6) if 2**k <= cores)}):
-        rows.append(_size_row("threads", threads, cloud(100_000, 1920, 1080), best, threads, rounds))
-    return rows
-
-
-def _size_row(axis: str, value: int, scene: Scene, build_name: str, threads: int, rounds: int) -> Row:
-    row = step_row(scene, build_name, threads, rounds)
-    row.update(table="sizes", axis=axis, value=value)
-    row["render_ms"] = sum(row["ms_by_pass"][k] for k in ("project", "bin", "forward"))
-    return row
+        yield row("threads", threads, cloud(100_000, 1920, 1080), threads)
+    yield memory_row("million")
 
 
 def exponent(points: list[Row], key: str) -> float:
@@ -348,31 +298,23 @@ def exponent(points: list[Row], key: str) -> float:
     return float(np.polyfit(x, y, 1)[0])
 
 
-def size_figure(rows: list[Row]) -> None:
+def size_figure(rows: list[Row]) -> Figure:
     figure, panels = _plot.axes(3, width=4.6)
-    for panel, axis in zip(panels, ("Gaussians", "pixels", "threads"), strict=True):
-        points = [r for r in rows if r["table"] == "sizes" and r["axis"] == axis]
-        for key, label, color in (("ms", "training step", "#1b6ca8"), ("render_ms", "render", "#e08e2b")):
-            e = exponent(points, key)
-            panel.plot(
-                [r["value"] for r in points],
-                [r[key] for r in points],
-                "o-",
-                color=color,
-                label=f"{label}, exponent {e:.2f}",
-            )
+    labels = {
+        "Gaussians": "Gaussians, at 1920x1080",
+        "pixels": "pixels, 100k Gaussians",
+        "threads": "threads, 100k at 1920x1080",
+    }
+    for panel, (axis, label) in zip(panels, labels.items(), strict=True):
+        points = of(rows, table="sizes", axis=axis)
+        values = [r["value"] for r in points]
+        for key, what, color in (("ms", "training step", "#1b6ca8"), ("render_ms", "render", "#e08e2b")):
+            text = f"{what}, exponent {exponent(points, key):.2f}"
+            panel.plot(values, [r[key] for r in points], "o-", color=color, label=text)
         panel.set_xscale("log", base=2 if axis == "threads" else 10)
-        panel.set_yscale("log")
-        panel.set_xlabel(
-            {
-                "Gaussians": "Gaussians, at 1920x1080",
-                "pixels": "pixels, 100k Gaussians",
-                "threads": "threads, 100k at 1920x1080",
-            }[axis]
-        )
-        panel.set_ylabel("milliseconds")
+        _plot.name(panel, label, "milliseconds", log="y")
         panel.legend(fontsize=8)
-    _plot.save(figure, HERE / "figures" / "kernels_sizes.png", footer(rows))
+    return figure
 
 
 # ---- tables
@@ -385,104 +327,90 @@ REACH = {
 }
 
 
-def table(rows: list[Row]) -> str:
-    by = {
-        name: [r for r in rows if r["table"] == name]
-        for name in ("probe", "step", "render", "memory", "precision")
-    }
-    lines = [
-        "# Kernels: speed, and error against time",
-        "",
-        "Generated by `python -m splatmill_worker bench kernels` from `results/kernels.jsonl`. SH degree 3, float32; medians.",
-        "",
-        "| what | backend | threads | ms | target | by pass (ms) |",
-        "|---|---|---|---|---|---|",
-    ]
-    for r in by["step"] + by["render"]:
-        passes = ", ".join(f"{k} {v:.2f}" for k, v in r.get("ms_by_pass", {}).items())
-        what = "training step" if r["table"] == "step" else "render"
-        goal = (
-            REACH.get((r["table"], r["scene"]), "")
-            if r["threads"] == 2 and r["backend"].endswith("avx512")
-            else ""
-        )
-        lines.append(
-            f"| {what}, {r['scene']}, {r['width']}x{r['height']} | {r['backend']} | {r['threads']} | {r['ms']:.2f} | {goal} | {passes} |"
-        )
-    lines += [
-        "",
-        "| composite, exact (tile, Gaussian) pairs | pairs a view | forward | backward | target |",
-        "|---|---|---|---|---|",
-    ]
-    for r in by["step"]:
-        goal = (
-            "85 M/s / 50 M/s, then 100 / 60"
-            if "100k" in r["scene"] and r["backend"].endswith("avx512") and r["threads"] == 2
-            else ""
-        )
-        lines.append(
-            f"| {r['scene']}, {r['width']}x{r['height']}, {r['backend']}, {r['threads']} threads | {r['pairs'] / 1e3:.0f} k | "
-            f"{r['forward_pairs_per_s'] / 1e6:.0f} M/s | {r['backward_pairs_per_s'] / 1e6:.0f} M/s | {goal} |"
-        )
-    lines += ["", *ratios(by["step"])]
-    for p in by["probe"]:
-        lines.append(
-            f"- Probed peak on {p['threads']} thread(s): {p['gfma_per_s']:.0f} G multiply-adds a second (matrix product), {p['gb_per_s']:.0f} GB/s (copy)."
-        )
-    lines += shares(by["step"], by["probe"])
-    for m in by["memory"]:
-        name = "training step" if m["scene"] == "step" else "step at a million Gaussians"
-        lines.append(
-            f"- Memory of the {name} ({m['gaussians']:,} Gaussians, {m['width']}x{m['height']}): {m['beyond_mb']:.0f} MB beyond parameters, "
-            f"moments and photos; the whole process peaked at {m['process_mb']:.0f} MB."
-        )
-    lines += [
-        "",
-        "![error against time](figures/kernels_precision.png)",
-        "",
-        "| scene | backend | threads | ms | image error | worst gradient error |",
-        "|---|---|---|---|---|---|",
-    ]
-    for r in by["precision"]:
-        worst = max(r["gradient_errors"].items(), key=lambda kv: kv[1], default=("", 0.0))
-        lines.append(
-            f"| {r['scene']}, {r['width']}x{r['height']} | {r['backend']} | {r['threads']} | {r['ms']:.1f} | {r['image_error']:.1e} | {worst[1]:.1e} {worst[0]} |"
-        )
-    lines += ["", footer(rows), ""]
-    return "\n".join(lines)
+SIZE = "{width}x{height}"
 
 
-def ratios(steps: list[Row]) -> list[str]:
-    """AVX2 against AVX-512, and one thread against two, on each scene."""
+def target(row: Row) -> str:
+    reached = row["threads"] == 2 and row["backend"].endswith("avx512")
+    return REACH.get((row["table"], row["scene"]), "") if reached else ""
+
+
+def speed(rows: list[Row]) -> str:
+    what = {"step": "training step", "render": "render"}
+    columns: list[Column] = [
+        ("what", lambda r: f"{what[r['table']]}, {r['scene']}, {SIZE.format_map(r)}"), ("backend", "{backend}"), ("threads", "{threads}"),
+        ("ms", "{ms:.2f}"), ("target", target),
+        ("by pass (ms)", lambda r: ", ".join(f"{k} {v:.2f}" for k, v in r.get("ms_by_pass", {}).items())),
+    ]  # fmt: skip
+    return of_rows(columns, of(rows, table="step") + of(rows, table="render"))
+
+
+def pairs(rows: list[Row]) -> str:
+    goal = "85 M/s / 50 M/s, then 100 / 60"
+    columns: list[Column] = [
+        ("composite, exact (tile, Gaussian) pairs", "{scene}, " + SIZE + ", {backend}, {threads} threads"),
+        ("pairs a view", lambda r: f"{r['pairs'] / 1e3:.0f} k"), ("forward", lambda r: f"{r['forward_pairs_per_s'] / 1e6:.0f} M/s"),
+        ("backward", lambda r: f"{r['backward_pairs_per_s'] / 1e6:.0f} M/s"), ("target", lambda r: goal if target(r) and "100k" in r["scene"] else ""),
+    ]  # fmt: skip
+    return of_rows(columns, of(rows, table="step"))
+
+
+def errors(rows: list[Row]) -> str:
+    def worst(row: Row) -> str:
+        name, error = max(row["gradient_errors"].items(), key=lambda kv: kv[1], default=("", 0.0))
+        return f"{error:.1e} {name}"
+
+    columns: list[Column] = [
+        ("scene", "{scene}, " + SIZE), ("backend", "{backend}"), ("threads", "{threads}"), ("ms", "{ms:.1f}"),
+        ("image error", "{image_error:.1e}"), ("worst gradient error", worst),
+    ]  # fmt: skip
+    return of_rows(columns, of(rows, table="precision"))
+
+
+def memory(rows: list[Row]) -> str:
+    names = {"step": "training step", "million": "step at a million Gaussians"}
+    return "\n".join(
+        f"- Memory of the {names[m['scene']]} ({m['gaussians']:,} Gaussians, {SIZE.format_map(m)}): {m['beyond_mb']:.0f} MB beyond parameters, "
+        f"moments and photos; the whole process peaked at {m['process_mb']:.0f} MB."
+        for m in of(rows, table="memory")
+    )
+
+
+def best_build(rows: list[Row]) -> str:
+    """The first that was measured."""
+    backend: str = of(rows, table="step")[0]["backend"]
+    return backend
+
+
+def ratios(rows: list[Row]) -> str:
+    """AVX2 against AVX-512, and one thread against two, on each scene; then the machine's own peaks."""
     found = []
-    for scene in dict.fromkeys(r["scene"] for r in steps):
-        mine = {(r["backend"], r["threads"]): r["ms"] for r in steps if r["scene"] == scene}
+    best = best_build(rows)
+    for scene in distinct(of(rows, table="step"), "scene"):
+        mine = {(r["backend"], r["threads"]): r["ms"] for r in of(rows, table="step", scene=scene)}
         if ("cpu avx512", 2) in mine and ("cpu avx2", 2) in mine:
+            share = mine["cpu avx2", 2] / mine["cpu avx512", 2]
             found.append(
-                f"- {scene}: AVX2 takes {mine['cpu avx2', 2] / mine['cpu avx512', 2]:.2f} times as long as AVX-512 (target 2.2, then 1.8)."
+                f"- {scene}: AVX2 takes {share:.2f} times as long as AVX-512 (target 2.2, then 1.8)."
             )
-        best = f"cpu {isa.supported()[0]}"
         if (best, 1) in mine and (best, 2) in mine:
-            found.append(
-                f"- {scene}: two threads are {mine[best, 1] / mine[best, 2]:.2f} times as fast as one (target 1.9 at 100k)."
-            )
-    return found
+            share = mine[best, 1] / mine[best, 2]
+            found.append(f"- {scene}: two threads are {share:.2f} times as fast as one (target 1.9 at 100k).")
+    found += [
+        f"- Probed peak on {p['threads']} thread(s): {p['gfma_per_s']:.0f} G multiply-adds a second (matrix product), {p['gb_per_s']:.0f} GB/s (copy)."
+        for p in of(rows, table="probe")
+    ]
+    return "\n".join(found)
 
 
-def shares(steps: list[Row], probes: list[Row]) -> list[str]:
+def shares(rows: list[Row]) -> str:
     """The share of the measured peaks that passes reach: compositing of arithmetic, the update of memory bandwidth.
 
     The update reads and writes parameters and two moments, 59 floats a Gaussian.
     """
-    found = [
-        "",
-        "| roofline: share of the probed peak | threads | forward, of the multiplications | backward, of the multiplications | update, of the bandwidth |",
-        "|---|---|---|---|---|",
-    ]
-    for r in steps:
-        for p in probes:
-            if p["threads"] != r["threads"] or r["backend"] != f"cpu {isa.supported()[0]}":
-                continue
+    lines = []
+    for r in of(rows, table="step", backend=best_build(rows)):
+        for p in of(rows, table="probe", threads=r["threads"]):
             done = [
                 100 * 16e-9 * count * r["blocks"][name] / (r["ms_by_pass"][name] / 1e3) / p["gfma_per_s"]
                 for name, count in MULTIPLIES.items()
@@ -490,84 +418,94 @@ def shares(steps: list[Row], probes: list[Row]) -> list[str]:
             moved = r["gaussians"] * 59 * 4 * 3 * 2e-9 / (r["ms_by_pass"]["update"] / 1e3)
             # What fits into the caches does not wait for the memory.
             share = f"{100 * moved / p['gb_per_s']:.0f} %" if r["gaussians"] >= 50_000 else "in the caches"
-            found.append(f"| {r['scene']} | {r['threads']} | {done[0]:.0f} % | {done[1]:.0f} % | {share} |")
-    return [
-        *found,
-        "",
-        f"A block of sixteen pixels takes {MULTIPLIES['forward']} vector multiplications forward and {MULTIPLIES['backward']} backward; the blocks are counted. What is",
-        "missing to 100 % in compositing is latency, stores and the work of each pair; what stands near 100 % in the update is the memory itself.",
-        "",
-    ]
+            lines.append([r["scene"], r["threads"], *(f"{x:.0f} %" for x in done), share])
+    head = "roofline: share of the probed peak|threads|forward, of the multiplications|backward, of the multiplications|update, of the bandwidth"
+    return table(head, lines)
 
 
-def main(argv: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="bench kernels", description=__doc__)
-    parser.add_argument(
-        "--sizes", action="store_true", help="growth with Gaussians, pixels and threads instead"
-    )
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--memory", help=argparse.SUPPRESS)
-    options = parser.parse_args(argv)
-    if options.memory:
-        measure_memory(options.memory)
-        return 0
-    if options.sizes:
-        rows = [*size_rows(options.rounds), memory_row("million")]
-        write("kernels_sizes", rows)
-        rows = read("kernels_sizes")
-        size_figure(rows)
-        (HERE / "kernels_sizes.md").write_text(size_table(rows))
-        return 0
-    rows = [probe(t) for t in THREADS]
-    small, large = fox(480), fox(480, 100_000)
-    best = isa.supported()[0]
-    for scene in [s for s in (small, large) if s] or [cloud(11_000, 270, 480), cloud(100_000, 270, 480)]:
-        for name in isa.supported():
-            for threads in THREADS if name == best else (2,):
-                rows.append(
-                    step_row(scene, name, threads, max(1, options.rounds // 2) if name == best else 1)
-                )
-    for n in (100_000, 1_000_000):
-        scene = cloud(n, 1920, 1080)
-        for name in isa.supported()[:2]:
-            rows.append(render_row(scene, name, 2, options.rounds))
-    rows.append(memory_row("step"))
-    for drawn in (small, cloud(2_000, 128, 128), cloud(20_000, 256, 256)):
-        if drawn is not None:
-            rows += precision_rows(drawn, options.rounds)
-    write("kernels", rows)
-    rows = read("kernels")
-    precision_figure(rows)
-    (HERE / "kernels.md").write_text(table(rows))
-    return 0
+def sizes(rows: list[Row]) -> str:
+    columns: list[Column] = [
+        ("grows", "{axis}"), ("value", "{value:,}"), ("training step, ms", "{ms:.1f}"), ("render, ms", "{render_ms:.1f}"),
+        ("pairs", lambda r: f"{r['pairs'] / 1e3:.0f} k"),
+    ]  # fmt: skip
+    return of_rows(columns, of(rows, table="sizes"))
 
 
-def size_table(rows: list[Row]) -> str:
-    lines = [
-        "# Kernels: growth with size",
-        "",
-        "Generated by `python -m splatmill_worker bench kernels --sizes` from `results/kernels_sizes.jsonl`. Synthetic clouds.",
-        "",
-        "| grows | value | training step, ms | render, ms | pairs |",
-        "|---|---|---|---|---|",
-    ]
-    sizes = [r for r in rows if r["table"] == "sizes"]
-    lines += [
-        f"| {r['axis']} | {r['value']:,} | {r['ms']:.1f} | {r['render_ms']:.1f} | {r['pairs'] / 1e3:.0f} k |"
-        for r in sizes
-    ]
-    lines.append("")
-    for axis in dict.fromkeys(r["axis"] for r in sizes):
-        points = [r for r in sizes if r["axis"] == axis]
+def growth(rows: list[Row]) -> str:
+    lines = []
+    for axis in distinct(of(rows, table="sizes"), "axis"):
+        points = of(rows, table="sizes", axis=axis)
         lines.append(
             f"- time grows as {axis}^{exponent(points, 'ms'):.2f} (step), ^{exponent(points, 'render_ms'):.2f} (render)."
         )
-    for m in (r for r in rows if r["table"] == "memory"):
-        lines.append(
-            f"- {m['gaussians']:,} Gaussians at {m['width']}x{m['height']}: the whole process peaked at {m['process_mb'] / 1024:.2f} GiB while "
-            f"rendering and differentiating, {m['beyond_mb'] / 1024:.2f} GiB of it beyond parameters, moments and photo (bound: 4 GB)."
-        )
-    return "\n".join([*lines, "", "![growth](figures/kernels_sizes.png)", "", footer(rows), ""])
+    lines += [
+        f"- {m['gaussians']:,} Gaussians at {SIZE.format_map(m)}: the whole process peaked at {m['process_mb'] / 1024:.2f} GiB while "
+        f"rendering and differentiating, {m['beyond_mb'] / 1024:.2f} GiB of it beyond parameters, moments and photo (bound: 4 GB)."
+        for m in of(rows, table="memory")
+    ]
+    return "\n".join(lines)
+
+
+# ---- the two studies
+
+
+def steps(options: argparse.Namespace) -> Iterator[Row]:
+    best = isa.supported()[0]
+    captured = [scene for scene in (fox(480), fox(480, 100_000)) if scene]
+    for scene in captured or [cloud(11_000, 270, 480), cloud(100_000, 270, 480)]:
+        for name in isa.supported():
+            for threads in THREADS if name == best else (2,):
+                yield step_row(scene, name, threads, max(1, options.rounds // 2) if name == best else 1)
+
+
+def renders(options: argparse.Namespace) -> Iterator[Row]:
+    for n in (100_000, 1_000_000):
+        scene = cloud(n, 1920, 1080)
+        yield from (render_row(scene, name, 2, options.rounds) for name in isa.supported()[:2])
+
+
+def precisions(options: argparse.Namespace) -> Iterator[Row]:
+    for scene in (fox(480), cloud(2_000, 128, 128), cloud(20_000, 256, 256)):
+        if scene is not None:
+            yield from precision_rows(scene, options.rounds)
+
+
+KEY = ("table", "scene", "axis", "value", "backend", "threads")
+ROUNDS = {"rounds": {"type": int, "default": 5}}
+STUDY = Study(
+    name="kernels",
+    about=__doc__,
+    cases={
+        "probe": lambda _: map(probe, THREADS),
+        "step": steps,
+        "render": renders,
+        "memory": lambda _: [memory_row("step")],
+        "precision": precisions,
+    },
+    key=KEY,
+    blocks={
+        "speed": speed, "pairs": pairs, "ratios": ratios, "shares": shares, "memory": memory, "errors": errors,
+        "footer": footer,
+    },
+    figures={"kernels_precision": precision_figure},
+    options=ROUNDS,
+)  # fmt: skip
+SIZES = Study(
+    name="kernels_sizes",
+    about=__doc__,
+    cases={"sizes": size_rows},
+    key=KEY,
+    blocks={"sizes": sizes, "growth": growth, "footer": footer},
+    figures={"kernels_sizes": size_figure},
+    options=ROUNDS,
+)
+
+
+def main(argv: list[str]) -> int:
+    if argv[:1] == ["--memory"]:  # a process of `memory_row`
+        measure_memory(argv[1])
+        return 0
+    return (SIZES if "--sizes" in argv else STUDY).main([word for word in argv if word != "--sizes"])
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
     splatmill bench live                                    # the still life, 1500 steps, 5 rounds: about 10 minutes
     splatmill bench live --scene fox --steps 3000 --rounds 9
-    splatmill bench live --plot-only
 
 In each round the three runs follow each other in turning order, each in a process of its own, with the same seed,
 plan and number of steps. `without` has no live view, as `splatmill train` of earlier versions; `unwatched` has the
@@ -11,7 +10,7 @@ fetches every snapshot, as the server does for a browser. Both also have what th
 of that thread, and the seconds for which training waited for snapshots. Other work on the machine disturbs these two
 least. Seconds run from the first step to the export, evaluations and
 snapshots included, so that a snapshot cannot hide on a stopped clock. CPU seconds are those of the training process;
-other work on the machine disturbs them less. Rows go to results/live.jsonl, the table to live.md.
+other work on the machine disturbs them less.
 
 Expected before it was measured: unwatched within the noise of `without`, watched at most 3 % more. A snapshot may take
 2 % of the time (live.SHARE), and Redis' copy the rest.
@@ -31,9 +30,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import _page
 import psutil
 import redis
-from _rows import HERE, Row, append, footer, lines, origin, worked
+from _rows import HERE, Row, footer, of, worked
+from _studies.study import Study
 from _train import scenes
 from _train.child import prepared
 
@@ -47,37 +48,12 @@ JOB = "bench000000live0"
 
 
 def main(argv: list[str]) -> int:
-    """Measure the rounds that were asked for, and write the table."""
-    parser = argparse.ArgumentParser(
-        prog="splatmill bench live", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--scene", default="synthetic", help="a scene of bench train, or the folder of a capture"
-    )
-    parser.add_argument("--steps", type=int, default=1500)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument(
-        "--work", type=Path, default=CACHE, help="where photos and recovered cameras are kept"
-    )
-    parser.add_argument("--results", type=Path, default=HERE / "results" / "live.jsonl")
-    parser.add_argument("--plot-only", action="store_true", help="write the table of the rows that are there")
-    parser.add_argument("--run", help=argparse.SUPPRESS)
-    asked = parser.parse_args(argv)
-    if asked.run is not None:
-        return _measure(json.loads(asked.run))
-    if not asked.plot_only:
-        _rounds(asked)
-    found = lines(asked.results)
-    if not found:
-        print(f"There are no rows in {asked.results}.", file=sys.stderr)
-        return 1
-    table = HERE / "live.md" if asked.results.parent == HERE / "results" else asked.results.with_suffix(".md")
-    table.write_text(document(found))
-    print(f"Table: {table}")
-    return 0
+    if argv[:1] == ["--run"]:  # a process of `_rounds`
+        return _measure(json.loads(argv[1]))
+    return STUDY.main(argv)
 
 
-def _rounds(asked: argparse.Namespace) -> None:
+def _rounds(asked: argparse.Namespace) -> Iterator[Row]:
     scene = scenes.named(asked.scene, asked.work)
     ready = prepared(scene, asked.work)
     if "failure" in ready:
@@ -98,13 +74,7 @@ def _rounds(asked: argparse.Namespace) -> None:
                     subprocess.run([*_command(), "--run", json.dumps(job)], check=True)
                 row = json.loads(answer.read_text())
                 row |= {"bench": "live", "scene": scene.name, "asked_steps": asked.steps, "round": number}
-                row |= {"fetched": len(fetched), "fetched_bytes": sum(fetched)}
-                append(asked.results, row | origin())
-                print(
-                    f"{number + 1}/{asked.rounds} {arm}: {row['seconds']:.2f} s, {row['cpu_seconds']:.2f} CPU s, "
-                    f"{row['snapshots']} snapshots",
-                    flush=True,
-                )
+                yield row | {"fetched": len(fetched), "fetched_bytes": sum(fetched)}
 
 
 def _command() -> list[str]:
@@ -173,18 +143,8 @@ def _cpu_of(name: str) -> float:
 def _redis(folder: Path) -> Iterator[str]:
     """A Redis of our own; yields the path of its socket."""
     path = folder / "redis.sock"
-    quiet = [
-        "--port",
-        "0",
-        "--save",
-        "",
-        "--unixsocket",
-        str(path),
-        "--dir",
-        str(folder),
-        "--loglevel",
-        "warning",
-    ]
+    place = ["--unixsocket", str(path), "--dir", str(folder)]
+    quiet = ["--port", "0", "--save", "", *place, "--loglevel", "warning"]
     with subprocess.Popen([find().path, *quiet], stdout=subprocess.DEVNULL) as server:
         try:
             while not path.exists():
@@ -223,47 +183,48 @@ def _onlooker(address: str, watches: bool) -> Iterator[list[int]]:
         looker.join()
 
 
-def document(rows: list[Row]) -> str:
-    """The table of the medians, by scene and number of steps."""
-    parts = [
-        "# What the live view costs",
-        "",
-        "Made by `splatmill bench live`; the head of `live.py` says what is compared, and what was expected. Medians",
-        "of the rounds; in brackets, over the median of `without`. Seconds include snapshots and evaluations. The last",
-        "two columns: the share of these seconds for which training waited for snapshots, and the share of the CPU",
-        "seconds of the thread that asks whether anybody looks.",
-        "",
-        "| scene | steps | live view | rounds | seconds | CPU seconds | snapshots | training waited | thread |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    groups = dict.fromkeys((row["scene"], row["asked_steps"]) for row in rows)
-    for scene, steps in groups:
-        of = {
-            arm: [r for r in rows if (r["scene"], r["asked_steps"], r["arm"]) == (scene, steps, arm)]
-            for arm in ARMS
-        }
-        for arm, found in of.items():
-            if not found or not of["without"]:
+def table(rows: list[Row]) -> str:
+    """The medians, by scene and number of steps."""
+    lines = []
+    for scene, steps in dict.fromkeys((row["scene"], row["asked_steps"]) for row in rows):
+        found = {arm: of(rows, scene=scene, asked_steps=steps, arm=arm) for arm in ARMS}
+        for arm, mine in found.items():
+            if not mine or not found["without"]:
                 continue
-            cells = []
+            cells: list[object] = []
             for name in ("seconds", "cpu_seconds"):
-                own, base = (statistics.median(row[name] for row in some) for some in (found, of["without"]))
+                own, base = (
+                    statistics.median(row[name] for row in some) for some in (mine, found["without"])
+                )
                 cells.append(f"{own:.2f} ({100 * (own / base - 1):+.1f} %)")
-            snapshots = statistics.median(row["snapshots"] for row in found)
-            waited, thread = (
-                statistics.median(row[name] / row[whole] for row in found)
-                for name, whole in (("live_seconds", "seconds"), ("thread_cpu_seconds", "cpu_seconds"))
-            )
-            parts.append(
-                f"| {scene} | {steps} | {arm} | {len(found)} | {cells[0]} | {cells[1]} | {snapshots:g} "
-                f"| {100 * waited:.2f} % | {100 * thread:.2f} % |"
-            )
-    others = statistics.median(row["others_cpu_seconds"] / row["seconds"] for row in rows)
-    parts += [
-        "",
-        f"Meanwhile other programs used {others:.1f} cores (median), Redis and the onlooker included.",
-        "",
-        footer(rows),
-        "",
-    ]
-    return "\n".join(parts)
+            cells.append(f"{statistics.median(row['snapshots'] for row in mine):g}")
+            for name, whole in (("live_seconds", "seconds"), ("thread_cpu_seconds", "cpu_seconds")):
+                cells.append(f"{100 * statistics.median(row[name] / row[whole] for row in mine):.2f} %")
+            lines.append([scene, steps, arm, len(mine), *cells])
+    return _page.table(
+        "scene|steps|live view|rounds|seconds|CPU seconds|snapshots|training waited|thread", lines
+    )
+
+
+def others(rows: list[Row]) -> str:
+    cores = statistics.median(row["others_cpu_seconds"] / row["seconds"] for row in rows)
+    return f"Meanwhile other programs used {cores:.1f} cores (median), Redis and the onlooker included."
+
+
+STUDY = Study(
+    name="live",
+    about=__doc__,
+    cases={"rounds": _rounds},
+    key=("scene", "asked_steps", "arm", "round"),
+    blocks={"medians": table, "others": others, "footer": footer},
+    figures={},
+    options={
+        "scene": {"default": "synthetic", "help": "a scene of bench train, or the folder of a capture"},
+        "steps": {"type": int, "default": 1500},
+        "rounds": {"type": int, "default": 5},
+        "work": {"type": Path, "default": CACHE, "help": "where photos and recovered cameras are kept"},
+    },
+)
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -8,14 +8,6 @@
 Each variant is a build of the C++ kernels with other compile definitions (`_studies/precision/variants.py`), made for
 the instruction set in use, in a folder of the benchmark; the installed engine is not touched. All are measured in one
 process, in turning order. Trainings that have a row of the present code are not repeated.
-
-Expected before it was measured: the update is bound by memory, and moments in bf16 move 16 bytes a value in place of 24,
-a third less of a pass that is a quarter of the step at 100,000 Gaussians: 5 to 8 % of the step there, 1 to 2 % at 10,000.
-Records of half a cache line gain little, since they are fetched ahead: 0 to 3 %. Coefficients in 16 bits save a quarter of
-the update's bytes and half of the projection's: 5 % at 100,000. Tiles of 8 list more pairs for the same blocks: slower. A cut at 1/64
-removes a fifth of the area of an ellipse of opacity 1/2, so 10 to 20 % of the passes over pixels, for an error of whole 8-bit steps.
-The end at 1e-2 saves most where scenes are opaque: 5 to 10 %. A second moment in bf16, rounded to nearest, cannot fall by
-0.1 % a step, as half an ulp is 0.2 to 0.4 %: it keeps its largest value, and steps become too short.
 """
 
 from __future__ import annotations

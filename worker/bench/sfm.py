@@ -4,7 +4,6 @@
     python -m splatmill_worker bench sfm --scenes fox kermit --settings auto --again --no-train
     python -m splatmill_worker bench sfm --growth                 # 25 to 500 generated photos, and the fit
 
-Rows go to results/sfm.jsonl (results/sfm_growth.jsonl) one by one, the figures to figures/, the tables to sfm*.md.
 A row that is there is not measured again, unless by --again; without a training of --train seconds it is not whole.
 Rules: photos come from ../shared/data, and a scene that is not there gets no row; every run starts from an empty
 folder; a failed run gets no point in the figure and is named in the table. A row during which other programs took
@@ -26,7 +25,7 @@ import math
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,7 +35,11 @@ import _rows
 import numpy as np
 import numpy.typing as npt
 import psutil
-from _plot import axes, save
+from _page import Column, of_rows
+from _plot import axes
+from _rows import Row, of
+from _studies.study import Study
+from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from splatmill.schema import TrainOptions
@@ -54,7 +57,7 @@ Float = npt.NDArray[np.float64]
 NAMES = ("fox", "lund", "kermit", "beer", "snowmiku", "unrelated", "rotation")
 FOLDERS = {name: _data.FOLDERS[name] for name in NAMES}
 MISPLACED = ("beer",)  # cameras that came with the capture are wrong
-GROWTH = (25, 50, 100, 200, 500)
+COUNTS = (25, 50, 100, 200, 500)
 GROWTH_WIDTH, GROWTH_HEIGHT = 480, 360
 TRAIN_SIDE = 480
 BUSY = 0.1  # of the machine's time, taken by other programs
@@ -276,21 +279,23 @@ def reference(name: str) -> dict[str, Camera]:
     return {view.name: view.camera for view in found.load().views} if found is not None else {}
 
 
-def scenes_bench(
-    scenes: list[str], settings: list[str], train: float | None, rows: dict[tuple[str, str], _rows.Row]
-) -> None:
-    """Measure the combinations of scene and setting that `rows` lacks, and store each row at once."""
-    for name in scenes:
+def scenes_bench(options: argparse.Namespace) -> Iterator[Row | str]:
+    """Measure the combinations of scene and setting that have no whole row."""
+    train = None if options.no_train else options.train
+    for name in options.scenes:
         images = _data.SHARED / FOLDERS[name] / "images"
         if not images.is_dir():
-            print(f"{name} is not here ({images}); no row for it.", file=sys.stderr)
+            yield f"{name} is not here ({images}); no row for it."
             continue
-        for setting in settings:
-            if (name, setting) not in rows:
-                keep("sfm", rows, measure(name, images, setting, reference(name), train))
+        for setting in options.settings:
+            if options.again or not any(
+                train is None or row["outcome"] != "placed" or row.get("train") == train
+                for row in of(options.known, scene=name, setting=setting)
+            ):
+                yield measure(name, images, setting, reference(name), train)
 
 
-def growth_bench(counts: Sequence[int], setting: str, rows: dict[tuple[str, str], _rows.Row]) -> None:
+def growth_bench(options: argparse.Namespace) -> Iterator[Row]:
     """Seconds against the number of photos, on generated orbits of constant overlap between neighbours.
 
     Taking the photos is not on the clock, and each set is taken once in each size by each version of the generator.
@@ -298,9 +303,9 @@ def growth_bench(counts: Sequence[int], setting: str, rows: dict[tuple[str, str]
     sources = [Path(str(module.__file__)).read_bytes() for module in (synthetic, textures)]
     place = Path(tempfile.gettempdir()) / "splatmill-bench-growth"
     version = hashlib.sha256(b"".join(sources)).hexdigest()[:12]
-    for count in counts:
+    for count in options.counts:
         name = f"still life {count}"
-        if (name, setting) in rows:
+        if of(options.known, scene=name) and not options.again:
             continue
         folder = place / f"{count}-{GROWTH_WIDTH}x{GROWTH_HEIGHT}-{version}"
         poses = folder / "poses.json"
@@ -311,71 +316,39 @@ def growth_bench(counts: Sequence[int], setting: str, rows: dict[tuple[str, str]
             n: Camera(GROWTH_WIDTH, GROWTH_HEIGHT, K[0][0], K[1][1], K[0][2], K[1][2], np.array(viewmat))
             for n, (K, viewmat) in json.loads(poses.read_text()).items()
         }
-        keep("sfm_growth", rows, measure(name, folder / "images", setting, truth, None))
+        yield measure(name, folder / "images", "auto", truth, None)
 
 
-def keep(name: str, rows: dict[tuple[str, str], _rows.Row], row: _rows.Row) -> None:
-    """Add a row and store all of them, so that an interrupted benchmark can be resumed."""
-    rows[row["scene"], row["setting"]] = row | _rows.origin()
-    path = _rows.HERE / "results" / f"{name}.jsonl"
-    part = path.with_suffix(".part")
-    part.write_text("".join(json.dumps(row) + "\n" for row in rows.values()))
-    part.replace(path)
-    print(row, flush=True)
-
-
-def kept(name: str) -> dict[tuple[str, str], _rows.Row]:
-    """The rows of earlier runs by scene and setting."""
-    return {
-        (row["scene"], row["setting"]): row for row in _rows.lines(_rows.HERE / "results" / f"{name}.jsonl")
-    }
-
-
-def exponent(rows: list[dict[str, Any]], key: str = "cpu_seconds") -> float:
+def exponent(rows: list[Row], key: str = "cpu_seconds") -> float:
     """The slope of log seconds over log photos, by least squares."""
     photos = np.log([row["photos"] for row in rows])
     return float(np.polyfit(photos, np.log([row[key] for row in rows]), 1)[0])
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    columns = {
-        "scene": "scene",
-        "setting": "setting",
-        "outcome": "outcome",
-        "seconds": "s",
-        "cpu_seconds": "CPU s",
-        "points": "points",
-        "reprojection_pixels": "reproj. px",
-        "rotation_deg": "rotation °",
-        "position_percent": "position %",
-        "gps_metres": "GPS m",
-        "psnr": "PSNR dB",
-    }
-    lines = ["| " + " | ".join(["photos", *columns.values()]) + " |", "|" + "---|" * (len(columns) + 1)]
-    for row in rows:
-        share = f"{row['registered']} of {row['photos']}"
-        cells = [str(row[key]) if row.get(key) is not None else "" for key in columns]
-        cells[3] += " (busy)" if row["busy"] else ""
-        lines.append("| " + " | ".join([share, *cells]) + " |")
-    return "\n".join(lines) + "\n\n" + _rows.footer(rows) + "\n"
+def table(rows: list[Row]) -> str:
+    def of_field(name: str) -> Callable[[Row], object]:
+        return lambda row: "" if row.get(name) is None else row[name]
+
+    columns: list[Column] = [
+        ("photos", "{registered} of {photos}"), ("scene", "{scene}"), ("setting", "{setting}"),
+        ("outcome", "{outcome}"), ("s", lambda row: f"{row['seconds']}{' (busy)' * row['busy']}"),
+        ("CPU s", "{cpu_seconds}"), ("points", "{points}"), ("reproj. px", of_field("reprojection_pixels")),
+        ("rotation °", of_field("rotation_deg")), ("position %", of_field("position_percent")),
+        ("GPS m", of_field("gps_metres")), ("PSNR dB", of_field("psnr")),
+    ]  # fmt: skip
+    return of_rows(columns, rows)
 
 
-def scenes_figure(rows: list[dict[str, Any]], path: Path) -> None:
+def scenes_figure(rows: list[Row]) -> Figure:
     """Left: held-out PSNR, right: pose error, both over the seconds that the cameras took."""
     figure, (left, right) = axes(2)
     colors = {name: f"C{index}" for index, name in enumerate(FOLDERS)}
     markers = dict(zip(SETTINGS, "sovD^P", strict=True))
-    for row in rows:
-        if row["outcome"] != "placed":
-            continue
+    for row in of(rows, outcome="placed"):
         color = colors[row["scene"]]
         face = "none" if row["busy"] else color
-        style: dict[str, Any] = {
-            "edgecolors": color,
-            "facecolors": face,
-            "marker": markers[row["setting"]],
-            "s": 48,
-        }
+        marker = markers[row["setting"]]
+        style: dict[str, Any] = {"edgecolors": color, "facecolors": face, "marker": marker, "s": 48}
         label = f"{row['scene']}, {row['setting']}"
         if "psnr" in row:
             left.scatter(row["seconds"], row["psnr"], label=label, **style)
@@ -392,11 +365,11 @@ def scenes_figure(rows: list[dict[str, Any]], path: Path) -> None:
         f"{row['scene']}, {row['setting']}: {row['outcome']}" for row in rows if row["outcome"] != "placed"
     ]
     hollow = " · hollow: on a busy machine" if any(row["busy"] for row in rows) else ""
-    note = f"{hollow} · no point for: {'; '.join(failed)}" if failed else hollow
-    save(figure, path, _rows.footer(rows) + note)
+    figure.set_label(f"{hollow} · no point for: {'; '.join(failed)}" if failed else hollow)
+    return figure
 
 
-def growth_figure(rows: list[dict[str, Any]], path: Path) -> None:
+def growth_figure(rows: list[Row]) -> Figure:
     figure, (axis,) = axes(1)
     photos = np.array([row["photos"] for row in rows], float)
     for key, label in (("seconds", "wall"), ("cpu_seconds", "CPU")):
@@ -408,54 +381,47 @@ def growth_figure(rows: list[dict[str, Any]], path: Path) -> None:
         )
     axis.set(xscale="log", yscale="log", xlabel="photos", ylabel="seconds for the cameras")
     axis.legend()
-    save(figure, path, _rows.footer(rows))
+    return figure
+
+
+def fit(rows: list[Row]) -> str:
+    wall, cpu = exponent(rows, "seconds"), exponent(rows)
+    return f"Fit: wall seconds grow as n^{wall:.2f}, CPU seconds as n^{cpu:.2f}."
+
+
+AGAIN: dict[str, Any] = {"action": "store_true", "help": "measure the chosen rows again"}
+STUDY = Study(
+    name="sfm",
+    about=__doc__,
+    cases={"scenes": scenes_bench},
+    key=("scene", "setting"),
+    order=lambda row: (list(FOLDERS).index(row["scene"]), list(SETTINGS).index(row["setting"])),
+    blocks={"table": table, "footer": _rows.footer},
+    figures={"sfm": scenes_figure},
+    options={
+        "scenes": {"nargs": "+", "choices": FOLDERS, "default": list(FOLDERS)},
+        "settings": {
+            "nargs": "+", "choices": SETTINGS, "default": ["COLMAP defaults", "auto", "lean, all pairs"],
+        },
+        "train": {"type": float, "default": 20.0, "help": "seconds of training on top of the cameras"},
+        "no-train": {"action": "store_true"},
+        "again": AGAIN,
+    },
+)  # fmt: skip
+GROWTH = Study(
+    name="sfm_growth",
+    about=__doc__,
+    cases={"growth": growth_bench},
+    key=("scene", "setting"),
+    order=lambda row: row["photos"],
+    blocks={"table": table, "footer": _rows.footer, "fit": fit},
+    figures={"sfm_growth": growth_figure},
+    options={"counts": {"nargs": "+", "type": int, "default": COUNTS}, "again": AGAIN},
+)
 
 
 def main(argv: list[str]) -> int:
-    parser = argparse.ArgumentParser(
-        prog="bench sfm", description=__doc__.splitlines()[0] if __doc__ else None
-    )
-    parser.add_argument("--scenes", nargs="+", choices=FOLDERS, default=list(FOLDERS))
-    parser.add_argument(
-        "--settings", nargs="+", choices=SETTINGS, default=["COLMAP defaults", "auto", "lean, all pairs"]
-    )
-    parser.add_argument("--train", type=float, default=20.0, help="seconds of training on top of the cameras")
-    parser.add_argument("--no-train", action="store_true")
-    parser.add_argument("--growth", action="store_true", help="generated sets of growing size instead")
-    parser.add_argument("--counts", nargs="+", type=int, default=GROWTH)
-    parser.add_argument("--again", action="store_true", help="measure the chosen rows again")
-    chosen = parser.parse_args(argv)
-    name = "sfm_growth" if chosen.growth else "sfm"
-    known = kept(name)
-    scenes = [f"still life {count}" for count in chosen.counts] if chosen.growth else chosen.scenes
-    settings = ["auto"] if chosen.growth else chosen.settings
-    train = None if chosen.growth or chosen.no_train else chosen.train
-    for key, row in list(known.items()):
-        whole = train is None or row["outcome"] != "placed" or row.get("train") == train
-        if key[0] in scenes and key[1] in settings and (chosen.again or not whole):
-            del known[key]
-    if chosen.growth:
-        growth_bench(chosen.counts, "auto", known)
-    else:
-        scenes_bench(scenes, settings, train, known)
-    if not known:
-        print("No scene was there to measure.", file=sys.stderr)
-        return 1
-    if chosen.growth:
-        rows = sorted(known.values(), key=lambda row: row["photos"])
-    else:
-        order = [*FOLDERS, *SETTINGS]
-        rows = sorted(known.values(), key=lambda r: (order.index(r["scene"]), order.index(r["setting"])))
-    text = table(rows)
-    if chosen.growth:
-        wall, cpu = exponent(rows, "seconds"), exponent(rows)
-        text += f"\nFit: wall seconds grow as n^{wall:.2f}, CPU seconds as n^{cpu:.2f}.\n"
-        growth_figure(rows, _rows.HERE / "figures" / "sfm_growth.png")
-    else:
-        scenes_figure(rows, _rows.HERE / "figures" / "sfm.png")
-    (_rows.HERE / f"{name}.md").write_text(text)
-    print(text)
-    return 0
+    return (GROWTH if "--growth" in argv else STUDY).main([word for word in argv if word != "--growth"])
 
 
 if __name__ == "__main__":

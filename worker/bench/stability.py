@@ -4,8 +4,7 @@
     splatmill bench stability                       # all axes, the oracle, figures and table: under 10 minutes
     splatmill bench stability --only beside --dry   # one axis, printed only
 
-An error of 1 unit is what any algorithm has that reads float32 (`_studies/stability/conditioning.py`). Expected before
-the first run: a flat line near 1 for the fused step, and growth with the axis ratio for all that assembles the conic.
+An error of 1 unit is what any algorithm has that reads float32 (`_studies/stability/conditioning.py`).
 """
 
 from __future__ import annotations

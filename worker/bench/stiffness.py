@@ -9,21 +9,6 @@ Cases: `needles` (Gauss-Newton blocks), `curvature` (largest eigenvalue of Adam'
 training), `products` (how exact the Hessian's products are), `runs` (the same trainings at boosts of the rates),
 `groups` (boost of 8, and four times that for one group) and `recovery` (a jump of all rates in the midst of a
 training). No figure is a time.
-
-Expected before the first run:
-1. With the exact gradient, Adam would train at the limit at every boost, since its metric adapts (Cohen et al. 2022).
-   With one photo a step, the second moments hold the variance between photos, which is larger than the square of the
-   mean: the eigenvalue over the limit should be below 1 at a boost of 1 and grow more slowly than the boost. At 8 it
-   should be within a factor of two of 1, at 16 and 32 at or above it; opacities, whose rate is largest, should lead.
-2. Held-out quality should be best near the root of the ratio of steps (`boost_of`), also beyond 8 where a run is
-   short, and fall by half a decibel or more at four times that.
-3. Nothing should diverge up to 32, since no value moves by much more than its rate in a step. Where a run does, the
-   roll-back to half the rates should save it.
-4. Needles: see `_studies/stiffness/needles.py`.
-
-The first trial showed ratios of 0.003 to 0.05 at a boost of 8. The limit for the mean square, which photos drawn one
-at a time have to keep (`_studies/stiffness/mean_square.py`), was added after it; expected was a ratio above 1 at
-boosts from 8 on.
 """
 
 from __future__ import annotations

@@ -34,7 +34,8 @@ class Study:
     cases: what can be measured alone, by name.
     key: fields that no two measurements share all of.
     blocks: text of each block of the page, by its name.
-    figures: by the stem of their files.
+    figures: by the stem of their files; a figure's label stands behind its footer.
+    order: sorts the rows; as they were measured first where it is left out.
     options: of the command, beside those of every study: by name, arguments of `add_argument`.
     """
 
@@ -45,12 +46,12 @@ class Study:
     blocks: Mapping[str, Callable[[list[Row]], str]]
     figures: Mapping[str, Callable[[list[Row]], Figure]]
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    order: Callable[[Row], Any] = lambda _: 0
 
     def rows(self, folder: Path = HERE) -> list[Row]:
-        """The last row of each measurement, in the order of the first."""
-        return list(
-            {tuple(row.get(name) for name in self.key): row for row in lines(self.place(folder))}.values()
-        )
+        """The last row of each measurement."""
+        last = {tuple(row.get(name) for name in self.key): row for row in lines(self.place(folder))}
+        return sorted(last.values(), key=self.order)
 
     def place(self, folder: Path = HERE) -> Path:
         """The file of the rows."""
@@ -68,7 +69,8 @@ class Study:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         add = parser.add_argument
-        add("--only", nargs="+", choices=self.cases, metavar="CASE", help=f"of {', '.join(self.cases)}")
+        if len(self.cases) > 1:
+            add("--only", nargs="+", choices=self.cases, metavar="CASE", help=f"of {', '.join(self.cases)}")
         add("--dry", action="store_true", help="print rows, and write nothing")
         add("--plot-only", action="store_true", help="page and figures from the rows that there are")
         add("--out", type=Path, default=HERE, help="folder of results/, figures/ and the page")
@@ -79,7 +81,7 @@ class Study:
     def measure(self, options: argparse.Namespace) -> bool:
         """Measure the cases; each row is kept as soon as it is there. Returns whether nothing was left out."""
         whole = True
-        for name in options.only or self.cases:
+        for name in getattr(options, "only", None) or self.cases:
             options.known = self.rows(options.out)
             for row in self.cases[name](options):
                 if isinstance(row, str):
@@ -102,7 +104,9 @@ class Study:
             if not options.plot_only:
                 replace(self.place(options.out), rows)
             for stem, draw in self.figures.items():
-                _plot.save(draw(rows), options.out / "figures" / f"{stem}.png", footer(rows))
+                figure = draw(rows)
+                note = f"{footer(rows)}{figure.get_label()}"
+                _plot.save(figure, options.out / "figures" / f"{stem}.png", note)
             (options.out / f"{self.name}.md").write_text(self.page(rows))
         return 0 if whole else 1
 

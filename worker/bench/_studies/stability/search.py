@@ -196,8 +196,7 @@ def by_hypothesis(search: Search, aim: str, seconds: float, number: int) -> Prog
     search.until = time.process_time() + seconds
     inputs = st.sampled_from(list(FAMILIES.values())).flatmap(
         lambda family: st.tuples(
-            st.just(family),
-            st.lists(st.floats(0, 1), min_size=family.numbers, max_size=family.numbers),
+            st.just(family), st.lists(st.floats(0, 1), min_size=family.numbers, max_size=family.numbers)
         )
     )
 

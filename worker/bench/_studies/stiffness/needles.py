@@ -7,13 +7,6 @@ Gaussian before a constant background it moves every pixel as the opacity does, 
 
 The quaternion's length changes no pixel, and one eigenvalue of the 11 is 0; condition numbers are those of the other
 ten.
-
-Expected: the thin axes' variances are small beside the 0.3 pixels^2 that projection adds, so that the derivatives by
-their log-scales and by a roll about the long axis fall with the square of the axis ratio, and the condition number
-grows with its fourth power. A diagonal metric over the quaternion's four values cannot see the roll, which is a
-mixture of them, so that neither Adam nor a Jacobi scaling removes this; in a frame of the needle's own axes, Jacobi
-scaling does. The largest eigenvalue stops growing once the thin axes are below the blur: needles are flat directions,
-not stiff ones.
 """
 
 from __future__ import annotations
@@ -35,13 +28,7 @@ LENGTH, SIDE, FOCAL, DISTANCE = 4.0, 32, 64.0, 3.0
 """Standard deviation along the needle, side of the images and focal length in pixels; distance of the cameras."""
 
 VALUES = 11
-EYES = [
-    (1.0, 0.2, 0.1),
-    (-0.3, 1.0, 0.4),
-    (0.2, -0.4, 1.0),
-    (-0.8, -0.7, 0.3),
-    (0.6, -0.6, -0.5),
-]
+EYES = [(1.0, 0.2, 0.1), (-0.3, 1.0, 0.4), (0.2, -0.4, 1.0), (-0.8, -0.7, 0.3), (0.6, -0.6, -0.5)]
 TURN = (0.5, 0.5, -0.3, 0.4)
 
 
