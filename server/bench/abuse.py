@@ -2,7 +2,6 @@
 
     splatmill bench abuse                     # three trainings alone, three under abuse: some minutes
     splatmill bench abuse --repetitions 5
-    splatmill bench abuse --plot-only         # the page from the rows that are there
 
 One `splatmill up` on this machine with two owners. One uploads a small capture with one photo in pieces, trains it,
 follows its events, imports a file and is told of the end by a webhook (`_abuse/trainer.py`), first alone. Then the
@@ -16,8 +15,8 @@ other does all of this at once, from one process and with one key whose storage 
 - edits, converts, renders and restarts in parallel, which the limit of its storage has to stop;
 - loads a shared link from eight connections.
 
-Meanwhile the bytes of all its captures, jobs and models are summed ten times a second. Rows go to results/abuse.jsonl,
-the table to abuse.md. What does not come within a minute is counted as not arrived.
+Meanwhile the bytes of all its captures, jobs and models are summed ten times a second.
+What does not come within a minute is counted as not arrived.
 
 Expected: everything that concerns the first owner takes as long as alone, but for the cores and the one worker, which
 the two share: a job waits for at most one of the other's jobs, which end a second or two after they begin, and all that
@@ -37,15 +36,17 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
 from _abuse.hosts import serving
 from _abuse.trainer import LONGEST, Trainer
-from _rows import Row, append, footer, lines, origin
+from _page import table
+from _rows import Row, footer
 from _still_life import posed_capture
+from _studies.study import Study
 from _up import served
 
 HERE = Path(__file__).resolve().parent
@@ -66,37 +67,7 @@ MEASURED = {
 """The seconds of a row, and what they are."""
 
 
-def main(argv: list[str]) -> int:
-    """Measure both ways, and write the table."""
-    parser = argparse.ArgumentParser(
-        prog="splatmill bench abuse",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "--repetitions", type=int, default=3, help="trainings alone and under abuse (default: 3)"
-    )
-    parser.add_argument("--results", type=Path, default=HERE / "results" / "abuse.jsonl")
-    parser.add_argument(
-        "--plot-only", action="store_true", help="write the page from the rows that are there"
-    )
-    asked = parser.parse_args(argv)
-    if not asked.plot_only:
-        for row in measure(asked.repetitions):
-            append(asked.results, row | origin("server", "client"))
-            print({name: value for name, value in row.items() if name != "answers"}, flush=True)
-    rows = lines(asked.results)
-    if not rows:
-        print(f"There are no rows in {asked.results}.", file=sys.stderr)
-        return 1
-    own = asked.results.parent == HERE / "results"
-    table = HERE / "abuse.md" if own else asked.results.with_suffix(".md")
-    table.write_text(document(rows))
-    print(table.read_text())
-    return 0
-
-
-def measure(repetitions: int) -> Iterator[Row]:
+def measure(options: argparse.Namespace) -> Iterator[Row]:
     """Train alone and under abuse."""
     photos = posed_capture(PHOTOS, WIDTH, HEIGHT)
     piecewise = next(path for path in photos if path.startswith("images/"))
@@ -114,11 +85,11 @@ def measure(repetitions: int) -> Iterator[Row]:
         abuses |= _prepared(url, _key(admin, "abuses", LIMIT), photos)
         (Path(name) / Path(piecewise).name).write_bytes(photos[piecewise])
         abuses["photo"] = str(Path(name) / Path(piecewise).name)
-        for number in range(repetitions):
+        for number in range(options.repetitions):
             yield {"bench": "abuse", "run": run, "abused": False, "repetition": number, **trainer.run()}
         storage = Path(name) / "data" / "storage"
         with _watched(storage, trainer.records) as seen, _abusing(abuses) as answers:
-            rows = [trainer.run() for _ in range(repetitions)]
+            rows = [trainer.run() for _ in range(options.repetitions)]
         for number, row in enumerate(rows):
             also = {"limit": LIMIT, "most_bytes": seen[0], "answers": answers}
             yield {"bench": "abuse", "run": run, "abused": True, "repetition": number, **row, **also}
@@ -231,44 +202,67 @@ def newest(rows: list[Row]) -> tuple[list[Row], list[Row]]:
     return [row for row in of_run if not row["abused"]], [row for row in of_run if row["abused"]]
 
 
-def document(rows: list[Row]) -> str:
-    """Return the page with the table of the newest run."""
-    alone, abused = newest(rows)
-    text = [
-        "# One owner under the abuse of another",
-        "",
+def summary(rows: list[Row]) -> str:
+    return (
         "Made by `splatmill bench abuse`; the head of `abuse.py` says what runs, and what was expected. Medians of "
-        f"{len(abused)} trainings, and the worst of them in brackets.",
-        "",
-        "| of the owner who trains | alone | under abuse |",
-        "|---|---|---|",
-    ]
-    for name, what in MEASURED.items():
-        cells = [f"{shown(median(found, name))} ({shown(worst(found, name))})" for found in (alone, abused)]
-        text.append(f"| {what} | {' | '.join(cells)} |")
-    for what, count in (
-        ("jobs that succeeded", lambda row: row["state"] == "succeeded"),
-        ("event streams that ended with the job", lambda row: row["stream_ended"]),
-        ("uploads without a conflict", lambda row: not row["upload_conflicts"]),
-    ):
-        cells = [f"{sum(map(count, found))} of {len(found)}" for found in (alone, abused)]
-        text.append(f"| {what} | {' | '.join(cells)} |")
-    last = abused[-1]
-    text += [
-        "",
-        f"The owner who abuses may store {last['limit'] / 1e6:.1f} MB, and stored {last['most_bytes'] / 1e6:.1f} MB at "
-        "most. It got these answers:",
-        "",
-        "| request | answers, by status or error |",
-        "|---|---|",
-    ]
-    kinds: dict[str, list[str]] = {}
-    for name, count_of in last["answers"].items():
-        kind, _, status = name.partition(" ")
-        kinds.setdefault(kind, []).append(f"{status}: {count_of}")
-    text += [f"| {kind} | {', '.join(found)} |" for kind, found in kinds.items()]
-    return "\n".join([*text, "", footer([*alone, *abused])]) + "\n"
+        f"{len(newest(rows)[1])} trainings, and the worst of them in brackets."
+    )
 
+
+def seconds(rows: list[Row]) -> str:
+    """What the owner who trains waits for, and what came of its jobs."""
+    ways = newest(rows)
+    lines = [
+        [what, *(f"{shown(median(found, name))} ({shown(worst(found, name))})" for found in ways)]
+        for name, what in MEASURED.items()
+    ]
+    held: dict[str, Callable[[Row], bool]] = {
+        "jobs that succeeded": lambda row: row["state"] == "succeeded",
+        "event streams that ended with the job": lambda row: row["stream_ended"],
+        "uploads without a conflict": lambda row: not row["upload_conflicts"],
+    }
+    for what, count in held.items():
+        lines.append([what, *(f"{sum(map(count, found))} of {len(found)}" for found in ways)])
+    return table("of the owner who trains|alone|under abuse", lines)
+
+
+def stored(rows: list[Row]) -> str:
+    last = newest(rows)[1][-1]
+    return (
+        f"The owner who abuses may store {last['limit'] / 1e6:.1f} MB, and stored {last['most_bytes'] / 1e6:.1f} MB at "
+        "most. It got these answers:"
+    )
+
+
+def responses(rows: list[Row]) -> str:
+    kinds: dict[str, list[str]] = {}
+    for name, count in newest(rows)[1][-1]["answers"].items():
+        kind, _, status = name.partition(" ")
+        kinds.setdefault(kind, []).append(f"{status}: {count}")
+    return table(
+        "request|answers, by status or error", ([kind, ", ".join(found)] for kind, found in kinds.items())
+    )
+
+
+STUDY = Study(
+    name="abuse",
+    about=__doc__,
+    cases={"trainings": measure},
+    key=("run", "abused", "repetition"),
+    home=HERE,
+    parts=("server", "client"),
+    blocks={
+        "summary": summary,
+        "seconds": seconds,
+        "stored": stored,
+        "responses": responses,
+        "footer": lambda rows: footer([row for found in newest(rows) for row in found]),
+    },
+    figures={},
+    options={
+        "repetitions": {"type": int, "default": 3, "help": "trainings alone and under abuse (default: 3)"},
+    },
+)
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(STUDY.main(sys.argv[1:]))

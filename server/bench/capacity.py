@@ -3,12 +3,10 @@
     splatmill bench capacity                     # a hundred thousand of each, a thousand followers; some ten minutes
     splatmill bench capacity --records 2000 --followers 100
     splatmill bench capacity --storage s3        # two thousand of each, on moto's S3 server
-    splatmill bench capacity --table             # the table again, from the rows
 
 Records are seeded as the service stores them (`_capacity/seed.py`). Redis is a process of its own, storage a folder or
 an S3 server on this machine, which answers some hundred requests a second and is there to count them, not to time them.
 A page is asked of the app in this process, where its operations are counted; the rest is measured on a server process.
-Rows go to results/capacity.jsonl, the table to capacity.md.
 
 Expected before it was measured: a page takes 2 to 3 round trips and under 100 ms anywhere in a list; an ended job and
 its model take under 10 kB; lists are made at some thousand records a second, bound by the parsing of records.
@@ -38,9 +36,10 @@ import structlog
 from _capacity.followers import Served, follow_all
 from _capacity.operations import counted
 from _capacity.seed import FIRST, Seeded, seed
-from _capacity.table import write_table
+from _capacity.table import sections
 from _private_redis import running
-from _rows import Row, append, origin
+from _rows import Row
+from _studies.study import Study
 
 from splatmill.backplane import keys, memory
 from splatmill.backplane.connection import connect
@@ -51,7 +50,6 @@ from splatmill_server.base.settings import Settings
 from splatmill_server.service import Service
 
 HERE = Path(__file__).resolve().parent
-ROWS = HERE / "results" / "capacity.jsonl"
 
 RECORDS = {"folder": 100_000, "s3": 2000}
 """Records of each kind, by where they are stored."""
@@ -60,31 +58,15 @@ PAGE = 50
 REPEATS = 5
 
 
-def main(argv: list[str]) -> int:
-    """Measure, and write rows and table."""
-    parser = argparse.ArgumentParser(
-        prog="splatmill bench capacity",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--storage", choices=list(RECORDS), default="folder")
-    parser.add_argument("--records", type=int, help="of each kind (default: 100000, on s3 2000)")
-    parser.add_argument("--followers", type=int, default=1000, help="of events (default: 1000)")
-    parser.add_argument("--table", action="store_true", help="write the table from the rows")
-    asked = parser.parse_args(argv)
+def measured(options: argparse.Namespace) -> Iterator[Row]:
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
-    if not asked.table:
-        records = asked.records or RECORDS[asked.storage]
-        with (
-            tempfile.TemporaryDirectory(prefix="capacity") as name,
-            running(Path(name)) as url,
-            _s3_server.running("capacity") if asked.storage == "s3" else nullcontext() as bucket,
-        ):
-            for row in measure(Path(name), url, records, asked.followers, bucket):
-                print(row, flush=True)
-                append(ROWS, {**row, **origin("server", "client")})
-    write_table(ROWS, HERE / "capacity.md")
-    return 0
+    with (
+        tempfile.TemporaryDirectory(prefix="capacity") as name,
+        running(Path(name)) as url,
+        _s3_server.running("capacity") if options.storage == "s3" else nullcontext() as bucket,
+    ):
+        records = options.records or RECORDS[options.storage]
+        yield from measure(Path(name), url, records, options.followers, bucket)
 
 
 def measure(
@@ -223,3 +205,23 @@ def _server(settings: Settings) -> Iterator[Served]:
 def _listens(path: Path) -> bool:
     with socket.socket(socket.AF_UNIX) as probe:
         return probe.connect_ex(str(path)) == 0
+
+
+STUDY = Study(
+    name="capacity",
+    about=__doc__,
+    cases={"records": measured},
+    key=("records", "storage_in", "what", "list", "where"),
+    home=HERE,
+    parts=("server", "client"),
+    blocks={"sections": sections},
+    figures={},
+    options={
+        "storage": {"choices": list(RECORDS), "default": "folder"},
+        "records": {"type": int, "help": "of each kind (default: 100000, on s3 2000)"},
+        "followers": {"type": int, "default": 1000, "help": "of events (default: 1000)"},
+    },
+)
+
+if __name__ == "__main__":
+    sys.exit(STUDY.main(sys.argv[1:]))

@@ -2,13 +2,12 @@
 
     splatmill bench fleet                                # 10, 100, 300 and 1000 workers; some five minutes
     splatmill bench fleet --workers 10 --jobs 50 --seconds 3
-    splatmill bench fleet --table                        # the page again, from the rows
 
 Redis is a process of its own that stores as `splatmill up` lets it. Workers are simulated in a few processes
 (`_fleet/workers.py`): they register, take jobs, send heartbeats and events, store models and settle by the worker's own
 code, and train nothing. The API is this process: jobs are created by its endpoint, and its reaper retires them. All of
-them share the cores of one machine, so a rate is one of the machine; what each part spends on a job is not. Rows go to
-results/fleet.jsonl, the page to fleet.md, and what it comes to for a service to sizing.md.
+them share the cores of one machine, so a rate is one of the machine; what each part spends on a job is not.
+sizing.md has what it comes to for a service.
 
 Expected before it was measured: an idle worker makes two round trips a second, a training one ten (four events, each
 with a question before it, one look for onlookers, and heartbeats), and a job takes a hundred. Redis spends 20
@@ -37,9 +36,10 @@ from _capacity.operations import counted
 from _fleet import meter
 from _fleet.api import Api
 from _fleet.sizing import write_sizing
-from _fleet.table import write_table
+from _fleet.table import TABLES
 from _private_redis import running
-from _rows import Row, append, lines, origin
+from _rows import Row, footer
+from _studies.study import Study
 
 from splatmill.backplane import keys, leases
 from splatmill.backplane.connection import connect
@@ -47,7 +47,6 @@ from splatmill.backplane.entries import open_queue, split_rq_id
 from splatmill_server.base.settings import Settings
 
 HERE = Path(__file__).resolve().parent
-ROWS = HERE / "results" / "fleet.jsonl"
 
 PROCESSES = 4
 """Processes in which workers are simulated."""
@@ -62,37 +61,11 @@ _LONGEST = 600.0
 _STORING = {"appendonly": "yes", "appendfsync": "everysec", "maxclients": "20000"}
 
 
-def main(argv: list[str]) -> int:
-    """Measure, and write rows and page."""
-    parser = argparse.ArgumentParser(
-        prog="splatmill bench fleet",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--workers", type=int, nargs="+", default=[10, 100, 300, 1000])
-    parser.add_argument("--jobs", type=int, default=600, help="jobs of the rate (default: 600)")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each look at a fleet (default: 20)")
-    parser.add_argument("--results", type=Path, default=ROWS)
-    parser.add_argument("--table", action="store_true", help="write the page from the rows")
-    asked = parser.parse_args(argv)
+def measured(options: argparse.Namespace) -> Iterator[Row]:
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
-    if not asked.table:
-        for count in asked.workers:
-            kept = [row for row in lines(asked.results) if row["workers"] != count]
-            asked.results.unlink(missing_ok=True)
-            for row in kept:
-                append(asked.results, row)
-            with (
-                tempfile.TemporaryDirectory(prefix="fleet") as name,
-                running(Path(name), **_STORING) as url,
-            ):
-                for row in measure(Path(name), url, count, asked.jobs, asked.seconds):
-                    print(row, flush=True)
-                    append(asked.results, {**row, **origin("server", "client")})
-    folder = HERE if asked.results == ROWS else asked.results.parent
-    write_table(asked.results, folder / "fleet.md")
-    write_sizing(asked.results, HERE / "results" / "capacity.jsonl", folder / "sizing.md")
-    return 0
+    for count in options.workers:
+        with tempfile.TemporaryDirectory(prefix="fleet") as name, running(Path(name), **_STORING) as url:
+            yield from measure(Path(name), url, count, options.jobs, options.seconds)
 
 
 def measure(folder: Path, url: str, workers: int, jobs: int, seconds: float) -> Iterator[Row]:
@@ -296,6 +269,33 @@ def _until(condition: Callable[[], bool]) -> int:
         time.sleep(0.05)
         looks += 1
     return looks
+
+
+STUDY = Study(
+    name="fleet",
+    about=__doc__,
+    cases={"workers": measured},
+    key=("workers", "what"),
+    order=lambda row: (row["workers"], row["what"]),
+    home=HERE,
+    parts=("server", "client"),
+    blocks={**TABLES, "footer": footer},
+    figures={},
+    options={
+        "workers": {"type": int, "nargs": "+", "default": [10, 100, 300, 1000]},
+        "jobs": {"type": int, "default": 600, "help": "jobs of the rate (default: 600)"},
+        "seconds": {"type": float, "default": 20.0, "help": "of each look at a fleet (default: 20)"},
+    },
+)
+
+
+def main(argv: list[str]) -> int:
+    options = STUDY.parser().parse_args(argv)
+    status = STUDY.main(argv)
+    if not options.dry:
+        sizing = options.out / "sizing.md"
+        write_sizing(STUDY.place(options.out), HERE / "results" / "capacity.jsonl", sizing)
+    return status
 
 
 if __name__ == "__main__":

@@ -3,11 +3,10 @@
     splatmill bench load                            # 10 to 400 clients, twenty seconds each
     splatmill bench load --clients 200 --label "with uvloop"
     splatmill bench load --profile                  # what the API spends its time with, at the last number of clients
-    splatmill bench load --plot-only
 
 One `splatmill up` on this machine, whose cores the clients, the training and the renderer share. The clients are
 described in `_load/clients.py`. Each number of clients gets rows with p50 and p99 by kind of request, the CPU seconds a
-second and the memory of each process. Rows go to results/load.jsonl, the table to load.md and figures/load.png.
+second and the memory of each process.
 
 Clients arrive independently of each other. When they began together, second by second, half of a job's answer at 50
 clients was the wait for those that had come with it; with equal waits, 40 % of 200 clients came within 80 ms of each
@@ -41,11 +40,15 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import _plot
 import httpx
 import psutil
-from _rows import Row, append, footer, lines, origin, worked
+from _page import table
+from _rows import Row, distinct, footer, of, worked
 from _still_life import posed_capture
+from _studies.study import Study
 from _up import served
+from matplotlib.figure import Figure
 
 HERE = Path(__file__).resolve().parent
 
@@ -65,34 +68,7 @@ _PROCESSES = {
 }
 
 
-def main(argv: list[str]) -> int:
-    """Measure the numbers of clients that were asked for, and write table and figure."""
-    parser = argparse.ArgumentParser(
-        prog="splatmill bench load", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--clients", type=int, nargs="+", default=list(COUNTS))
-    parser.add_argument("--seconds", type=float, default=20.0, help="seconds of each number (default: 20)")
-    parser.add_argument("--label", default="", help="what is compared: a name of this state of the code")
-    parser.add_argument("--idle", action="store_true", help="no training runs meanwhile")
-    parser.add_argument("--profile", action="store_true", help="print where the API process spends its time")
-    parser.add_argument("--results", type=Path, default=HERE / "results" / "load.jsonl")
-    parser.add_argument("--plot-only", action="store_true", help="draw the rows that are there")
-    asked = parser.parse_args(argv)
-    if not asked.plot_only:
-        _measure(asked)
-    rows = lines(asked.results)
-    if not rows:
-        print(f"There are no rows in {asked.results}.", file=sys.stderr)
-        return 1
-    own = asked.results.parent == HERE / "results"
-    table = HERE / "load.md" if own else asked.results.with_suffix(".md")
-    table.write_text(document(rows))
-    _draw(rows, HERE / "figures" / "load.png" if own else asked.results.with_suffix(".png"))
-    print(table.read_text())
-    return 0
-
-
-def _measure(asked: argparse.Namespace) -> None:
+def _measure(asked: argparse.Namespace) -> Iterator[Row]:
     with tempfile.TemporaryDirectory(prefix="splatmill-load-") as folder, served(Path(folder)) as (url, up):
         http = httpx.Client(base_url=url, timeout=60, trust_env=False)
         capture = _upload(http)
@@ -110,19 +86,10 @@ def _measure(asked: argparse.Namespace) -> None:
         for count in asked.clients:
             found = _with_clients(url, up, count, asked, job, model, camera)
             for row in found["requests"]:
-                row = {
-                    "bench": "load",
-                    "label": asked.label,
-                    "clients": count,
-                    "seconds": asked.seconds,
-                    "training": not asked.idle,
-                    **row,
-                    "processes": found["processes"],
-                }
-                append(asked.results, row | origin("server", "client"))
-                print(
-                    {key: row[key] for key in ("clients", "what", "requests", "errors", "p50_ms", "p99_ms")}
-                )
+                yield {
+                    "bench": "load", "label": asked.label, "clients": count, "seconds": asked.seconds,
+                    "training": not asked.idle, **row, "processes": found["processes"],
+                }  # fmt: skip
             print(found["processes"], found["errors"][:5], flush=True)
         http.post(f"/v1/jobs/{job}/cancel")
         http.close()
@@ -256,31 +223,25 @@ def _child(up: psutil.Process, words: str) -> psutil.Process:
     return next(child for child in children if words in " ".join(child.cmdline()))
 
 
-def document(rows: list[Row]) -> str:
-    """Return the page with the table."""
-    text = ["# Answers against the number of clients", ""]
-    text += [
-        "Made by `splatmill bench load`; the head of `load.py` says what runs, and what was expected.",
-        "",
-    ]
-    for label in dict.fromkeys(row["label"] for row in rows):
-        of_label = [row for row in rows if row["label"] == label]
-        text += [f"## {label}", ""] if label else []
-        whats = list(dict.fromkeys(row["what"] for row in of_label if row["requests"]))
-        text.append(
-            "| clients | " + " | ".join(f"{what}, p50 / p99 ms" for what in whats) + " | requests a second |"
-            " errors | API, CPU ms an answer |"
-            " cores: API, Redis, renderer, training, clients, whole machine | memory: API, Redis, renderer MB |"
-        )
-        text.append("|---" * (len(whats) + 6) + "|")
-        for count in sorted({row["clients"] for row in of_label}):
-            text.append(_line([row for row in of_label if row["clients"] == count], whats, count))
-        text.append("")
-    text.append(footer(rows))
-    return "\n".join(text) + "\n"
+def tables(rows: list[Row]) -> str:
+    """A table for each label."""
+    text = []
+    for label in distinct(rows, "label"):
+        of_label = of(rows, label=label)
+        text += [f"## {label}"] if label else []
+        whats = distinct((row for row in of_label if row["requests"]), "what")
+        head = [
+            "clients", *(f"{what}, p50 / p99 ms" for what in whats), "requests a second", "errors",
+            "API, CPU ms an answer",
+            "cores: API, Redis, renderer, training, clients, whole machine", "memory: API, Redis, renderer MB",
+        ]  # fmt: skip
+        counts = sorted({row["clients"] for row in of_label})
+        lines = [_line(of(of_label, clients=count), whats, count) for count in counts]
+        text.append(table("|".join(head), lines))
+    return "\n\n".join(text)
 
 
-def _line(rows: list[Row], whats: list[str], count: int) -> str:
+def _line(rows: list[Row], whats: list[str], count: int) -> list[object]:
     newest = {row["what"]: row for row in rows}
     cells = []
     for what in whats:
@@ -296,25 +257,41 @@ def _line(rows: list[Row], whats: list[str], count: int) -> str:
     )
     memory = ", ".join(f"{taken[n]['bytes'] / 1e6:.0f}" for n in ("api", "redis", "renderer"))
     cost = f"{taken['api']['ms_per_answer']:.1f}"
-    return f"| {count} | {' | '.join(cells)} | {served:.0f} | {errors} | {cost} | {cores} | {memory} |"
+    return [count, *cells, f"{served:.0f}", errors, cost, cores, memory]
 
 
-def _draw(rows: list[Row], path: Path) -> None:
-    import _plot
-
-    figure, (left, right) = _plot.axes(2)
-    for place, what in ((left, "job"), (right, "view")):
-        for label in dict.fromkeys(row["label"] for row in rows):
-            found = {row["clients"]: row for row in rows if row["what"] == what and row["label"] == label}
+def _draw(rows: list[Row]) -> Figure:
+    figure, panels = _plot.axes(2)
+    for panel, what in zip(panels, ("job", "view"), strict=True):
+        for label in distinct(rows, "label"):
+            found = {row["clients"]: row for row in of(rows, what=what, label=label)}
             counts = sorted(found)
             for key, style in (("p50_ms", "--"), ("p99_ms", "-")):
                 name = f"{key[:3]} {label}".strip()
-                place.plot(counts, [found[count][key] for count in counts], style, marker="o", label=name)
-        place.axhline(50 if what == "job" else 100, color="#999999", linewidth=0.8)
-        place.set(xlabel="clients", ylabel="milliseconds", xscale="log", yscale="log", title=what)
-        place.legend(fontsize=8)
-    _plot.save(figure, path, footer(rows))
+                panel.plot(counts, [found[count][key] for count in counts], style, marker="o", label=name)
+        panel.axhline(50 if what == "job" else 100, color="#999999", linewidth=0.8)
+        panel.set(xlabel="clients", ylabel="milliseconds", xscale="log", yscale="log", title=what)
+        panel.legend(fontsize=8)
+    return figure
 
+
+STUDY = Study(
+    name="load",
+    about=__doc__,
+    cases={"clients": _measure},
+    key=("label", "clients", "what", "training"),
+    home=HERE,
+    parts=("server", "client"),
+    blocks={"tables": tables, "footer": footer},
+    figures={"load": _draw},
+    options={
+        "clients": {"type": int, "nargs": "+", "default": list(COUNTS)},
+        "seconds": {"type": float, "default": 20.0, "help": "seconds of each number (default: 20)"},
+        "label": {"default": "", "help": "what is compared: a name of this state of the code"},
+        "idle": {"action": "store_true", "help": "no training runs meanwhile"},
+        "profile": {"action": "store_true", "help": "print where the API process spends its time"},
+    },
+)
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(STUDY.main(sys.argv[1:]))

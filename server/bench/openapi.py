@@ -2,7 +2,6 @@
 
     splatmill bench openapi                        # one round after the other until there are 10000; ten minutes
     splatmill bench openapi --requests 1000 --seed 7
-    splatmill bench openapi --table                # the page again, from the rows
 
 `splatmill up` with an API key, a worker and a renderer, and what schemathesis knows to try: values at the edges of each
 schema, made-up ones that fit it and that do not, and sequences along the links between operations. Half of the ids are
@@ -10,7 +9,7 @@ those of records, among them a model with its files, a share and a webhook (`_op
 is a server error; status, headers, media type and body are those of the document; what is refused without a key; what
 was made can be read, and what was deleted cannot. Streams of events, which do not end, are left out.
 
-Rows go to results/openapi.jsonl, the page to openapi.md. Ends with status 1 if a check failed, if a request was not
+Ends with status 1 if a check failed, if a request was not
 answered, if the service logged an error that it did not expect, or if it is not ready at the end.
 """
 
@@ -23,19 +22,21 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx
 import psutil
-from _rows import Row, append, footer, lines, origin
+from _page import table
+from _rows import Row, footer
 from _still_life import posed_capture
+from _studies.study import Study
 from _up import served
 
 from splatmill_server.base.settings import Settings
 
 HERE = Path(__file__).resolve().parent
-ROWS = HERE / "results" / "openapi.jsonl"
 
 KEY = "bench-openapi"
 PHASES = ("coverage", "fuzzing", "stateful")
@@ -50,35 +51,11 @@ LEFT_OUT = {
 _UNEXPECTED = ("unexpected error", "Traceback")
 
 
-def main(argv: list[str]) -> int:
-    """Ask, and write rows and page."""
-    parser = argparse.ArgumentParser(
-        prog="splatmill bench openapi",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--requests", type=int, default=10_000, help="at least (default: 10000)")
-    parser.add_argument("--seed", type=int, default=0, help="of the first round (default: 0)")
-    parser.add_argument(
-        "--examples", type=int, default=20, help="for each operation, in a round (default: 20)"
-    )
-    parser.add_argument("--phases", nargs="+", default=list(PHASES), choices=PHASES)
-    parser.add_argument("--results", type=Path, default=ROWS)
-    parser.add_argument("--table", action="store_true", help="write the page from the rows")
-    asked = parser.parse_args(argv)
-    good = True
-    if not asked.table:
-        row = measure(asked.requests, asked.seed, asked.examples, asked.phases)
-        append(asked.results, row | origin("server", "client"))
-        good = row["ready"] and not (row["failures"] or row["errors"] or row["unexpected"])
-    rows = lines(asked.results)
-    if not rows:
-        print(f"There are no rows in {asked.results}.", file=sys.stderr)
-        return 1
-    page = HERE / "openapi.md" if asked.results == ROWS else asked.results.with_suffix(".md")
-    page.write_text(document(rows[-1]))
-    print(page.read_text())
-    return 0 if good else 1
+def measured(options: argparse.Namespace) -> Iterator[Row | str]:
+    row = measure(options.requests, options.seed, options.examples, options.phases)
+    yield row
+    if not row["ready"] or row["failures"] or row["errors"] or row["unexpected"]:
+        yield "Not all held: the row has the failures."
 
 
 def measure(requests: int, seed: int, examples: int, phases: list[str]) -> Row:
@@ -186,38 +163,30 @@ def _outcomes(reports: list[Row]) -> dict[str, int]:
     return sums
 
 
-def document(row: Row) -> str:
-    """Return the page of a row."""
-    text = ["# Requests made up from the OpenAPI document", ""]
-    text += [
-        "Made by `splatmill bench openapi`; the head of `openapi.py` says what is tried and checked.",
-        "",
-    ]
-    text += [
+def summary(rows: list[Row]) -> str:
+    """What came of the newest run."""
+    row = rows[-1]
+    return (
         f"{row['requests']} requests to {row['operations']} operations in {row['rounds']} rounds, "
         f"{row['seconds']:.0f} seconds: {sum(f['count'] for f in row['failures'])} failed checks, "
         f"{len(row['errors'])} errors of the tool, {len(row['unexpected'])} unexpected errors in the service's log. "
         f"The API process grew by {row['grown_bytes'] / 1e6:.0f} MB; at the end the service "
-        f"{'was' if row['ready'] else 'was not'} ready.",
-        "",
-        "| of the well-formed requests | number |",
-        "|---|---:|",
-    ]
-    said: dict[str, str] = {
+        f"{'was' if row['ready'] else 'was not'} ready."
+    )
+
+
+def outcomes(rows: list[Row]) -> str:
+    """The outcomes of well-formed requests, and the checks that failed."""
+    words = {
         "accepted": "accepted",
         "rejected": "refused for their content",
         "unreachable": "named a record that is not there",
         "conflicts": "met a record in another state",
     }
-    text += [f"| {said.get(outcome, outcome)} | {count} |" for outcome, count in row["outcomes"].items()]
-    if row["failures"]:
-        text += ["", "| failed check | times | operations |", "|---|---:|---|"]
-        text += [
-            f"| {_named(failure)} | {failure['count']} | {_where(failure)} |" for failure in row["failures"]
-        ]
-    text += ["", "Not checked:", ""]
-    text += [f"- `{check}`: {reason}." for check, reason in LEFT_OUT.items()]
-    return "\n".join([*text, "", footer([row])]) + "\n"
+    cells = [[words.get(outcome, outcome), count] for outcome, count in rows[-1]["outcomes"].items()]
+    text = table("of the well-formed requests|number:", cells)
+    failures = [[_named(each), each["count"], _where(each)] for each in rows[-1]["failures"]]
+    return f"{text}\n\n{table('failed check|times:|operations', failures)}" if failures else text
 
 
 def _named(failure: dict[str, Any]) -> str:
@@ -228,5 +197,27 @@ def _where(failure: dict[str, Any]) -> str:
     return ", ".join(f"`{operation}`" for operation in failure["operations"])
 
 
+STUDY = Study(
+    name="openapi",
+    about=__doc__,
+    cases={"requests": measured},
+    key=("bench",),
+    home=HERE,
+    parts=("server", "client"),
+    blocks={
+        "summary": summary,
+        "outcomes": outcomes,
+        "unchecked": lambda _: "\n".join(f"- `{check}`: {reason}." for check, reason in LEFT_OUT.items()),
+        "footer": footer,
+    },
+    figures={},
+    options={
+        "requests": {"type": int, "default": 10_000, "help": "at least (default: 10000)"},
+        "seed": {"type": int, "default": 0, "help": "of the first round (default: 0)"},
+        "examples": {"type": int, "default": 20, "help": "for each operation, in a round (default: 20)"},
+        "phases": {"nargs": "+", "default": list(PHASES), "choices": PHASES},
+    },
+)
+
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(STUDY.main(sys.argv[1:]))

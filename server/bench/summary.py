@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import abuse
+from _page import filled
 from _rows import Row, footer, lines
 from _soak.words import jobs, kills
 
 HERE = Path(__file__).resolve().parent
 README = HERE.parents[1] / "README.md"
-BEGIN, END = "<!-- from splatmill bench summary -->", "<!-- end of it -->"
 
 CLIENTS = 200
 """Clients of the line about load."""
@@ -28,17 +28,9 @@ def main(argv: list[str]) -> int:
     if argv:
         print("splatmill bench summary takes no arguments.", file=sys.stderr)
         return 2
-    text = README.read_text()
-    README.write_text(replaced(text, table()))
+    README.write_text(filled(README.read_text(), {"summary": table()}))
     print(table())
     return 0
-
-
-def replaced(text: str, by: str) -> str:
-    """Return a text with what stands between the two comments replaced."""
-    before, _, rest = text.partition(BEGIN)
-    after = rest.partition(END)[2]
-    return f"{before}{BEGIN}\n{by}\n{END}{after}"
 
 
 def table(results: Path = HERE / "results") -> str:

@@ -44,7 +44,7 @@ def test_what_did_not_arrive_counts_as_longer_than_all_else() -> None:
 
 def test_the_page_shows_the_newest_run() -> None:
     rows = [row(False, "old", import_s=9.0), row(True, "old"), row(False), row(True, import_s=None)]
-    page = abuse.document(rows)
+    page = abuse.STUDY.page(rows)
     assert "| import | 0.5 s (0.5 s) | over 60 s (over 60 s) |" in page
     assert "| jobs that succeeded | 1 of 1 | 1 of 1 |" in page
     assert "may store 8.0 MB, and stored 7.5 MB at most" in page

@@ -15,7 +15,7 @@ def test_a_parser_is_given_inputs_and_its_outcomes_are_counted() -> None:
     assert row["inputs"] >= 200
     assert sum(row["outcomes"].values()) == row["inputs"]
     origin = {"machine": "one", "versions": {"python": "3"}, "commit": "abc"}
-    page = fuzz.document([row | origin])
+    page = fuzz.STUDY.page([row | origin])
     assert f"| Last-Event-ID | 0 | {row['inputs']} |" in page
     assert page.count("| none |") == 1
 

@@ -33,9 +33,11 @@ def test_outcomes_are_summed_over_operations_and_phases() -> None:
 
 
 def test_the_page_names_failed_checks() -> None:
-    page = openapi.document(ROW)
+    page = openapi.STUDY.page([ROW])
     assert "11 requests to 2 operations in 1 rounds, 3 seconds: 0 failed checks" in page
     assert "| refused for their content | 5 |" in page
     assert "failed check |" not in page
     failure = {"title": "Server error", "code": "ST100", "count": 2, "operations": ["GET /v1/jobs"]}
-    assert "| Server error (ST100) | 2 | `GET /v1/jobs` |" in openapi.document({**ROW, "failures": [failure]})
+    assert "| Server error (ST100) | 2 | `GET /v1/jobs` |" in openapi.outcomes(
+        [{**ROW, "failures": [failure]}]
+    )

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from _page import END, filled
-from _rows import HERE, Row
+from _rows import HERE, Row, footer
 from _studies.study import Study
 
 STUDIES = [
@@ -21,13 +21,14 @@ STUDIES = [
     *((name, "STUDY") for name in ("kernels", "sfm", "formats", "live")),
     ("kernels", "SIZES"),
     ("sfm", "GROWTH"),
+    *((name, "STUDY") for name in ("abuse", "capacity", "fleet", "fuzz", "load", "openapi")),
 ]
 
 
 @pytest.mark.parametrize(("module", "name"), STUDIES)
 def test_a_page_is_made_from_its_rows(module: str, name: str) -> None:
     study = getattr(importlib.import_module(module), name)
-    assert study.page(study.rows()) == (HERE / f"{study.name}.md").read_text()
+    assert study.page(study.rows()) == (study.home / f"{study.name}.md").read_text()
 
 
 def test_pages_name_the_constants_that_their_figures_show() -> None:
@@ -47,11 +48,10 @@ def test_a_page_without_a_place_for_a_block_is_an_error() -> None:
 
 
 @pytest.fixture
-def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Study:
+def study(tmp_path: Path) -> Study:
     (tmp_path / "squares.md").write_text(
         f"<!-- from rows: sum -->\n{END}\n<!-- from rows: footer -->\n{END}\n"
     )
-    monkeypatch.setattr("_studies.study.HERE", tmp_path)
 
     def two(options: Namespace) -> list[Row | str]:
         return [
@@ -64,27 +64,27 @@ def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Study:
         about=None,
         cases={"one": lambda _: [{"x": 1, "square": 1}], "two": two},
         key=("x",),
-        blocks={"sum": lambda rows: str([row["square"] for row in rows])},
+        home=tmp_path,
+        blocks={"sum": lambda rows: str([row["square"] for row in rows]), "footer": footer},
         figures={},
         options={"power": {"type": int, "default": 4}},
     )
 
 
 def test_a_row_replaces_that_of_the_same_measurement(study: Study, tmp_path: Path, capsys: Any) -> None:
-    out = ["--out", str(tmp_path)]
-    assert study.main(out) == 1
+    assert study.main([]) == 1
     assert "The third is left out" in capsys.readouterr().err
-    assert study.main([*out, "--only", "one"]) == 0
-    assert study.main([*out, "--only", "two", "--power", "7"]) == 1
-    assert [row["square"] for row in study.rows(tmp_path)] == [1, 9]
-    assert study.place(tmp_path).read_text().count("\n") == 2
+    assert study.main(["--only", "one"]) == 0
+    assert study.main(["--only", "two", "--power", "7"]) == 1
+    assert [row["square"] for row in study.rows()] == [1, 9]
+    assert study.place().read_text().count("\n") == 2
     assert (tmp_path / "squares.md").read_text().startswith("<!-- from rows: sum -->\n[1, 9]\n")
-    assert all(row["commit"] for row in study.rows(tmp_path))
+    assert all(row["commit"] for row in study.rows())
 
 
 def test_a_dry_run_writes_nothing(study: Study, tmp_path: Path, capsys: Any) -> None:
     before = (tmp_path / "squares.md").read_text()
-    assert study.main(["--out", str(tmp_path), "--dry", "--only", "one"]) == 0
+    assert study.main(["--dry", "--only", "one"]) == 0
     assert capsys.readouterr().out == '{"x": 1, "square": 1}\n'
     assert [path.name for path in tmp_path.iterdir()] == ["squares.md"]
     assert (tmp_path / "squares.md").read_text() == before

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import summary
+from _page import filled
 
 ORIGIN = {"machine": "one", "versions": {"python": "3"}, "commit": "abc"}
 SOAK: list[dict[str, Any]] = [
@@ -27,7 +28,7 @@ def write(folder: Path, name: str, *rows: dict[str, object]) -> None:
 
 def test_the_readme_has_the_newest_rows() -> None:
     text = summary.README.read_text()
-    assert summary.replaced(text, summary.table()) == text, "run `splatmill bench summary`"
+    assert filled(text, {"summary": summary.table()}) == text, "run `splatmill bench summary`"
 
 
 def test_benches_without_rows_have_no_line(tmp_path: Path) -> None:

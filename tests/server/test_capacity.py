@@ -10,8 +10,7 @@ from pathlib import Path
 import _s3_server
 import capacity
 import pytest
-from _capacity import followers, table
-from _rows import append
+from _capacity import followers
 
 pytestmark = pytest.mark.slow
 
@@ -28,10 +27,7 @@ def test_every_row_is_measured_and_written(
     assert max(row["round_trips"] for row in pages) <= 10
     (followed,) = (row for row in rows if row["what"] == "followers")
     assert (followed["followers"], followed["told_everything"]) == (20, 20)
-    for row in rows:
-        append(tmp_path / "rows.jsonl", row)
-    table.write_table(tmp_path / "rows.jsonl", tmp_path / "capacity.md")
-    text = (tmp_path / "capacity.md").read_text()
+    text = capacity.STUDY.page(rows)
     assert "| jobs: of an owner |" in text
     assert "20 clients followed one job: 20 were told everything." in text
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import fleet
 import pytest
-from _fleet import sizing, table
-from _rows import append
+from _fleet import sizing
+from _rows import append, lines
 
 from tests.support.redis_server import empty_redis
 
@@ -37,8 +37,7 @@ def test_every_row_is_measured_and_written(tmp_path: Path, monkeypatch: pytest.M
     for row in found:
         append(tmp_path / "fleet.jsonl", {**row, **origin})
     append(tmp_path / "capacity.jsonl", {"records": 100, "what": "memory", "bytes": 780_000, **origin})
-    table.write_table(tmp_path / "fleet.jsonl", tmp_path / "fleet.md")
-    assert "| 3 | 6 | " in (tmp_path / "fleet.md").read_text()
+    assert "| 3 | 6 | " in fleet.STUDY.page(lines(tmp_path / "fleet.jsonl"))
     sizing.write_sizing(tmp_path / "fleet.jsonl", tmp_path / "capacity.jsonl", tmp_path / "sizing.md")
     written = (tmp_path / "sizing.md").read_text()
     assert "| ended job, with its capture and model | 7.8 kB of Redis | 100 records |" in written

@@ -27,12 +27,11 @@ def filled(page: str, blocks: Mapping[str, str]) -> str:
 
 
 def table(head: str, lines: Iterable[Iterable[object]]) -> str:
-    """A Markdown table; `head` holds the column names, separated by bars."""
-    names = head.split("|")
+    """A Markdown table; `head` holds the column names, separated by bars. A colon behind a name aligns it right."""
+    names = [name.removesuffix(":") for name in head.split("|")]
+    rule = "".join("---:|" if name.endswith(":") else "---|" for name in head.split("|"))
     rows = [" | ".join(str(cell).replace("|", "/").replace("\n", " ") for cell in cells) for cells in lines]
-    return "\n".join(
-        ["| " + " | ".join(names) + " |", "|" + "---|" * len(names), *(f"| {row} |" for row in rows)]
-    )
+    return "\n".join(["| " + " | ".join(names) + " |", "|" + rule, *(f"| {row} |" for row in rows)])
 
 
 def of_rows(columns: Sequence[Column], rows: Iterable[Row]) -> str:

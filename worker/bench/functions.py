@@ -24,7 +24,7 @@ from _rows import Row, of
 from _studies.functions.estimates import ESTIMATE_BOUNDS
 from _studies.functions.library import load, measure
 from _studies.functions.spans import BINS, FUNCTIONS, Function, place_of, value
-from _studies.study import Study
+from _studies.study import Study, generated
 from matplotlib.figure import Figure
 
 from splatmill_worker.kernels.cpu import isa
@@ -170,7 +170,14 @@ STUDY = Study(
     cases={build: partial(of_build, build) for build in isa.ISAS} | {ORACLE: oracle},
     key=("function", "build"),
     order=lambda row: [*isa.ISAS, ORACLE].index(row["build"]),
-    blocks={"outcome": outcome, "functions": errors, "absent": absent, "bounds": bounds, "oracle": exactness},
+    blocks={
+        "outcome": outcome,
+        "functions": errors,
+        "absent": absent,
+        "bounds": bounds,
+        "oracle": exactness,
+        "footer": partial(generated, "functions"),
+    },
     figures={"functions": draw},
     options={"stride": {"type": int, "default": 1, "help": "only every so many-th input, for --dry"}},
 )

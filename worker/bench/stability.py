@@ -25,7 +25,7 @@ from _studies.stability.conditioning import Problem, state
 from _studies.stability.engines import CHAIN, CONIC, FUSED, GPU, Engine, engines
 from _studies.stability.formulas import FORMULAS
 from _studies.stability.scenes import AXES, GROUPS, Axis
-from _studies.study import Study
+from _studies.study import Study, generated
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -304,6 +304,7 @@ STUDY = Study(
         "axes": along_axes,
         "decisions": decisions,
         "oracle": definition,
+        "footer": partial(generated, "stability"),
     },
     figures={
         "stability": partial(draw_axes, AXES, 3),

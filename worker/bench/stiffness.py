@@ -31,7 +31,7 @@ from _studies.stiffness.curvature import COLUMNS
 from _studies.stiffness.products import Sampled
 from _studies.stiffness.runs import ALL, Probe, training
 from _studies.stiffness.scenes import Small, absence, load
-from _studies.study import Case, Study
+from _studies.study import Case, Study, generated
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -379,8 +379,7 @@ STUDY = Study(
         "runs": runs_table,
         "groups": groups_table,
         "warnings": warnings_list,
-        "needles": needles_table,
-    },
+        "needles": needles_table, "footer": partial(generated, "stiffness")},
     figures={"stiffness": draw},
     options={
         "scenes": {"nargs": "*", "default": SCENES},

@@ -38,7 +38,7 @@ from _studies.stability.search import (
     posed,
     ratios,
 )
-from _studies.study import Study
+from _studies.study import Study, generated
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -223,7 +223,13 @@ STUDY = Study(
     about=__doc__,
     cases={name: partial(searched, name) for name in COMPARED},
     key=("kind", "engine", "quantity", "target", "searcher"),
-    blocks={"outcome": outcome, "inputs": inputs, "mended": mended, "searchers": searchers},
+    blocks={
+        "outcome": outcome,
+        "inputs": inputs,
+        "mended": mended,
+        "searchers": searchers,
+        "footer": partial(generated, "worst"),
+    },
     figures={"worst": draw},
     options={
         "seconds": {"type": float, "default": 300.0, "help": "CPU seconds for each engine"},
