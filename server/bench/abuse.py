@@ -263,6 +263,4 @@ STUDY = Study(
         "repetitions": {"type": int, "default": 3, "help": "trainings alone and under abuse (default: 3)"},
     },
 )
-
-if __name__ == "__main__":
-    sys.exit(STUDY.main(sys.argv[1:]))
+main = STUDY.main

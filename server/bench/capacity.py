@@ -222,6 +222,4 @@ STUDY = Study(
         "followers": {"type": int, "default": 1000, "help": "of events (default: 1000)"},
     },
 )
-
-if __name__ == "__main__":
-    sys.exit(STUDY.main(sys.argv[1:]))
+main = STUDY.main

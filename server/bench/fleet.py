@@ -296,7 +296,3 @@ def main(argv: list[str]) -> int:
         sizing = options.out / "sizing.md"
         write_sizing(STUDY.place(options.out), HERE / "results" / "capacity.jsonl", sizing)
     return status
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -97,6 +97,4 @@ STUDY = Study(
         "together": {"type": int, "default": 2, "help": "parsers at a time (default: 2)"},
     },
 )
-
-if __name__ == "__main__":
-    sys.exit(STUDY.main(sys.argv[1:]))
+main = STUDY.main

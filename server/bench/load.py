@@ -292,6 +292,4 @@ STUDY = Study(
         "profile": {"action": "store_true", "help": "print where the API process spends its time"},
     },
 )
-
-if __name__ == "__main__":
-    sys.exit(STUDY.main(sys.argv[1:]))
+main = STUDY.main

@@ -218,6 +218,4 @@ STUDY = Study(
         "phases": {"nargs": "+", "default": list(PHASES), "choices": PHASES},
     },
 )
-
-if __name__ == "__main__":
-    sys.exit(STUDY.main(sys.argv[1:]))
+main = STUDY.main

@@ -16,6 +16,8 @@ from _page import END, filled
 from _rows import HERE, Row, footer
 from _studies.study import Study
 
+from splatmill_worker.__main__ import main
+
 STUDIES = [
     *((name, "STUDY") for name in ("stability", "worst", "functions", "stiffness", "precision")),
     *((name, "STUDY") for name in ("kernels", "sfm", "formats", "live")),
@@ -29,6 +31,18 @@ STUDIES = [
 def test_a_page_is_made_from_its_rows(module: str, name: str) -> None:
     study = getattr(importlib.import_module(module), name)
     assert study.page(study.rows()) == (study.home / f"{study.name}.md").read_text()
+
+
+@pytest.mark.parametrize("name", sorted({module for module, _ in STUDIES}))
+def test_a_study_is_a_command(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main(["bench", name, "--help"])
+    assert "--plot-only" in capsys.readouterr().out
+
+
+def test_a_study_without_rows_says_so(study: Study, capsys: pytest.CaptureFixture[str]) -> None:
+    assert study.main(["--plot-only"]) == 1
+    assert f"There are no rows in {study.place()}." in capsys.readouterr().err
 
 
 def test_pages_name_the_constants_that_their_figures_show() -> None:

@@ -74,13 +74,6 @@ def worked() -> float:
     return float(sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0))
 
 
-def write(name: str, rows: list[Row]) -> None:
-    """Replace results/NAME.jsonl by `rows`, each with its origin, which a row that was read keeps."""
-    replace(
-        HERE / "results" / f"{name}.jsonl", [row if "commit" in row else {**row, **origin()} for row in rows]
-    )
-
-
 def replace(path: Path, rows: Iterable[Row]) -> None:
     """Replace a file by `rows`. An interrupted write leaves the file as it was."""
     path.parent.mkdir(parents=True, exist_ok=True)

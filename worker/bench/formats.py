@@ -14,7 +14,6 @@ fourth for 0.2 dB; .sog at a fourteenth for 0.4 dB, more where few steps leave m
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -154,6 +153,4 @@ STUDY = Study(
         "work": {"type": Path, "default": CACHE, "help": "where recovered cameras are kept"},
     },
 )
-
-if __name__ == "__main__":
-    sys.exit(STUDY.main(sys.argv[1:]))
+main = STUDY.main

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import sys
 from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import Any
@@ -181,6 +180,4 @@ STUDY = Study(
     figures={"functions": draw},
     options={"stride": {"type": int, "default": 1, "help": "only every so many-th input, for --dry"}},
 )
-
-if __name__ == "__main__":
-    sys.exit(STUDY.main(sys.argv[1:]))
+main = STUDY.main

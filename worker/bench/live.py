@@ -225,6 +225,3 @@ STUDY = Study(
         "work": {"type": Path, "default": CACHE, "help": "where photos and recovered cameras are kept"},
     },
 )
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

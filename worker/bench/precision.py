@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import math
 import statistics
-import sys
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
@@ -271,6 +270,4 @@ STUDY = Study(
         "work": {"type": Path, "default": CACHE, "help": "builds, photos and recovered cameras"},
     },
 )  # fmt: skip
-
-if __name__ == "__main__":
-    sys.exit(STUDY.main(sys.argv[1:]))
+main = STUDY.main

@@ -22,7 +22,6 @@ import argparse
 import hashlib
 import json
 import math
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -422,7 +421,3 @@ GROWTH = Study(
 
 def main(argv: list[str]) -> int:
     return (GROWTH if "--growth" in argv else STUDY).main([word for word in argv if word != "--growth"])
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -316,6 +316,4 @@ STUDY = Study(
         "draws": {"type": int, "default": 8, "help": "changes of the inputs per scene"},
     },
 )
-
-if __name__ == "__main__":
-    sys.exit(STUDY.main(sys.argv[1:]))
+main = STUDY.main

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial, reduce
 from itertools import chain
@@ -392,6 +391,4 @@ STUDY = Study(
         "work": {"type": Path, "default": CACHE, "help": "folder that keeps recovered cameras"},
     },
 )  # fmt: skip
-
-if __name__ == "__main__":
-    sys.exit(STUDY.main(sys.argv[1:]))
+main = STUDY.main

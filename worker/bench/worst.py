@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Iterator
 from dataclasses import asdict, fields
 from functools import partial
@@ -238,6 +237,4 @@ STUDY = Study(
         "replay": {"action": "store_true", "help": "measure the stored inputs once more"},
     },
 )
-
-if __name__ == "__main__":
-    sys.exit(STUDY.main(sys.argv[1:]))
+main = STUDY.main

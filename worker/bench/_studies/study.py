@@ -99,18 +99,22 @@ class Study:
         return whole
 
     def main(self, argv: list[str]) -> int:
-        """Run the command; 1 where something was left out."""
+        """Run the command; 1 where something was left out, or where there are no rows."""
         options = self.parser().parse_args(argv)
         whole = options.plot_only or self.measure(options)
-        if not options.dry:
-            rows = self.rows(options.out)
-            if not options.plot_only:
-                replace(self.place(options.out), rows)
-            for stem, draw in self.figures.items():
-                figure = draw(rows)
-                note = f"{footer(rows)}{figure.get_label()}"
-                _plot.save(figure, options.out / "figures" / f"{stem}.png", note)
-            (options.out / f"{self.name}.md").write_text(self.page(rows))
+        if options.dry:
+            return 0 if whole else 1
+        rows = self.rows(options.out)
+        if not rows:
+            print(f"There are no rows in {self.place(options.out)}.", file=sys.stderr)
+            return 1
+        if not options.plot_only:
+            replace(self.place(options.out), rows)
+        for stem, draw in self.figures.items():
+            figure = draw(rows)
+            note = f"{footer(rows)}{figure.get_label()}"
+            _plot.save(figure, options.out / "figures" / f"{stem}.png", note)
+        (options.out / f"{self.name}.md").write_text(self.page(rows))
         return 0 if whole else 1
 
 
