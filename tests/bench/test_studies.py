@@ -6,7 +6,8 @@ Not proven here: what each study measures (the other files of this folder), and 
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
+import sys
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from _rows import HERE, Row, footer
 from _studies.study import Study
 
 from splatmill_worker.__main__ import main
+from tests.support.paths import ROOT
 
 STUDIES = [
     *((name, "STUDY") for name in ("stability", "worst", "functions", "stiffness", "precision")),
@@ -27,9 +29,23 @@ STUDIES = [
 ]
 
 
+def study_of(module: str, name: str) -> Study:
+    """A study of a benchmark's file. By its path: tests/kernels is a `kernels` too."""
+    path = next(
+        path for part in ("worker", "server") if (path := ROOT / part / "bench" / f"{module}.py").exists()
+    )
+    spec = importlib.util.spec_from_file_location(f"bench_{module}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    sys.modules[spec.name] = loaded = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+    found: Study = getattr(loaded, name)
+    return found
+
+
 @pytest.mark.parametrize(("module", "name"), STUDIES)
 def test_a_page_is_made_from_its_rows(module: str, name: str) -> None:
-    study = getattr(importlib.import_module(module), name)
+    study = study_of(module, name)
     assert study.page(study.rows()) == (study.home / f"{study.name}.md").read_text()
 
 
