@@ -6,7 +6,9 @@ from docs.generate.markdown import choices, code, table
 
 from splatmill.cli.schema_options import PANELS
 from splatmill.schema import (
+    PRESET_GAIN,
     PRESET_STEPS,
+    PRESET_VISITS,
     FitImageOptions,
     OptionHelp,
     Preset,
@@ -32,8 +34,10 @@ number of bytes.
 PRESETS = """(presets)=
 ### Presets
 
-What a preset decides, where no other setting does: the number of steps, and the longest side of the photos in pixels
-on each backend.
+What a preset decides, where no other setting does. Training ends once the last doubling of its steps has raised the
+PSNR of [validation photos](../report.md#validation-photos) by less than the gain, and at the latest after the number of
+steps, or after the steps for each photo where these are more. The last columns are the longest side of the photos in
+pixels on each backend.
 """
 
 FIT_IMAGE = """## Fitting one picture
@@ -56,12 +60,16 @@ def _presets() -> str:
     rows = [
         [
             code(preset.value),
+            f"{PRESET_GAIN[preset]:g} dB",
             f"{PRESET_STEPS[preset]:,}",
+            str(PRESET_VISITS[preset]),
             *(f"{size[preset]:,}" for size in PRESET_SIZE.values()),
         ]
         for preset in Preset
     ]
-    return table(["preset", "steps", *(code(backend) for backend in PRESET_SIZE)], rows)
+    return table(
+        ["preset", "gain", "steps", "steps for each photo", *(code(backend) for backend in PRESET_SIZE)], rows
+    )
 
 
 def _table(options: list[OptionHelp]) -> str:

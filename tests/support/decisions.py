@@ -75,7 +75,16 @@ NAMED: dict[str, dict[str, Forced]] = {
 
 ELSEWHERE = {
     **dict.fromkeys(
-        ("schedule.budget", "steps", "time_budget", "target_psnr", "stops_when_flat", "validation"), "end"
+        (
+            "schedule.budget",
+            "steps",
+            "time_budget",
+            "target_psnr",
+            "stops_when_flat",
+            "validation",
+            "least_gain",
+        ),
+        "end",
     ),
     "schedule.degree": "sh_degree",
     "kernels": "backend",

@@ -144,7 +144,9 @@ if TYPE_CHECKING:
         StageSeconds,
     )
     from splatmill.schema.options import (
+        PRESET_GAIN,
         PRESET_STEPS,
+        PRESET_VISITS,
         Backend,
         Background,
         Effort,
@@ -157,6 +159,7 @@ if TYPE_CHECKING:
         Switch,
         TrainOptions,
         describe_options,
+        preset_steps,
     )
     from splatmill.schema.orbits import (
         JoinOrbit,
@@ -247,7 +250,9 @@ __all__ = [
     "OUTPUT_MARKS",
     "OUTPUT_MEDIA",
     "PHOTO_SUFFIXES",
+    "PRESET_GAIN",
     "PRESET_STEPS",
+    "PRESET_VISITS",
     "PROBLEMS",
     "PROBLEM_MEDIA_TYPE",
     "RIGID_TOLERANCE",
@@ -396,6 +401,7 @@ __all__ = [
     "may_be_empty",
     "parse_bytes",
     "parse_duration",
+    "preset_steps",
     "safe_name",
     "storable_name",
 ]

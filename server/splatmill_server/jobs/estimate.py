@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from statistics import median
 
-from splatmill.schema import PRESET_STEPS, Backend, Estimate, EstimateJob, Preset, StageEstimate, TrainOptions
+from splatmill.schema import Backend, Estimate, EstimateJob, StageEstimate, TrainOptions, preset_steps
 from splatmill_server.jobs.finished import Figures
 
 ALIKE = 5
@@ -59,7 +59,10 @@ def _cameras(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
 
 def _training(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
     options = request.options
-    steps, limit = steps_of(options), math.inf if options.time_budget is None else options.time_budget
+    steps, limit = (
+        steps_of(options, request.photos),
+        math.inf if options.time_budget is None else options.time_budget,
+    )
     if steps is None:
         return _stage("training", [limit], f"The time budget is {limit:g} s.")
     alike = _nearest(
@@ -77,7 +80,8 @@ def _training(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
     if not alike:
         return StageEstimate(stage="training", because="No such job has finished on this server yet.")
     each = [found.train / found.steps * _size_factor(found, options) for found in alike]
-    at_most = ", at most, since the target may be reached earlier" if options.target_psnr is not None else ""
+    ends_early = options.steps is None or options.target_psnr is not None
+    at_most = ", at most, since training may end earlier" if ends_early else ""
     return _stage(
         "training",
         [min(limit, seconds * steps) for seconds in each],
@@ -97,13 +101,13 @@ def _rest(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
     )
 
 
-def steps_of(options: TrainOptions) -> int | None:
-    """Return the largest number of steps that the options allow, or None where a time budget alone limits them."""
+def steps_of(options: TrainOptions, photos: int) -> int | None:
+    """Return the largest number of steps that the options allow for so many photos, or None where time limits them."""
     if options.steps is not None:
         return options.steps
     if options.time_budget is not None:
         return None
-    return PRESET_STEPS[Preset.quality if options.target_psnr is not None else options.preset]
+    return preset_steps(options.ending, photos)
 
 
 def _size_distance(found: Figures, options: TrainOptions) -> float:

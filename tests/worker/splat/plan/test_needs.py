@@ -56,7 +56,7 @@ def test_gaps_are_left_where_photos_of_the_other_side_look_through_them() -> Non
 
 
 def test_gaussians_added_beside_points_count_among_the_first_ones() -> None:
-    sparse = changed(points=900, gap_share=0.5, gap_points=30_000, sightings=90.0)
+    sparse = changed(width=100, height=100, points=900, gap_share=0.5, gap_points=30_000, sightings=90.0)
     plan = planned(sparse, steps=100)
     assert plan.max_gaussians == 30_900
     assert "30000 Gaussians are added there" in plan.reasons["gaps"]

@@ -1,21 +1,19 @@
-"""Proves when a curve of validation PSNR counts as flat, whatever the held-out PSNR does.
+"""Proves what the last doubling of the steps is found to have gained on validation photos, whatever held-out ones say.
 
 Does not prove that stopping there saves time on real photos.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from splatmill_worker.splat.train.curve import CurvePoint, is_flat
+from splatmill_worker.splat.train.curve import CurvePoint, last_gain
 
 
-def curve(*scores: float | None, first_step: int = 1000) -> list[CurvePoint]:
-    """Points one second apart."""
+def curve(*scores: float | None, every: int = 100) -> list[CurvePoint]:
+    """Points of so many steps, one second apart; held-out photos gain all the time."""
     return [
         CurvePoint(
             seconds=float(i + 1),
-            step=first_step + i,
+            step=every * (i + 1),
             loss=0.1,
             psnr=20.0 + i,
             ssim=None,
@@ -26,21 +24,18 @@ def curve(*scores: float | None, first_step: int = 1000) -> list[CurvePoint]:
     ]
 
 
-RISING: Sequence[float] = (20.0, 21.0, 22.0, 23.0, 24.0, 25.0, 26.0, 27.0, 28.0, 29.0)
-FLAT: Sequence[float] = (20.0, 24.0, 26.0, 27.0, 28.0, 28.0, 28.0, 28.0, 28.01, 28.0)
+def test_the_best_of_the_second_half_is_compared_with_the_best_before() -> None:
+    assert last_gain(curve(20.0, 24.0, 26.0, 27.0, 27.5, 27.25)) == 1.5
+    assert last_gain(curve(20.0, 28.0, 27.0, 27.0, 27.5, 27.25)) == -0.5
 
 
-def test_a_curve_that_gains_nothing_over_the_last_points_is_flat() -> None:
-    assert is_flat(curve(*FLAT))
-    assert not is_flat(curve(*RISING))
-
-
-def test_one_gain_above_the_limit_is_enough_to_go_on() -> None:
-    assert not is_flat(curve(*FLAT[:-2], 28.03, 28.0))
+def test_points_on_all_photos_say_nothing_and_do_not_count() -> None:
+    assert last_gain(curve(20.0, 24.0, 26.0, 27.0, 27.5, 27.25, None)) == 1.5
 
 
 def test_too_few_points_or_steps_or_no_validation_views_are_no_evidence() -> None:
-    assert not is_flat(curve(28.0, 28.0, 28.0))
-    assert not is_flat(curve(*FLAT, first_step=10))
-    assert not is_flat(curve(*[None] * 10))
-    assert not is_flat([])
+    assert last_gain(curve(20.0, 24.0, 26.0, 27.0)) is None
+    assert last_gain(curve(20.0, 24.0, every=400)) is None
+    assert last_gain(curve(20.0, 24.0, 26.0, 27.0, 27.5, 27.25, every=80)) is None
+    assert last_gain(curve(*[None] * 10)) is None
+    assert last_gain([]) is None

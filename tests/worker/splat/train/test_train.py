@@ -6,6 +6,7 @@ Does not prove quality or speed on real photos: those are measured by `bench tra
 from __future__ import annotations
 
 import math
+import re
 import time
 from dataclasses import replace
 from itertools import count
@@ -23,7 +24,7 @@ from splatmill_worker.splat.plan.budget import Budget, Clock
 from splatmill_worker.splat.plan.rates import Annealing, boost_of
 from splatmill_worker.splat.start import frusta
 from splatmill_worker.splat.start.points import from_points
-from splatmill_worker.splat.train import checkpoint, loop
+from splatmill_worker.splat.train import checkpoint, curve, loop
 from splatmill_worker.splat.train.loop import Hooks, TrainingProgress, train
 from splatmill_worker.splat.train.renderer import evaluation_background
 from splatmill_worker.splat.train.run import TrainingRun
@@ -273,6 +274,26 @@ def test_photos_set_aside_are_trained_on_after_the_last_decision() -> None:
     assert not {3, 9} & set(engine.photos[: int(last)])
     assert {3, 9} <= set(engine.photos[int(last) :])
     assert trained.stopped == "the budget is spent"
+
+
+@pytest.mark.parametrize("least", [0.0, 50.0])
+def test_a_run_ends_when_a_doubling_of_its_steps_gains_too_little(
+    least: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(curve, "GAIN_FROM", 0)
+    views, held_out = split()
+    course = plan(100, stops_when_flat=True, least_gain=least, validation=2, densify=False)
+    trained = train(first_engine(), views, held_out, course, extent=1.1)
+    ended, _, gained = trained.stopped.partition("; ")
+    assert float(re.findall(r"the last one gained (-?[\d.]+) dB", gained)[0]) > 0.0
+    if least:
+        assert trained.steps == round(
+            1.1 * 40
+        )  # after 40 %, where two points of the curve lie in the second half
+        assert ended == "another doubling of the steps would gain less than 50 dB"
+    else:
+        assert trained.steps == 100
+        assert ended == "the budget is spent"
 
 
 def test_a_resumed_run_sets_the_same_photos_aside() -> None:

@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from splatmill.schema import PRESET_STEPS, Preset, TrainOptions
+from splatmill.schema import PRESET_VISITS, Preset, TrainOptions, format_duration, preset_steps
 from splatmill_worker.kernels.gpu.device import largest_budget
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.facts import Facts, Speed
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.reasons import Reasons
-
-GAUSSIANS_PER_ROOT_STEP = 1550.0
-"""Gaussians that a run can train, per square root of its number of steps (decisions: GAUSSIANS_PER_ROOT_STEP)."""
 
 PIXELS_PER_GAUSSIAN = 50
 """Pixels of all training photos for each Gaussian that they resolve (decisions: PIXELS_PER_GAUSSIAN)."""
@@ -35,19 +32,6 @@ class Capacity(NamedTuple):
     max_gaussians: int
 
 
-class _Limits(NamedTuple):
-    """Limits on the number of Gaussians that do not depend on the number of steps.
-
-    photos: number that the photos resolve.
-    memory: number that fits in memory.
-    overall: limit of every plan of this scene, whatever its number of steps.
-    """
-
-    photos: int
-    memory: int
-    overall: int
-
-
 def decide_capacity(
     facts: Facts,
     options: TrainOptions,
@@ -57,14 +41,16 @@ def decide_capacity(
     initial: int,
     pixels: float,
 ) -> Capacity:
-    """The budget of a run, and the largest number of Gaussians that it trains within that budget.
+    """The budget of a run, and the largest number of Gaussians that it may train.
 
     initial: number of Gaussians before the first step.
     pixels: number of pixels of a photo at the training size.
     """
-    limits = _limits(facts, options, kernels, pixels, initial)
-    budget, steps = _budget(options, facts.speed or ASSUMED_SPEED, pixels, initial, limits, reasons)
-    return Capacity(budget, steps, _max_gaussians(facts, options, limits, steps, pixels, initial, reasons))
+    most = _max_gaussians(facts, options, kernels, pixels, initial, reasons)
+    # Charged as midway, in the logarithm, between the first Gaussians and the most (decisions: forecast).
+    step = (facts.speed or ASSUMED_SPEED).step(pixels, math.sqrt(max(1, min(initial, most)) * most))
+    budget, steps = _budget(facts, options, step, reasons)
+    return Capacity(budget, steps, most)
 
 
 def decide_densification(
@@ -84,103 +70,66 @@ def resolved(pixels: float, views: int) -> int:
     return round(pixels * views / PIXELS_PER_GAUSSIAN)
 
 
-def _limits(facts: Facts, options: TrainOptions, kernels: Kernels, pixels: float, initial: int) -> _Limits:
+def _max_gaussians(
+    facts: Facts, options: TrainOptions, kernels: Kernels, pixels: float, initial: int, reasons: Reasons
+) -> int:
+    """The largest number of Gaussians: training adds them only where the photos ask for more detail, so that a limit is
+    all that a plan needs (decisions: PIXELS_PER_GAUSSIAN).
+    """
     by_photos = resolved(pixels, facts.views)
     if kernels == "gpu":
         photo_bytes = round(3 * pixels * (facts.views + facts.held_out))
         by_memory = largest_budget(options.max_memory or facts.memory_available, round(pixels), photo_bytes)
     else:
         by_memory = Plan.gaussians_within(options.max_memory or facts.memory_available // 2)
-    overall = max(min(by_photos, by_memory), min(initial, by_memory))
-    if options.max_gaussians is not None:
-        overall = min(overall, options.max_gaussians)
-    return _Limits(by_photos, by_memory, overall)
+    most = min(max(by_photos, initial), by_memory)
+    if options.max_gaussians is not None and options.max_gaussians <= most:
+        reasons.option("max_gaussians")
+        return options.max_gaussians
+    because = {
+        by_photos: f"{facts.views} photos of {round(pixels)} pixels resolve {by_photos} Gaussians. Training makes as "
+        "many of them as the detail of the scene asks for.",
+        by_memory: f"Memory holds {by_memory} Gaussians.",
+    }
+    reasons.chosen["max_gaussians"] = because.get(
+        most, f"Training starts with {initial} Gaussians, more than the photos resolve."
+    )
+    return most
 
 
-def _budget(
-    options: TrainOptions, speed: Speed, pixels: float, initial: int, limits: _Limits, reasons: Reasons
-) -> tuple[Budget, int]:
-    """The budget, and the number of steps that it is expected to allow."""
+def _budget(facts: Facts, options: TrainOptions, step: float, reasons: Reasons) -> tuple[Budget, int]:
+    """The budget, and the number of steps that it is expected to allow, at `step` seconds each."""
     if options.time_budget is not None:
-        return _time_budget(options, options.time_budget, speed, pixels, initial, limits, reasons)
+        return _time_budget(facts, options, options.time_budget, step, reasons)
     if options.steps is not None:
         reasons.option("budget")
         reasons.chosen["schedule"] = f"The option steps asks for {options.steps} steps."
         return Budget(options.steps), options.steps
-    # A run with a target ends once the target is reached, so the longest preset is no longer than needed.
-    preset = Preset.quality if options.target_psnr is not None else options.preset
-    steps = PRESET_STEPS[preset]
-    reasons.chosen["budget"] = f"No budget was given; the preset {preset.value} allows {steps} steps."
-    reasons.chosen["schedule"] = reasons.chosen["budget"]
+    steps = preset_steps(options.ending, facts.views)
+    reasons.chosen["budget"] = (
+        f"No budget was given; for {facts.views} photos, the preset {options.ending.value} allows {steps} steps."
+    )
+    reasons.chosen["schedule"] = (
+        f"{steps} steps take about {format_duration(steps * step)} on this machine, at most."
+    )
     return Budget(steps), steps
 
 
 def _time_budget(
-    options: TrainOptions,
-    seconds: float,
-    speed: Speed,
-    pixels: float,
-    initial: int,
-    limits: _Limits,
-    reasons: Reasons,
+    facts: Facts, options: TrainOptions, seconds: float, step: float, reasons: Reasons
 ) -> tuple[Budget, int]:
-    affordable = _affordable_steps(seconds, speed, pixels, initial, limits.overall)
+    affordable = max(1, int(seconds / step))
     steps = affordable if options.steps is None else min(affordable, options.steps)
     reasons.option("budget")
     reasons.chosen["schedule"] = (
-        f"{seconds:g} s at {1e9 * speed.per_pixel:.0f} ns per pixel and {1e9 * speed.per_gaussian:.0f} ns per Gaussian "
-        f"allow about {affordable} steps"
+        f"{seconds:g} s at {1e3 * step:.2g} ms a step allow about {affordable} steps"
         + ("." if steps == affordable else f", of which the option steps asks for {steps}.")
     )
+    few = PRESET_VISITS[Preset.draft]
+    if steps < few * facts.views:
+        needed = format_duration(few * facts.views * step)
+        reasons.chosen["schedule"] += (
+            f" They show each of {facts.views} photos {steps / facts.views:.1f} times. Up to about {few} times, every "
+            f"doubling makes the pictures clearly sharper; that would take {needed}."
+        )
     return Budget(options.steps, seconds), steps
-
-
-def _affordable_steps(seconds: float, speed: Speed, pixels: float, initial: int, most: int) -> int:
-    """Steps in `seconds` when the number of Gaussians grows with the steps from `initial`, up to `most`.
-
-    Each is charged as the last one: that early steps have fewer Gaussians and smaller photos, and that photos of a
-    trained scene take longer than those of the probe, make up for one another (decisions: forecast).
-    """
-
-    def fits(steps: int) -> bool:
-        gaussians = min(most, max(initial, _trainable(steps)))
-        return steps * speed.step(pixels, gaussians) <= seconds
-
-    few, many = 10, 10**7
-    while few + 1 < many:
-        middle = (few + many) // 2
-        few, many = (middle, many) if fits(middle) else (few, middle)
-    return few
-
-
-def _trainable(steps: int) -> int:
-    """How many Gaussians `steps` steps can train."""
-    return round(GAUSSIANS_PER_ROOT_STEP * math.sqrt(steps))
-
-
-def _max_gaussians(
-    facts: Facts,
-    options: TrainOptions,
-    limits: _Limits,
-    steps: int,
-    pixels: float,
-    initial: int,
-    reasons: Reasons,
-) -> int:
-    trainable = _trainable(steps)
-    most = max(min(trainable, limits.photos, limits.memory), min(initial, limits.memory))
-    if options.max_gaussians is not None:
-        most = min(options.max_gaussians, max(most, min(limits.photos, limits.memory)))
-        if most == options.max_gaussians:
-            reasons.option("max_gaussians")
-            return most
-    because = {
-        trainable: f"About {steps} steps can train {trainable} Gaussians.",
-        limits.photos: f"{facts.views} photos of {round(pixels)} pixels resolve {limits.photos} Gaussians.",
-        limits.memory: f"Memory holds {limits.memory} Gaussians.",
-    }
-    reasons.chosen["max_gaussians"] = because.get(
-        most,
-        f"Training starts with {initial} Gaussians, more than the steps can train or the photos resolve.",
-    )
-    return most

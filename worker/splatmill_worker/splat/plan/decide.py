@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
-from splatmill.schema import TrainOptions
+from splatmill.schema import PRESET_GAIN, TrainOptions
 from splatmill_worker.kernels.records import BETA2
 from splatmill_worker.splat.plan.capacity import Capacity, decide_capacity, decide_densification
 from splatmill_worker.splat.plan.facts import Facts
@@ -74,6 +74,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         gaps=needs.gaps,
         pose_refinement=needs.pose_refinement,
         validation=validation,
+        least_gain=PRESET_GAIN[options.ending],
         reasons=reasons.chosen,
         left_out=reasons.left_out,
         forced=tuple(reasons.forced),

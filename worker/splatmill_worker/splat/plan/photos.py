@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from splatmill.schema import Background, Preset, Switch, TrainOptions
+from splatmill.schema import PRESET_GAIN, Background, Preset, Switch, TrainOptions
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.needs import FEW_VIEWS
 from splatmill_worker.splat.plan.plan import Kernels
@@ -190,7 +190,10 @@ def decide_validation(facts: Facts, options: TrainOptions, reasons: Reasons) -> 
         )
         return None
     else:
-        what = "the training ends when their PSNR no longer rises"
+        what = (
+            f"the training ends when the last doubling of the steps has raised their mean PSNR by less than "
+            f"{PRESET_GAIN[options.ending]:g} dB"
+        )
     reasons.chosen["validation"] = (
         f"{count} of {facts.views} training photos are set aside until the last decision: {what}."
     )

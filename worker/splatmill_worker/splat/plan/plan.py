@@ -34,13 +34,14 @@ class Plan:
     antialias: opacities are compensated for the 0.3 pixels by which projection widens every Gaussian.
     target_psnr: PSNR of the validation photos at which training ends, dB; None: none.
     max_memory: limit of the memory in use, bytes; None: none.
-    stops_when_flat: training ends early once the PSNR of the validation photos no longer rises.
+    stops_when_flat: training ends early once the last doubling of the steps has gained less than `least_gain`.
     seed: of all random numbers.
     far_shell: Gaussians stand behind the scene, wherever photos look.
     gaps: Gaussians are added where photos show something that no point describes.
     pose_refinement: the cameras of training photos are corrected.
     validation: number of training photos that are set aside for `target_psnr` and `stops_when_flat`; None: neither is
         asked for.
+    least_gain: dB on the validation photos, for `stops_when_flat`.
     reasons: a sentence for each field of the plan.
     left_out: a sentence for each thing that this scene does not need.
     forced: names of what an option fixed.
@@ -63,6 +64,7 @@ class Plan:
     gaps: bool = False
     pose_refinement: bool = False
     validation: int | None = None
+    least_gain: float = 0.02
     reasons: dict[str, str] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     forced: tuple[str, ...] = ()

@@ -16,6 +16,7 @@ import torch
 
 from splatmill_worker.scene import MIN_DEPTH, WRONG_OUTLINES, Camera, looked_at
 from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS
 from splatmill_worker.splat.start.points import ENOUGH_POINTS, from_points
 from splatmill_worker.splat.views import Target
 
@@ -60,8 +61,9 @@ COLOR_PHOTOS = 32
 HIDDEN = 1e-3
 """Weight of a photo in the colour of a point that it shows behind others."""
 
-AT_FIRST = 0.5
-"""Share of the plan's Gaussians that the hull gets: training adds the others where the photos ask for them."""
+AT_FIRST = 1 / 16
+"""Share of a hull's points that become Gaussians, where that is more than RANDOM_GAUSSIANS: training adds others where
+the photos ask for them."""
 
 
 class Hull(NamedTuple):
@@ -187,7 +189,7 @@ def visual_hull(targets: Sequence[Target], most: int) -> Hull | NoHull:
 
 def at_first(points: int, max_gaussians: int) -> int:
     """Number of Gaussians that start on a hull of so many points."""
-    return max(2, min(points, round(AT_FIRST * max_gaussians)))
+    return max(2, min(points, max(RANDOM_GAUSSIANS, round(AT_FIRST * points)), max_gaussians // 2))
 
 
 def _carved(outlines: Sequence[_Silhouette], most: int) -> tuple[Real, float, _Inner] | NoHull:

@@ -1,22 +1,16 @@
-"""The curve of error against run time, and when it has become flat."""
+"""The curve of error against run time, and what its last doubling of the steps has gained."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-FLAT_GAIN = 0.02
-"""dB on the validation photos: a smaller gain over FLAT_SHARE of the training time counts as none."""
+GAIN_POINTS = 2
+"""Points of the curve that must lie in the second half of the steps. One point is no evidence: the curve dips where
+Gaussians were just added or the photos became larger."""
 
-FLAT_SHARE = 0.4
-"""Share of the training time so far over which the gain is looked at."""
-
-FLAT_POINTS = 3
-"""Points of the curve that must lie in that share. One point is no evidence: the curve dips where Gaussians were just
-added or the photos became larger."""
-
-FLAT_FROM = 500
-"""Steps before which a curve is not called flat."""
+GAIN_FROM = 500
+"""Steps before which a gain says nothing about those to come."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +43,12 @@ class CurvePoint:
     validation_psnr: float | None = None
 
 
-def is_flat(curve: Sequence[CurvePoint]) -> bool:
-    """Whether every point in the last FLAT_SHARE of the time is less than FLAT_GAIN above the best one before it."""
-    scores = [(point.seconds, point.validation_psnr) for point in curve if point.validation_psnr is not None]
-    if not scores or curve[-1].step < FLAT_FROM:
-        return False
-    since = (1.0 - FLAT_SHARE) * scores[-1][0]
-    before = [psnr for seconds, psnr in scores if seconds <= since]
-    after = [psnr for seconds, psnr in scores if seconds > since]
-    return bool(before) and len(after) >= FLAT_POINTS and max(after) < max(before) + FLAT_GAIN
+def last_gain(curve: Sequence[CurvePoint]) -> float | None:
+    """dB that the best validation PSNR has gained since half of the steps; None where that is not known yet."""
+    scores = [(point.step, point.validation_psnr) for point in curve if point.validation_psnr is not None]
+    if not scores or scores[-1][0] < GAIN_FROM:
+        return None
+    half = scores[-1][0] / 2
+    before = [psnr for step, psnr in scores if step <= half]
+    after = [psnr for step, psnr in scores if step > half]
+    return max(after) - max(before) if before and len(after) >= GAIN_POINTS else None

@@ -13,7 +13,7 @@ from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.evaluate import Score
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.plan import Plan
-from splatmill_worker.splat.train.curve import CurvePoint, is_flat
+from splatmill_worker.splat.train.curve import CurvePoint, last_gain
 from splatmill_worker.splat.train.disagreement import Disagreement, Look
 from splatmill_worker.splat.train.evaluations import Evaluations, corrected
 from splatmill_worker.splat.train.poses import Poses, mean_depth
@@ -36,7 +36,7 @@ FIRST_CHECKPOINT_SECONDS = 2.5
 from the beginning, so that an attempt which is lost early loses half of its work at most."""
 
 FLAT_TAIL = 0.1
-"""Share of the time spent so far in which the rates fall to their ends once the curve is flat."""
+"""Share of the time spent so far in which the rates fall to their ends once doublings gain too little."""
 
 
 @dataclass(frozen=True)
@@ -250,14 +250,21 @@ def _scene_depth(engine: Engine, views: Sequence[TrainingView], plan: Plan) -> f
 
 
 def _reason_to_stop(run: TrainingRun) -> str:
-    """Why the run ends after its last evaluation; empty where it goes on. Cuts the budget where the curve is flat."""
-    plan = run.plan
+    """Why the run ends after its last evaluation; empty where it goes on. May cut the budget."""
+    plan, gain = run.plan, last_gain(run.curve)
     if run.progress >= 1.0:
-        return "the curve of the validation photos became flat" if run.shortened else "the budget is spent"
+        why = (
+            f"another doubling of the steps would gain less than {plan.least_gain:g} dB"
+            if run.shortened
+            else "the budget is spent"
+        )
+        if gain is None or not plan.stops_when_flat:
+            return why
+        return f"{why}; the last one gained {gain:.2f} dB on the validation photos"
     reached = run.curve[-1].validation_psnr
     if plan.target_psnr is not None and reached is not None and reached >= plan.target_psnr:
         return f"the validation photos ({len(run.set_aside)}) reached {reached:.2f} dB"
-    if plan.stops_when_flat and not run.shortened and is_flat(run.curve):
+    if plan.stops_when_flat and not run.shortened and gain is not None and gain < plan.least_gain:
         run.shorten(FLAT_TAIL)
     return ""
 
