@@ -51,6 +51,7 @@ def seconds(request: dict[str, Any], *finished: Figures) -> list[float | None]:
 def test_stages_are_scaled_by_photos_and_steps() -> None:
     assert seconds({"photos": 20}, job()) == [10.0, 60.0, 7.0]
     assert seconds({"photos": 40}, job()) == [20.0, 60.0, 9.0]
+    assert seconds({"photos": 200}, job())[1] == 144.0  # 36 steps for each photo
     assert seconds({"photos": 20, "options": {"preset": "draft"}}, job())[1] == 20.0
     assert seconds({"photos": 20, "options": {"steps": 6000}}, job())[1] == 120.0
     assert (
