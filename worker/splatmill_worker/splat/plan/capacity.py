@@ -122,7 +122,7 @@ def _time_budget(
     steps = affordable if options.steps is None else min(affordable, options.steps)
     reasons.option("budget")
     reasons.chosen["schedule"] = (
-        f"{seconds:g} s at {1e3 * step:.2g} ms a step allow about {affordable} steps"
+        f"{seconds:g} s at {1e3 * step:.1f} ms a step allow about {affordable} steps"
         + ("." if steps == affordable else f", of which the option steps asks for {steps}.")
     )
     few = PRESET_VISITS[Preset.draft]
