@@ -243,6 +243,26 @@ def test_files_that_draw_nothing_are_refused(service: Up, model: SmallModel, vis
     assert psnr(pixels(page), before) > 50, "the model before stays"
 
 
+def test_what_lies_beyond_a_radius_is_not_drawn(service: Up, model: SmallModel, shown: Page) -> None:
+    whole = pixels(shown)
+    middle, spread = shown.evaluate("[view.middle, view.spread]")
+    content = service.http.get(f"/v1/models/{model.id}/files/model.ply").content
+    head, _, rows = content.partition(b"end_header\n")
+    vertices = np.frombuffer(rows, np.float32).reshape(-1, head.count(b"property float"))
+    distances = np.linalg.norm(vertices[:, :3] - middle, axis=1) / spread
+    radius = float(np.median(distances))
+    shown.evaluate("(radius) => view.hideBeyond(radius)", radius)
+    rest(shown)
+    hidden = pixels(shown)
+    assert psnr(hidden, whole) < 25
+    inside = vertices[distances <= radius]
+    head = head.replace(b"vertex %d\n" % len(vertices), b"vertex %d\n" % len(inside))
+    shown.evaluate("view.hideBeyond(null)")
+    assert replaced(shown, head + b"end_header\n" + inside.tobytes()) is None
+    rest(shown)
+    assert psnr(pixels(shown), hidden) > 45, "it is the model without what lies outside"
+
+
 def test_nothing_is_drawn_while_nothing_moves(shown: Page) -> None:
     drawn = shown.evaluate("view.frames")
     shown.evaluate("new Promise((done) => setTimeout(done, 600))")

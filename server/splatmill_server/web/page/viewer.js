@@ -84,7 +84,7 @@ export class View extends EventTarget {
     /** Half the width and height at distance 1 that have to be seen. */
     this.tangents = { x: 0, y: Math.tan((FOV * Math.PI) / 360) };
     this.middle = around?.middle ?? this.focus;
-    /** Radius around the cameras' mean outside of which the far side is not drawn; null draws everything. @type {number | null} */
+    /** Radius around the cameras' mean outside of which Gaussians are not drawn; null draws all. @type {number | null} */
     this.visible = null;
     /** @type {"webgl" | "pictures" | "depth"} */
     this.kind = "webgl";
@@ -225,7 +225,8 @@ export class View extends EventTarget {
   }
 
   /**
-   * Leave out what lies behind a sphere around the cameras' mean, as the far shell does. Pictures by the server show it.
+   * Leave out Gaussians whose centres lie outside of a sphere around the cameras' mean, as those of the far shell do.
+   * Pictures by the server show them.
    * @param {number | null} radius  over the farthest camera's distance from the mean; null shows everything
    */
   hideBeyond(radius) {
@@ -274,9 +275,8 @@ export class View extends EventTarget {
       surface.resize(Math.max(1, Math.round(width * ratio)), Math.max(1, Math.round(height * ratio)));
       [this.overlay.canvas.width, this.overlay.canvas.height] = [canvas.width, canvas.height];
     }
-    const far =
-      this.visible === null ? FAR * this.spread : length(sub(this.pose.position, this.middle)) + this.visible;
-    surface.draw(this.pose, this.fovY, NEAR * this.spread, far);
+    const sphere = this.visible === null ? null : { center: this.middle, radius: this.visible };
+    surface.draw(this.pose, this.fovY, { near: NEAR * this.spread, far: FAR * this.spread }, sphere);
     this.overlay.draw(this.pose, height / 2 / Math.tan(this.fovY / 2), this.ratio);
     this.frames += 1;
     element.dataset.frames = `${this.frames}`;

@@ -92,6 +92,7 @@ export class Stage {
     this.edit.attach(view);
     this.toggleCameras(this.showing.cameras);
     this.hideFar(this.showing.hidden);
+    this.farButton.hidden = view.kind !== "webgl";
     if (!this.lapse) {
       this.lapse = timeLapse(shown, this);
       if (this.lapse) byId("panels").prepend(this.lapse.element);

@@ -2,11 +2,14 @@
  * Draws Gaussians with PlayCanvas on a WebGL canvas. A frame is drawn when one is asked for, and when the splats have
  * been sorted anew, so that a view that nobody moves costs nothing.
  *
- * @import {Pose} from "./pose.js"
+ * @import {Pose, Vec} from "./pose.js"
  * @import {Source} from "./source.js"
  */
 import { ViewerError } from "./errors.js";
 import { opened } from "./source.js";
+
+/** Name of a uniform: the centre and radius of the sphere outside of which nothing is drawn; radius 0 draws all. */
+const SPHERE = "visible_sphere";
 
 /** Whether this browser draws with WebGL 2. */
 export function hasWebGL() {
@@ -68,7 +71,7 @@ export class Splats {
     gsplat.useFog = false;
     gsplat.antiAlias = options.antialias ?? false;
     gsplat.dataFormat = pc.GSPLATDATA_LARGE;
-    drawWholeGaussians(pc, device);
+    changeShaders(pc, device);
     gsplat.material.update();
     this.app.start();
     cancelAnimationFrame(this.app.frameRequestId);
@@ -132,10 +135,13 @@ export class Splats {
   /**
    * Draw a frame.
    * @param {Pose} pose @param {number} fovY  vertical field of view, radians
-   * @param {number} near @param {number} far  distances of the clipping planes
+   * @param {{near: number, far: number}} clip  distances of the clipping planes
+   * @param {{center: Vec, radius: number} | null} sphere  draw only Gaussians whose centres lie in it; null draws all
    */
-  draw(pose, fovY, near, far) {
+  draw(pose, fovY, { near, far }, sphere) {
     const { pc, app, eye } = this;
+    const scope = app.graphicsDevice.scope;
+    scope.resolve(SPHERE).setValue(sphere ? [...sphere.center, sphere.radius] : [0, 0, 0, 0]);
     const { right, down, forward, position } = pose;
     const world = new pc.Mat4();
     // PlayCanvas's cameras have OpenGL axes: y up, z backward.
@@ -189,17 +195,24 @@ async function loaded(assets, asset) {
 }
 
 /**
- * Let PlayCanvas draw Gaussians as they were trained: it lets them end at 2.8 standard deviations and lowers the whole
+ * Change PlayCanvas' shaders in two ways.
+ *
+ * Gaussians are drawn as they were trained: PlayCanvas lets them end at 2.8 standard deviations and lowers the whole
  * curve, so that it is zero there, which costs two to three dB against our renderer (docs/web.md). Here they end where
  * their opacity falls under 1/255.
+ *
+ * Those outside of a sphere can be left out. A far plane does not do it: PlayCanvas draws what lies beyond onto it.
  * @param {any} pc @param {any} device
  */
-function drawWholeGaussians(pc, device) {
+function changeShaders(pc, device) {
   const chunks = pc.ShaderChunks.get(device, pc.SHADERLANGUAGE_GLSL);
   for (const [chunk, before, after] of [
     ["gsplatPS", "(exp(x * -4.0) - EXP4) * INV_EXP4", "exp(x * -4.0)"],
     ["gsplatPS", "A > 1.0", "A > 1.5"],
     ["gsplatCommonVS", "min(1.0, sqrt(max(0.0, log(alpha / alphaClipValue))) * 0.5)", "sqrt(max(0.0, log(alpha / alphaClipValue))) * 0.5"],
+    ["gsplatVS", "void main(void) {", `uniform vec4 ${SPHERE};\nvoid main(void) {`],
+    ["gsplatVS", "if (!initCenter(modelCenter, center)) {",
+      `if (${SPHERE}.w > 0.0 && distance(modelCenter, ${SPHERE}.xyz) > ${SPHERE}.w || !initCenter(modelCenter, center)) {`],
   ]) {
     const source = chunks.get(chunk);
     // The lock file fixes the version of PlayCanvas; a newer one with other shaders has to be looked at.
