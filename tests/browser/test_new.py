@@ -23,7 +23,7 @@ from PIL import Image, ImageFilter
 from playwright.sync_api import Locator, Page, Request, expect
 
 from splatmill.local_capture import find_files
-from splatmill.schema import describe_options
+from splatmill.schema import MIN_PHOTOS, describe_options
 from splatmill_worker.images.prepare import prepare
 from tests.browser.conftest import Open, SmallModel, Visit
 from tests.support import still_life
@@ -312,6 +312,21 @@ def test_a_killed_upload_sends_what_is_missing(visit: Visit, service: Up, tmp_pa
     opened(again)
     expect(again.locator("#go-on")).to_have_count(0)
 
+    # A page that was closed when all had arrived: nothing was interrupted, whether its job began or not.
+    other = service.http.post("/v1/captures", json={"name": "whole"}).json()["id"]
+    service.http.put(f"/v1/captures/{other}/images/0.jpg", content=(tmp_path / "0.jpg").read_bytes())
+    remember = """(capture) => localStorage.setItem("splatmill.upload", JSON.stringify({
+      key: "k", capture, name: "whole", options: { time_budget: "8s" }, files: [["images", "0.jpg", 60000]],
+      at: new Date().toISOString(),
+    }))"""
+    for capture, words, budget in ((other, "whole: one file", "8s"), (job["capture"], "", "")):
+        again.evaluate(remember, capture)
+        opened(again)
+        expect(again.locator("#place")).to_contain_text(words) if words else expect(
+            again.locator("#place")
+        ).to_be_empty()
+        expect(again.locator("#option-time_budget")).to_have_value(budget)
+
 
 def left(page: Page) -> list[str]:
     """The names of the photos that the server does not hold."""
@@ -431,10 +446,30 @@ def test_settings_have_the_help_of_the_command_line_and_errors_beside_them(
     page.get_by_text("All settings").click()
     page.get_by_label("Time budget").fill("soon")
     expect(page.locator("#option-time_budget-error")).to_contain_text("'soon' is not a duration")
-    # Nothing is sent with settings that are not valid.
+    # Nothing is sent with settings that are not valid: the reason stands beside the button, which leads to the field.
+    page.locator("#settings-all summary").click()
     page.get_by_role("button", name="Upload and train").click()
-    expect(page.locator("#option-time_budget-error")).to_contain_text("'soon' is not a duration")
+    expect(page.locator("#problem")).to_contain_text("Time budget: 'soon' is not a duration")
+    expect(page.get_by_label("Time budget")).to_be_focused()
+    expect(page.get_by_label("Time budget")).to_be_in_viewport()
     expect(page.get_by_role("button", name="Upload and train")).to_be_enabled()
+
+
+def test_too_few_photos_are_refused_before_the_upload(page: Page, photos: Path) -> None:
+    opened(page)
+    for number, path in enumerate(sorted(photos.iterdir())[: MIN_PHOTOS - 1]):
+        give(page, path)
+        expect(page.locator(".verdict")).to_have_text(["More photos are needed."] * (number + 1))
+        expect(page.locator("#estimate")).to_contain_text(f"from {MIN_PHOTOS} at least")
+        expect(page.locator("#estimate")).not_to_contain_text("About")
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.get_by_role("button", name="Upload and train").click()
+    expect(page.locator("#problem")).to_contain_text("photos are too few")
+    assert asked == []
+    give(page, *sorted(photos.iterdir())[:MIN_PHOTOS])
+    expect(page.locator('.photo[data-verdict="good"]')).to_have_count(MIN_PHOTOS)
+    expect(page.locator("#problem")).to_be_empty()
 
 
 def test_a_further_job_on_stored_photos_with_an_estimate(
@@ -450,6 +485,13 @@ def test_a_further_job_on_stored_photos_with_an_estimate(
     expect(page.locator("#estimate")).to_contain_text(re.compile("About .+ for 14 photos"))
     page.get_by_text("How this was derived").click()
     expect(page.locator("#estimate")).to_contain_text("per step")
+    ranges = """async (given) => (await import("/page/any/new/estimate.js")).range(given).join("")"""
+    for seconds, lowest, highest, words in (
+        (22, 20, 41, "20 s to 40 s"),
+        (31, 20, 41, "30 s (20 s to 40 s)"),
+        (20, 20, 20, "20 s"),
+    ):
+        assert page.evaluate(ranges, {"seconds": seconds, "lowest": lowest, "highest": highest}) == words
     page.locator("#settings").get_by_text("draft", exact=True).click()
     page.get_by_role("button", name="Train", exact=True).click()
     job = started(page, service)

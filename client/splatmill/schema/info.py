@@ -72,6 +72,7 @@ class Accepted(Response):
         default_factory=dict,
         description="Programs whose cameras are not read, with patterns of the names, in lower case, of their files.",
     )
+    min_photos: int = Field(description="Photos without cameras that a job needs at least.")
     min_photo_side: int = Field(
         description="Pixels; photos with a shorter side are left out of the training."
     )

@@ -30,6 +30,9 @@ ARCHIVE_SUFFIXES = (".zip",)
 MASK_SUFFIXES = tuple(sorted(PHOTO_SUFFIXES, key=lambda suffix: suffix != ".png"))
 """In the order in which the mask of a photo is searched for. Which pictures are masks: `masks.py`."""
 
+MIN_PHOTOS = 3
+"""Photos from which cameras can be recovered, at least."""
+
 MIN_PHOTO_SIDE = 16
 """Pixels. A smaller photo has hardly any features, and covers one tile of the renderer at most."""
 

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from splatmill.schema.photos import MIN_PHOTOS
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.sfm.cameras import FOCAL_BOUNDS
 from splatmill_worker.sfm.matching.pairs import Pair
 from splatmill_worker.sfm.matching.two_view import MIN_INLIERS, ROTATION_CONFIGURATIONS, TwoView
-
-MIN_PHOTOS = 3
-"""Least number of photos for which structure from motion is tried, and of registered photos of a usable model."""
 
 MIN_SHARE = 0.3
 """Share of the photos that must be registered, in sets of more than SMALL_SET photos."""

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from splatmill.schema import KnownDistance
+from splatmill.schema import MIN_PHOTOS, KnownDistance
 from splatmill.schema.quantities import counted
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.scene import Scene
-from splatmill_worker.sfm import cameras, checks, lenses, stereo
+from splatmill_worker.sfm import cameras, lenses, stereo
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if
 from splatmill_worker.sfm.effort import solve_at
 from splatmill_worker.sfm.final_model import final_model
@@ -115,10 +115,10 @@ def _require_photos(prepared: Prepared) -> None:
             facts,
             "Give JPEG, PNG, WebP, TIFF, HEIC or AVIF photos, a video, or a zip of photos.",
         )
-    if count < checks.MIN_PHOTOS:
+    if count < MIN_PHOTOS:
         raise SfmFailed(
             "too_few_images",
-            f"{counted(count, 'photo is', 'photos are')} usable; at least {checks.MIN_PHOTOS} are needed.",
+            f"{counted(count, 'photo is', 'photos are')} usable; at least {MIN_PHOTOS} are needed.",
             facts,
             "Take photos from different places, 20 or more for a good result.",
         )

@@ -7,6 +7,11 @@ export function number(count) {
   return whole.format(Math.round(count));
 }
 
+/** How many there are of something: "1 photo", "1,200 photos". @param {number} many @param {string} noun in the singular */
+export function count(many, noun) {
+  return `${number(many)} ${noun}${Math.round(many) === 1 ? "" : "s"}`;
+}
+
 /** Bytes in units of 1,000, as downloads show them. @param {number} count */
 export function bytes(count) {
   const units = ["bytes", "kB", "MB", "GB", "TB"];

@@ -1,6 +1,6 @@
 // The time that a job will take, as the server derives it from the jobs that it has finished.
 
-import { seconds } from "../format.js";
+import { count, seconds } from "../format.js";
 import { h } from "../dom.js";
 
 const STAGES = { cameras: "Cameras", training: "Training", rest: "Start, loading, measuring, storing" };
@@ -16,24 +16,31 @@ const STAGES = { cameras: "Cameras", training: "Training", rest: "Start, loading
  */
 export function estimateOf(estimate, photos, waiting) {
   const { jobs, machine } = estimate;
-  const queue = waiting > 0 ? ` ${waiting === 1 ? "One job waits" : `${waiting} jobs wait`} before it.` : "";
+  const queue = waiting > 0 ? ` ${count(waiting, "job")} ${waiting === 1 ? "waits" : "wait"} before it.` : "";
   if (jobs === 0 && estimate.stages.every((stage) => stage.seconds === null)) {
     return h("p", {}, `How long it will take is not known: no job has finished on this server yet.${queue}`);
   }
   const head = estimate.seconds === null
     ? h("p", {}, `How long all of it will take is not known yet.${queue}`)
-    : h("p", {}, "About ", h("strong", {}, rough(estimate.seconds)), spread(estimate), ` for ${photos === 1 ? "one photo" : `${photos} photos`}, once a worker has taken the job.${queue}`);
+    : h("p", {}, "About ", h("strong", {}, range(estimate)[0]), range(estimate)[1], ` for ${count(photos, "photo")}, once a worker has taken the job.${queue}`);
   return h("div", {}, head, h("details", {}, h("summary", {}, "How this was derived"),
     h("dl", { class: "facts" }, estimate.stages.flatMap((stage) => [
       h("dt", {}, STAGES[stage.stage] ?? stage.stage),
-      h("dd", {}, stage.seconds === null ? "not known. " : `${rough(stage.seconds)}${spread(stage)}. `, stage.because),
+      h("dd", {}, stage.seconds === null ? "not known. " : `${range(stage).join("")}. `, stage.because),
     ])),
-    machine && h("p", { class: "hint" }, `Figures of ${jobs === 1 ? "one job" : `${jobs} jobs`} on ${machine}. The cameras of a capture are recovered once; a further job on it does without that time.`)));
+    machine && h("p", { class: "hint" }, `Figures of ${count(jobs, "job")} on ${machine}. The cameras of a capture are recovered once; a further job on it does without that time.`)));
 }
 
-/** @param {{lowest: number | null, highest: number | null}} range */
-function spread({ lowest, highest }) {
-  return lowest === null || highest === null || rough(lowest) === rough(highest) ? "" : ` (${rough(lowest)} to ${rough(highest)})`;
+/**
+ * The time that is estimated, and how long alike jobs took. Rounded, the estimate may be an end of its own range, which
+ * then stands alone.
+ * @param {{seconds: number | null, lowest: number | null, highest: number | null}} range
+ * @returns {[string, string]} the time, and the range in brackets or nothing
+ */
+export function range({ seconds: middle, lowest, highest }) {
+  const [from, about, to] = [lowest ?? middle, middle, highest ?? middle].map((time) => rough(time ?? 0));
+  if (from === to) return [about, ""];
+  return about === from || about === to ? [`${from} to ${to}`, ""] : [about, ` (${from} to ${to})`];
 }
 
 /** A duration without a precision that an estimate does not have. @param {number} given */

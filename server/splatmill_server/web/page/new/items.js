@@ -43,6 +43,8 @@ export class Items {
     this.count = 0;
     /** @type {string | null} why the files cannot be one capture */
     this.problem = null;
+    /** Why these photos are too few for a scene, a sentence; "" where nothing is known against it. */
+    this.lacking = "";
     /** @type {string[]} sentences about files that are not used, or are used otherwise than may be expected */
     this.said = [];
   }
@@ -127,13 +129,28 @@ export class Items {
     return this.accepted.photos.includes(ending) ? "photo" : this.accepted.videos.includes(ending) ? "video" : "archive";
   }
 
-  /** Give each photo that is not left out its verdict. */
-  judge() {
+  /** Give each photo that is not left out its verdict, and say whether they are enough. @param {Held[]} held files that the capture holds */
+  judge(held) {
     const photos = this.photos.filter((item) => !item.left);
     verdicts(photos, this.limits).forEach((verdict, index) => {
       const item = photos[index];
       item.verdict = item.lost ? { kind: "bad", text: item.lost } : verdict;
     });
+    this.lacking = this.tooFew(held);
+    if (!this.lacking) return;
+    for (const item of photos) if (item.verdict.kind === "good") item.verdict = { kind: "hint", text: "More photos are needed." };
+  }
+
+  /** @param {Held[]} held */
+  tooFew(held) {
+    const { photos, posed } = this.size(held, Infinity);
+    if (posed || photos === null) return "";
+    const digests = this.used.flatMap(({ kind, digest }) => (kind === "photo" && digest !== null ? [digest] : []));
+    const different = photos - (digests.length - new Set(digests).size);
+    const least = this.accepted.min_photos;
+    if (different >= least) return "";
+    const few = different === 0 ? "There is no photo among these files" : different === 1 ? "One photo is too few" : `${different} photos are too few`;
+    return `${few}: where each was taken is found out from ${least} at least that show the same things, and 20 or more make a good scene.`;
   }
 
   /** Sentences about files that are not used, and about masks. */

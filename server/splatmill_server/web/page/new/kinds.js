@@ -17,6 +17,7 @@
  * @property {string[]} output_media
  * @property {{what: string, suffixes: string[], advice: string}[]} unread
  * @property {Record<string, string[]>} other_cameras patterns of names, in lower case, by program
+ * @property {number} min_photos that cameras can be recovered from, at least
  * @property {number} min_photo_side pixels
  */
 

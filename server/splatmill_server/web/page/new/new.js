@@ -38,7 +38,7 @@ const items = new Items(info.accepted, info.limits.max_image_pixels);
 const form = new OptionsForm(options, estimateSoon);
 const gallery = new Gallery(byId("photos"), byId("others"), byId("more"), toggle);
 const looking = new Looking(onLooked);
-const start = new Start(items, form, { redraw: () => redraw(), problem: showProblem });
+const start = new Start(items, form, { redraw: () => redraw(), problem: refused });
 
 byId("settings-first").append(form.first);
 byId("settings-all").append(form.all);
@@ -162,7 +162,7 @@ function redrawSoon() {
 function redraw() {
   clearTimeout(redrawing);
   redrawing = undefined;
-  items.judge();
+  items.judge(start.held);
   gallery.show(items);
   const any = items.all.length > 0;
   const usable = items.used.length > 0 || start.held.length > 0;
@@ -204,7 +204,7 @@ async function estimate() {
   const values = form.values();
   const { photos, posed } = items.size(start.held, Number(values.max_video_frames) || options.find((/** @type {any} */ one) => one.name === "max_video_frames").default);
   const body = { photos: Math.max(1, photos ?? 1), posed, options: values };
-  const question = JSON.stringify([body, photos]);
+  const question = JSON.stringify([body, photos, items.lacking]);
   if (question === asked) return;
   asked = question;
   try {
@@ -212,7 +212,7 @@ async function estimate() {
     if (asked !== question) return;
     form.show(null);
     showProblem(null);
-    byId("estimate").replaceChildren(photos === null
+    byId("estimate").replaceChildren(items.lacking ? h("p", { class: "error" }, items.lacking) : photos === null
       ? h("p", {}, "How long it will take is not known: the server has yet to count the photos in the archive.")
       : estimateOf(found, photos, info.queued));
   } catch (error) {
@@ -223,10 +223,16 @@ async function estimate() {
   }
 }
 
-/** Show a problem beside the field that it concerns, or else above the button. @param {Error | null} problem */
+/** Show a problem above the button, and beside the field that it concerns. @param {Error | null} problem */
 function showProblem(problem) {
-  const placed = form.show(problem instanceof Problem ? problem : null);
-  byId("problem").replaceChildren(...(problem && !(problem instanceof Problem && placed) ? [noticeOf(problem)] : []));
+  const placed = form.show(problem instanceof Problem ? problem : null) && problem instanceof Problem;
+  byId("problem").replaceChildren(...(placed ? form.errors.map((text) => h("p", { class: "error" }, text)) : problem ? [noticeOf(problem)] : []));
+}
+
+/** Show why the button did nothing, and lead to the field that is to be changed. @param {Error | null} problem */
+function refused(problem) {
+  showProblem(problem);
+  form.lead();
 }
 
 async function showPhone() {
@@ -249,19 +255,24 @@ async function useCapture(id, earlier) {
     const capture = await get(`/v1/captures/${encodeURIComponent(id)}`);
     start.use(capture);
     if (earlier) form.fill((await get(`/v1/jobs/${encodeURIComponent(earlier)}`)).options);
-    const size = capture.files.reduce((/** @type {number} */ sum, /** @type {any} */ file) => sum + file.size, 0);
-    byId("place").replaceChildren(h("div", { class: "notice" },
-      h("p", {}, `${capture.name || "A capture without a name"}: ${capture.files.length === 1 ? "one file" : `${number(capture.files.length)} files`} (${bytes(size)}) are already on the server.`),
-      h("p", {}, "Choose the settings of another job, or give more photos first. ", h("a", { href: "/" }, "Begin with new photos"))));
-    byId("drop-title").textContent = "Drop more photos here";
-    redraw();
+    showCapture(capture);
   } catch (error) {
     notify(/** @type {Error} */ (error));
     await listCaptures();
   }
 }
 
-/** Offer to continue an upload that another visit of this browser began. */
+/** Say what the server holds of a capture that a job is to be started on. @param {any} capture */
+function showCapture(capture) {
+  const size = capture.files.reduce((/** @type {number} */ sum, /** @type {any} */ file) => sum + file.size, 0);
+  byId("place").replaceChildren(h("div", { class: "notice" },
+    h("p", {}, `${capture.name || "A capture without a name"}: ${capture.files.length === 1 ? "one file" : `${number(capture.files.length)} files`} (${bytes(size)}) are already on the server.`),
+    h("p", {}, "Choose the settings of another job, or give more photos first. ", h("a", { href: "/" }, "Begin with new photos"))));
+  byId("drop-title").textContent = "Drop more photos here";
+  redraw();
+}
+
+/** Offer to continue an upload that another visit of this browser began, or to train what has arrived whole. */
 async function offerToGoOn() {
   const upload = recall();
   if (!upload) return;
@@ -275,9 +286,16 @@ async function offerToGoOn() {
       throw error;
     }
   }
+  const there = upload.files.filter(([role, name, size]) => capture?.files.some((/** @type {any} */ file) => file.role === role && file.name === name && file.size === size)).length;
+  if (capture && there === upload.files.length) {
+    forget();
+    if ((await get("/v1/jobs", { capture: capture.id, limit: 1 })).jobs.length) return; // its job began, and only the answer was lost
+    form.restore(upload.options);
+    start.use(capture);
+    return showCapture(capture);
+  }
   start.offer(upload, capture);
   form.restore(upload.options);
-  const there = upload.files.filter(([role, name, size]) => capture?.files.some((/** @type {any} */ file) => file.role === role && file.name === name && file.size === size)).length;
   const box = h("div", { class: "notice", "data-kind": "warning", id: "go-on" },
     h("p", {}, `An upload was interrupted ${ago(upload.at)}: ${upload.name || "without a name"}, ${number(there)} of ${number(upload.files.length)} files have arrived.`),
     h("p", {}, "Give the same files again, and it goes on with those that are missing. Browsers do not keep files for a page."),

@@ -37,7 +37,7 @@ export class OptionsForm {
   constructor(options, onChange) {
     this.options = options;
     this.onChange = onChange;
-    /** @type {Map<string, {control: () => string, put: (text: string) => void, error: HTMLElement, inputs: HTMLElement[]}>} */
+    /** @type {Map<string, {label: string, control: () => string, put: (text: string) => void, error: HTMLElement, inputs: HTMLInputElement[]}>} */
     this.fields = new Map();
     /** Settings that are shown at first. */
     this.first = h("div", { class: "settings-first" }, FIRST.flatMap((name) => options.filter((option) => option.name === name)).map((option) => this.field(option)));
@@ -115,6 +115,17 @@ export class OptionsForm {
     return errors.length > 0 && placed.length === errors.length;
   }
 
+  /** The errors that are shown, each with the name of its setting. */
+  get errors() {
+    return [...this.fields.values()].filter(({ error }) => error.textContent).map(({ label, error }) => `${label}: ${error.textContent}`);
+  }
+
+  /** Lead to the first field with an error. */
+  lead() {
+    const wrong = [...this.fields.values()].find(({ error }) => error.textContent);
+    (wrong?.inputs.find((input) => input.checked) ?? wrong?.inputs[0])?.focus();
+  }
+
   /** @param {Option} option */
   field(option) {
     const id = `option-${option.name}`;
@@ -126,13 +137,14 @@ export class OptionsForm {
     const control = this.control(option, { id, "aria-describedby": described });
     const boolean = control instanceof HTMLInputElement && control.type === "checkbox";
     this.fields.set(option.name, {
+      label,
       control: () => (boolean ? (control.checked ? "true" : "") : control.value),
       put: (text) => {
         if (boolean) control.checked = text === "true";
         else control.value = text;
       },
       error,
-      inputs: [control],
+      inputs: [/** @type {HTMLInputElement} */ (control)],
     });
     if (boolean) return h("div", { class: "field" }, h("label", { class: "row", for: id }, control, label), help, error);
     return h("div", { class: "field" }, h("label", { for: id }, label), control, help, error);
@@ -157,6 +169,7 @@ export class OptionsForm {
       type: "radio", name: option.name, value: choice, checked: choice === option.default, onchange: this.onChange,
     }));
     this.fields.set(option.name, {
+      label,
       control: () => inputs.find((input) => input.checked && input.value !== option.default)?.value ?? "",
       put: (text) => {
         for (const input of inputs) input.checked = input.value === text;

@@ -119,7 +119,7 @@ export class Start {
     this.on.redraw();
     let last = "";
     try {
-      if (this.items.problem) throw new Error(this.items.problem);
+      if (this.items.problem || this.items.lacking) throw new Error(this.items.problem ?? this.items.lacking);
       await this.check();
       await this.looked();
       await this.makeCapture();
