@@ -284,6 +284,36 @@ def test_an_answer_that_breaks_off_is_told_as_a_lost_connection(page: Page) -> N
     assert told == ["unreachable", "unreachable", "SyntaxError"]
 
 
+def test_a_scene_that_comes_before_its_cameras_is_seen_from_where_they_are(
+    page: Page, model: SmallModel
+) -> None:
+    page.goto(f"/jobs/{model.id}")
+    poses = page.evaluate(
+        """async (id) => {
+          const { LiveScene } = await import("/page/any/job/live_scene.js");
+          const placement = await (await fetch(`/v1/jobs/${id}/cameras`)).json();
+          const snapshot = await (await fetch(`/v1/models/${id}/files/model.ply`)).arrayBuffer();
+          const scene = (steps) => steps.reduce(async (before, step) => {
+            const made = await before;
+            if (step === "cameras") made.setPlacement(placement, new Map());
+            else await made.draw(snapshot.slice());
+            return made;
+          }, Promise.resolve(new LiveScene(document.body.appendChild(document.createElement("div")), id)));
+          const [late, early] = [await scene(["draw", "cameras"]), await scene(["cameras", "draw"])];
+          const pose = () => late.boxes.scene.dataset.pose;
+          const [framed, wanted] = [pose(), early.boxes.scene.dataset.pose];
+          const far = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -99], [0, 0, 0, 1]];
+          late.view.setCamera({ ...late.view.getCamera(), camera_to_world: far });
+          const away = pose();
+          late.homeButton.click();
+          return [framed, pose(), wanted, away];
+        }""",
+        model.id,
+    )
+    framed, home, wanted, away = poses
+    assert framed == home == wanted != away
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_page_fits_a_phone(service: Up, model: SmallModel, open_window: Open, scheme: str) -> None:
     page = open_window(service, viewport={"width": 360, "height": 740}, color_scheme=scheme).page

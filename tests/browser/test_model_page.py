@@ -6,11 +6,13 @@ Does not prove what the viewer draws: tests/browser/test_viewer.py does.
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.conftest import Open, SmallModel, Visit
@@ -80,12 +82,18 @@ def test_the_model_is_compared_with_its_held_out_photos(service: Up, model: Smal
 def test_distances_are_measured_in_a_unit_that_is_set(shown: Page) -> None:
     shown.get_by_role("button", name="Measure").click()
     panel = shown.locator("form.panel").first
+    panel.get_by_role("button", name="Set the scale").click()
+    expect(panel.get_by_role("status")).to_contain_text("Mark two points first")
+    expect(panel.get_by_role("button", name="Mark the point in the middle")).to_be_focused()
     panel.get_by_role("button", name="Mark the point in the middle").click()
     expect(panel.get_by_role("status")).to_have_text("Click a second point in the view.", timeout=WAIT)
     box = shown.locator(".view").bounding_box()
     assert box is not None
     shown.locator(".view").click(position={"x": 0.5 * box["width"], "y": 0.6 * box["height"]})
     expect(panel.get_by_role("status")).to_contain_text("units apart", timeout=WAIT)
+    panel.get_by_role("button", name="Set the scale").click()
+    expect(panel.get_by_role("status")).to_contain_text("a number over 0")
+    expect(panel.get_by_label("Its true length")).to_be_focused()
     panel.get_by_label("Its true length").fill("12")
     panel.get_by_role("button", name="Set the scale").click()
     expect(panel.get_by_role("status")).to_have_text("The points are 12 cm apart.")
@@ -98,11 +106,25 @@ def test_distances_are_measured_in_a_unit_that_is_set(shown: Page) -> None:
 
 
 def test_the_view_is_changed_by_its_tools(shown: Page) -> None:
-    shown.get_by_role("button", name="Cameras", exact=True).click()
-    expect(shown.locator("#viewer-note")).to_contain_text("Orange: held out")
+    note = shown.locator("#viewer-note")
+    expect(note).to_contain_text("Drag or arrow keys")
+    cameras = shown.get_by_role("button", name="Cameras", exact=True)
+    cameras.click()
+    expect(note).to_contain_text("Orange: held out")
+    cameras.click()
+    expect(note).to_contain_text("Drag or arrow keys")
+    cameras.click()
     shown.get_by_text(re.compile("Cameras: 14 photos, 2 of them held out")).click()
     shown.get_by_role("button", name="Look from 03.png").click()
     expect(shown.locator("#viewer-note")).to_have_text("The view of 03.png.")
+    with shown.expect_response(re.compile("/files/time_lapse/")):
+        shown.get_by_label("Time-lapse").fill("0")
+    expect(shown.locator(".view .said")).to_be_empty()  # no words about loading stay
+    # The ring of the focus is seen at the edge of the canvas.
+    shown.keyboard.press("Shift")
+    shown.locator(".view").focus()
+    ring = Image.open(io.BytesIO(shown.locator(".view").screenshot())).convert("RGB").getpixel((100, 1))
+    assert ring == (0x8F, 0xB2, 0xFF)
     shown.get_by_label("Kind of view").select_option("depth")
     expect(shown.locator("#viewer[data-ready=depth] .depth-scale, .depth-scale")).to_contain_text(
         "units", timeout=WAIT
@@ -223,6 +245,17 @@ def test_a_crop_makes_a_new_model_and_keeps_the_first(service: Up, model: SmallM
     models = service.http.get("/v1/models").json()["models"]
     shown.get_by_role("button", name="Crop and clean").click()
     panel = shown.get_by_role("form", name="Crop and clean")
+    opacity, kept = panel.get_by_label("Least opacity"), panel.get_by_label("Keep only what lies in the box")
+    opacity.fill("2")
+    panel.get_by_role("button", name="Measure what it does").click()
+    expect(panel.get_by_role("status")).to_contain_text("from 0 to 0.99")
+    expect(opacity).to_be_focused()
+    opacity.fill("0")
+    kept.uncheck()
+    panel.get_by_role("button", name="Make a new model").click()
+    expect(panel.get_by_role("status")).to_contain_text("Nothing would change")
+    expect(kept).to_be_focused()
+    kept.check()
     panel.get_by_role("slider", name="The box along x, from").fill("100")
     assert shown.evaluate("document.querySelectorAll('.view canvas').length") == 2
     panel.get_by_role("button", name="Measure what it does").click()

@@ -26,6 +26,12 @@ VENDOR = Tree(Path(__file__).parent / "vendor")
 IMPORT_MAP_HERE = "<!-- import map -->"
 """Where a page's import map goes."""
 
+POSTER_HERE = "<!-- poster -->"
+"""Where the picture of a shared model goes, which browsers show before any script has run."""
+
+PICTURE = "preview.jpg"
+"""The file with the picture of a model."""
+
 _FOREVER = "public, max-age=31536000, immutable"
 _METHODS = ["GET", "HEAD"]
 
@@ -90,11 +96,14 @@ def vendor_file(request: Request, digest: str, name: str) -> Response:
     return _asset(request, VENDOR, digest, name)
 
 
-def page(request: Request, name: str, *, embedded: bool = False, head: str = "") -> Response:
+def page(
+    request: Request, name: str, *, embedded: bool = False, head: str = "", poster: str = ""
+) -> Response:
     """Return the page `name` with the addresses of the files that it loads.
 
     embedded: whether pages of others may show it in a frame.
     head: elements for the page's head.
+    poster: the element of the model's picture.
     """
     file = PAGE.find(name)
     if file is None:
@@ -104,6 +113,7 @@ def page(request: Request, name: str, *, embedded: bool = False, head: str = "")
     imports = import_map(root)
     text = (
         file.path.read_text(encoding="utf-8")
+        .replace(POSTER_HERE, poster, 1)
         .replace('"/page/', f'"/page/{PAGE.digest}/')
         .replace('="/', f'="{root}')
     )
@@ -117,32 +127,38 @@ def page(request: Request, name: str, *, embedded: bool = False, head: str = "")
 
 def _shared(service: Service, request: Request, token: str, *, embedded: bool) -> Response:
     """Return the page of a link, whose status says whether the link is valid; the page says it to people."""
-    status, head = 200, ""
+    status, head, poster = 200, "", ""
     try:
         model = service.shares.get_model(service.shares.get(token))
-        head = _poster(str(request.base_url), token, model)
+        head = _card(str(request.base_url), token, model)
+        if _has_picture(model):
+            said = escape(f"A picture of {model.name or 'the scene'}")
+            poster = f'<img class="still" src="/s/{token}/model/files/{PICTURE}" alt="{said}" fetchpriority="high">'
     except ProblemError as error:
         status = error.problem.status
-    shown = page(
-        request, "share/embed.html" if embedded else "share/share.html", embedded=embedded, head=head
-    )
+    name = "share/embed.html" if embedded else "share/share.html"
+    shown = page(request, name, embedded=embedded, head=head, poster=poster)
     shown.status_code = status
     shown.headers["X-Robots-Tag"] = "noindex"
     return shown
 
 
-def _poster(base: str, token: str, model: SharedModel) -> str:
+def _has_picture(model: SharedModel) -> bool:
+    return any(file.name == PICTURE for file in model.files)
+
+
+def _card(base: str, token: str, model: SharedModel) -> str:
     """Return the elements by which messengers show a picture of the model beside a link to it."""
     quality = f", {model.psnr:.1f} dB on photos not trained on" if model.psnr is not None else ""
     found = {
         "og:type": "website",
         "og:title": model.name or "A scene in 3D",
         "og:description": f"{model.gaussians:,} Gaussians{quality}. Look at it from any side.",
-        "og:image": f"{base}s/{token}/model/files/preview.jpg",
+        "og:image": f"{base}s/{token}/model/files/{PICTURE}",
         "og:url": f"{base}s/{token}",
         "twitter:card": "summary_large_image",
     }
-    if not any(file.name == "preview.jpg" for file in model.files):
+    if not _has_picture(model):
         del found["og:image"]
     return "".join(f'\n<meta property="{name}" content="{escape(text)}">' for name, text in found.items())
 

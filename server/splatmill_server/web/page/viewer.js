@@ -12,6 +12,7 @@
  * @import {Source} from "./viewer/source.js"
  * @import {Line, ShownCamera} from "./viewer/overlay.js"
  */
+import { bytes } from "./format.js";
 import { Pictures } from "./viewer/pictures_view.js";
 import { Controls, HELP } from "./viewer/controls.js";
 import { ViewerError } from "./viewer/errors.js";
@@ -35,17 +36,20 @@ const FRUSTUM = 0.07;
 /**
  * @typedef {Object} Options
  * @property {string} [url]  address of a file of splats: .ply, compressed .ply or .sog
+ * @property {(say: (text: string) => void) => Promise<Source>} [find]  finds the file while the engine is loaded, in place
+ *   of an address
  * @property {ArrayBuffer | Uint8Array} [bytes]  its bytes, in place of an address
  * @property {string} [model]  address of a stored model, as /v1/models/{id}: the server renders it where there is no WebGL
  * @property {Camera[]} [cameras]  of the photos: they tell where up is, where to look, and how far away to be. Without
  *   any, -y is up, and the dense middle of the Gaussians is seen from the side
- * @property {Camera} [camera]  to start from; left out, one of `cameras` whose view is close to the middle of all
+ * @property {Camera} [camera]  to start from, exactly; left out, upright from the side of one of `cameras` whose view is
+ *   close to the middle of all
+ * @property {string} [poster]  address of a picture as `camera` sees it, shown until the model is drawn
  * @property {"webgl" | "pictures" | "depth"} [kind]  the kind of view; left out, webgl where the browser has it
  * @property {"black" | "white"} [background]  colour behind the model; left out, black
  * @property {boolean} [antialias]  whether the model was trained with antialiasing
  * @property {number} [roam]  how far the camera may leave the cameras' mean, over the farthest camera's distance from it
  * @property {string} [label]  what is seen, for people who do not see it
- * @property {(done: number, total: number) => void} [progress]  bytes of the model that are loaded
  */
 
 /**
@@ -71,19 +75,20 @@ export class View extends EventTarget {
     super();
     this.container = container;
     this.options = options;
-    const around = options.cameras?.length ? surroundings(options.cameras) : null;
     /** @type {Vec} */
-    this.up = around?.up ?? [0, -1, 0];
+    this.up = [0, -1, 0];
     /** @type {Vec} */
-    this.focus = around?.focus ?? [0, 0, 0];
-    this.spread = around?.spread || (around && length(sub(around.focus, around.middle))) || 1;
-    this.limit = around && options.roam ? { center: around.middle, radius: options.roam * this.spread } : null;
+    this.focus = [0, 0, 0];
+    /** @type {Vec} */
+    this.middle = [0, 0, 0];
+    this.spread = 1;
+    /** @type {{center: Vec, radius: number} | null} */
+    this.limit = null;
     /** @type {Pose} */
-    this.pose = lookingAt([0, 0, -3 * this.spread], this.focus, this.up);
-    this.distance = 3 * this.spread;
+    this.pose = lookingAt([0, 0, -3], this.focus, this.up);
+    this.distance = 3;
     /** Half the width and height at distance 1 that have to be seen. */
     this.tangents = { x: 0, y: Math.tan((FOV * Math.PI) / 360) };
-    this.middle = around?.middle ?? this.focus;
     /** Radius around the cameras' mean outside of which Gaussians are not drawn; null draws all. @type {number | null} */
     this.visible = null;
     /** @type {"webgl" | "pictures" | "depth"} */
@@ -109,8 +114,18 @@ export class View extends EventTarget {
     this.canvas = document.createElement("canvas");
     const over = document.createElement("canvas");
     this.overlay = new Overlay(over);
-    this.overlay.size = FRUSTUM * this.spread;
-    this.element.append(this.canvas, over);
+    this.poster = document.createElement("img");
+    this.poster.alt = "";
+    this.poster.addEventListener("error", () => this.poster.remove());
+    /** What is being loaded, or why nothing is shown, in words. */
+    this.said = document.createElement("p");
+    this.said.className = "said";
+    this.said.setAttribute("role", "status");
+    this.element.append(this.canvas, over, this.said);
+    if (options.poster) {
+      this.poster.src = options.poster;
+      this.element.append(this.poster);
+    }
     container.append(this.element);
     this.controls = new Controls(this.element, this, {
       moved: () => this.moved(),
@@ -122,20 +137,43 @@ export class View extends EventTarget {
       this.again();
     });
     this.watch.observe(this.element);
-    const start = options.camera ?? (options.cameras?.length ? mostCentral(options.cameras, this.focus) : null);
-    if (start) this.frame(start);
+    if (options.cameras?.length) this.surround(options.cameras);
+    if (options.camera) {
+      this.setCamera(options.camera);
+      this.settle();
+    }
+  }
+
+  /** Take over where the scene is from the cameras of its photos, and look at it unless somebody has moved the camera. @param {Camera[]} cameras */
+  surround(cameras) {
+    const { pose, distance, tangents, home } = this;
+    const { up, focus, middle, spread } = surroundings(cameras);
+    [this.up, this.focus, this.middle] = [up, focus, middle];
+    this.spread = spread || length(sub(focus, middle)) || 1;
+    this.limit = this.options.roam ? { center: middle, radius: this.options.roam * this.spread } : null;
+    this.overlay.size = FRUSTUM * this.spread;
+    this.frame(mostCentral(cameras, focus));
+    if (pose !== home) Object.assign(this, { pose, distance, tangents });
   }
 
   async begin() {
     const { options } = this;
     const wanted = options.kind ?? "webgl";
+    /** The model that `open` was asked for. @type {Source} */
+    this.source = options;
+    /** @type {Promise<Source> | undefined} */
+    let found;
     if (wanted === "webgl") {
+      this.say("Loading the viewer");
       try {
         if (!hasWebGL()) throw new ViewerError("no_webgl", "This browser has no WebGL, which drawing in 3D needs.");
+        found = options.find?.((text) => this.say(text));
+        found?.catch(() => {}); // it is waited for below, unless the engine fails first
         this.surface = await Splats.open(this.canvas, {
           antialias: options.antialias,
           background: options.background === "white" ? [1, 1, 1] : [0, 0, 0],
           again: () => this.again(),
+          drawn: () => this.poster.remove(),
         });
       } catch (error) {
         if (!(error instanceof ViewerError) || !options.model) throw error;
@@ -149,12 +187,18 @@ export class View extends EventTarget {
         model: options.model,
         depth: this.kind === "depth",
         background: options.background,
-        failed: (message) => this.dispatchEvent(new CustomEvent("trouble", { detail: message })),
+        failed: (message) => {
+          this.say(message);
+          if (!message) this.poster.remove();
+          this.dispatchEvent(new CustomEvent("trouble", { detail: message }));
+        },
         range: (near, far) => this.dispatchEvent(new CustomEvent("range", { detail: { near, far } })),
       });
     }
     this.element.dataset.kind = this.kind;
-    if (options.url || options.bytes || this.kind !== "webgl") await this.surface.load(options, options.progress);
+    if (found && this.kind === "webgl") this.source = await found;
+    this.say("");
+    if (this.source.url || this.source.bytes || this.kind !== "webgl") await this.load(this.source);
     if (!options.camera && !options.cameras?.length && this.surface instanceof Splats) this.frameMiddle(this.surface.points);
     this.again();
   }
@@ -164,8 +208,27 @@ export class View extends EventTarget {
    * @param {Source} source
    */
   async replace(source) {
-    await this.surface?.load(source, this.options.progress);
+    await this.load(source);
     this.again();
+  }
+
+  /** @param {Source} source */
+  async load(source) {
+    const told = this.surface instanceof Splats && source.url;
+    const loading = `Loading ${source.what ?? "the model"}`;
+    if (told) this.say(loading);
+    try {
+      await this.surface?.load(source, (done, total) => {
+        if (told) this.say(`${loading}: ${bytes(done)}${total ? ` of ${bytes(total)}` : ""}`);
+      });
+    } finally {
+      if (told) this.say("");
+    }
+  }
+
+  /** Say in the view what is being done; "" ends it. @param {string} text */
+  say(text) {
+    this.said.textContent = text;
   }
 
   /** How many Gaussians are drawn; 0 where the server draws them. */
@@ -203,8 +266,13 @@ export class View extends EventTarget {
     this.pose = lookingAt(poseOf(camera).position, this.focus, this.up);
     this.distance = Math.max(length(sub(this.focus, this.pose.position)), 1e-3);
     this.tangents = tangentsOf(camera);
-    [this.home, this.homeDistance, this.homeTangents] = [this.pose, this.distance, this.tangents];
+    this.settle();
     this.moved();
+  }
+
+  /** Make the present view that of `goHome`. */
+  settle() {
+    [this.home, this.homeDistance, this.homeTangents] = [this.pose, this.distance, this.tangents];
   }
 
   /** Look at the dense middle of a scene without cameras from the side. @param {Float32Array | null} points */
@@ -215,7 +283,7 @@ export class View extends EventTarget {
     this.overlay.size = FRUSTUM * reach;
     this.pose = lookingAt([focus[0], focus[1] - 0.5 * reach, focus[2] - 2.5 * reach], focus, this.up);
     this.distance = length(sub(focus, this.pose.position));
-    [this.home, this.homeDistance] = [this.pose, this.distance];
+    this.settle();
     this.moved();
   }
 

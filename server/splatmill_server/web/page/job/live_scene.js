@@ -32,6 +32,8 @@ export class LiveScene {
     /** Why there is no 3D view of the scene; empty while there may be one. */
     this.trouble = viewerInstalled ? "" : "The 3D viewer is not installed on this server.";
     this.tag = "";
+    /** Whether the view knows the cameras. */
+    this.surrounded = false;
     this.busy = false;
     this.again = false;
     this.picture = h("img", { alt: "The scene in training from the position of one photo", hidden: true });
@@ -47,9 +49,10 @@ export class LiveScene {
     this.frusta = h("input", { type: "checkbox", id: "show-frusta", onchange: () => this.showFrusta() });
     this.buttons = /** @type {Record<Kind, HTMLButtonElement>} */ (Object.fromEntries(Object.entries(KINDS).map(([kind, title]) =>
       [kind, h("button", { type: "button", class: "small", "aria-pressed": "false", hidden: true, onclick: () => this.choose(/** @type {Kind} */ (kind)) }, title)])));
+    this.homeButton = h("button", { type: "button", class: "small", hidden: true, onclick: () => this.view?.goHome() }, "Start view");
     this.frustaField = h("label", { class: "row small check", for: "show-frusta", hidden: true }, this.frusta, "Show the cameras");
     container.replaceChildren(
-      h("div", { class: "row tools" }, h("div", { class: "row", role: "group", "aria-label": "What is shown" }, Object.values(this.buttons)), this.frustaField),
+      h("div", { class: "row tools" }, h("div", { class: "row", role: "group", "aria-label": "What is shown" }, Object.values(this.buttons)), this.homeButton, this.frustaField),
       h("div", { class: "stage" }, this.empty, Object.values(this.boxes)),
       this.caption);
   }
@@ -78,6 +81,7 @@ export class LiveScene {
     }
     this.picture.hidden = !this.has("picture");
     this.empty.hidden = this.kind !== null;
+    this.homeButton.hidden = this.kind !== "scene";
     this.frustaField.hidden = this.kind !== "scene" || !this.cameras.length;
     this.showPlacement();
     this.describe();
@@ -99,8 +103,16 @@ export class LiveScene {
     this.placement = placement.cameras.length ? placement : null;
     this.cameras = placement.cameras.map((/** @type {any} */ { name, camera }) => ({ name, camera, color: colorOf(this.empty, kinds.get(name)?.kind ?? "train") }));
     this.stale = true;
+    this.surround();
     this.arrange();
     this.showFrusta();
+  }
+
+  /** Let the cameras say where the scene is seen from, once. A snapshot may come before them, as after a reload. */
+  surround() {
+    if (!this.view || this.surrounded || !this.cameras.length) return;
+    this.surrounded = true;
+    this.view.surround(this.cameras.map(({ camera }) => camera));
   }
 
   showPlacement() {
@@ -170,7 +182,11 @@ export class LiveScene {
       await this.view.replace(source);
     } else {
       this.boxes.scene.hidden = false; // the viewer takes its size from the box
-      this.view = await open(this.boxes.scene, { ...source, cameras: this.cameras.map(({ camera }) => camera), label: "The scene in training" });
+      const cameras = this.cameras.map(({ camera }) => camera);
+      this.view = await open(this.boxes.scene, { ...source, cameras, label: "The scene in training" });
+      this.surrounded = cameras.length > 0;
+      this.surround();
+      this.surrounded = this.cameras.length > 0;
       // Where the camera stands can be read off the page: it must not change with a snapshot.
       this.view.addEventListener("move", () => this.stand());
       this.stand();

@@ -5,6 +5,7 @@ import { send } from "../api.js";
 import { h, toggle } from "../dom.js";
 import { number } from "../format.js";
 import { noticeOf } from "../shell.js";
+import { LOADING } from "../viewer/errors.js";
 
 /**
  * @import {Stage} from "./stage.js"
@@ -37,7 +38,7 @@ export class Edit {
     this.state = h("div", { role: "status" });
     this.measureButton = h("button", { type: "button", onclick: () => void this.run(true) }, "Measure what it does");
     this.makeButton = h("button", { type: "submit", class: "primary" }, "Make a new model");
-    this.panel = h("form", { class: "panel card", hidden: true, "aria-label": "Crop and clean", onsubmit: (/** @type {Event} */ event) => {
+    this.panel = h("form", { class: "panel card", novalidate: true, hidden: true, "aria-label": "Crop and clean", onsubmit: (/** @type {Event} */ event) => {
       event.preventDefault();
       void this.run(false);
     } },
@@ -78,8 +79,26 @@ export class Edit {
     this.view?.mark({ box: this.on && this.crop.checked ? this.box : null });
   }
 
+  /** Why there is nothing to ask the server for, a sentence; it leads to the field that is to be changed. */
+  problem() {
+    if (!this.view) return LOADING;
+    const wrong = [this.opacity, this.size].find((field) => !field.checkValidity());
+    for (const field of [this.opacity, this.size]) field.setAttribute("aria-invalid", String(field === wrong));
+    wrong?.focus();
+    if (wrong === this.opacity) return "The least opacity is a number from 0 to 0.99.";
+    if (wrong) return "The largest size is a number over 0, or left empty.";
+    if (this.crop.checked || Number(this.opacity.value) > 0 || Number(this.size.value) > 0) return "";
+    this.crop.focus();
+    return "Nothing would change: keep only the box, or give a least opacity or a largest size.";
+  }
+
   /** Ask the server for the edit. @param {boolean} preview */
   async run(preview) {
+    const problem = this.problem();
+    if (problem) {
+      this.state.replaceChildren(h("p", { class: "error" }, problem));
+      return;
+    }
     const wanted = {
       ...(this.crop.checked ? { box: this.box } : {}),
       ...(Number(this.opacity.value) > 0 ? { min_opacity: Number(this.opacity.value) } : {}),

@@ -2,9 +2,9 @@
 
 import { request, whole } from "../api.js";
 import { h, toggle } from "../dom.js";
-import { notify } from "../shell.js";
 import { add, length, poseOf, sub, times } from "../viewer/pose.js";
 import { readArray } from "../viewer/depth.js";
+import { LOADING } from "../viewer/errors.js";
 
 /**
  * @import {Stage} from "./stage.js"
@@ -29,14 +29,15 @@ export class Measure {
     this.known = h("input", { id: "known", type: "number", min: 0, step: "any", class: "narrow-field", inputmode: "decimal" });
     this.unit = h("input", { id: "unit", class: "narrow-field", maxlength: 12, value: this.scale?.unit ?? "cm" });
     this.set = h("button", { type: "submit" }, "Set the scale");
-    this.panel = h("form", { class: "panel card", hidden: true, onsubmit: (/** @type {Event} */ event) => {
+    this.middleButton = h("button", { type: "button", onclick: () => void this.mark(...this.middle()) }, "Mark the point in the middle");
+    this.panel = h("form", { class: "panel card", novalidate: true, hidden: true, onsubmit: (/** @type {Event} */ event) => {
       event.preventDefault();
       this.setScale();
     } },
       h("h2", {}, "Measure"),
       this.state,
       h("div", { class: "row" },
-        h("button", { type: "button", onclick: () => void this.mark(...this.middle()) }, "Mark the point in the middle"),
+        this.middleButton,
         h("button", { type: "button", class: "quiet", onclick: () => this.clear() }, "Start over")),
       h("div", { class: "row" },
         h("div", { class: "field" }, h("label", { for: "known" }, "Its true length"), this.known),
@@ -73,18 +74,21 @@ export class Measure {
 
   /** Mark the point of the scene that is seen at a place of the view. @param {number} x @param {number} y CSS pixels */
   async mark(x, y) {
-    if (!this.view) return;
+    if (!this.view) {
+      this.state.textContent = LOADING;
+      return;
+    }
     try {
       const point = await pointAt(this.stage.shown.address, this.view, x, y);
       if (!point) {
-        notify("There is nothing of the scene at this place.", "warning");
+        this.state.textContent = "There is nothing of the scene at this place. Mark another one.";
         return;
       }
       this.points = this.points.length === 2 ? [point] : [...this.points, point];
       this.draw();
       this.tell();
     } catch (error) {
-      notify(/** @type {Error} */ (error));
+      this.state.textContent = /** @type {Error} */ (error).message;
     }
   }
 
@@ -111,7 +115,6 @@ export class Measure {
     this.state.textContent = measured === null
       ? ["Click a first point in the view.", "Click a second point in the view."][this.points.length]
       : `The points are ${this.distance(measured)} apart.`;
-    this.set.disabled = measured === null;
   }
 
   draw() {
@@ -125,10 +128,9 @@ export class Measure {
   setScale() {
     const { measured } = this;
     const known = Number(this.known.value);
-    if (measured === null || !(known > 0) || !(measured > 0)) {
-      notify("Give the true length as a number over 0.", "warning");
-      return;
-    }
+    if (measured === null || !(measured > 0)) return this.refuse("Mark two points first: their distance is what the true length belongs to.", this.middleButton);
+    if (!(known > 0)) return this.refuse("Give the true length as a number over 0.", this.known);
+    this.known.removeAttribute("aria-invalid");
     this.scale = { factor: known / measured, unit: this.unit.value.trim() || "units" };
     try {
       localStorage.setItem(this.key, JSON.stringify(this.scale));
@@ -137,6 +139,13 @@ export class Measure {
     }
     this.draw();
     this.tell();
+  }
+
+  /** Say why nothing was done, and lead to what comes first. @param {string} reason @param {HTMLElement} place */
+  refuse(reason, place) {
+    this.state.textContent = reason;
+    if (place === this.known) place.setAttribute("aria-invalid", "true");
+    place.focus();
   }
 
   dropScale() {

@@ -1,9 +1,8 @@
 // The viewer of the model's page with its tools: kinds of view, cameras, far background, time-lapse, measuring.
 
 import { byId, h, toggle } from "../dom.js";
-import { bytes } from "../format.js";
+import { openModel } from "../opening.js";
 import { noticeOf } from "../shell.js";
-import { open } from "../viewer.js";
 import { GRADIENT } from "../viewer/depth.js";
 import { HELP } from "../viewer/controls.js";
 import { Edit } from "./edit.js";
@@ -31,6 +30,8 @@ export class Stage {
     /** Distance of the far shell over that of the farthest camera; 0 where there is none. */
     this.shell = plan?.far_shell ? Number(facts?.shell_distance) || 0 : 0;
     this.showing = { cameras: false, hidden: false };
+    /** Name of the photo from whose place the view looks; "" once it was moved. */
+    this.photo = "";
     this.note = byId("viewer-note");
     this.kind = h("select", { "aria-label": "Kind of view", onchange: () => this.switchTo(this.kind.value) },
       h("option", { value: "webgl" }, "3D"), h("option", { value: "pictures" }, "Pictures by the server"), h("option", { value: "depth" }, "Depth"));
@@ -55,33 +56,26 @@ export class Stage {
     const camera = this.view?.getCamera();
     this.view?.dispose();
     this.view = null;
-    const loading = byId("loading");
-    loading.textContent = "Loading the model";
     try {
-      this.view = await open(byId("viewer"), {
-        url: `${shown.address}/files/model.ply`,
-        model: shown.address,
-        cameras: shown.cameras.map((entry) => entry.camera),
+      this.view = await openModel(byId("viewer"), { ...shown, files: shown.model.files }, {
         kind,
         antialias: antialias(shown.report),
         background: shown.background,
         roam: this.shell ? ROAM * this.shell : ROAM_FREELY,
         label: shown.model.name || "The model",
-        progress: (done, total) => {
-          loading.textContent = `Loading the model: ${bytes(done)}${total ? ` of ${bytes(total)}` : ""}`;
-        },
       });
     } catch (error) {
-      loading.textContent = "";
       byId("viewer").append(noticeOf(/** @type {Error} */ (error)));
       return;
     }
-    loading.textContent = "";
     const { view } = this;
     this.kind.value = view.kind;
-    this.note.textContent = view.whyNot || HELP;
     if (camera) view.setCamera(camera);
-    view.addEventListener("trouble", (event) => (loading.textContent = /** @type {CustomEvent} */ (event).detail));
+    view.addEventListener("move", () => {
+      if (!this.photo) return;
+      this.photo = "";
+      this.tell();
+    });
     view.addEventListener("range", (event) => this.showScale(/** @type {CustomEvent} */ (event).detail));
     view.addEventListener("pick-camera", (event) => {
       const { name } = /** @type {CustomEvent} */ (event).detail;
@@ -110,10 +104,16 @@ export class Stage {
   /** @param {any} entry of the cameras */
   lookFrom(entry) {
     this.view?.setCamera(entry.camera);
-    this.selected = entry.name;
+    this.selected = this.photo = entry.name;
     this.toggleCameras(this.showing.cameras);
     byId("viewer").scrollIntoView({ block: "nearest" });
-    this.note.textContent = `The view of ${entry.name}.`;
+  }
+
+  /** Say below the view what it shows, or else how it is moved. */
+  tell() {
+    this.note.textContent = this.photo ? `The view of ${this.photo}.`
+      : this.showing.cameras ? "Blue: trained on. Orange: held out. Click the tip of a camera to look from there."
+        : this.view?.whyNot || HELP;
   }
 
   /** @param {boolean} on */
@@ -123,7 +123,7 @@ export class Stage {
       name: entry.name, camera: entry.camera, selected: entry.name === this.selected,
       color: entry.split === "test" ? "#f0a061" : "#8fb2ff",
     })) : []);
-    if (on) this.note.textContent = "Blue: trained on. Orange: held out. Click the tip of a camera to look from there.";
+    this.tell();
   }
 
   /** @param {boolean} on */

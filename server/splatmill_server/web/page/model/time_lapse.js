@@ -44,7 +44,8 @@ export function timeLapse({ report, address, model }, stage) {
     try {
       while (shown !== wanted) {
         const next = wanted;
-        await stage.view?.replace({ url: `${address}/files/${taken[next]?.file ?? "model.ply"}` });
+        const file = taken[next]?.file;
+        await stage.view?.replace(file ? { url: `${address}/files/${file}` } : stage.view.source);
         shown = next;
       }
     } catch (error) {

@@ -1,3 +1,6 @@
+/** What a tool says that needs the view before it is there. */
+export const LOADING = "The model is still being loaded. Try again in a moment.";
+
 /** Why a model cannot be shown. */
 export class ViewerError extends Error {
   /**

@@ -3,7 +3,10 @@
  */
 import { ViewerError } from "./errors.js";
 
-/** @typedef {{url?: string, bytes?: ArrayBuffer | Uint8Array}} Source  a file of a model */
+/**
+ * @typedef {{url?: string, bytes?: ArrayBuffer | Uint8Array, what?: string}} Source  a file of a model
+ *   what: what is loaded, in words; left out, "the model"
+ */
 
 const DRAWN = "The viewer draws .ply, compressed .ply and .sog.";
 

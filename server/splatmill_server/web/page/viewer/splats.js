@@ -22,8 +22,9 @@ export function hasWebGL() {
 export class Splats {
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {{antialias?: boolean, background?: [number, number, number], again: () => void}} options
+   * @param {{antialias?: boolean, background?: [number, number, number], again: () => void, drawn: () => void}} options
    *   antialias: whether the model was trained with antialiasing. again: called when another frame has to be drawn.
+   *   drawn: called when a frame shows a model.
    * @returns {Promise<Splats>}
    */
   static async open(canvas, options) {
@@ -51,6 +52,8 @@ export class Splats {
     this.pc = pc;
     this.canvas = canvas;
     this.again = options.again;
+    this.drawn = options.drawn;
+    this.sorted = false;
     const settings = new pc.AppOptions();
     settings.graphicsDevice = device;
     settings.componentSystems = [pc.CameraComponentSystem, pc.GSplatComponentSystem];
@@ -75,7 +78,10 @@ export class Splats {
     gsplat.material.update();
     this.app.start();
     cancelAnimationFrame(this.app.frameRequestId);
-    this.app.scene.on("gsplat:sorted", () => this.again());
+    this.app.scene.on("gsplat:sorted", () => {
+      this.sorted = true;
+      this.again();
+    });
     this.app.systems.gsplat.on("frame:request", () => this.again());
     device.on("devicerestored", () => this.again());
     /** @type {any} */
@@ -159,6 +165,7 @@ export class Splats {
     app.renderNextFrame = true;
     app.tick(performance.now());
     cancelAnimationFrame(app.frameRequestId); // the viewer decides when the next frame is drawn
+    if (this.sorted) this.drawn();
   }
 
   dispose() {
