@@ -11,7 +11,7 @@ PIP_ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 KERNELS := $(shell find worker/splatmill_worker/kernels/cpu -name '*.[ch]pp' 2>/dev/null) worker/CMakeLists.txt
-WEB := server/web/package.json server/web/package-lock.json server/web/packages.py
+WEB := server/web/package.json server/web/package-lock.json server/web/packages.py server/web/bundle.mjs
 PARTS := constraints.txt $(wildcard */pyproject.toml) client/splatmill/__init__.py server/setup.py worker/version.py
 # The tests run in this many processes, a file in one process. They wait for servers and browsers a third of the time, so there
 # are three more than cores.

@@ -15,15 +15,18 @@ class AsyncShares:
         self._connection = connection
         self._path = f"/v1/models/{model_id}/shares"
 
-    async def create(self, *, expires_in: float | str = "30d", name: str | None = None) -> ShareWithToken:
+    async def create(
+        self, *, expires_in: float | str = "30d", name: str | None = None, photos: bool = False
+    ) -> ShareWithToken:
         """Create a link. `path` of the returned one is its address on the server, which cannot show it again.
 
         expires_in: for how long it is valid: seconds, or a text such as 12h or 30d.
+        photos: whether the held-out photos and the page of the report, which shows some, go along.
 
         Raises InvalidRequest for a time that is not valid.
         """
         try:
-            request = CreateShare.model_validate({"expires_in": expires_in, "name": name})
+            request = CreateShare.model_validate({"expires_in": expires_in, "name": name, "photos": photos})
         except ValidationError as error:
             raise invalid_request(error) from error
         # It is sent once: repeated after a lost answer, it would leave a link that nobody knows of.
@@ -46,9 +49,11 @@ class Shares:
         self._loop = loop
         self._async = shares
 
-    def create(self, *, expires_in: float | str = "30d", name: str | None = None) -> ShareWithToken:
+    def create(
+        self, *, expires_in: float | str = "30d", name: str | None = None, photos: bool = False
+    ) -> ShareWithToken:
         """Create a link. `path` of the returned one is its address on the server, which cannot show it again."""
-        return self._loop.run(self._async.create(expires_in=expires_in, name=name))
+        return self._loop.run(self._async.create(expires_in=expires_in, name=name, photos=photos))
 
     def revoke(self, share_id: str) -> None:
         """Revoke a link at once and for good."""

@@ -19,7 +19,16 @@ from pydantic import ValidationError
 from splatmill.backplane import layout
 from splatmill.backplane.records import FORMAT, check_format, reason, warn
 from splatmill.backplane.storage import Storage
-from splatmill.schema import CreateShare, Response, Share, SharedModel, ShareWithToken, Time
+from splatmill.schema import (
+    HELD_OUT,
+    CreateShare,
+    ModelCameras,
+    Response,
+    Share,
+    SharedModel,
+    ShareWithToken,
+    Time,
+)
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.root_path import address
 from splatmill_server.models import Models
@@ -30,9 +39,12 @@ MAX_SHARES = 100
 KEPT_ENDED = timedelta(days=90)
 """Time for which the record of a link that has ended is kept, so that its page can say so."""
 
-HIDDEN_FILES = frozenset({"job.json", "frame.json", "report.json"})
+_HIDDEN_FILES = frozenset({"job.json", "frame.json", "report.json"})
 """Files of a model that no link gives out: the record names the owner and the options of the job, the frame says where
 the photos were taken, and the report for programs names the machine. The page of the report does not."""
+
+_REPORT_PAGE = "report.html"
+"""It shows photos, so that it is given out with the held-out photos alone."""
 
 _TOKEN = re.compile(r"([a-z0-9]{8,40})-([0-9a-f]{8})-([0-9a-f]{32})", re.ASCII)
 
@@ -50,6 +62,7 @@ class StoredShare(Response):
     created_at: Time
     expires_at: Time
     revoked_at: Time | None = None
+    photos: bool = False
     sha256: str
 
     @property
@@ -61,6 +74,11 @@ class StoredShare(Response):
     def ended_at(self) -> Time:
         """When the link ended, or will end."""
         return min(self.revoked_at or self.expires_at, self.expires_at)
+
+    def gives(self, name: str) -> bool:
+        """Whether it gives out a file of the model."""
+        shows_photos = name == _REPORT_PAGE or name.startswith(f"{HELD_OUT}/")
+        return name not in _HIDDEN_FILES and (self.photos or not shows_photos)
 
     def public(self) -> Share:
         """Return what the owner sees of it."""
@@ -96,6 +114,7 @@ class Shares:
             name=request.name,
             created_at=now,
             expires_at=now + timedelta(seconds=request.expires_in),
+            photos=request.photos,
             sha256=_digest(token),
         )
         self._store(share)
@@ -143,9 +162,18 @@ class Shares:
     def get_model(self, share: StoredShare) -> SharedModel:
         """Return what somebody with the link may know of the model."""
         model = self.models.get(share.model)
-        files = [file for file in model.files if file.name not in HIDDEN_FILES]
+        files = [file for file in model.files if share.gives(file.name)]
         known = model.model_dump(exclude={"files"})
-        return SharedModel.model_validate(known | {"files": files, "expires_at": share.expires_at})
+        known |= {"antialias": self.models.antialias(share.model), "expires_at": share.expires_at}
+        return SharedModel.model_validate(known | {"files": files})
+
+    def get_cameras(self, share: StoredShare) -> ModelCameras:
+        """Return the cameras of the photos; those of a link without photos name no photo that it would not give out."""
+        found = self.models.get_cameras(share.model)
+        if share.photos:
+            return found
+        cameras = [camera.model_copy(update={"photo": None}) for camera in found.cameras]
+        return found.model_copy(update={"cameras": cameras})
 
     def _stored(self, model_id: str) -> Sequence[StoredShare]:
         entries = self.storage.entries(layout.shares_of(model_id))

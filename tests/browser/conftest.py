@@ -17,6 +17,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from PIL import Image
 from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
 from tests.support import still_life
@@ -117,6 +118,16 @@ def service(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 def model(service: Up, trained: Path) -> SmallModel:
     """The model that the service holds."""
     return SmallModel(**json.loads((trained / "model.json").read_text()))
+
+
+@pytest.fixture(scope="session")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of 14 photos of the still life."""
+    folder = tmp_path_factory.mktemp("photos")
+    for number, (_, rgb, _) in enumerate(still_life.pictures()):
+        picture = Image.fromarray(rgb).resize((4 * still_life.WIDTH, 4 * still_life.HEIGHT))
+        picture.save(folder / f"still_{number:02d}.jpg", quality=95)
+    return folder
 
 
 @dataclass

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import io
 import threading
 from collections.abc import Iterator
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -14,10 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
+import numpy.typing as npt
 import pytest
+from PIL import Image
 from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import Open, SmallModel
+from tests.browser.test_job_page import NO_WEBGL
 from tests.support.up import Up
 
 DRAWN = "() => Number(document.querySelector('#view .view')?.dataset.frames) > 0"
@@ -34,10 +39,19 @@ def test_links_are_made_and_revoked_on_the_page(service: Up, model: SmallModel, 
     tile.get_by_role("button", name="Share").press("Enter")
     dialog = page.get_by_role("dialog")
     dialog.get_by_label("Valid for").select_option("7 days")
+    expect(dialog).to_contain_text("the names of the photo files")
+    expect(dialog.get_by_label("Show photos too")).not_to_be_checked()
     dialog.get_by_label("For whom").fill("for mum")
     page.keyboard.press("Enter")
     link = dialog.get_by_label("The link").input_value()
-    assert httpx.get(f"{link}/model").json()["id"] == model.id
+    bare = httpx.get(f"{link}/model").json()
+    assert bare["id"] == model.id
+    dialog.get_by_label("Show photos too").check()
+    dialog.get_by_role("button", name="Make a link").click()
+    expect(dialog.get_by_role("listitem").filter(has_text="with photos")).to_have_count(1)
+    whole = httpx.get(f"{dialog.get_by_label('The link').input_value()}/model").json()
+    photos = {file["name"] for file in whole["files"]} - {file["name"] for file in bare["files"]}
+    assert photos == {"held_out/000.webp", "held_out/001.webp", "report.html"}
     expect(dialog).to_contain_text("Only this machine reaches 127.0.0.1")
     entry = dialog.get_by_role("listitem").filter(has_text="for mum")
     expect(entry).to_contain_text("valid until")
@@ -53,17 +67,42 @@ def test_links_are_made_and_revoked_on_the_page(service: Up, model: SmallModel, 
     )
 
 
+def picture(page: Page) -> npt.NDArray[np.float64]:
+    """The middle of the view as it is shown, without the words at its lower edge, RGB in 0 to 1."""
+    with Image.open(io.BytesIO(page.locator("#view").screenshot())) as shown:
+        pixels = np.asarray(shown.convert("RGB")) / 255.0
+    height, width = pixels.shape[:2]
+    side = int(0.6 * height)  # the picture is 4:3 and as high as the view
+    return pixels[: int(0.85 * height), width // 2 - side : width // 2 + side]
+
+
 def test_a_link_shows_the_scene_and_its_files(
     service: Up, model: SmallModel, link: dict[str, Any], open_window: Open
 ) -> None:
+    service.http.get(f"/v1/models/{model.id}/download/sog", timeout=60)
     visit = open_window(service)
     asked: list[str] = []
     visit.page.on("request", lambda request: asked.append(request.url))
-    visit.page.goto(link["path"])
+    session, loaded = visit.context.new_cdp_session(visit.page), [0]
+    session.send("Network.enable")
+    session.on("Network.dataReceived", lambda part: loaded.append(part["encodedDataLength"]))
+    slow = {"offline": False, "latency": 150, "downloadThroughput": 200_000, "uploadThroughput": 200_000}
+    session.send("Network.emulateNetworkConditions", slow)
+    visit.page.goto(link["path"], wait_until="commit")
+    visit.page.wait_for_function("() => document.querySelector('#view img')?.naturalWidth > 0", polling=50)
+    assert sum(loaded) < 60_000, "the picture comes before the engine"
+    poster = picture(visit.page)
+    expect(visit.page.locator(".view .said")).to_contain_text("Loading")
+    visit.page.wait_for_function(f"() => ({DRAWN})() && !document.querySelector('.view img')", polling=50)
+    assert sum(loaded) < 600_000
+    expect(visit.page.locator(".view .said")).to_be_empty()
+    assert -10 * np.log10(np.square(picture(visit.page) - poster).mean()) > 25, (
+        "it is the view of the picture"
+    )
+    assert not [url for url in asked if url.endswith("/model.ply")]
+    session.detach()
     expect(visit.page.get_by_role("heading", level=1)).to_have_text("still life")
     expect(visit.page.locator("#figures")).to_contain_text("Gaussians")
-    visit.page.wait_for_function(DRAWN, polling=100)
-    expect(visit.page.locator("img.still")).to_have_count(0)
     base = str(service.http.base_url).rstrip("/")
     allowed = (f"{base}{link['path']}", f"{base}/page/", f"{base}/vendor/", "blob:", "data:")
     assert not [url for url in asked if not url.startswith(allowed)], "it needs nothing that asks for a key"
@@ -96,8 +135,10 @@ def test_only_the_viewer_alone_can_be_framed_by_a_page_of_others(
     service: Up, link: dict[str, Any], open_window: Open, tmp_path: Path
 ) -> None:
     visit = open_window(service)
+    visit.context.add_init_script(NO_WEBGL)
     visit.page.goto(link["path"] + "/embed")
-    visit.page.wait_for_function(DRAWN, polling=100)
+    visit.page.locator(".view canvas[data-shown]").wait_for()
+    expect(visit.page.locator(".notice, .view img")).to_have_count(0)
     expect(visit.page.get_by_role("link", name="Open the page")).to_have_attribute("href", link["path"])
 
     base = str(service.http.base_url).rstrip("/")

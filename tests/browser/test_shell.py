@@ -4,9 +4,12 @@ bite. What the pages themselves do is tested page by page.
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from playwright.sync_api import Page, expect
 
+from splatmill_server.web.pages import PAGE
 from tests.browser.conftest import Open, SmallModel, Visit
 from tests.support.up import Up
 
@@ -51,8 +54,10 @@ def test_the_theme_follows_the_system_until_it_is_chosen(service: Up, open_windo
 
 def test_the_engine_of_the_viewer_loads_under_the_policy(page: Page) -> None:
     page.goto("/models")
-    found = page.evaluate("import('playcanvas').then((pc) => [pc.version, typeof pc.Application])")
-    assert found == ["2.23.3", "function"]
+    version, names = page.evaluate("import('playcanvas').then((pc) => [pc.version, Object.keys(pc)])")
+    assert version == "2.23.3"
+    used = re.findall(r"\bpc\.(\w+)", (PAGE.folder / "viewer" / "splats.js").read_text())
+    assert {*used} == {*names}, "server/web/bundle.mjs takes what the viewer uses"
 
 
 def test_the_policy_stops_scripts_of_others(visit: Visit) -> None:

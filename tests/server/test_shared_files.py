@@ -69,7 +69,11 @@ def test_a_link_gives_out_nothing_about_the_machine(serve: Serve, tmp_path: Path
         outcome.out,
         Room(app.redis, found.owner, job),
     )
-    link = app.http.post(f"/v1/models/{job}/shares", json={}).raise_for_status().json()["path"]
+    links = [
+        app.http.post(f"/v1/models/{job}/shares", json={"photos": photos}).raise_for_status().json()["path"]
+        for photos in (False, True)
+    ]
+    link = links[-1]
     with httpx.Client(base_url=app.http.base_url) as stranger:
         base = f"{link}/model"
         shown = stranger.get(base).raise_for_status()
@@ -93,6 +97,18 @@ def test_a_link_gives_out_nothing_about_the_machine(serve: Serve, tmp_path: Path
                 assert secret not in repr(answer.headers).encode(), f"the headers of {name} name the {kind}"
         for hidden in ("job.json", "frame.json", "report.json"):
             problem(stranger.get(f"{base}/files/{hidden}"), 404, "file_not_found")
+        # A link without photos gives out the same files but for the photos and the report, which shows some.
+        bare = f"{links[0]}/model"
+        left = {*names} - {file["name"] for file in stranger.get(bare).json()["files"]}
+        assert left == {"report.html"} | {name for name in names if name.startswith("held_out/")}
+        for name in left:
+            problem(stranger.get(f"{bare}/files/{name}"), 404, "file_not_found")
+        assert [
+            camera["photo"]
+            for camera in stranger.get(f"{base}/cameras").json()["cameras"]
+            if "photo" in camera
+        ]
+        assert not any(camera.get("photo") for camera in stranger.get(f"{bare}/cameras").json()["cameras"])
     own = app.http.get(f"/v1/jobs/{job}/report").raise_for_status().text
     for kind, secret in secrets_of(work).items():
         assert secret.decode() not in own or kind == "processor", (

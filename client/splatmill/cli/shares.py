@@ -22,13 +22,17 @@ def create(
         str, typer.Option(metavar="TIME", help="For how long the link is valid, such as 12h or 30d.")
     ] = "30d",
     name: Annotated[str | None, typer.Option(help="What people call the link.")] = None,
+    photos: Annotated[
+        bool,
+        typer.Option("--photos", help="Give out the held-out photos too, and the report, which shows some."),
+    ] = False,
     server: ServerOption = None,
 ) -> None:
     """Create a link to a model, and print its address, which the server cannot show again."""
     from splatmill.connection import own_path
 
     with open_client(server) as client:
-        made = client.model(model_id).shares.create(expires_in=expires_in, name=name)
+        made = client.model(model_id).shares.create(expires_in=expires_in, name=name, photos=photos)
         typer.echo(f"link {made.id}, valid until {made.expires_at:%Y-%m-%d %H:%M} UTC")
         typer.echo(f"{client.server.rstrip('/')}{own_path(client.server, made.path)}")
 

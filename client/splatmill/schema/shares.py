@@ -19,6 +19,10 @@ class CreateShare(Request):
         description="For how long the link is valid: seconds, or a text such as 90s, 12h, 30d.",
     )
     name: Label | None = Field(default=None, description="A name to recognise the link by.")
+    photos: bool = Field(
+        default=False,
+        description="Whether the link also gives out the held-out photos, and the report as a page, which shows some.",
+    )
 
 
 class Share(Response):
@@ -30,6 +34,7 @@ class Share(Response):
     created_at: Time
     expires_at: Time
     revoked_at: Time | None = Field(default=None, description="When it was revoked.")
+    photos: bool = Field(default=False, description="Whether it gives out held-out photos and the report.")
     active: bool = Field(description="Whether the link is neither revoked nor expired.")
 
 
@@ -55,6 +60,9 @@ class SharedModel(Response):
     gaussians: int = Field(ge=0, description="Number of Gaussians.")
     bytes: int = Field(ge=0, description="Size of model.ply in bytes.")
     sh_degree: int = Field(ge=0, le=3, description="Degree of the spherical harmonics.")
+    antialias: bool = Field(
+        default=False, description="Whether it was trained with antialiasing, and is to be drawn with it."
+    )
     psnr: Measured = Field(default=None, description="Mean over the held-out photos, in dB.")
     ssim: Measured = Field(default=None, description="Mean over the held-out photos.")
     files: list[ModelFile] = Field(default_factory=list, description="The files that the link gives out.")

@@ -16,7 +16,7 @@ from splatmill_server.base.root_path import address
 from splatmill_server.routes.models import CAMERA_QUERY, RENDER_PROBLEMS, RENDERED
 from splatmill_server.routes.openapi import answer, binary, problems
 from splatmill_server.service import Shared
-from splatmill_server.shares import HIDDEN_FILES, StoredShare
+from splatmill_server.shares import StoredShare
 
 router = APIRouter(prefix="/s/{token}/model", tags=["shares"])
 
@@ -60,7 +60,7 @@ def get_shared_model(service: Shared, share: OpenShare) -> SharedModel:
 )
 async def get_shared_file(service: Shared, share: OpenShare, name: str, request: Request) -> Response:
     """Download a file of the model that a link shows."""
-    if name in HIDDEN_FILES:
+    if not share.gives(name):
         raise ProblemError("file_not_found", f"The link gives out no file {name!r}.")
     return await model_file(service, share.model, name, request)
 
@@ -127,7 +127,7 @@ async def download_shared(
 )
 def get_shared_cameras(service: Shared, share: OpenShare) -> ModelCameras:
     """Get the cameras of the photos in the coordinates of the model that a link shows."""
-    return service.models.get_cameras(share.model)
+    return service.shares.get_cameras(share)
 
 
 @router.get(

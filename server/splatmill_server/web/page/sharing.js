@@ -1,7 +1,7 @@
 // The dialog that makes, shows and revokes links to a model.
 
 import { at, isLoopback } from "./address.js";
-import { get, send } from "./api.js";
+import { get, request, send } from "./api.js";
 import { h } from "./dom.js";
 import { moment } from "./format.js";
 import { noticeOf } from "./shell.js";
@@ -15,6 +15,7 @@ const TERMS = [["1d", "1 day"], ["7d", "7 days"], ["30d", "30 days"], ["365d", "
  */
 export async function openSharing(address, name) {
   const term = h("select", { id: "share-term" }, TERMS.map(([value, text]) => h("option", { value, selected: value === "30d" }, text)));
+  const photos = h("input", { type: "checkbox", id: "share-photos", "aria-describedby": "share-photos-hint" });
   const label = h("input", { id: "share-name", maxlength: 200, autocomplete: "off" });
   const made = h("div", { class: "stack", role: "status" });
   const list = h("ul", { class: "links" });
@@ -23,12 +24,15 @@ export async function openSharing(address, name) {
     h("div", { class: "row" },
       h("div", { class: "field" }, h("label", { for: "share-term" }, "Valid for"), term),
       h("div", { class: "field" }, h("label", { for: "share-name" }, "For whom (only you see it)"), label)),
+    h("div", {},
+      h("label", { class: "row small", for: "share-photos" }, photos, "Show photos too"),
+      h("p", { class: "hint", id: "share-photos-hint" }, "The photos that the model was compared with, in full size, and the report, which shows some of them.")),
     h("p", {}, h("button", { class: "primary", type: "submit" }, "Make a link")));
   const dialog = h("dialog", { class: "sharing", "aria-labelledby": "sharing-title" },
     h("div", { class: "stack" },
       h("div", { class: "row" }, h("h2", { id: "sharing-title" }, `Share ${name}`),
         h("button", { class: "quiet small push", type: "button", "aria-label": "Close", onclick: () => dialog.close() }, "✕")),
-      h("p", { class: "muted" }, "Whoever has the link sees this model, its files and its cameras, without a key and without being listed anywhere, until the link ends."),
+      h("p", {}, "Whoever has the link can look at this model and download it, without a key, until the link ends. With it go its picture, where each photo was taken relative to the scene, the names of the photo files, and how the error fell. It is listed nowhere."),
       form, trouble, made, list));
 
   /** Do what may fail, and say it in the dialog. @param {() => Promise<void>} work */
@@ -45,7 +49,7 @@ export async function openSharing(address, name) {
     const { shares } = await get(`${address}/shares`);
     list.replaceChildren(...shares.map((/** @type {any} */ share) => h("li", { class: "row" },
       h("span", {}, share.name || `Link ${share.id}`),
-      h("span", { class: "hint" }, share.revoked_at ? `revoked ${moment(share.revoked_at)}` : `${share.active ? "valid until" : "expired"} ${moment(share.expires_at)}`),
+      h("span", { class: "hint" }, share.revoked_at ? `revoked ${moment(share.revoked_at)}` : `${share.active ? "valid until" : "expired"} ${moment(share.expires_at)}${share.photos ? ", with photos" : ""}`),
       share.active && h("button", { class: "small push", type: "button", onclick: () => revoke(share) }, "Revoke", h("span", { class: "visually-hidden" }, ` ${share.name || share.id}`)))));
   }
 
@@ -59,7 +63,8 @@ export async function openSharing(address, name) {
   form.addEventListener("submit", (event) => {
     event.preventDefault();
     void tried(async () => {
-      const share = await send("POST", `${address}/shares`, { expires_in: term.value, name: label.value.trim() || null });
+      const share = await send("POST", `${address}/shares`, { expires_in: term.value, name: label.value.trim() || null, photos: photos.checked });
+      request("HEAD", `${address}/download/sog`).catch(() => {}); // what visitors load is made before they come
       made.replaceChildren(link(`${location.origin}${at(share.path)}`));
       label.value = "";
       await show();

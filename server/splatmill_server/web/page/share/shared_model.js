@@ -36,7 +36,7 @@ async function view(box, model, name) {
   try {
     const has = model.files.some((/** @type {any} */ file) => file.name === "cameras.json");
     const [{ cameras }, { openModel }] = await Promise.all([has ? get(`${address}/cameras`) : { cameras: [] }, import("../opening.js")]);
-    await openModel(box, { address, files: model.files, cameras, waits: true }, { label: name });
+    await openModel(box, { address, files: model.files, cameras, waits: true }, { antialias: model.antialias, label: name });
   } catch (error) {
     // The picture of the model, which the page came with, stays.
     box.append(noticeOf(/** @type {Error} */ (error), "warning"));
