@@ -106,7 +106,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         ],
     )
     app.state.service = service
-    problems.install(app)
+    problems.install(app, pages.missing_page)
     app.router.routes.extend(_routes())
     _describe(app, keyless=settings.local and settings.api_key is None)
     return app

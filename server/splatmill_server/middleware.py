@@ -7,11 +7,13 @@ import logging
 import time
 import uuid
 from collections.abc import Awaitable, Callable
+from urllib.parse import quote
 
 import redis
 import structlog
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
+from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from splatmill.backplane.storage import StorageError
@@ -22,6 +24,7 @@ from splatmill_server.access.permission import is_open
 from splatmill_server.base.problems import (
     ProblemError,
     ProblemResponse,
+    for_people,
     problem_of_redis,
     problem_of_storage,
     shown_path,
@@ -75,8 +78,7 @@ class RequestMiddleware:
                 try:
                     await self._admit(scope, headers)
                 except ProblemError as refused:
-                    response = ProblemResponse(refused.problem, scope["path"], refused.headers)
-                    await response(scope, receive, send_marked)
+                    await _refusal(refused, scope, headers)(scope, receive, send_marked)
                 else:
                     await self._answer(scope, self._bounded(scope, headers, receive), send_marked)
         finally:
@@ -180,6 +182,13 @@ class RequestMiddleware:
             advice="Upload files one by one with PUT /v1/captures/{id}/images/{name}.",
             facts={"limit": self.max_body},
         )
+
+
+def _refusal(refused: ProblemError, scope: Scope, headers: Headers) -> Response:
+    """The answer to a refused request; somebody without a session who asks for a page is led to the sign-in page."""
+    if refused.problem.status == 401 and for_people(scope, headers):
+        return RedirectResponse(f"/sign-in?next={quote(scope['path'])}", 303)
+    return ProblemResponse(refused.problem, scope["path"], refused.headers)
 
 
 def _job_of(scope: Scope) -> dict[str, str]:

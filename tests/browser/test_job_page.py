@@ -328,7 +328,7 @@ def test_the_page_fits_a_phone(service: Up, model: SmallModel, open_window: Open
 def test_a_job_that_is_not_there_says_so(page: Page, visit: Any) -> None:
     visit.watched.allow("404")
     page.goto("/jobs/0123456789abcdef")
-    expect(page.get_by_role("alert")).to_contain_text("0123456789abcdef")
+    expect(page.get_by_role("alert")).to_contain_text("The list of jobs shows those that are there.")
 
 
 COURSE = """async (records) => {

@@ -34,6 +34,22 @@ def shown(page: Page, model: SmallModel) -> Page:
     return page
 
 
+FOR_PROGRAMS = re.compile(r"(GET|POST|PUT|DELETE) /|/v1/|image_size|registered|harmonics are|\b1 \w+s\b")
+"""Words of the API and of the field that pages for people do without."""
+
+
+def test_figures_and_settings_are_in_plain_words_with_a_link_to_what_they_mean(shown: Page) -> None:
+    expect(shown.locator("#lead")).to_contain_text("dB on photos that it has not seen")
+    expect(shown.locator("#downloads")).to_contain_text("view-dependent colour", timeout=WAIT)
+    assert not FOR_PROGRAMS.findall(shown.inner_text("main"))
+    shown.locator("#lead .term").last.click()
+    expect(shown.locator("dt:target")).to_have_text("dB, PSNR")
+    assert shown.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    shown.goto("/")
+    shown.locator("html[data-ready]").wait_for()
+    assert not FOR_PROGRAMS.findall(shown.locator("main").text_content() or "")
+
+
 def test_the_model_is_compared_with_its_held_out_photos(service: Up, model: SmallModel, shown: Page) -> None:
     cameras = service.http.get(f"/v1/models/{model.id}/cameras").json()["cameras"]
     held = {camera["name"]: camera for camera in cameras if camera["split"] == "test"}
@@ -228,7 +244,14 @@ def test_assistive_technology_finds_nothing_serious(
 def test_a_model_that_is_not_there_is_said(visit: Visit) -> None:
     visit.watched.allow("404")
     visit.page.goto("/models/0123456789abcdef")
-    expect(visit.page.get_by_role("alert")).to_contain_text("There is no model '0123456789abcdef'.")
+    alert = visit.page.get_by_role("alert")
+    expect(alert).to_contain_text("There is no model '0123456789abcdef'.")
+    expect(alert).to_contain_text("The list of models shows those that are there.")
+    assert "/v1/" not in visit.page.inner_text("main")
+    visit.page.goto("/nothing/here")
+    expect(visit.page.get_by_role("heading", level=1)).to_have_text("There is no page at this address")
+    visit.page.get_by_role("link", name="Models").click()
+    expect(visit.page.get_by_role("heading", level=1)).to_have_text("Models")
 
 
 def test_deleting_asks_first(model: SmallModel, shown: Page) -> None:

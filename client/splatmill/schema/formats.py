@@ -49,7 +49,7 @@ MODEL_FORMATS: dict[str, ModelFormat] = {
             readable=True,
             writable=True,
             loses="Positions and scales keep 10 to 11 bits within a chunk of 256 Gaussians, colours and opacities 8; "
-            "harmonics are clamped to 4 and keep steps of 1/32.",
+            "view-dependent colour is limited to 4 and keeps steps of 1/32.",
             readers=("SuperSplat", "PlayCanvas", "Spark"),
         ),
         ModelFormat(
@@ -59,7 +59,7 @@ MODEL_FORMATS: dict[str, ModelFormat] = {
             readable=True,
             writable=True,
             loses="Scales keep steps of 6 % and lie between 0.00005 and 380 units, opacities and colours keep 8 bits, "
-            "harmonics are clamped to 1 and keep 6 bits. The offset of far scenes is lost.",
+            "view-dependent colour is limited to 1 and keeps 6 bits. The offset of far scenes is lost.",
             readers=("Scaniverse", "Spark", "Babylon.js", "splat-transform"),
         ),
         ModelFormat(
@@ -68,7 +68,7 @@ MODEL_FORMATS: dict[str, ModelFormat] = {
             "application/octet-stream",
             readable=True,
             writable=False,
-            loses="All harmonics above the colour; colours, opacities and quaternions keep 8 bits.",
+            loses="All view-dependent colour; colours, opacities and quaternions keep 8 bits.",
         ),
         ModelFormat(
             ".ksplat",
@@ -76,7 +76,8 @@ MODEL_FORMATS: dict[str, ModelFormat] = {
             "application/octet-stream",
             readable=True,
             writable=False,
-            loses="Harmonics of degree 3; at levels 1 and 2 positions keep 16 bits within a bucket, the rest 8 to 16.",
+            loses="View-dependent colour of degree 3; at levels 1 and 2 positions keep 16 bits in a bucket, and the "
+            "rest 8 to 16.",
         ),
         ModelFormat(
             ".sog",
@@ -85,7 +86,7 @@ MODEL_FORMATS: dict[str, ModelFormat] = {
             readable=True,
             writable=True,
             loses="Positions keep 16 bits of their logarithm; scales and colours are of 256 values, chosen for the "
-            "scene; rotations and opacities keep 8 bits; the harmonics of similar Gaussians become the same.",
+            "scene; rotations and opacities keep 8 bits; similar Gaussians get the same view-dependent colour.",
             readers=("SuperSplat", "PlayCanvas", "Spark", "Babylon.js"),
         ),
         ModelFormat(

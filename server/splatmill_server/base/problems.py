@@ -1,13 +1,14 @@
 """Converts every error into a problem document (RFC 9457) with a code from `splatmill.schema.PROBLEMS`."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import redis
 import structlog
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.responses import Response
@@ -74,13 +75,27 @@ def _methods(request: Request) -> list[str]:
     return [method for method in METHODS if accepted(method)]
 
 
-def install(app: FastAPI) -> None:
-    """Register the handlers of all errors that endpoints raise."""
+def for_people(scope: Scope, headers: Headers) -> bool:
+    """Whether a browser asks for a page, to show it to a person, and not a program for an answer of the API."""
+    return (
+        scope["method"] in ("GET", "HEAD")
+        and "text/html" in headers.get("accept", "")
+        and not own_path(scope).startswith("/v1/")
+    )
+
+
+def install(app: FastAPI, missing_page: Callable[[Request], Response]) -> None:
+    """Register the handlers of all errors that endpoints raise.
+
+    missing_page: returns what people see at an address that has no page.
+    """
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:
         if isinstance(error, ProblemError):
             return ProblemResponse(error.problem, request.url.path, error.headers)
+        if error.status_code == 404 and for_people(request.scope, request.headers):
+            return missing_page(request)
         code, path, headers = code_for_status(error.status_code), request.url.path, dict(error.headers or {})
         match error.status_code:
             case 404:

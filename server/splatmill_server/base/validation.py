@@ -68,7 +68,24 @@ def _path(error: Any) -> str:
     return ".".join(str(part) for part in error["loc"] if part != "body") or "body"
 
 
+_WORDS = {
+    "greater_than": "It must be more than {gt}.",
+    "greater_than_equal": "It must be at least {ge}.",
+    "less_than": "It must be less than {lt}.",
+    "less_than_equal": "It must be at most {le}.",
+    "enum": "It must be {expected}.",
+    "literal_error": "It must be {expected}.",
+    "int_parsing": "It must be a whole number.",
+    "int_type": "It must be a whole number.",
+    "float_parsing": "It must be a number.",
+    "float_type": "It must be a number.",
+}
+"""What pydantic says of a value, in words that also fit beside a field of the page."""
+
+
 def _sentence(error: Any) -> str:
+    if (words := _WORDS.get(error["type"])) is not None:
+        return words.format(**error.get("ctx", {}))
     text = str(error["msg"]).removeprefix("Value error, ").strip()
     return text[:1].upper() + text[1:] + ("" if text.endswith((".", "?", "!")) else ".")
 

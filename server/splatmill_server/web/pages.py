@@ -72,6 +72,19 @@ def sign_in_page(request: Request) -> Response:
     return page(request, "sign-in/sign-in.html")
 
 
+@router.api_route("/glossary", methods=_METHODS)
+def glossary_page(request: Request) -> Response:
+    """What the words of the pages mean."""
+    return page(request, "plain/glossary.html")
+
+
+def missing_page(request: Request) -> Response:
+    """What people see at an address that has no page."""
+    shown = page(request, "plain/missing.html")
+    shown.status_code = 404
+    return shown
+
+
 @router.api_route("/s/{token}", methods=_METHODS)
 def share_page(service: Shared, request: Request, token: str) -> Response:
     """A model that somebody has shared."""

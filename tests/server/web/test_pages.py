@@ -5,6 +5,7 @@ Not proved here: that a browser shows it (tests/browser).
 
 from __future__ import annotations
 
+import ast
 import base64
 import hashlib
 import json
@@ -16,9 +17,18 @@ import pytest
 
 from splatmill_server.web import pages
 from splatmill_server.web.tree import Tree
+from tests.support.paths import ROOT
 from tests.support.served_app import Serve, ServedApp, problem
 
-PAGES = ("/", "/jobs", "/jobs/0123456789abcdef", "/models", "/models/0123456789abcdef", "/sign-in")
+PAGES = (
+    "/",
+    "/jobs",
+    "/jobs/0123456789abcdef",
+    "/models",
+    "/models/0123456789abcdef",
+    "/sign-in",
+    "/glossary",
+)
 
 
 @pytest.mark.parametrize("path", PAGES)
@@ -116,3 +126,39 @@ def test_every_page_has_a_place_for_the_import_map() -> None:
         text = (pages.PAGE.folder / name).read_text()
         assert text.count(pages.IMPORT_MAP_HERE) == 1, name
         assert '<html lang="en">' in text, name
+
+
+def test_people_read_no_requests_of_the_api_as_advice() -> None:
+    replaced = (pages.PAGE.folder / "advice.js").read_text()
+    known = set(re.findall(r"^  (\w+): \"", replaced, re.MULTILINE))
+    request = re.search(r"const REQUEST = /(.+)/;", replaced)
+    assert request is not None
+    codes = {
+        call.args[0].value
+        for path in (ROOT / "server" / "splatmill_server").rglob("*.py")
+        for call in ast.walk(ast.parse(path.read_text()))
+        if isinstance(call, ast.Call) and call.args and isinstance(call.args[0], ast.Constant)
+        for keyword in call.keywords
+        if keyword.arg == "advice" and re.search(request[1].replace("\\/", "/"), ast.unparse(keyword.value))
+    }
+    unseen = {
+        "key_not_found",
+        "import_not_found",
+        "webhook_not_found",
+        "delivery_not_found",
+    }  # no page asks for them
+    assert len(codes) > 20
+    assert codes - known == unseen
+
+
+def test_people_see_a_page_at_an_unknown_address_and_programs_a_problem(serve: Serve) -> None:
+    browser = {"Accept": "text/html,*/*"}
+    keyless, keyed = serve(), serve(api_key="s3cret")
+    page = keyless.http.get("/nothing/here", headers=browser)
+    assert (page.status_code, page.headers["content-type"]) == (404, "text/html; charset=utf-8")
+    problem(keyless.http.get("/nothing/here"), 404, "not_found")
+    problem(keyless.http.get("/v1/nothing", headers=browser), 404, "not_found")
+    with httpx.Client(base_url=keyed.http.base_url) as stranger:
+        led = stranger.get("/nothing/here", headers=browser)
+        assert (led.status_code, led.headers["location"]) == (303, "/sign-in?next=/nothing/here")
+        problem(stranger.get("/v1/models", headers=browser), 401, "unauthorized")

@@ -198,7 +198,7 @@ def require_usable(facts: dict[str, Any]) -> None:
     verified, turned = facts.get("pairs_verified", 0), facts.get("pairs_turned_only", 0)
     least = min_registered(photos)
     if registered < least or facts["points"] < MIN_POINTS:
-        outcome = f"Only {registered} of {photos} photos were registered, with {facts['points']} points"
+        outcome = f"Only {registered} of {photos} photos could be placed, with {facts['points']} points"
         if verified >= max(1, photos // 3) and turned > 0.5 * verified:
             raise SfmFailed(
                 "sfm_no_parallax",
@@ -217,7 +217,7 @@ def require_usable(facts: dict[str, Any]) -> None:
     if facts["parallax_degrees"] < MIN_TRIANGULATION_ANGLE:
         raise SfmFailed(
             "sfm_no_parallax",
-            f"{registered} of {photos} photos were registered, but the median triangulation angle of the points is "
+            f"{registered} of {photos} photos could be placed, but the median triangulation angle of the points is "
             f"{facts['parallax_degrees']} degrees, and at least {MIN_TRIANGULATION_ANGLE} are needed: the camera "
             "turned and hardly moved.",
             facts,

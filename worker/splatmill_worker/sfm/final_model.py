@@ -79,7 +79,7 @@ def _with_plausible_intrinsics(
             run.threads,
             run.options.seed,
             fixed_intrinsics=True,
-            on_progress=lambda done, total: run.on_progress("mapping", done, total, "photos registered"),
+            on_progress=lambda done, total: run.on_progress("mapping", done, total, "photos placed"),
             on_model=run.show,
             cancelled=run.cancelled,
         )
@@ -88,7 +88,7 @@ def _with_plausible_intrinsics(
         raise SfmFailed(
             "sfm_failed",
             f"The estimated camera has {implausible}, which no lens has; with the initial focal length only "
-            f"{again.registered} of {run.count} photos were registered, and at least {least} are needed.",
+            f"{again.registered} of {run.count} photos could be placed, and at least {least} are needed.",
             checks.pair_facts(result.matched) | checks.model_facts(again.largest, run.count),
             "Give the original photos, not cropped and all at the same zoom, taken from more sides.",
         )

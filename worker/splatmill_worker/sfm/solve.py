@@ -153,7 +153,7 @@ def _solve(run: SfmRun) -> EffortResult:
     for effort in _efforts(run.options, longest):
         if best is not None:
             run.notes.append(
-                f"{best_counts[0]} of {run.count} photos were registered reliably with {best.effort.name} effort; "
+                f"{best_counts[0]} of {run.count} photos were placed reliably with {best.effort.name} effort; "
                 f"{effort.name} effort was tried next."
             )
         result = solve_at(run, effort, best)

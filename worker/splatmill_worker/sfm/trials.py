@@ -61,7 +61,7 @@ def best_mapping(run: SfmRun, database: Path, verified: Collection[pairs.Pair]) 
                 run.threads,
                 run.options.seed,
                 relaxed=relaxed,
-                on_progress=lambda done, total: run.on_progress("mapping", done, total, "photos registered"),
+                on_progress=lambda done, total: run.on_progress("mapping", done, total, "photos placed"),
                 on_model=run.show,
                 cancelled=run.cancelled,
             )

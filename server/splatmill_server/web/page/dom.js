@@ -28,6 +28,14 @@ export function h(tag, attributes = {}, ...children) {
 }
 
 /**
+ * A word with a link to what it means on these pages.
+ * @param {string} text @param {string} id of its entry in glossary.html
+ */
+export function term(text, id) {
+  return h("a", { class: "term", href: `/glossary#${id}` }, text);
+}
+
+/**
  * Append children, leaving out those that are false or null.
  * @param {Element} element
  * @param {(Child | Child[])[]} children

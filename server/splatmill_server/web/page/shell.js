@@ -1,6 +1,7 @@
 // What every page has around its contents: header, navigation, theme switch, who is signed in, and notices.
 
 import { at, pathOfPage } from "./address.js";
+import { adviceOf } from "./advice.js";
 import { Problem, request, signIn, whole } from "./api.js";
 import { h } from "./dom.js";
 
@@ -126,7 +127,7 @@ export function notify(message, kind = message instanceof Error ? "error" : "inf
  * @param {"info" | "good" | "warning" | "error"} [kind]
  */
 export function noticeOf(message, kind = message instanceof Error ? "error" : "info") {
-  const advice = message instanceof Problem ? message.advice : "";
+  const advice = message instanceof Problem ? adviceOf(message) : "";
   return h("div", { class: "notice", "data-kind": kind, role: kind === "error" ? "alert" : "status" },
     h("div", { class: "row" }, h("div", {},
       h("p", {}, message instanceof Error ? message.message : message),

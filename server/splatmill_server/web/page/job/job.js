@@ -3,7 +3,7 @@
 import { Problem, follow, get, idOfPage, send } from "../api.js";
 import { ErrorChart } from "../chart.js";
 import { byId, h } from "../dom.js";
-import { bytes, decibels, moment, number, seconds } from "../format.js";
+import { bytes, count, decibels, moment, number, seconds } from "../format.js";
 import { FINAL, badgeKind, badgeText } from "../job_states.js";
 import { confirmAction, noticeOf, notify, startShell } from "../shell.js";
 import { Course } from "./course.js";
@@ -224,11 +224,11 @@ function outcome() {
 }
 
 function waiting() {
-  if (job.waiting_for) return `The job waits for a worker that serves the queue "${job.waiting_for}"; none does now. It begins once one is started.`;
+  if (job.waiting_for) return `No running worker serves "${job.waiting_for}". The job starts when one does.`;
   const { queue_position: place, estimated_start: start } = job;
   const when = start ? ` It probably begins at ${moment(start)}.` : "";
   if (place === null || place === undefined) return `The job begins in a moment.${when}`;
-  return place === 0 ? `The job is the next to begin.${when}` : `${number(place)} ${place === 1 ? "job is" : "jobs are"} run before this one.${when}`;
+  return place === 0 ? `The job is the next to begin.${when}` : `${count(place, "job")} ${place === 1 ? "is" : "are"} run before this one.${when}`;
 }
 
 /** @param {any} problem */
@@ -237,7 +237,7 @@ function failure(problem) {
   box.prepend(h("h2", {}, problem?.title ?? "The job failed"));
   const skipped = problem?.facts?.skipped;
   if (Array.isArray(skipped) && skipped.length) {
-    box.append(h("details", {}, h("summary", {}, `${number(skipped.length)} photos that are not used`), h("ul", {}, skipped.map((text) => h("li", {}, String(text))))));
+    box.append(h("details", {}, h("summary", {}, `${count(skipped.length, "photo")} not used`), h("ul", {}, skipped.map((text) => h("li", {}, String(text))))));
   }
   return box;
 }

@@ -1,7 +1,7 @@
 // Which photos are used and how, which are not and why, and which do not agree with the others.
 
 import { h } from "../dom.js";
-import { number } from "../format.js";
+import { count, number } from "../format.js";
 
 /** What a photo is to the job, in words. job.css has a colour for each kind that has a camera. */
 export const KINDS = /** @type {const} */ ({
@@ -50,7 +50,7 @@ export function photoParts(placement, kinds) {
     parts.push(h("ul", { class: "legend" }, [...counts].map(([kind, count]) =>
       h("li", { "data-kind": kind }, h("span", { class: "swatch", "aria-hidden": "true" }), `${number(count)} ${KINDS[/** @type {keyof typeof KINDS} */ (kind)]}`))));
   } else {
-    parts.push(h("p", {}, `${number(placement.cameras.length)} cameras and ${number(placement.points_total)} points are placed so far.`));
+    parts.push(h("p", {}, `${count(placement.cameras.length, "camera")} and ${count(placement.points_total, "point")} are placed so far.`));
   }
   if (unused.length) parts.push(h("h3", {}, "Photos that are not used"), table(unused));
   if (doubtful.length) parts.push(h("h3", {}, "Photos that do not agree with the others"), table(doubtful));

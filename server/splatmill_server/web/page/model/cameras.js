@@ -1,7 +1,7 @@
 // The table of the cameras, from whose places the model can be looked at.
 
 import { h } from "../dom.js";
-import { decibels } from "../format.js";
+import { count, decibels, number } from "../format.js";
 
 /**
  * @import {Shown} from "./model.js"
@@ -18,7 +18,7 @@ export function showCameras(section, { cameras }, stage) {
   section.hidden = false;
   const held = cameras.filter((camera) => camera.split === "test").length;
   section.append(h("details", {},
-    h("summary", {}, h("span", { id: "cameras-title" }, `Cameras: ${cameras.length} photos, ${held} of them held out`)),
+    h("summary", {}, h("span", { id: "cameras-title" }, `Cameras: ${count(cameras.length, "photo")}, ${number(held)} of them held out`)),
     h("div", { class: "scroll" }, h("table", { class: "table" },
       h("thead", {}, h("tr", {}, ["Photo", "Used for"].map((text) => h("th", { scope: "col" }, text)),
         ["PSNR", "SSIM"].map((text) => h("th", { scope: "col", class: "number" }, text)),

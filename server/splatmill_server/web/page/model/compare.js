@@ -1,8 +1,8 @@
 // The comparison of held-out photos with the model: photo and rendering of the same camera under a slider, with the
 // PSNR and SSIM of the report. The rendering is the server's, which is what was measured.
 
-import { h } from "../dom.js";
-import { decibels } from "../format.js";
+import { h, term } from "../dom.js";
+import { count, decibels, number } from "../format.js";
 
 /** @import {Shown} from "./model.js" */
 
@@ -73,8 +73,8 @@ export function showCompare(section, { address, cameras, background, report }) {
   });
   section.append(
     h("h2", { id: "compare-title" }, "Against photos that it has not seen"),
-    h("p", { class: "muted" }, `${photos.length} photos were held out from the training. Figures are those of the training's report${report.result?.ssim ? `: on average ${decibels(report.result.psnr)}, SSIM ${report.result.ssim.toFixed(3)}` : ""}.`,
-      missing > 0 && ` ${missing} more have no picture here; the report says why.`),
+    h("p", { class: "muted" }, `${count(photos.length, "photo")} ${photos.length === 1 ? "was" : "were"} `, term("held out", "held-out"), ` from the training. Figures are those of the training's report${report.result?.ssim ? `: on average ${decibels(report.result.psnr)}, SSIM ${report.result.ssim.toFixed(3)}` : ""}.`,
+      missing > 0 && ` ${number(missing)} more ${missing === 1 ? "has" : "have"} no picture here; the report says why.`),
     h("div", { class: "compare" },
       h("figure", {}, pair, slider, caption),
       h("div", { class: "stack" }, order, list)));

@@ -122,7 +122,7 @@ export class Edit {
 /** @param {any} done the answer of the server */
 function said(done) {
   const gone = done.gaussians_before - done.gaussians;
-  const error = done.psnr === null ? "no held-out photos to measure on"
+  const error = done.psnr === null ? "there are no photos to measure it on"
     : `${done.psnr_before.toFixed(2)} dB before, ${done.psnr.toFixed(2)} dB after`;
   return `${number(gone)} of ${number(done.gaussians_before)} Gaussians ${done.model ? "are left out" : "would be left out"}: ${error}.`;
 }

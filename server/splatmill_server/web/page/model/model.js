@@ -3,12 +3,13 @@
 import { at } from "../address.js";
 import { get, idOfPage, modelAddress, request } from "../api.js";
 import { byId, h } from "../dom.js";
-import { ago, bytes, decibels, number } from "../format.js";
+import { ago, bytes } from "../format.js";
 import { showCompare } from "./compare.js";
 import { showCameras } from "./cameras.js";
 import { showDownloads } from "./downloads.js";
 import { showOrbit } from "./orbit.js";
 import { Stage } from "./stage.js";
+import { figures } from "../figures.js";
 import { openSharing } from "../sharing.js";
 import { confirmAction, noticeOf, startShell } from "../shell.js";
 
@@ -49,12 +50,7 @@ async function show(shown) {
   const name = model.name || `Model ${model.id}`;
   document.title = `${name} - Splatmill`;
   byId("title").textContent = name;
-  byId("lead").textContent = [
-    `${number(model.gaussians)} Gaussians`,
-    bytes(model.bytes),
-    model.psnr === null || model.psnr === undefined ? "no held-out photos" : `${decibels(model.psnr)} on held-out photos`,
-    `made ${ago(model.created_at)}`,
-  ].join(" · ");
+  byId("lead").append(...figures(model), ` · ${bytes(model.bytes)} · made ${ago(model.created_at)}`);
   byId("actions").append(...actions(shown));
   byId("whole").hidden = false;
   showCompare(byId("compare"), shown);

@@ -1,7 +1,8 @@
 // The photos as a grid, each with its verdict and a button that leaves it out, and the other files as a list.
 
+import { adviceOf } from "../advice.js";
 import { h } from "../dom.js";
-import { bytes, number } from "../format.js";
+import { bytes, count, number } from "../format.js";
 
 /** @typedef {import("./items.js").Item} Item */
 
@@ -128,7 +129,7 @@ class FileRow extends Tile {
 
 /** @param {Item} item */
 function textOf(item) {
-  if (item.problem) return `${item.problem.message} ${item.problem.advice}`.trim();
+  if (item.problem) return `${item.problem.message} ${adviceOf(item.problem)}`.trim();
   if (item.left) return "Left out";
   if (item.stored) return "On the server";
   return item.lost ?? item.verdict.text;
@@ -137,5 +138,5 @@ function textOf(item) {
 /** @param {Item} item */
 function insideOf(item) {
   if (item.kind !== "archive" || !item.inside) return "";
-  return `${number(item.inside.length)} files inside`;
+  return `${count(item.inside.length, "file")} inside`;
 }

@@ -2,7 +2,7 @@
 
 import { Problem, each, get, send } from "../api.js";
 import { byId, h } from "../dom.js";
-import { ago, bytes, number } from "../format.js";
+import { ago, bytes, count, number } from "../format.js";
 import { estimateOf } from "./estimate.js";
 import { Gallery } from "./gallery.js";
 import { chosen, dropped } from "./given.js";
@@ -188,7 +188,7 @@ function summary() {
   const left = items.photos.length - photos.length;
   const size = items.used.reduce((sum, item) => sum + item.file.size, 0);
   return [
-    photos.length === 1 ? "one photo" : `${number(photos.length)} photos`, masks > 0 && `${number(masks)} masks`, bytes(size),
+    count(photos.length, "photo"), masks > 0 && count(masks, "mask"), bytes(size),
     checking > 0 && `${number(checking)} being checked`, checking === 0 && advised().length > 0 && `${number(advised().length)} to look at`,
     left > 0 && `${number(left)} left out`,
   ].filter(Boolean).join(", ");
@@ -266,7 +266,7 @@ async function useCapture(id, earlier) {
 function showCapture(capture) {
   const size = capture.files.reduce((/** @type {number} */ sum, /** @type {any} */ file) => sum + file.size, 0);
   byId("place").replaceChildren(h("div", { class: "notice" },
-    h("p", {}, `${capture.name || "A capture without a name"}: ${capture.files.length === 1 ? "one file" : `${number(capture.files.length)} files`} (${bytes(size)}) are already on the server.`),
+    h("p", {}, `${capture.name || "Photos without a name"}: ${count(capture.files.length, "file")}, ${bytes(size)}, already on the server.`),
     h("p", {}, "Choose the settings of another job, or give more photos first. ", h("a", { href: "/" }, "Begin with new photos"))));
   byId("drop-title").textContent = "Drop more photos here";
   redraw();
@@ -297,7 +297,7 @@ async function offerToGoOn() {
   start.offer(upload, capture);
   form.restore(upload.options);
   const box = h("div", { class: "notice", "data-kind": "warning", id: "go-on" },
-    h("p", {}, `An upload was interrupted ${ago(upload.at)}: ${upload.name || "without a name"}, ${number(there)} of ${number(upload.files.length)} files have arrived.`),
+    h("p", {}, `An upload was interrupted ${ago(upload.at)}: ${upload.name || "without a name"}, ${number(there)} of ${count(upload.files.length, "file")} arrived.`),
     h("p", {}, "Give the same files again, and it goes on with those that are missing. Browsers do not keep files for a page."),
     h("button", { type: "button", class: "small", onclick: () => {
       start.withdraw();

@@ -132,7 +132,7 @@ export class OptionsForm {
     const error = h("p", { class: "error", id: `${id}-error`, "aria-live": "polite" });
     const described = `${id}-help ${id}-error`;
     const label = titleOf(option.name);
-    const help = h("p", { class: "hint", id: `${id}-help` }, option.help, option.minimum !== null && option.maximum !== null && option.type !== "list" ? ` ${range(option)}` : "");
+    const help = h("p", { class: "hint", id: `${id}-help` }, this.plain(option.help), option.minimum !== null && option.maximum !== null && option.type !== "list" ? ` ${range(option)}` : "");
     if (option.type === "choice" && option.name === "preset") return this.radios(option, label, error, help);
     const control = this.control(option, { id, "aria-describedby": described });
     const boolean = control instanceof HTMLInputElement && control.type === "checkbox";
@@ -148,6 +148,12 @@ export class OptionsForm {
     });
     if (boolean) return h("div", { class: "field" }, h("label", { class: "row", for: id }, control, label), help, error);
     return h("div", { class: "field" }, h("label", { for: id }, label), control, help, error);
+  }
+
+  /** A text in which settings have the names of this form. @param {string} text */
+  plain(text) {
+    const named = this.options.map(({ name }) => name).filter((name) => name.includes("_"));
+    return named.reduce((said, name) => said.replaceAll(name, `"${titleOf(name)}"`), text);
   }
 
   /** @param {Option} option @param {Record<string, string>} attributes */

@@ -3,7 +3,7 @@
 import { at } from "../address.js";
 import { get, request, send, whole } from "../api.js";
 import { byId } from "../dom.js";
-import { number } from "../format.js";
+import { count, number } from "../format.js";
 import { showProgress } from "./progress.js";
 import { forget, remember, unique } from "./remembered.js";
 import { Sending } from "./upload/sending.js";
@@ -148,7 +148,7 @@ export class Start {
   async looked() {
     const waiting = () => this.items.used.filter((item) => item.digest === null && !item.lost);
     while (waiting().length) {
-      this.say(`Checking ${waiting().length === 1 ? "one file" : `${number(waiting().length)} files`}`);
+      this.say(`Checking ${count(waiting().length, "file")}`);
       await new Promise((resolve) => setTimeout(resolve, 100));
     }
     const lost = this.items.used.find((item) => item.lost);
@@ -195,7 +195,7 @@ export class Start {
     this.sending = null;
     const refused = used.filter((item) => item.problem);
     if (!refused.length) return true;
-    this.on.problem(new Error(`The server refused ${refused.length === 1 ? "one file" : `${number(refused.length)} files`}: ${refused.slice(0, 3).map((item) => item.problem?.message).join(" ")}`));
+    this.on.problem(new Error(`The server refused ${count(refused.length, "file")}: ${refused.slice(0, 3).map((item) => item.problem?.message).join(" ")}`));
     return false;
   }
 

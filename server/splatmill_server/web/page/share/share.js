@@ -2,7 +2,8 @@
 
 import { get } from "../api.js";
 import { byId, h } from "../dom.js";
-import { bytes, decibels, moment, number } from "../format.js";
+import { figures } from "../figures.js";
+import { bytes, moment } from "../format.js";
 import { copy } from "../sharing.js";
 import { address, showShared } from "./shared_model.js";
 import { startShell } from "../shell.js";
@@ -15,7 +16,7 @@ const KINDS = /** @type {Record<string, string>} */ ({
 await startShell({ open: true, visitor: true });
 const model = await showShared();
 if (model) {
-  byId("figures").textContent = `${number(model.gaussians)} Gaussians` + (model.psnr === null ? "" : ` · ${decibels(model.psnr)} on photos not trained on`);
+  byId("figures").append(...figures(model));
   const { formats } = await get(`${address}/formats`);
   byId("downloads").append(...formats.map((/** @type {any} */ format) => h("li", {},
     h("a", { href: format.address, download: "", title: format.loses }, format.name),

@@ -1,6 +1,7 @@
 // Exchanges an API key for the cookie of a session, which scripts cannot read, and leads back to where the reader was.
 
 import { at } from "../address.js";
+import { adviceOf } from "../advice.js";
 import { Problem, request } from "../api.js";
 import { byId } from "../dom.js";
 import { startShell } from "../shell.js";
@@ -30,7 +31,7 @@ form.addEventListener("submit", async (event) => {
   } catch (refused) {
     const wrong = refused instanceof Problem && refused.status === 401;
     const message = wrong ? "The server does not know this key. It may have been revoked." : /** @type {Error} */ (refused).message;
-    error.textContent = message + (refused instanceof Problem && !wrong && refused.advice ? ` ${refused.advice}` : "");
+    error.textContent = message + (refused instanceof Problem && !wrong ? ` ${adviceOf(refused)}` : "");
     key.setAttribute("aria-invalid", "true");
     key.select();
   }
