@@ -33,6 +33,7 @@ await build({
   format: "esm",
   target: "es2022",
   conditions: ["production"],
+  drop: ["console"], // as PlayCanvas' own small build does: the viewer says itself what could not be loaded
   plugins: [withoutWebGPU],
   logLevel: "error",
 });

@@ -90,7 +90,6 @@ export class Controls {
     this.element.setPointerCapture(event.pointerId);
     this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
     this.start = this.pointers.size === 1 ? { x: event.clientX, y: event.clientY } : null;
-    this.element.focus({ preventScroll: true });
   }
 
   /** @param {PointerEvent} event */
