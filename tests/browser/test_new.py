@@ -443,7 +443,7 @@ def test_too_few_photos_are_refused_before_the_upload(page: Page, photos: Path) 
     for number, path in enumerate(sorted(photos.iterdir())[: MIN_PHOTOS - 1]):
         give(page, path)
         expect(page.locator(".verdict")).to_have_text(["More photos are needed."] * (number + 1))
-        expect(page.locator("#estimate")).to_contain_text(f"from {MIN_PHOTOS} at least")
+        expect(page.locator("#estimate")).to_contain_text(f"at least {MIN_PHOTOS} that show the same things")
         expect(page.locator("#estimate")).not_to_contain_text("About")
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))

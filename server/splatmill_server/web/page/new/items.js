@@ -150,7 +150,7 @@ export class Items {
     const least = this.accepted.min_photos;
     if (different >= least) return "";
     const few = different === 0 ? "There is no photo among these files" : different === 1 ? "One photo is too few" : `${different} photos are too few`;
-    return `${few}: where each was taken is found out from ${least} at least that show the same things, and 20 or more make a good scene.`;
+    return `${few}. A scene needs at least ${least} that show the same things from different places; 20 or more make a good one.`;
   }
 
   /** Sentences about files that are not used, and about masks. */
