@@ -218,10 +218,10 @@ def test_a_queued_job_says_its_place_and_a_job_is_cancelled_by_keyboard(
 
 def test_a_failed_job_says_why_and_what_to_do(service: Up, visit: Visit) -> None:
     page = visit.page
-    capture = service.http.post("/v1/captures", json={"name": "two photos"}).json()["id"]
-    body = io.BytesIO()
-    Image.new("RGB", (64, 48), "gray").save(body, "PNG")
-    for name in ("a.png", "b.png"):
+    capture = service.http.post("/v1/captures", json={"name": "empty photos"}).json()["id"]
+    for name, colour in (("a.png", "gray"), ("b.png", "silver"), ("c.png", "white")):
+        body = io.BytesIO()
+        Image.new("RGB", (64, 48), colour).save(body, "PNG")
         service.http.put(f"/v1/captures/{capture}/images/{name}", content=body.getvalue())
     options = {"preset": "draft", "time_budget": "90s", "gaps": "off", "test_views": ["a.png"]}
     asked = {"capture": capture, "options": options}

@@ -16,6 +16,7 @@ HEADER = "X-Forwarded-Prefix"
 OWN_PATHS = frozenset(
     {
         "docs",
+        "glossary",
         "healthz",
         "jobs",
         "metrics",
