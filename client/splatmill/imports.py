@@ -1,16 +1,13 @@
 """Files that the server fetches from an address: `AsyncClient.imports` and `Client.imports`."""
 
 import asyncio
-from collections.abc import Callable
 
 from pydantic import ValidationError
 
 from splatmill.connection import Connection, read_answer
 from splatmill.errors import Refused, invalid_request
-from splatmill.loop import BackgroundLoop
 from splatmill.schema import Capture, CreateImport, Import, ImportList, Progress, Role
-
-OnProgress = Callable[[Progress], None]
+from splatmill.uploads import OnProgress
 
 _POLL_SECONDS = 0.5
 _LONGEST_POLL = 5.0
@@ -94,42 +91,3 @@ class AsyncImports:
         """Return the imports of a capture, newest first."""
         response = await self._connection.request("GET", f"/v1/captures/{capture}/imports")
         return read_answer(ImportList, response).imports
-
-
-class Imports:
-    """The synchronous twin of `AsyncImports`; see there."""
-
-    def __init__(self, loop: BackgroundLoop, imports: AsyncImports) -> None:
-        self._loop = loop
-        self._async = imports
-
-    def start(
-        self,
-        url: str,
-        *,
-        capture: str | None = None,
-        role: Role | str = Role.images,
-        name: str | None = None,
-        sha256: str | None = None,
-    ) -> Import:
-        """Let the server fetch a file of a capture from an address, in the background."""
-        return self._loop.run(self._async.start(url, capture=capture, role=role, name=name, sha256=sha256))
-
-    def get(self, capture: str, import_id: str) -> Import:
-        """Return an import: its state, the bytes received, and at the end the file or the problem."""
-        return self._loop.run(self._async.get(capture, import_id))
-
-    def wait(
-        self,
-        capture: str,
-        import_id: str,
-        on_progress: OnProgress | None = None,
-    ) -> Import:
-        """Wait for the end of an import and return it, also where it has failed."""
-        return self._loop.run_reporting(
-            lambda report: self._async.wait(capture, import_id, report), on_progress
-        )
-
-    def list(self, capture: str) -> list[Import]:
-        """Return the imports of a capture, newest first."""
-        return self._loop.run(self._async.list(capture))

@@ -32,18 +32,16 @@ MOST_LINES = 10_000
 
 
 class AsyncJobHandle:
-    """A job on the server.
-
-    job: its record, as of the last request.
-    refused: names of the photos that the server refused in the upload, each with the reason.
-    renamed: names of the files that are stored under other names, each with its name in the capture.
-    """
+    """A job on the server."""
 
     def __init__(self, connection: Connection, job: Job) -> None:
         self.connection = connection
         self.job = job
+        """The record of the job, as of the last request."""
         self.refused: tuple[tuple[str, Problem], ...] = ()
+        """Names of the photos that the server refused in the upload, each with the reason."""
         self.renamed: tuple[tuple[str, str], ...] = ()
+        """Names of the files that are stored under other names, each with its name in the capture."""
 
     @property
     def id(self) -> str:

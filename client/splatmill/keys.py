@@ -7,7 +7,6 @@ from pydantic import ValidationError
 
 from splatmill.connection import Connection, read_answer
 from splatmill.errors import invalid_request
-from splatmill.loop import BackgroundLoop
 from splatmill.schema import (
     DEFAULT_OWNER,
     CreateKey,
@@ -66,37 +65,6 @@ class AsyncKeys:
         path = f"/v1/keys/{key_id}/rotate"
         response = await self._connection.request("POST", path, json=request.model_dump(mode="json"))
         return read_answer(KeyWithSecret, response)
-
-
-class Keys:
-    """The synchronous twin of `AsyncKeys`; see there."""
-
-    def __init__(self, loop: BackgroundLoop, keys: AsyncKeys) -> None:
-        self._loop = loop
-        self._async = keys
-
-    def create(
-        self,
-        name: str,
-        *,
-        owner: str = DEFAULT_OWNER,
-        scopes: Iterable[Scope | str] = (Scope.read, Scope.train),
-        limits: KeyLimits | Mapping[str, Any] | None = None,
-    ) -> KeyWithSecret:
-        """Create a key. `secret` of the returned key is what clients send; the server cannot show it again."""
-        return self._loop.run(self._async.create(name, owner=owner, scopes=scopes, limits=limits))
-
-    def list(self) -> list[Key]:
-        """Return the keys, the oldest first."""
-        return self._loop.run(self._async.list())
-
-    def revoke(self, key_id: str) -> None:
-        """Revoke a key. The server refuses it within two seconds."""
-        self._loop.run(self._async.revoke(key_id))
-
-    def rotate(self, key_id: str, *, grace: float | str = 0.0) -> KeyWithSecret:
-        """Give a key a new secret. The former one stays valid for `grace`: seconds, or a text such as `1h`."""
-        return self._loop.run(self._async.rotate(key_id, grace=grace))
 
 
 def _checked(kind: type[R], body: Mapping[str, Any]) -> R:

@@ -43,6 +43,7 @@ class AsyncModelHandle:
     def __init__(self, connection: Connection, model: Model) -> None:
         self.connection = connection
         self.model = model
+        """The record of the model."""
         self.shares = AsyncShares(connection, model.id)
         self.orbits = AsyncOrbits(connection, model.id)
 

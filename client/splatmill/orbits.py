@@ -10,7 +10,6 @@ from splatmill.arguments import OrbitArguments
 from splatmill.connection import Connection, read_answer
 from splatmill.downloads import AnyPath, download, target_of
 from splatmill.errors import error_for, invalid_request
-from splatmill.loop import BackgroundLoop
 from splatmill.schema import Orbit, OrbitList, OrbitRequest, Progress
 from splatmill.uploads import OnProgress
 
@@ -89,35 +88,3 @@ class AsyncOrbits:
         Raises NotFound for a video that does not exist.
         """
         await self._connection.request("DELETE", f"{self._path}/{orbit_id}")
-
-
-class Orbits:
-    """The synchronous twin of `AsyncOrbits`; see there."""
-
-    def __init__(self, loop: BackgroundLoop, orbits: AsyncOrbits) -> None:
-        self._loop = loop
-        self._async = orbits
-
-    def start(self, **options: Unpack[OrbitArguments]) -> Orbit:
-        """Let the server render a video in the background, and keep it with the model."""
-        return self._loop.run(self._async.start(**options))
-
-    def get(self, orbit_id: str) -> Orbit:
-        """Return a video: its state, the frames that are rendered, and at the end its size or the problem."""
-        return self._loop.run(self._async.get(orbit_id))
-
-    def wait(self, orbit_id: str, on_progress: OnProgress | None = None) -> Orbit:
-        """Wait until a video is whole, and return it."""
-        return self._loop.run_reporting(lambda report: self._async.wait(orbit_id, report), on_progress)
-
-    def list(self) -> list[Orbit]:
-        """Return the videos of the model, newest first."""
-        return self._loop.run(self._async.list())
-
-    def download(self, orbit_id: str, path: AnyPath) -> Path:
-        """Download a video that is whole to `path`, a file or an existing folder, and return the path written."""
-        return self._loop.run(self._async.download(orbit_id, path))
-
-    def delete(self, orbit_id: str) -> None:
-        """Delete a video; one that is not whole is not rendered any further."""
-        self._loop.run(self._async.delete(orbit_id))

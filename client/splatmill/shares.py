@@ -4,7 +4,6 @@ from pydantic import ValidationError
 
 from splatmill.connection import Connection, read_answer
 from splatmill.errors import invalid_request
-from splatmill.loop import BackgroundLoop
 from splatmill.schema import CreateShare, Share, ShareList, ShareWithToken
 
 
@@ -40,25 +39,3 @@ class AsyncShares:
     async def list(self) -> list[Share]:
         """Return the links, newest first, also those that have ended, without their tokens."""
         return read_answer(ShareList, await self._connection.request("GET", self._path)).shares
-
-
-class Shares:
-    """The synchronous twin of `AsyncShares`; see there."""
-
-    def __init__(self, loop: BackgroundLoop, shares: AsyncShares) -> None:
-        self._loop = loop
-        self._async = shares
-
-    def create(
-        self, *, expires_in: float | str = "30d", name: str | None = None, photos: bool = False
-    ) -> ShareWithToken:
-        """Create a link. `path` of the returned one is its address on the server, which cannot show it again."""
-        return self._loop.run(self._async.create(expires_in=expires_in, name=name, photos=photos))
-
-    def revoke(self, share_id: str) -> None:
-        """Revoke a link at once and for good."""
-        self._loop.run(self._async.revoke(share_id))
-
-    def list(self) -> list[Share]:
-        """Return the links, newest first, also those that have ended, without their tokens."""
-        return self._loop.run(self._async.list())

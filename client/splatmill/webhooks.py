@@ -6,7 +6,6 @@ from pydantic import ValidationError
 
 from splatmill.connection import Connection, read_answer
 from splatmill.errors import invalid_request
-from splatmill.loop import BackgroundLoop
 from splatmill.schema import (
     CreateWebhook,
     Delivery,
@@ -70,41 +69,3 @@ class AsyncWebhooks:
     async def list(self) -> list[Webhook]:
         """Return the webhooks, the oldest first."""
         return read_answer(WebhookList, await self._connection.request("GET", PATH)).webhooks
-
-
-class Webhooks:
-    """The synchronous twin of `AsyncWebhooks`; see there."""
-
-    def __init__(self, loop: BackgroundLoop, webhooks: AsyncWebhooks) -> None:
-        self._loop = loop
-        self._async = webhooks
-
-    def create(
-        self, url: str, *, events: Iterable[WebhookEvent | str] | None = None, name: str | None = None
-    ) -> WebhookWithSecret:
-        """Create a webhook. `secret` of the returned one verifies its requests; the server cannot show it again."""
-        return self._loop.run(self._async.create(url, events=events, name=name))
-
-    def delete(self, webhook_id: str) -> None:
-        """Delete a webhook and its log."""
-        self._loop.run(self._async.delete(webhook_id))
-
-    def rotate(self, webhook_id: str) -> WebhookWithSecret:
-        """Give a webhook a new secret. For 24 hours, its requests are signed with the former one too."""
-        return self._loop.run(self._async.rotate(webhook_id))
-
-    def enable(self, webhook_id: str) -> Webhook:
-        """Let the server send to a disabled webhook again."""
-        return self._loop.run(self._async.enable(webhook_id))
-
-    def deliveries(self, webhook_id: str) -> list[Delivery]:
-        """Return the deliveries of a webhook, newest first, with every attempt."""
-        return self._loop.run(self._async.deliveries(webhook_id))
-
-    def repeat(self, webhook_id: str, delivery_id: str) -> Delivery:
-        """Let the server send a delivery that is over once more."""
-        return self._loop.run(self._async.repeat(webhook_id, delivery_id))
-
-    def list(self) -> list[Webhook]:
-        """Return the webhooks, the oldest first."""
-        return self._loop.run(self._async.list())

@@ -4,7 +4,6 @@ Not proved here: what is sent and when (tests/server/test_webhooks.py).
 """
 
 import asyncio
-import inspect
 import json
 
 import pytest
@@ -14,7 +13,6 @@ from splatmill import AsyncClient, Client, verify_webhook
 from splatmill.cli.app import app
 from splatmill.errors import InvalidRequest, NotFound
 from splatmill.schema import JobState, Problem, StateEvent, WebhookEvent
-from splatmill.webhooks import AsyncWebhooks, Webhooks
 from splatmill_server.base.settings import Settings
 from tests.support.waiting import wait_for
 
@@ -70,14 +68,7 @@ def test_the_life_of_a_webhook(service, peer, tmp_path):
             client.webhooks.create(peer.url, events=["job.began"])
 
 
-def test_the_twins_have_the_same_methods(service, peer):
-    names = {name for name in vars(AsyncWebhooks) if not name.startswith("_")}
-    assert names == {name for name in vars(Webhooks) if not name.startswith("_")}
-    for name in names:
-        one, other = getattr(Webhooks, name), getattr(AsyncWebhooks, name)
-        assert inspect.signature(one) == inspect.signature(other)
-        assert str(inspect.getdoc(one)).splitlines()[0] == str(inspect.getdoc(other)).splitlines()[0]
-
+def test_the_asynchronous_twin(service, peer):
     async def life() -> None:
         async with AsyncClient(service.url) as client:
             made = await client.webhooks.create(peer.url)
