@@ -7,9 +7,9 @@ https://github.com/mkkellogg/GaussianSplats3D (`src/loaders/SplatBuffer.js`).
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,45 +21,49 @@ from splatmill_worker.splat.formats.contents import Contents, finite, logits
 from splatmill_worker.splat.formats.splat import log_scales
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 
-HEADER_BYTES = 4096
-SECTION_HEADER_BYTES = 1024
+HEADER = np.dtype(
+    {
+        "names": ["major", "minor", "sections", "level", "low", "high"],
+        "formats": ["u1", "u1", "<u4", "<u2", "<f4", "<f4"],
+        "offsets": [0, 1, 4, 20, 36, 40],
+        "itemsize": 4096,
+    }
+)
+"""Level 0 to 2; low and high are the bounds of the harmonics of level 2."""
+
+SECTION = np.dtype(
+    {
+        "names": [
+            "count",
+            "room",
+            "capacity",
+            "buckets",
+            "block",
+            "bucket_bytes",
+            "half",
+            "full",
+            "partial",
+            "degree",
+        ],
+        "formats": ["<u4", "<u4", "<u4", "<u4", "<f4", "<u2", "<u4", "<u4", "<u4", "<u2"],
+        "offsets": [0, 4, 8, 12, 16, 20, 24, 32, 36, 40],
+        "itemsize": 1024,
+    }
+)
+"""Of `room` rows, `count` hold Gaussians, in `buckets` with an edge of `block` units, which are 2 `half` steps. `full`
+ones hold `capacity` Gaussians; of the `partial` ones, the sizes precede the middles of all buckets and the rows."""
 
 _HARMONICS = {0: 0, 1: 9, 2: 24}
-_TYPES = ("<f4", "<f2", "u1")  # of the harmonics, by level
 _STEPS = 32767  # of half a bucket, where the section does not say
 
 
 @dataclass(frozen=True)
-class _File:
-    """level: 0 to 2. low, high: bounds of the harmonics of level 2. sections: those that hold Gaussians."""
-
-    level: int
-    low: float
-    high: float
-    sections: tuple[_Section, ...]
-
-
-@dataclass(frozen=True)
 class _Section:
-    """A section; counts and sizes as in its header.
+    """The fields of a section and of the file, by name; the byte after its partial buckets' sizes; and its rows."""
 
-    count: Gaussians. full_buckets, partial_buckets: how many; full ones hold `bucket_capacity` Gaussians.
-    step: of a position, in units of the scene. degree: of the harmonics.
-    sizes_at, centers_at, rows_at: bytes at which the sizes of the partial buckets, the middles of all buckets and the
-        rows begin.
-    """
-
-    count: int
-    bucket_capacity: int
-    bucket_count: int
-    full_buckets: int
-    partial_buckets: int
-    half: int
-    step: float
-    degree: int
-    sizes_at: int
+    fields: dict[str, Any]
     centers_at: int
-    rows_at: int
+    rows: npt.NDArray[np.void]
 
 
 def read(path: Path) -> Contents:
@@ -68,10 +72,10 @@ def read(path: Path) -> Contents:
     try:
         check("reading it", size, size)
         data = path.read_bytes()
-        file = _parsed(data[: _head_bytes(data)], size)
-        degree = max((section.degree for section in file.sections), default=0)
-        check_gaussians(sum(section.count for section in file.sections), degree, size)
-        parts = [_gaussians(data, file, section) for section in file.sections]
+        sections = _sections(data)
+        degree = max((section.fields["degree"] for section in sections), default=0)
+        check_gaussians(sum(len(section.rows) for section in sections), degree, size)
+        parts = [_gaussians(data, section) for section in sections]
     except ValueError as error:
         raise ModelUnreadable(f"{path.name} could not be read as a .ksplat file: {error}.") from error
     empty = Gaussians(
@@ -81,55 +85,48 @@ def read(path: Path) -> Contents:
     return Contents(finite(Gaussians(*(torch.cat(group) for group in zip(*padded, strict=True)))))
 
 
-def _head_bytes(head: bytes) -> int:
-    """Bytes of the headers. Raises ValueError."""
-    if len(head) < HEADER_BYTES:
-        raise ValueError(f"it has {len(head)} bytes, and its header alone has {HEADER_BYTES}")
-    major, minor = head[0], head[1]
-    if major != 0 or minor < 1:
-        raise ValueError(f"its version is {major}.{minor}, and 0.1 and later are known")
-    sections = int(struct.unpack_from("<I", head, 4)[0])
-    if sections > 1024:
-        raise ValueError(f"it announces {sections} sections, and 1024 are read at most")
-    return HEADER_BYTES + sections * SECTION_HEADER_BYTES
-
-
-def _parsed(head: bytes, size: int) -> _File:
-    """The headers of a file of `size` bytes, of which `head` is the beginning. Raises ValueError."""
-    begin = _head_bytes(head)
-    if len(head) < begin:
-        raise ValueError(f"it ends after {len(head)} bytes, within its {begin} bytes of headers")
-    level = int(struct.unpack_from("<H", head, 20)[0])
-    if level > 2:
-        raise ValueError(f"its compression level is {level}, and 0 to 2 are known")
-    low, high = struct.unpack_from("<ff", head, 36)
+def _sections(data: bytes) -> list[_Section]:
+    """The sections that hold Gaussians. Raises ValueError."""
+    if len(data) < HEADER.itemsize:
+        raise ValueError(f"it has {len(data)} bytes, and its header alone has {HEADER.itemsize}")
+    file = _fields(data, HEADER, 0)
+    if file["major"] != 0 or file["minor"] < 1:
+        raise ValueError(f"its version is {file['major']}.{file['minor']}, and 0.1 and later are known")
+    if file["sections"] > 1024:
+        raise ValueError(f"it announces {file['sections']} sections, and 1024 are read at most")
+    if file["level"] > 2:
+        raise ValueError(f"its compression level is {file['level']}, and 0 to 2 are known")
+    end = HEADER.itemsize + file["sections"] * SECTION.itemsize
+    if len(data) < end:
+        raise ValueError(f"it ends after {len(data)} bytes, within its {end} bytes of headers")
     sections = []
-    for at in range(HEADER_BYTES, len(head), SECTION_HEADER_BYTES):
-        count, room, capacity, buckets, block, bucket_bytes, _, half, _, full, partial, degree = (
-            struct.unpack_from("<IIIIfHHIIIIH", head, at)
-        )
-        if degree not in _HARMONICS:
-            raise ValueError(f"its harmonics are of degree {degree}, and 0 to 2 are known")
-        half = half or _STEPS
-        centers_at = begin + 4 * partial
-        rows_at = centers_at + bucket_bytes * buckets
-        end = rows_at + room * _row(level, degree).itemsize
-        if count > room or end > size:
-            raise ValueError(f"a section of {count} Gaussians ends at byte {end} of {size}")
-        if level and (bucket_bytes != 12 or full + partial > buckets):
-            raise ValueError(f"a section has {full + partial} of {buckets} buckets of {bucket_bytes} bytes")
-        if count:
-            step = block / 2.0 / half
-            sections.append(
-                _Section(
-                    count, capacity, buckets, full, partial, half, step, degree, begin, centers_at, rows_at
-                )
+    for at in range(HEADER.itemsize, end, SECTION.itemsize):
+        own = _fields(data, SECTION, at)
+        if own["degree"] not in _HARMONICS:
+            raise ValueError(f"its harmonics are of degree {own['degree']}, and 0 to 2 are known")
+        kind = row(file["level"], own["degree"])
+        centers_at = end + 4 * own["partial"]
+        rows_at = centers_at + own["bucket_bytes"] * own["buckets"]
+        end = rows_at + own["room"] * kind.itemsize
+        if own["count"] > own["room"] or end > len(data):
+            raise ValueError(f"a section of {own['count']} Gaussians ends at byte {end} of {len(data)}")
+        used = own["full"] + own["partial"]
+        if file["level"] and (own["bucket_bytes"] != 12 or used > own["buckets"]):
+            raise ValueError(
+                f"a section has {used} of {own['buckets']} buckets of {own['bucket_bytes']} bytes"
             )
-        begin = end
-    return _File(level, low or -1.5, high or 1.5, tuple(sections))
+        if own["count"]:
+            rows = np.frombuffer(data, kind, own["count"], rows_at)
+            sections.append(_Section(file | own, centers_at, rows))
+    return sections
 
 
-def _row(level: int, degree: int) -> np.dtype[np.void]:
+def _fields(data: bytes, kind: np.dtype[np.void], at: int) -> dict[str, Any]:
+    return dict(zip(kind.names or (), np.frombuffer(data, kind, 1, at)[0].item(), strict=True))
+
+
+def row(level: int, degree: int) -> np.dtype[np.void]:
+    """The type of a Gaussian's row."""
     number, mean = ("<f4", "<f4") if level == 0 else ("<f2", "<u2")
     return np.dtype(
         [
@@ -137,45 +134,36 @@ def _row(level: int, degree: int) -> np.dtype[np.void]:
             ("scale", number, 3),
             ("quat", number, 4),
             ("rgba", "u1", 4),
-            ("sh", _TYPES[level], _HARMONICS[degree]),
+            ("sh", ("<f4", "<f2", "u1")[level], _HARMONICS[degree]),
         ]
     )
 
 
-def _gaussians(data: bytes, file: _File, section: _Section) -> Gaussians:
-    rows = np.frombuffer(data, _row(file.level, section.degree), section.count, section.rows_at)
+def _gaussians(data: bytes, section: _Section) -> Gaussians:
+    own, rows = section.fields, section.rows
     means = rows["mean"].astype(np.float32)
-    if file.level:
-        sizes = np.frombuffer(data, "<u4", section.partial_buckets, section.sizes_at).astype(np.int64)
-        centers = np.frombuffer(data, "<f4", 3 * section.bucket_count, section.centers_at).reshape(-1, 3)
-        ends = np.concatenate(
-            [
-                section.bucket_capacity * np.arange(1, section.full_buckets + 1, dtype=np.int64),
-                section.bucket_capacity * section.full_buckets + np.cumsum(sizes),
-            ]
-        )
-        bucket = np.searchsorted(ends, np.arange(section.count), side="right")
-        if len(bucket) and int(bucket[-1]) >= len(ends):
-            raise ValueError(f"its buckets hold fewer than the {section.count} Gaussians of a section")
-        means = (means - section.half) * np.float32(section.step) + centers[bucket]
+    if own["level"]:
+        partial = np.frombuffer(data, "<u4", own["partial"], section.centers_at - 4 * own["partial"])
+        centers = np.frombuffer(data, "<f4", 3 * own["buckets"], section.centers_at).reshape(-1, 3)
+        full = own["capacity"] * np.arange(1, own["full"] + 1, dtype=np.int64)
+        ends = np.append(full, own["capacity"] * own["full"] + np.cumsum(partial.astype(np.int64)))
+        bucket = np.searchsorted(ends, np.arange(len(rows)), side="right")
+        if int(bucket[-1]) >= len(ends):
+            raise ValueError(f"its buckets hold fewer than the {len(rows)} Gaussians of a section")
+        half = own["half"] or _STEPS
+        means = (means - half) * np.float32(own["block"] / 2.0 / half) + centers[bucket]
     rgba = torch.from_numpy(rows["rgba"].astype(np.float32) / 255.0)
-    sh = [((rgba[:, :3] - 0.5) / SH_C0)[:, None]]
-    if section.degree:
-        values = rows["sh"].astype(np.float32)
-        if file.level == 2:
-            values = file.low + values / 255.0 * (file.high - file.low)
-        sh.append(_by_coefficient(values))
+    values = rows["sh"].astype(np.float32)
+    if own["level"] == 2:
+        low, high = float(own["low"]) or -1.5, float(own["high"]) or 1.5
+        values = low + values / 255.0 * (high - low)
+    # Rows hold each degree by channel, then by coefficient.
+    degrees = [values[:, :9].reshape(len(rows), 3, -1), values[:, 9:].reshape(len(rows), 3, -1)]
+    rest = torch.from_numpy(np.concatenate(degrees, axis=2)).transpose(1, 2)
     return Gaussians(
         means=torch.from_numpy(means.astype(np.float32)),
         log_scales=log_scales(torch.from_numpy(rows["scale"].astype(np.float32))),
         quats=torch.from_numpy(rows["quat"].astype(np.float32)),
         logit_opacities=logits(rgba[:, 3]),
-        sh=torch.cat(sh, dim=1),
+        sh=torch.cat([((rgba[:, :3] - 0.5) / SH_C0)[:, None], rest], dim=1),
     )
-
-
-def _by_coefficient(values: npt.NDArray[np.float32]) -> torch.Tensor:
-    """Harmonics [N, K, 3] of rows that hold each degree by channel, then by coefficient."""
-    n = len(values)
-    degrees = [values[:, :9].reshape(n, 3, 3), values[:, 9:].reshape(n, 3, -1)]
-    return torch.from_numpy(np.concatenate(degrees, axis=2)).transpose(1, 2).contiguous()
