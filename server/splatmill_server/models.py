@@ -278,7 +278,7 @@ class Models:
         return int(count[1]), _DEGREE.get(len(_REST.findall(head)), 0)
 
     def _digests(self, model_id: str) -> dict[str, str]:
-        """Return the SHA-256 of the files that `job.json` names; earlier versions of the worker named none."""
+        """Return the SHA-256 of the files that `job.json` names."""
         digests = json.loads(self.storage.get(layout.job_record(model_id))).get("sha256")
         found = digests.items() if isinstance(digests, dict) else ()
         return {

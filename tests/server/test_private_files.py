@@ -56,11 +56,3 @@ def test_a_file_in_the_place_of_a_socket_is_kept(tmp_path: Path) -> None:
     with pytest.raises(OSError, match=f"cannot be created: .* or {ADVICE}"):
         private_files.listen(path / "s.sock", ADVICE)
     assert path.read_bytes() == b"precious"
-
-
-def test_a_folder_is_closed_and_keeps_its_other_rights(tmp_path: Path) -> None:
-    tmp_path.chmod(0o2755)
-    private_files.close(tmp_path, 0o027)
-    assert mode(tmp_path) == 0o2750
-    private_files.close(tmp_path / "absent", 0o077)
-    private_files.close(None, 0o077)

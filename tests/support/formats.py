@@ -11,7 +11,7 @@ import redis
 from tests.support.paths import ROOT
 
 V1 = ROOT / "tests" / "fixtures" / "formats" / "v1"
-"""What the first version stored: rows and records without a format number."""
+"""What version 1 of all formats looks like, as the service stored it."""
 
 
 def job_ids(folder: Path = V1) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 It runs the real service (`splatmill_server.up`) on a tiny posed capture and stores in FOLDER:
 
-    redis.json       all keys of Redis, by type
+    redis.json       all keys of Redis, by type, but the record of the worker, which names the machine
     storage/         storage: captures, and the finished model with job.json and report.json
     work/            plan.json, stages.json and the checkpoint of a job that was interrupted by the end of the service
     jobs.json        ids of the jobs by what became of them: succeeded, failed, cancelled, interrupted, queued
@@ -132,7 +132,8 @@ def dump_redis(program: str, data: Path, folder: Path) -> dict[str, Any]:
         while not address.exists() and time.monotonic() < end:
             time.sleep(0.05)
         connection.ping()
-        return {key.decode(): _contents(connection, key) for key in sorted(connection.scan_iter(b"*"))}
+        names = sorted(key for key in connection.scan_iter(b"*") if not key.startswith(b"rq:worker:"))
+        return {key.decode(): _contents(connection, key) for key in names}
     finally:
         server.terminate()
         server.wait()

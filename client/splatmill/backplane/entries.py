@@ -14,7 +14,7 @@ TRAIN = "train"
 
 ATTEMPT = "splatmill_worker.job.run_attempt"
 """The function name that each entry carries, because RQ requires one, with the job id as its argument. A worker runs
-its own attempt function whatever the name says. The name stays for workers of earlier versions, which import it."""
+its own attempt function whatever the name says."""
 
 SERIALIZER = JSONSerializer
 """JSON in place of pickle, RQ's default, so that write access to Redis does not allow running code in a worker.

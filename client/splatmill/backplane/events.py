@@ -9,13 +9,12 @@ machines share one clock.
 
 import heapq
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, cast
 
 import redis
-from redis.client import Pipeline
 
 from splatmill.backplane import keys
 from splatmill.backplane.records import FORMAT, check_format, reason, warn
@@ -65,9 +64,6 @@ if ARGV[6] ~= '' then
 end
 return id
 """
-
-_PAGE = 100  # entries per read
-_PAGES = 10
 
 
 @dataclass(frozen=True)
@@ -189,14 +185,17 @@ def read_progress(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
 
 def read_log(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
     """Return the log lines of all attempts at a job that were not trimmed, oldest first."""
-    found = _read(connection, job_id, keys.progress, keys.log, keys.warnings)
+    found = _read(connection, job_id, keys.log, keys.warnings)
     return [stored for stored in found if isinstance(stored.event, LogEvent)]
 
 
 def read_curve(connection: redis.Redis, job_id: str) -> list[CurveRow]:
     """Return the curve of a job as far as Redis has it, by step (see `joined`)."""
-    found = _read(connection, job_id, keys.progress, keys.curve)
-    metrics = (stored.event for stored in found if isinstance(stored.event, MetricEvent))
+    metrics = (
+        stored.event
+        for stored in _read(connection, job_id, keys.curve)
+        if isinstance(stored.event, MetricEvent)
+    )
     return joined(CurveRow.model_validate(event.model_dump(exclude={"type"})) for event in metrics)
 
 
@@ -235,31 +234,17 @@ def _read(connection: redis.Redis, job_id: str, *streams: Callable[[str], str]) 
 
 def last_progress(connection: redis.Redis, job_id: str) -> StoredEvent | None:
     """Return the newest `ProgressEvent` of a job, or None."""
-    with connection.pipeline(transaction=False) as pipe:
-        ask_progress(pipe, job_id)
-        replies = pipe.execute()
-    return answered_progress(connection, job_id, replies)
+    return answered_progress(ask_progress(connection, job_id), job_id)
 
 
-PROGRESS_REPLIES = 2
-"""Number of the replies to `ask_progress`."""
+def ask_progress(pipe: Any, job_id: str) -> Any:
+    """Ask for what `answered_progress` reads, by a connection or a pipeline."""
+    return pipe.hget(keys.latest(job_id), LATEST[ProgressEvent])
 
 
-def ask_progress(pipe: Pipeline, job_id: str) -> None:
-    """Add the commands to a pipeline whose replies `answered_progress` reads."""
-    pipe.hget(keys.latest(job_id), LATEST[ProgressEvent])
-    pipe.xlen(keys.progress(job_id))
-
-
-def answered_progress(connection: redis.Redis, job_id: str, replies: Sequence[Any]) -> StoredEvent | None:
-    """Return the newest `ProgressEvent` of a job that replies to `ask_progress` tell of, or None.
-
-    Workers of earlier versions wrote it to the stream alone; for their jobs the last 1000 entries are read.
-    """
-    stored, length = replies
-    if stored is not None:
-        return _latest(stored, job_id)
-    return _progress_in_stream(connection, job_id) if length else None
+def answered_progress(stored: bytes | None, job_id: str) -> StoredEvent | None:
+    """Return the newest `ProgressEvent` of a job that the reply to `ask_progress` holds, or None."""
+    return _latest(stored, job_id) if stored is not None else None
 
 
 def newest_entry(entry_id: str, generation: int, attempt: int, event: Event) -> tuple[str, str]:
@@ -280,16 +265,3 @@ def _latest(stored: bytes, job_id: str) -> StoredEvent | None:
     entry_id, generation, attempt, version, event = (*stored.split(b" ", 4), *[b""] * 4)[:5]
     fields = {b"g": generation, b"a": attempt, b"format": version, b"e": event}
     return next(iter(decode([(entry_id, fields)], keys.latest(job_id))), None)
-
-
-def _progress_in_stream(connection: redis.Redis, job_id: str) -> StoredEvent | None:
-    key, end = keys.progress(job_id), "+"
-    for _ in range(_PAGES):
-        page = cast(Any, connection.xrevrange(key, max=end, count=_PAGE))
-        for stored in decode(page, key):
-            if isinstance(stored.event, ProgressEvent):
-                return stored
-        if len(page) < _PAGE:
-            return None
-        end = f"({page[-1][0].decode()}"
-    return None

@@ -82,10 +82,7 @@ def states(job_id: str) -> str:
 
 
 def progress(job_id: str) -> str:
-    """Return the key of the stream of progress, previews, cameras and snapshots, which is trimmed. Only workers append.
-
-    Workers of earlier versions append metrics and log lines to it, too.
-    """
+    """Return the key of the stream of progress, previews, cameras and snapshots; trimmed. Only workers append."""
     return f"{PREFIX}job:{job_id}:progress"
 
 

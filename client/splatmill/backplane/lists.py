@@ -29,7 +29,7 @@ _TIES = 16
 
 
 class NotListed(Exception):
-    """The lists do not hold all records: Redis came back empty, or an earlier version has written it."""
+    """The lists do not hold all records: Redis came back empty, or another version has written them."""
 
 
 def name(kind: Kind, *, owner: str | None = None, group: str | None = None) -> str:

@@ -21,12 +21,12 @@ class WorkerRecord:
 
     key: the key of its record.
     name: its name.
-    lines: the lines that it serves; none for a worker of an earlier version.
+    lines: the lines that it serves; none before it has said so.
     state: idle, busy, suspended, ...
     entry: the entry that it runs.
     last_heartbeat: time of its last heartbeat by its own clock.
-    spare: bytes that are free on its disk beyond its reserve; negative once the reserve is used. None for a worker of
-        an earlier version.
+    spare: bytes that are free on its disk beyond its reserve; negative once the reserve is used. None before it
+        has said so.
     """
 
     key: str

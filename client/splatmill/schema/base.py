@@ -45,7 +45,7 @@ def without_controls(text: str) -> str:
 
 
 Label = Annotated[str, Field(max_length=200), AfterValidator(without_controls)]
-"""A name that a client gives to something, to recognise it by. Records of earlier versions may hold other text."""
+"""A name that a client gives to something, to recognise it by."""
 
 Time = AwareDatetime
 """A point in time with its time zone; ISO 8601 on the wire."""

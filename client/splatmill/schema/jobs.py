@@ -30,17 +30,8 @@ class CreateJob(Request):
     )
 
     def described(self, *, with_capture: bool = True) -> str:
-        """Return the request as JSON, by which a repeated request is known to be the same.
-
-        A field that was added after the first version is left out where it has its default, so that a request is known
-        again after an upgrade.
-        """
-        later: dict[str, Any] = {"options": self.options.later_defaults()}
-        if self.priority == 0:
-            later["priority"] = True
-        if not with_capture:
-            later["capture"] = True
-        return self.model_dump_json(exclude=later)
+        """Return the request as JSON, by which a repeated request is known to be the same."""
+        return self.model_dump_json(exclude=None if with_capture else {"capture"})
 
 
 def _readable_options(value: Any) -> Any:

@@ -89,10 +89,6 @@ def _group(name: str) -> dict[str, Any]:
 _BUDGET, _PHOTOS, _CAMERAS, _ENGINE = map(_group, ("budget", "photos", "cameras", "engine"))
 
 
-_ADDED_LATER = ("time_lapse", "scale")
-"""Options that requests to the first version did not have."""
-
-
 class TrainOptions(Request):
     """How to train. The worker decides from the photos what is left out, and its plan gives the reasons."""
 
@@ -360,11 +356,6 @@ class TrainOptions(Request):
         if scale is not None:
             known_distance(without_controls(scale))
         return scale
-
-    def later_defaults(self) -> set[str]:
-        """Return the options that were added after the first version and have their defaults."""
-        fields = type(self).model_fields
-        return {name for name in _ADDED_LATER if getattr(self, name) == fields[name].default}
 
     @property
     def ending(self) -> Preset:

@@ -78,7 +78,7 @@ class PartialUploads:
         # are held off by `Part.append`.
         self._locks: WeakValueDictionary[_Key, asyncio.Lock] = WeakValueDictionary()
         self._writers: dict[_Key, object] = {}
-        self._unfinished = UnfinishedUploads(storage, self._is_complete)
+        self._unfinished = UnfinishedUploads(storage)
 
     async def create(
         self, capture_id: str, role: Role, name: str, length: int | None, sha256: str | None
@@ -327,10 +327,6 @@ class PartialUploads:
             except (FileNotFoundError, ValueError):
                 continue
         return None
-
-    def _is_complete(self, capture_id: str, upload_id: str) -> bool:
-        record = self._record(capture_id, upload_id)
-        return record is not None and record.stored is not None
 
     def _write(self, capture_id: str, record: UploadRecord) -> None:
         place = layout.upload_record if record.stored is None else layout.upload_stored

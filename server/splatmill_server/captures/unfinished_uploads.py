@@ -1,13 +1,12 @@
 """The number of unfinished uploads of a capture, which is bounded: each has a record, and may have bytes."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from weakref import WeakValueDictionary
 
 from splatmill.backplane import layout
 from splatmill.backplane.storage import Storage
-from splatmill_server.base.lists import each
 from splatmill_server.base.problems import ProblemError
 
 MAX_UNFINISHED = 100
@@ -18,15 +17,10 @@ _REMEMBERED = 1000
 
 
 class UnfinishedUploads:
-    """Counts the unfinished uploads of captures.
+    """Counts the unfinished uploads of captures."""
 
-    is_complete: whether a record, of a capture and an upload, is that of a complete upload: those of earlier versions
-        have the same name as those of unfinished ones.
-    """
-
-    def __init__(self, storage: Storage, is_complete: Callable[[str, str], bool]) -> None:
+    def __init__(self, storage: Storage) -> None:
         self._storage = storage
-        self._is_complete = is_complete
         self._lock = threading.Lock()
         # One lock for each capture, so that no other capture waits while the uploads of one are listed.
         self._locks: WeakValueDictionary[str, threading.Lock] = WeakValueDictionary()
@@ -69,8 +63,4 @@ class UnfinishedUploads:
             upload_id = entry.path.split("/")[3]
             if entry.path == layout.upload_record(capture_id, upload_id):
                 ids.add(upload_id)
-        if len(ids) < MAX_UNFINISHED:
-            return len(ids)
-        return sum(
-            not done for done in each(lambda upload_id: self._is_complete(capture_id, upload_id), sorted(ids))
-        )
+        return len(ids)

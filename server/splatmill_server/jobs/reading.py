@@ -6,13 +6,11 @@ from dataclasses import dataclass
 import redis
 
 from splatmill.backplane import events, keys
-from splatmill.backplane.events import PROGRESS_REPLIES, StoredEvent
+from splatmill.backplane.events import StoredEvent
 from splatmill.backplane.fold import fold
 from splatmill.backplane.records import UnreadableRecord, warn
 from splatmill.backplane.row import JobRow
 from splatmill.schema import Job, JobState
-
-_REPLIES = 2 + PROGRESS_REPLIES
 
 
 @dataclass(frozen=True)
@@ -43,16 +41,15 @@ def read_jobs(connection: redis.Redis, job_ids: Sequence[str]) -> dict[str, Held
             pipe.hgetall(keys.job(job_id))
             pipe.xrange(keys.states(job_id))
             events.ask_progress(pipe, job_id)
-        replies = pipe.execute()
+        replies = iter(pipe.execute())
     found = {}
-    for index, job_id in enumerate(job_ids):
-        stored, states, *progress = replies[index * _REPLIES : (index + 1) * _REPLIES]
+    for job_id, stored, states, progress in zip(job_ids, replies, replies, replies, strict=True):
         try:
             row = JobRow.of(stored)
         except UnreadableRecord as error:
             warn(f"job {job_id} is not listed", str(error))
             continue
         if row is not None:
-            newest = events.answered_progress(connection, job_id, progress)
+            newest = events.answered_progress(progress, job_id)
             found[job_id] = Held(row, events.decode(states, keys.states(job_id)), newest)
     return found

@@ -230,7 +230,7 @@ class Jobs:
                     job.state is JobState.succeeded
                     and self.connection.zscore(lists.name("models"), job_id) is None
                 ):
-                    # Its worker was killed between the model and the list, or is of an earlier version.
+                    # Its worker was killed between the model and the list.
                     lists.add_model(self.connection, job_id, job.finished_at or job.created_at, known.owner)
                 self._announce_end(known)
         except StorageError as error:

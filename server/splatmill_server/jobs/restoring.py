@@ -34,7 +34,7 @@ def make_lists(connection: redis.Redis, storage: Storage, listed: Lists, succeed
     succeeded: gets the jobs that have.
     """
     lists.clear(connection, "jobs")
-    count = _list_rows(connection, storage, succeeded)
+    count = _list_rows(connection, succeeded)
     unfinished = requests.list_ids(storage)
     for start in range(0, len(unfinished), _BATCH):
         count += restore_unfinished(connection, storage, unfinished[start : start + _BATCH])
@@ -88,7 +88,7 @@ def _unfinished(storage: Storage, job_id: str) -> JobRow | None:
     return found
 
 
-def _list_rows(connection: redis.Redis, storage: Storage, succeeded: dict[str, Ended]) -> int:
+def _list_rows(connection: redis.Redis, succeeded: dict[str, Ended]) -> int:
     """List the jobs that have rows, each in its group."""
     active = {entry.decode() for entry in cast(set[bytes], connection.smembers(keys.ACTIVE))}
     now, count = connection.time()[0], 0
@@ -104,9 +104,6 @@ def _list_rows(connection: redis.Redis, storage: Storage, succeeded: dict[str, E
                     shrinking.note(pipe, job_id, now)
                     _note(succeeded, found.job())
             pipe.execute()
-        for found in held.values():
-            if not found.state.final:  # an earlier version stored no requests
-                requests.save(storage, found.row)
         count += len(held)
     return count
 

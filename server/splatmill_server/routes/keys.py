@@ -73,15 +73,12 @@ def rotate_key(
 
 @router.get("/me", responses=problems())
 def get_me(service: Shared, who: Who) -> Me:
-    """Get the owner, scopes, limits and use of the caller.
-
-    The scope `metrics`, which earlier versions of the SDK cannot read, is listed only where the key names it.
-    """
+    """Get the owner, scopes, limits and use of the caller."""
     return Me(
         owner=who.owner,
         key=who.key_id,
         key_name=who.key_name,
-        scopes=[s for s in Scope if s in who.scopes or (s is not Scope.metrics and who.has(s))],
+        scopes=[scope for scope in Scope if who.has(scope)],
         limits=who.limits,
         use=Use(unfinished_jobs=service.jobs.count_unfinished(who.owner)),
     )

@@ -44,7 +44,7 @@ def me(app: ServedApp, secret: str) -> httpx.Response:
 
 
 def test_the_first_key_closes_the_server_and_is_an_admins(app: ServedApp) -> None:
-    assert app.http.get("/v1/me").json()["scopes"] == ["read", "train", "admin"]
+    assert app.http.get("/v1/me").json()["scopes"] == ["read", "train", "admin", "metrics"]
     refused = app.http.post("/v1/keys", json={"name": "ann", "owner": "ann"})
     assert "admin" in problem(refused, 409, "admin_key_needed")["advice"]
     assert app.http.get("/v1/jobs").status_code == 200

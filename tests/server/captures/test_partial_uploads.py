@@ -18,6 +18,7 @@ import pytest
 
 from splatmill.backplane import layout
 from splatmill.backplane.parts import EndMoved, open_part
+from splatmill.backplane.storage import Entry
 from splatmill.schema import SHA256_HEADER, Role
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures import unfinished_uploads
@@ -416,11 +417,17 @@ def test_counting_the_uploads_of_one_capture_holds_up_no_other(
     assert [begin(app, full, **unsized).status_code for _ in range(2)] == [201, 201]
     counting, proceed = threading.Event(), threading.Event()
 
-    def is_complete(capture_id: str, upload_id: str) -> bool:
-        counting.set()
-        return not proceed.wait(30)
+    storage = app.service.storage
+    entries = storage.entries
 
-    counted = unfinished_uploads.UnfinishedUploads(app.service.storage, is_complete)
+    def slow_entries(prefix: str) -> Iterator[Entry]:
+        if full in prefix:
+            counting.set()
+            proceed.wait(30)
+        return entries(prefix)
+
+    monkeypatch.setattr(storage, "entries", slow_entries)
+    counted = unfinished_uploads.UnfinishedUploads(storage)
 
     def one_more(capture_id: str) -> None:
         with counted.one_more(capture_id, "a" * 16):

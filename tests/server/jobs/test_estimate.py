@@ -13,10 +13,10 @@ from splatmill.backplane.row import now
 from splatmill.schema import EstimateJob
 from splatmill_server.jobs.estimate import estimate
 from splatmill_server.jobs.finished import Figures, figures
-from tests.support.paths import ROOT
+from tests.support.formats import V1, job_ids
 from tests.support.served_app import ServedApp, problem
 
-STORED = ROOT / "tests" / "fixtures" / "formats" / "v1" / "storage" / "models" / "d30c898af4f8d541"
+STORED = V1 / "storage" / "models" / job_ids()["succeeded"]
 
 
 def records() -> tuple[dict[str, Any], dict[str, Any]]:
@@ -127,11 +127,11 @@ def test_figures_are_read_from_the_records_of_a_real_job() -> None:
         64,
         "cpu",
     )
-    assert found.machine == "Intel(R) Xeon(R) Processor, 2 cores"
-    assert found.train == pytest.approx(0.0662, abs=1e-4)
-    # All of its 8.31 s are accounted for.
+    assert found.machine == "AMD EPYC, 2 cores"
+    assert found.train == pytest.approx(0.1211, abs=1e-4)
+    # All of its 17.40 s are accounted for.
     wall = found.cameras + found.train + found.by_photo + found.fixed
-    assert wall == pytest.approx(8.3096, abs=1e-3)
+    assert wall == pytest.approx(17.4024, abs=1e-3)
     assert 0.0 < found.pixel_share < 1.0
     assert figures({**stored, "attempt": 2}, report) is None
 
@@ -156,8 +156,8 @@ def test_the_endpoint_estimates_from_stored_models_and_creates_nothing(app: Serv
         lists.add_model(app.redis, model_id, now(), "default")
     found = app.http.post("/v1/estimate", json=body).json()
     assert found["jobs"] == 1  # the one that cannot be read is left out
-    assert found["stages"][1]["seconds"] == pytest.approx(2 * 0.0662, abs=0.1)
-    assert found["seconds"] == pytest.approx(8.4, abs=0.2)
+    assert found["stages"][1]["seconds"] == pytest.approx(2 * 0.1211, abs=0.1)
+    assert found["seconds"] == pytest.approx(17.5, abs=0.2)
     assert STORED.name not in json.dumps(found)
     assert app.http.get("/v1/jobs").json()["jobs"] == []
 

@@ -10,7 +10,6 @@ import redis
 from _capacity.operations import counted
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from rq import Retry
 
 from splatmill.backplane import entries, keys, leases, lines, queue, workers
 from splatmill.backplane.lines import LINES, Line
@@ -92,19 +91,6 @@ def test_a_worker_takes_only_what_it_serves(connection: redis.Redis) -> None:
     assert drain(connection, "any", "cpu") == ["cpu", "reference", "any"]
     assert waiting(connection) == 1
     assert drain(connection, "gpu", "any", "cpu") == ["gpu"]
-
-
-def test_entries_of_earlier_versions_still_run(connection: redis.Redis) -> None:
-    write_row(connection, "job00001", options=TrainOptions(backend=Backend.gpu))
-    write_row(connection, "job00002")
-    for job_id in ("job00001", "job00002"):
-        # As the first version enqueued.
-        entries.open_queue(connection).enqueue_call(
-            entries.ATTEMPT, args=[job_id], job_id=f"{job_id}-1", timeout=-1, retry=Retry(max=3), unique=True
-        )
-        connection.hdel(keys.job(job_id), "owner", "priority", "format")
-    assert drain(connection, "any", "cpu") == ["job00002"]
-    assert drain(connection, "gpu") == ["job00001"]
 
 
 def test_an_entry_without_a_row_or_with_options_of_another_version_runs_anywhere(

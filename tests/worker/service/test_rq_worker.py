@@ -17,7 +17,7 @@ from typing import IO, Any, cast
 import pytest
 from rq.job import Callback
 
-from splatmill.backplane import entries, keys, layout, leases, lines, queue, totals, workers
+from splatmill.backplane import entries, keys, layout, leases, queue, totals, workers
 from splatmill.backplane.row import now
 from splatmill.backplane.storage import Storage
 from splatmill.schema import Backend, Job, Role, TrainOptions
@@ -88,7 +88,7 @@ def test_the_function_and_callbacks_that_an_entry_names_are_never_imported(
     )
     functions = {
         "job00001": entries.ATTEMPT,
-        "job00002": "splatmill_worker.job.run_attempt",  # the name in entries of earlier versions
+        "job00002": "splatmill_worker.pipeline.run",
         "job00003": "splatmill_worker.service.job.run_attempt",
         "job00004": "intruder.called",
         "job00005": "there.is.no.such.function",
@@ -296,19 +296,3 @@ def test_a_worker_whose_record_expired_while_redis_was_away_is_listed_again(
         connection.delete(*expired, "rq:workers", f"rq:workers:{entries.TRAIN}")
         (after,) = wait_for(lambda: workers.listening(connection))
         assert (after.name, after.lines) == (before.name, before.lines)
-
-
-def test_an_entry_that_a_dead_worker_of_the_first_version_had_taken_runs(
-    redis_server: RedisServer, storage: Storage, tmp_path: Path
-) -> None:
-    connection = redis_server.connection
-    write_row(connection, "job00001")
-    assert queue.enqueue(connection, "job00001", 1)
-    lines.withdraw(connection, "job00001-1")
-    connection.hset("rq:job:job00001-1", "status", "queued")
-    # Between taking an entry and registering it, that version kept it here; its record has expired since.
-    connection.rpush(f"rq:queue:{entries.TRAIN}:intermediate", "job00001-1")
-    connection.sadd("rq:workers", "rq:worker:earlier")
-    connection.sadd(f"rq:workers:{entries.TRAIN}", "rq:worker:earlier")
-    with worker(redis_server, storage, tmp_path):
-        assert wait_for(partial(ended, redis_server, "job00001")).state == "succeeded"

@@ -16,7 +16,7 @@ from rq import Worker
 from rq.executions import Execution
 from rq.worker_registration import REDIS_WORKER_KEYS, get_keys
 
-from splatmill.backplane import keys, leases, lines, workers
+from splatmill.backplane import keys, leases, lines
 from splatmill.backplane.entries import split_rq_id
 from splatmill.backplane.leases import Lease
 from splatmill.backplane.process import ProcessIdentity, wait_gone
@@ -74,28 +74,12 @@ def requeue_orphans(worker: Worker) -> None:
     for lease, owner in zip(held, leases.owners(worker.connection, held), strict=True):
         if owner not in living_names:
             _requeue_if_orphaned(worker, lease)
-    for entry_id in _kept_by_dead_workers(worker, dead):
-        if worker.connection.lrem(queue.intermediate_queue_key, 1, entry_id):
-            queue.push_job_id(entry_id)
     for key in dead:
         with worker.connection.pipeline() as pipeline:
             pipeline.srem(worker.redis_workers_keys, key)
             pipeline.srem(f"rq:workers:{queue.name}", key)
             pipeline.delete(key)
             pipeline.execute()
-
-
-def _kept_by_dead_workers(worker: Worker, dead: set[str]) -> list[str]:
-    """Return the entries that workers of earlier versions had taken and not registered when they died.
-
-    Those serve no lines, and keep such an entry in a list of RQ. With none of them alive, every entry in it belonged to
-    a dead one.
-    """
-    found: list[str] = worker.queues[0].intermediate_queue.get_job_ids()
-    if not found:
-        return []
-    living = [other for other in workers.listening(worker.connection) if other.key not in dead]
-    return found if all(other.lines for other in living) else []
 
 
 def _dead_workers(connection: redis.Redis, worker_keys: Sequence[str]) -> list[str]:

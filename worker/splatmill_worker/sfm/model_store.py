@@ -8,8 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from splatmill.schema import KnownDistance, ModelFrame
 from splatmill_worker.colmap import pycolmap, write_model
 from splatmill_worker.images.lens import remarks
@@ -89,13 +87,7 @@ def load_model(prepared: Prepared, folder: Path, known: KnownDistance | None = N
     )
     if (folder / STEREO).is_file():
         scene = stereo.add(scene, stereo.StereoPoints.load(folder / STEREO))
-    if (folder / FRAME).is_file():
-        frame = ModelFrame.model_validate_json((folder / FRAME).read_bytes())
-    elif known is None:
-        return scene
-    else:
-        frame = ModelFrame(unit="arbitrary", from_sfm=np.eye(4).tolist())
-    return in_frame(scene, frame, known)
+    return in_frame(scene, ModelFrame.model_validate_json((folder / FRAME).read_bytes()), known)
 
 
 def _views(prepared: Prepared, model: pycolmap.Reconstruction) -> dict[int, View]:
