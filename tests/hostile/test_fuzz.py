@@ -10,7 +10,6 @@ import resource
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
 
 from tests.support.hostile.bench import Bench, bench
 from tests.support.hostile.parsers import PARSERS
@@ -35,19 +34,5 @@ def test_changed_files_end_with_a_result_or_a_named_problem(parts: Bench, name: 
     parser = PARSERS[name]
     assert parser.give(parts, parser.valid())
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-    @settings(
-        max_examples=FEW,
-        derandomize=True,
-        database=None,
-        deadline=None,
-        print_blob=True,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
-    @given(data=parser.inputs())
-    def check(data: bytes) -> None:
-        parser.give(parts, data)
-
-    check()
+    parser.try_changed(lambda data: parser.give(parts, data), FEW, 0)
     assert 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) < MEMORY

@@ -1,4 +1,4 @@
-"""Proves whom the sockets and the folders with secrets of the service let in, and what takes the place of a socket.
+"""Proves whom the sockets of the service let in, and what takes the place of a socket.
 
 Not proved here: the modes of what a running service stores (test_main), and the renderer's use of its socket
 (tests/worker/render_service/test_command).

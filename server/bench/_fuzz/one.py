@@ -14,8 +14,6 @@ import sys
 import time
 from collections import Counter
 
-from hypothesis import HealthCheck, Phase, given, seed, settings
-
 from tests.support.hostile.bench import bench
 from tests.support.hostile.parsers import PARSERS
 
@@ -42,15 +40,7 @@ def main(name: str, seconds: float, first: int) -> None:
 
         end, number = time.monotonic() + seconds, first
         while time.monotonic() < end:
-            of_seed = seed(number)(given(data=parser.inputs())(check))
-            settings(
-                max_examples=_TOGETHER,
-                database=None,
-                deadline=None,
-                print_blob=True,
-                phases=[Phase.generate, Phase.shrink],
-                suppress_health_check=list(HealthCheck),
-            )(of_seed)()
+            parser.try_changed(check, _TOGETHER, number)
             number += 1
         grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
     said = {

@@ -1,4 +1,4 @@
-"""Files as a stranger may change them: bytes of a valid file flipped, cut, repeated, or set to extreme numbers."""
+"""Files as a stranger may change them: pieces of a valid file replaced by extreme numbers, other bytes, or copies."""
 
 from __future__ import annotations
 
@@ -26,28 +26,13 @@ _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 @st.composite
 def mutations(draw: st.DrawFn, data: bytes) -> bytes:
-    """One to four changes of a valid binary file."""
+    """One to four changes of a valid binary file: bytes are overwritten, inserted, repeated or removed."""
     for _ in range(draw(st.integers(1, 4))):
-        place = draw(st.integers(0, max(0, len(data) - 1)))
-        match draw(st.sampled_from(("set", "flip", "cut", "repeat", "remove", "insert"))):
-            case "set":
-                value = draw(st.sampled_from(_EXTREMES))
-                data = data[:place] + value + data[place + len(value) :]
-            case "flip":
-                data = (
-                    data[:place] + bytes([data[place] ^ draw(st.integers(1, 255))]) + data[place + 1 :]
-                    if data
-                    else b""
-                )
-            case "cut":
-                data = data[:place]
-            case "repeat":
-                end = place + draw(st.integers(1, 64))
-                data = data[:end] + data[place:end] * draw(st.integers(1, 20)) + data[end:]
-            case "remove":
-                data = data[:place] + data[place + draw(st.integers(1, 64)) :]
-            case "insert":
-                data = data[:place] + draw(st.binary(min_size=1, max_size=32)) + data[place:]
+        start = draw(st.integers(0, len(data)))
+        piece = data[start : start + draw(st.integers(1, 64) | st.just(len(data)))]
+        copies = st.integers(0, 20 if len(piece) <= 64 else 1).map(piece.__mul__)
+        new = draw(st.sampled_from(_EXTREMES) | st.binary(min_size=1, max_size=32) | copies)
+        data = data[:start] + new + data[start + (len(new) if draw(st.booleans()) else len(piece)) :]
     return data
 
 
@@ -55,10 +40,10 @@ def mutations(draw: st.DrawFn, data: bytes) -> bytes:
 def text_mutations(draw: st.DrawFn, data: bytes) -> bytes:
     """One to three changes of a valid text file: numbers become other words, or bytes change."""
     for _ in range(draw(st.integers(1, 3))):
-        numbers = list(_NUMBER.finditer(data))
+        numbers = [found.span() for found in _NUMBER.finditer(data)]
         whole: bool = draw(st.booleans())
         if numbers and whole:
-            start, end = numbers[draw(st.integers(0, len(numbers) - 1))].span()
+            start, end = draw(st.sampled_from(numbers))
             data = data[:start] + draw(st.sampled_from(_WORDS)) + data[end:]
         else:
             data = draw(mutations(data))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 from starlette.datastructures import Headers
 
@@ -44,9 +45,22 @@ class Parser:
     change: Callable[[bytes], st.SearchStrategy[bytes]]
     give: Callable[[Bench, bytes], str]
 
-    def inputs(self) -> st.SearchStrategy[bytes]:
-        """Changed files."""
-        return self.change(self.valid())
+    def try_changed(self, give: Callable[[bytes], object], count: int, number: int) -> None:
+        """Call `give` with `count` changed files, the same ones for the same number. A failure names the shortest."""
+
+        @seed(number)
+        @settings(
+            max_examples=count,
+            database=None,
+            deadline=None,
+            phases=[Phase.generate, Phase.shrink],
+            suppress_health_check=list(HealthCheck),
+        )
+        @given(data=self.change(self.valid()))
+        def check(data: bytes) -> None:
+            give(data)
+
+        check()
 
 
 def _outcome(answer: Answer) -> str:
