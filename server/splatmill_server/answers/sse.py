@@ -24,7 +24,7 @@ from splatmill_server.base.feed import Batch, Row, is_beyond
 from splatmill_server.service import Service
 
 _ENTRY = r"\d{1,19}-\d{1,19}"
-_POSITION = re.compile(rf"({_ENTRY})_({_ENTRY})_(\d{{1,9}})((?:_{_ENTRY}){{3}})?")
+_POSITION = re.compile(rf"({_ENTRY})_({_ENTRY})_(\d{{1,9}})((?:_{_ENTRY}){{3}})")
 _LINE_ENDS = {0x85: "\\u0085", 0x2028: "\\u2028", 0x2029: "\\u2029"}
 _LOOK_SECONDS = 1.0
 """Seconds without an event after which a follower looks whether it may go on."""
@@ -37,8 +37,7 @@ class Position:
     entries: id of the last entry read from each stream of a job, in the order of `events.BOUNDS`.
     row_events: number of the last event that follows from the row.
 
-    As text, it is `<states>_<progress>_<row events>_<log>_<warnings>_<curve>`. Earlier versions had no streams but the
-    first two, and their text ends after the row events: nothing in the other streams has been read then.
+    As text, it is `<states>_<progress>_<row events>_<log>_<warnings>_<curve>`.
     """
 
     entries: list[str] = field(default_factory=lambda: [START] * len(events.BOUNDS))
@@ -51,7 +50,7 @@ class Position:
         if match is None:
             return None
         states, progress, row_events, others = match.groups()
-        return cls([states, progress, *((others or f"_{START}" * 3)[1:].split("_"))], int(row_events))
+        return cls([states, progress, *others[1:].split("_")], int(row_events))
 
     @property
     def states(self) -> str:

@@ -32,6 +32,9 @@ FOLLOWERS = 150
 FAR = "9999999999999999999-0"
 """An entry's id that no stream reaches."""
 
+NONE = "_0-0" * 3
+"""Ids before the first entries of the streams of lines and metrics."""
+
 
 async def _follow(http: httpx.AsyncClient, job_id: str, after: str | None = None) -> list[dict[str, Any]]:
     headers = {"Last-Event-ID": after} if after is not None else {}
@@ -198,7 +201,7 @@ def test_a_follower_that_is_too_slow_reads_again_what_it_has_missed(
 
 
 @pytest.mark.parametrize(
-    "after", [f"{FAR}_{FAR}_1", "_".join([FAR, FAR, "1", FAR, FAR, FAR]), f"0-0_{FAR}_1", "0-0_0-0_999999999"]
+    "after", ["_".join([FAR, FAR, "1", FAR, FAR, FAR]), f"0-0_{FAR}_1{NONE}", f"0-0_0-0_999999999{NONE}"]
 )
 def test_a_position_beyond_the_end_concerns_nobody_else_and_misses_nothing(
     app: ServedApp, after: str

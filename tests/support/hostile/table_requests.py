@@ -394,7 +394,7 @@ REQUESTS = (
     Hostile(
         "Events",
         "a `Last-Event-ID` behind all events: nothing follows",
-        lambda b: _events(b, "9999999999999999999-0_9999999999999999999-0_9"),
+        lambda b: _events(b, "9999999999999999999-0_9999999999999999999-0_9" + "_0-0" * 3),
         "204",
     ),
     Hostile(
