@@ -12,7 +12,7 @@ from splatmill.backplane.storage import Storage
 from splatmill.schema import HELD_OUT, Edited, EditModel
 from splatmill_server.space.quota import Arrival
 
-STALE = ("time_lapse", "views", "disagreement", "warnings")
+STALE = ("time_lapse", "views", "disagreement", "misfits", "warnings")
 """Parts of a training's report that an edited model has not."""
 
 

@@ -161,8 +161,16 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
     expect(page.locator("#seconds")).to_contain_text("Live view")
     assert {item.get_attribute("data-status") for item in page.locator("#stages > li").all()} == {"done"}
 
+    misfit = next(view["name"] for view in report["views"] if view["split"] == "train")
+    report["misfits"] = [{"photo": misfit, "why": "It shows another place."}]
+    report["warnings"].append("The masks of 3 photos are not used: none has their shape.")
+    page.route(f"**/v1/jobs/{job_id}/report", lambda route: route.fulfill(json=report))
     page.reload()
     expect(page.get_by_role("link", name="Open the model")).to_be_visible()
+    expect(photos.get_by_role("row").filter(has_text=misfit)).to_contain_text("It shows another place.")
+    expect(page.locator("#warnings")).to_contain_text("The masks of 3 photos are not used")
+    expect(page.locator("#log")).to_contain_text("stray.png is left out")
+    expect(page.locator("#warnings")).not_to_contain_text("stray.png")
     expect(page.locator("#curve tbody tr")).to_have_count(len(rows))
     page.get_by_role("button", name="Cameras and points").click()
     expect(page.locator("#live .placement")).to_have_attribute("data-cameras", str(still_life.COUNT))

@@ -240,7 +240,7 @@ def _recover_cameras(task: Task, stages: Stages) -> Cameras:
     for warning in scene.warnings:
         task.emit(LogEvent(level="warning", message=warning))
     for sentence in omissions(scene.left_out):
-        task.emit(LogEvent(level="warning", message=sentence))
+        task.emit(LogEvent(level="warning", message=sentence, about="unused_photos"))
     normalization = Normalization.of(scene)
     world = ExportWorld.of(normalization, scene)
     placement = placement_of(scene, world, (view.name for view in parts.held_out))

@@ -105,9 +105,7 @@ def _followed(job: "JobHandle", limit: int) -> Iterator["LogLine"]:
     yield from known[-limit:]
     for record in job.events():
         if isinstance(record.event, LogEvent):
-            line = LogLine(
-                attempt=record.attempt, at=record.at, level=record.event.level, message=record.event.message
-            )
+            line = LogLine(attempt=record.attempt, at=record.at, **record.event.model_dump())
             # Events begin with the job, and several lines may have the same time.
             if not known or line.at > known[-1].at or (line.at == known[-1].at and line not in known):
                 yield line

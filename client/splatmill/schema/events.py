@@ -99,6 +99,9 @@ class LogEvent(Response):
     type: Literal["log"] = "log"
     level: Literal["debug", "info", "warning", "error"] = "info"
     message: str = Field(max_length=20_000)
+    about: str | None = Field(
+        default=None, description="unused_photos: photos that the job's cameras list as unused, too."
+    )
 
 
 class PreviewEvent(Response):

@@ -30,7 +30,7 @@ def get(connection: redis.Redis, storage: Storage, job_id: str) -> list[LogLine]
     if not known:
         return _stored_lines(storage, job_id)
     fresh = [
-        LogLine(attempt=stored.attempt, at=stored.at, level=stored.event.level, message=stored.event.message)
+        LogLine(attempt=stored.attempt, at=stored.at, **stored.event.model_dump())
         for stored in events.read_log(connection, job_id)
         if isinstance(stored.event, LogEvent)
     ]

@@ -73,19 +73,23 @@ def report_of(
 
 def test_a_photo_far_below_the_others_is_named_with_advice(tmp_path: Path) -> None:
     report = report_of(tmp_path, trained([30.0, 29.0, 31.0, 30.5, 12.0], held_out=True))
-    before, warning = report["warnings"]
-    assert before == "said before."
-    assert warning.startswith(
+    assert report["warnings"] == ["said before."]
+    (misfit,) = report["misfits"]
+    assert misfit["photo"] == "04.png"
+    assert misfit["why"].startswith(
         "04.png does not fit the other photos: its PSNR is 12.0 dB, the median 30.0 dB."
     )
-    assert "Leave it out" in warning
+    assert "Leave it out" in misfit["why"]
+    page = (tmp_path / "report.html").read_text()
+    assert page.index("said before.") < page.index(misfit["why"])
 
 
 def test_photos_without_a_camera_are_counted_and_named(tmp_path: Path) -> None:
     missing = tuple((f"x{i}.png", "It shares too little.") for i in range(7))
     report = report_of(tmp_path, trained([30.0], held_out=True), missing)
     named = "x0.png, x1.png, x2.png, x3.png, x4.png and 2 more"
-    assert f"7 of 21 photos are not used: {named}. The report lists the reasons." in report["warnings"]
+    page = (tmp_path / "report.html").read_text()
+    assert f"7 of 21 photos are not used: {named}. The report lists the reasons." in page
     assert {"photo": "x6.png", "why": "It shares too little."} in report["left_out"]
 
 
@@ -155,7 +159,7 @@ def test_photos_that_disagree_are_ranked_with_the_reason(tmp_path: Path) -> None
         "reason": "moving things",
     }
     assert len(report["disagreement"]) == 3
-    assert report["warnings"][1].endswith("and mask what moved.")
+    assert report["misfits"][0]["why"].endswith("and mask what moved.")
     page = (tmp_path / "report.html").read_text()
     assert "<td>02.png</td><td>other light</td><td class=n>4.0</td>" in page
     assert page.count("<figcaption>01.png: moving things</figcaption>") == 1
@@ -177,7 +181,7 @@ def test_where_the_cameras_are_wrong_no_photo_is_accused_of_another_light(tmp_pa
     result = replace(trained([30.0, 30.0, 12.0, 30.0, 29.0], True), disagreements=found)
     for contradicted in (False, True):
         report = report_of(tmp_path, result, said={"cameras_contradicted": contradicted})
-        (misfit,) = (each for each in report["warnings"] if each.startswith("02.png does not fit"))
+        (misfit,) = (each["why"] for each in report["misfits"] if each["photo"] == "02.png")
         assert ("light" in misfit) != contradicted
         assert ("other light" in (tmp_path / "report.html").read_text()) != contradicted
         assert report["disagreement"][0]["reason"] == (None if contradicted else "other light")

@@ -66,6 +66,7 @@ class Disagreeing:
 
 def render(
     report: dict[str, Any],
+    warnings: Sequence[str],
     figure: Path,
     comparisons: Sequence[ViewComparison],
     disagreeing: Disagreeing,
@@ -73,6 +74,7 @@ def render(
 ) -> str:
     """The page as text, with the picture `figure` of the curve and the pictures of `comparisons` embedded.
 
+    warnings: those of the report and those about photos.
     hidden: photos with what never moves marked.
     """
     curve = base64.b64encode(figure.read_bytes()).decode()
@@ -80,7 +82,7 @@ def render(
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
         f"<title>Splatmill report</title><style>{STYLE}</style>",
         f"<h1>{_headline(report['result'])}</h1>",
-        *(f"<p class=warn>{html.escape(warning)}</p>" for warning in report["warnings"]),
+        *(f"<p class=warn>{html.escape(warning)}</p>" for warning in warnings),
         f"<img alt='PSNR and SSIM against training seconds' src='data:image/png;base64,{curve}'>",
         "<h2>Time by stage</h2>",
         _table(["stage", "seconds"], [[name, f"{value:.1f}"] for name, value in report["seconds"].items()]),

@@ -123,7 +123,8 @@ def write_report(
                 ),
                 {"what": "lpips", "why": NO_LPIPS},
             ],
-            "warnings": [*finished.warnings, *_unplaced(planned.scene), *_misfits(trained)],
+            "misfits": _misfits(trained),
+            "warnings": finished.warnings,
             "facts": planned.facts.as_dict(),
             "sfm": planned.scene.facts,
             "frame": _frame(planned.scene.frame),
@@ -139,7 +140,9 @@ def write_report(
     worst = _worst_views(planned, trained, render)
     named = page.Disagreeing(disagreeing.named(trained), disagreeing.marked(trained))
     hidden = _hidden(planned, trained)
-    atomic_write(out / "report.html", page.render(report, out / "report.png", worst, named, hidden))
+    warnings = [*report["warnings"], *_unplaced(planned.scene), *(row["why"] for row in report["misfits"])]
+    text = page.render(report, warnings, out / "report.png", worst, named, hidden)
+    atomic_write(out / "report.html", text)
     return report
 
 
@@ -238,16 +241,19 @@ def _unplaced(scene: Scene) -> list[str]:
     return [f"{len(names)} of {photos} photos {verb} not used: {shown}. The report lists the reasons."]
 
 
-def _misfits(trained: Trained) -> list[str]:
-    """A warning for each training photo that the scene shows far worse than the others."""
+def _misfits(trained: Trained) -> list[dict[str, str]]:
+    """The training photos that the scene shows far worse than the others, each with a sentence."""
     ordered = sorted(trained.on_training.views, key=lambda view: view.psnr)
     if len(ordered) < 5:
         return []
     median = ordered[len(ordered) // 2].psnr
     reasons = {each.name: each.reason for each in trained.disagreements}
     return [
-        f"{view.name} does not fit the other photos: its PSNR is {view.psnr:.1f} dB, the median {median:.1f} dB. "
-        + ADVICE[reasons.get(view.name)]
+        {
+            "photo": view.name,
+            "why": f"{view.name} does not fit the other photos: its PSNR is {view.psnr:.1f} dB, the median "
+            f"{median:.1f} dB. {ADVICE[reasons.get(view.name)]}",
+        }
         for view in ordered
         if view.psnr < median - MISFIT
     ]

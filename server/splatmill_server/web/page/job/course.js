@@ -50,7 +50,7 @@ export class Course {
     this.plan = null;
     /** @type {import("../chart.js").CurveRow[]} */
     this.rows = [];
-    /** @type {{at: string, level: string, message: string}[]} */
+    /** @type {import("./log.js").Line[]} */
     this.lines = [];
     /** Number of lines so far, those that are no longer kept included. */
     this.logged = 0;
@@ -88,7 +88,7 @@ export class Course {
       case "log":
         // After a restore of its Redis, the server sends lines again.
         if (this.lines.some((line) => line.at === at && line.message === event.message)) break;
-        this.lines.push({ at, level: event.level ?? "info", message: event.message });
+        this.lines.push({ at, level: event.level ?? "info", message: event.message, about: event.about });
         this.logged += 1;
         if (this.lines.length > MOST_LINES) this.lines.shift();
         break;

@@ -303,15 +303,14 @@ function facts() {
 
 function showPhotos() {
   if (!placement) return;
-  const kinds = kindsOf(placement, report?.warnings ?? []);
+  const kinds = kindsOf(placement, report?.misfits ?? []);
   byId("photos-card").hidden = false;
   byId("photos").replaceChildren(...photoParts(placement, kinds));
   scene.setPlacement(placement, kinds);
 }
 
 function showWarnings() {
-  // Those about single photos are in the table of photos.
-  const found = [...new Set([...warningsOf(course.lines), ...(report?.warnings ?? [])])].filter((text) => !/ is left out: | does not fit the other photos| photos are not used: /.test(text));
+  const found = [...new Set([...warningsOf(course.lines), ...(report?.warnings ?? [])])];
   byId("warnings-card").hidden = !found.length;
   byId("warnings").replaceChildren(...found.map((text) => h("li", {}, text)));
 }

@@ -2,7 +2,7 @@
 
 import { h } from "../dom.js";
 
-/** @typedef {{at: string, level: string, message: string}} Line */
+/** @typedef {{at: string, level: string, message: string, about?: string | null}} Line */
 
 /** @type {WeakMap<object, HTMLLIElement>} */
 const items = new WeakMap();
@@ -24,7 +24,7 @@ function itemOf({ at, level, message }) {
     level !== "info" && level !== "debug" && h("strong", {}, `${level}: `), message);
 }
 
-/** The warnings among log lines, each once, newest last. @param {{level: string, message: string}[]} lines */
+/** The warnings among log lines, but those about single photos, which are in the table of photos. @param {Line[]} lines */
 export function warningsOf(lines) {
-  return [...new Set(lines.filter(({ level }) => level === "warning").map(({ message }) => message))];
+  return lines.filter(({ level, about }) => level === "warning" && about !== "unused_photos").map(({ message }) => message);
 }

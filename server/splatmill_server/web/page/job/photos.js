@@ -16,14 +16,14 @@ const SHOWN = 200;
 /**
  * The kind of each photo with a camera.
  * @param {any} placement of `/v1/jobs/{id}/cameras`
- * @param {string[]} warnings of the report; empty before there is one
+ * @param {{photo: string, why: string}[]} misfits of the report; empty before there is one
  * @returns {Map<string, {kind: keyof typeof KINDS, why: string}>}
  */
-export function kindsOf(placement, warnings) {
+export function kindsOf(placement, misfits) {
   const kinds = new Map();
   for (const { name, split } of placement.cameras) {
-    const doubt = warnings.find((warning) => warning.startsWith(`${name} does not fit `));
-    kinds.set(name, doubt ? { kind: "doubtful", why: doubt } : { kind: split === "test" ? "test" : "train", why: "" });
+    const misfit = misfits.find(({ photo }) => photo === name);
+    kinds.set(name, misfit ? { kind: "doubtful", why: misfit.why } : { kind: split === "test" ? "test" : "train", why: "" });
   }
   return kinds;
 }
