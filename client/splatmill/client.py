@@ -248,7 +248,7 @@ class JobHandle:
     def watch(self) -> float:
         """Ask the job for snapshots of its scene, and return for how many seconds it makes them without being asked.
 
-        While it does, events announce the snapshots. Raises Conflict for a job that has ended.
+        While it does, events announce the snapshots. A job that has ended makes none: 0.
         """
         return self._loop.run(self._async.watch())
 
