@@ -177,14 +177,17 @@ class Shares:
         self._loop = loop
         self._async = twin
 
-    def create(self, *, expires_in: float | str = "30d", name: str | None = None) -> ShareWithToken:
+    def create(
+        self, *, expires_in: float | str = "30d", name: str | None = None, photos: bool = False
+    ) -> ShareWithToken:
         """Create a link. `path` of the returned one is its address on the server, which cannot show it again.
 
         expires_in: for how long it is valid: seconds, or a text such as 12h or 30d.
+        photos: whether the held-out photos and the page of the report, which shows some, go along.
 
         Raises InvalidRequest for a time that is not valid.
         """
-        return self._loop.run(self._async.create(expires_in=expires_in, name=name))
+        return self._loop.run(self._async.create(expires_in=expires_in, name=name, photos=photos))
 
     def revoke(self, share_id: str) -> None:
         """Revoke a link at once and for good."""
