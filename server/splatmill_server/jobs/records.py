@@ -124,9 +124,14 @@ class Jobs:
         return cast(str, json.loads(stored)["job"]) if stored else None
 
     def get_row(self, job_id: str) -> JobRow:
-        """Return the row of a job. Raises a 404 problem if Redis has none, and a 500 problem if it is not readable."""
+        """Return the row of a job. Raises a 404 problem if there is none, and a 500 problem if it is not readable.
+
+        An unfinished job that Redis has lost, as one that stops without its last second of writes does, is restored.
+        """
         try:
             found = row.read(self.connection, job_id) if layout.is_id(job_id) else None
+            if found is None and layout.is_id(job_id) and self.restore([job_id]):
+                found = row.read(self.connection, job_id)
         except UnreadableRecord as error:
             raise ProblemError(
                 "job_corrupt",
@@ -148,6 +153,8 @@ class Jobs:
         if not layout.is_id(job_id):
             return None
         known, owner = self._owners([job_id])[0]
+        if not known and self.restore([job_id]):
+            known, owner = self._owners([job_id])[0]
         if known:
             return owner
         stored = self.get_stored(job_id)

@@ -163,6 +163,19 @@ def test_a_single_lost_row_is_restored_at_the_second_look(app: ServedApp) -> Non
     assert app.state(job_id) == "queued"
 
 
+def test_a_lost_row_is_restored_for_whoever_asks_for_its_job(app: ServedApp) -> None:
+    job_id, cancelled = app.job(), app.job()
+    before = app.http.get(f"/v1/jobs/{job_id}").json()
+    app.redis.delete(keys.job(job_id), keys.job(cancelled))
+    with pytest.raises(ProblemError, match="no job"):
+        app.service.jobs.check_visible(Caller("another", scopes=frozenset()), job_id)
+    assert app.http.get(f"/v1/jobs/{job_id}").json() == before
+    app.redis.delete(keys.job(job_id))
+    assert app.http.get(f"/v1/jobs/{job_id}").json() == before
+    assert app.http.post(f"/v1/jobs/{cancelled}/cancel").status_code == 202
+    assert app.http.get("/v1/jobs/0123456789abcdef").status_code == 404
+
+
 def test_a_refused_job_leaves_no_request(app: ServedApp) -> None:
     asked = CreateJob(capture=app.capture())
     with pytest.raises(ProblemError, match="permits 0 at once"):
