@@ -119,14 +119,14 @@ def walk(root: Path, left_out: dict[str, str] | None = None) -> list[str]:
                 if file.startswith("."):
                     continue
                 name = (inside / file).as_posix()
-                if (reason := _unreadable(os.path.join(folder, file))) is None:
+                if (reason := unreadable_file(os.path.join(folder, file))) is None:
                     names.append(name)
                 else:
                     omitted[name] = reason
     return sorted(names)
 
 
-def _unreadable(path: str) -> str | None:
+def unreadable_file(path: str | os.PathLike[str]) -> str | None:
     """Why a file is not read; None for a regular file that may be read."""
     try:
         mode = os.stat(path).st_mode

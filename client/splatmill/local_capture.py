@@ -6,6 +6,7 @@ import unicodedata
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from splatmill.data_sets import (
     Cameras,
@@ -14,6 +15,7 @@ from splatmill.data_sets import (
     is_camera_file,
     place_of_model,
     unread_cameras,
+    unreadable_file,
     walk,
 )
 from splatmill.errors import NothingToUpload
@@ -117,12 +119,13 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     """Find the files of the capture at `path`: a photo, a video, a zip archive, a folder of photos, a posed data set or
     a part of one (`_around`).
 
-    In a folder, the photos are those under `images/`, named relative to it. Without `images/`, they are all photos in
-    the folder, named relative to the folder, so that `train/r_0.png` keeps its name in `transforms_train.json`. Masks
-    lie in a folder such as `masks/`, or beside their photos (`splatmill.schema.masks`); poses are `transforms*.json`,
-    the `.ply` files of points that they name, and COLMAP models. All of this may lie some folders down: see
-    `data_sets.find_cameras`. Hidden files and folders are ignored. Videos and zip archives are used only where there
-    are no photos. Pictures in a folder of results are no photos (`splatmill.schema.outputs`).
+    In a folder, the photos are those under `images/`, named relative to it. Without `images/`, or where transforms
+    files name photos beside it, they are all photos in the folder, named relative to it, so that `train/r_0.png` keeps
+    its name in `transforms_train.json`. Masks lie in a folder such as `masks/`, beside their photos
+    (`splatmill.schema.masks`), or where frames name them; poses are `transforms*.json`, the `.ply` files of points that
+    they name, and COLMAP models. All of this may lie some folders down: see `data_sets.find_cameras`. Hidden files and
+    folders are ignored. Videos and zip archives are used only where there are no photos. Pictures in a folder of
+    results are no photos (`splatmill.schema.outputs`).
 
     A file whose name the service does not accept gets another one, or is left out. What is no regular file, or cannot
     be read, is left out too (`data_sets.walk`).
@@ -130,8 +133,9 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     Raises NothingToUpload where the path does not exist, cannot be read or holds none of these.
     """
     root = Path(path).expanduser()
-    if not root.exists():
-        raise NothingToUpload(f"{root} does not exist.", "Give a folder of photos, a zip archive or a video.")
+    if not root.is_dir() and (reason := unreadable_file(root)) is not None:
+        lacking = "does not exist" if not os.path.lexists(root) else reason.removeprefix("it ")
+        raise NothingToUpload(f"{root} {lacking}.", "Give a folder of photos, a zip archive or a video.")
     root, around = _around(root)
     if root.is_file():
         return _single(root)
@@ -151,9 +155,16 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     photo_root = f"{top}images/"
     if not any(name.startswith(photo_root) and _is_image(name) for name in names):
         photo_root = top
-    masks = _masks([name for name in names if name.startswith(top) and _is_image(name)], top, photo_root)
+    documents = _documents(root, cameras)
+    pictures = [name for name in names if name.startswith(top) and _is_image(name)]
+    if _has_photos_beside(_named(documents, "file_path", cameras.top).intersection(pictures), photo_root):
+        photo_root = top
+    masks = _masks(pictures, top, photo_root)
+    for name in _named(documents, "mask_path", cameras.top).intersection(pictures).difference(masks):
+        masks[name] = name.removeprefix(photo_root if name.startswith(photo_root) else top)
     poses = _poses(cameras, names)
-    poses |= _points_of(root, cameras, names)
+    points = _named(documents, "ply_file_path", cameras.top).intersection(names)
+    poses |= {name: name.removeprefix(cameras.top) for name in points if _suffix(name) == ".ply"}
     files: list[LocalFile] = []
     ignored: list[str] = []
     for name in names:
@@ -274,6 +285,16 @@ def _single(path: Path) -> Found:
     return Found.of([_local(Role.images, path.name, path)])
 
 
+def _has_photos_beside(named: Iterable[str], photo_root: str) -> bool:
+    """Whether cameras name photos outside the folder `images`, other than these in another size (`images_4`)."""
+    reduced = photo_root.rstrip("/") + "_"
+    return any(
+        not name.startswith(photo_root)
+        and not (name.startswith(reduced) and name.removeprefix(reduced).split("/")[0].isdecimal())
+        for name in named
+    )
+
+
 def _masks(pictures: list[str], top: str, photo_root: str) -> dict[str, str]:
     """Return the local name of each mask, with its name in the capture. All pictures are under `top`."""
     # A folder around the data set may be called masks too.
@@ -307,19 +328,27 @@ def _poses(cameras: Cameras, names: list[str]) -> dict[str, str]:
     return found
 
 
-def _points_of(root: Path, cameras: Cameras, names: list[str]) -> dict[str, str]:
-    """Return the .ply files with points that transforms files name, each with its name in the capture. A transforms
-    file that cannot be read names none here; the worker says what is wrong with it."""
-    found = {}
-    for path in (root / name for name in cameras.transforms):
+def _documents(root: Path, cameras: Cameras) -> list[dict[str, Any]]:
+    """The transforms files. One that cannot be read is left out here; the worker says what is wrong with it."""
+    documents = []
+    for name in cameras.transforms:
         try:
-            named = json.loads(path.read_bytes()).get("ply_file_path")
-        except (OSError, ValueError, AttributeError, RecursionError):
+            document = json.loads((root / name).read_bytes())
+        except (OSError, ValueError, RecursionError):
             continue
-        name = str(named).replace("\\", "/").removeprefix("./")
-        if cameras.top + name in names and _suffix(name) == ".ply":
-            found[cameras.top + name] = name
-    return found
+        if isinstance(document, dict):
+            documents.append(document)
+    return documents
+
+
+def _named(documents: Iterable[Mapping[str, Any]], key: str, top: str) -> set[str]:
+    """The files that transforms files or their frames name under `key`."""
+    entries: list[Any] = []
+    for document in documents:
+        frames = document.get("frames")
+        entries += [document, *(frames if isinstance(frames, list) else [])]
+    named = [entry[key] for entry in entries if isinstance(entry, dict) and isinstance(entry.get(key), str)]
+    return {top + name.replace("\\", "/").removeprefix("./") for name in named}
 
 
 def _local(role: Role, name: str, path: Path) -> LocalFile:

@@ -167,8 +167,10 @@ def _cameras() -> list[str]:
 
         In `transforms.json`, a frame or the document has {fields}. `camera_angle_x` and `camera_angle_y` may stand for
         the focal lengths; a size that is missing is that of the photo. `transform_matrix` is from camera to world, 4 x
-        4 or 3 x 4, with OpenGL axes. `mask_path` names the mask of a frame. Of the raw data of Polycam, corrected
-        cameras are preferred, which need the photos in `keyframes/corrected_images`.
+        4 or 3 x 4, with OpenGL axes; the fourth row is 0, 0, 0, 1. `mask_path` names the mask of a frame, in any
+        folder of the data set; a warning says how many are missing. Where frames name photos beside the folder
+        `images`, those are used too. Of the raw data of Polycam, corrected cameras are preferred, which need the photos
+        in `keyframes/corrected_images`.
 
         `transforms_train.json`, `transforms_test.json` and `transforms_val.json` are read, beside a `transforms.json`
         too, and so are the lists `train_filenames`, `test_filenames` and `val_filenames` in a file: those to test with

@@ -227,13 +227,59 @@ def test_transforms_without_such_points_are_sent_alone(tmp_path: Path, content: 
     assert roles(tmp_path)[Role.poses] == ["transforms.json"]
 
 
+@pytest.mark.parametrize(
+    ("named", "stored"),
+    [
+        ("sam/obj_0.png", "sam/obj_0.png"),
+        (".\\\\sam\\\\obj_0.png", "sam/obj_0.png"),
+        ("masks/obj_0.png", "obj_0.png"),
+        ("images/obj_0.png", "obj_0.png"),
+    ],
+)
+def test_the_masks_that_frames_name_are_masks(tmp_path: Path, named: str, stored: str):
+    path = named.replace("\\\\", "/").removeprefix("./")
+    tree(tmp_path, "images/a.jpg", path, "sam/other.png")
+    (tmp_path / "transforms.json").write_text(
+        f'{{"frames": [null, {{"file_path": "images/a.jpg", "mask_path": "{named}"}}]}}'
+    )
+    assert roles(tmp_path) == {
+        Role.images: ["a.jpg"],
+        Role.masks: [stored],
+        Role.poses: ["transforms.json"],
+    }
+
+
+@pytest.mark.parametrize(
+    ("named", "photos"),
+    [
+        ("more/b.jpg", ["images/a.jpg", "more/b.jpg"]),
+        ("images_4/a.jpg", ["a.jpg"]),
+        ("images/a.jpg", ["a.jpg"]),
+        ("more/missing.jpg", ["a.jpg"]),
+    ],
+)
+def test_photos_beside_the_folder_images_are_used_where_cameras_name_them(
+    tmp_path: Path, named: str, photos: list[str]
+):
+    tree(tmp_path, "images/a.jpg", "more/b.jpg", "images_4/a.jpg")
+    (tmp_path / "transforms.json").write_text(f'{{"frames": [{{"file_path": "./{named}"}}]}}')
+    found = roles(tmp_path)[Role.images]
+    assert [name for name in found if not name.startswith("images_4")] == photos
+
+
 def test_paths_with_nothing_to_train(tmp_path: Path):
     with pytest.raises(NothingToUpload, match="does not exist"):
         find_files(tmp_path / "nowhere")
+    (tmp_path / "gone").symlink_to("nowhere")
+    with pytest.raises(NothingToUpload, match=r"gone is a link to nothing\."):
+        find_files(tmp_path / "gone")
+    os.mkfifo(tmp_path / "pipe.zip")
+    with pytest.raises(NothingToUpload, match=r"pipe\.zip is a device, a socket or a pipe, not a file\."):
+        find_files(tmp_path / "pipe.zip")
     with pytest.raises(NothingToUpload, match="no photos"):
-        find_files(tree(tmp_path, "notes.txt"))
+        find_files(tree(tmp_path / "empty", "notes.txt"))
     with pytest.raises(NothingToUpload, match=r"neither a photo"):
-        find_files(tmp_path / "notes.txt")
+        find_files(tmp_path / "empty/notes.txt")
 
 
 @pytest.mark.parametrize(

@@ -148,6 +148,24 @@ def test_masks_and_points_with_backslashes_are_found(tmp_path: Path) -> None:
     assert views[NAMES[0]].mask == tmp_path / "cut/m.png"
 
 
+@pytest.mark.parametrize("named", ["./masks/cut_0.png", "sam\\Cut_0.png", "/home/me/scan/sam/cut_0.png"])
+def test_masks_of_a_capture_are_found_by_the_paths_that_frames_name(tmp_path: Path, named: str) -> None:
+    photos(tmp_path / "images")
+    stored = tmp_path / ("masks/cut_0.png" if "masks" in named else "masks/sam/cut_0.png")
+    photos(stored.parent, [stored.name])
+    given = frames()
+    given[0]["mask_path"] = named
+    given[1]["mask_path"] = "sam/gone.png"
+    (tmp_path / "poses").mkdir()
+    transforms(tmp_path / "poses/transforms.json", given)
+    scene = loaded(tmp_path)
+    assert {view.name: view.mask for view in scene.views if view.mask} == {NAMES[0]: stored}
+    assert [each for each in scene.warnings if each.startswith("Masks that")] == [
+        "Masks that transforms.json names are not in the capture, so that these photos have none: 1, such as "
+        "sam/gone.png."
+    ]
+
+
 @pytest.mark.parametrize("folders", [("images_2", "images_4"), ("images", "images_2", "images_8")])
 @pytest.mark.parametrize("root", ["", "images/"])
 def test_of_photos_in_several_sizes_the_largest_are_used(

@@ -93,6 +93,17 @@ class ImageFiles:
         """The mask of the photo with this relative name; None when it has none."""
         return self.masks.get(self._pairs.get(name, ""))
 
+    def named_mask(self, name: str) -> Path | None:
+        """The mask that a file of cameras names; None when there is none, or no single one."""
+        parts = [part for part in folded(name).split("/") if part not in (".", "..", "")]
+        inner = without_mask_folder("/".join(parts))
+        for wanted in [parts] if inner is None else [inner.split("/"), parts]:
+            for length in range(len(wanted), 0, -1):
+                found = self._masks_by_end.get(tuple(wanted[-length:]), [])
+                if len(found) == 1:
+                    return self.masks[found[0]]
+        return None
+
     @property
     def unused_masks(self) -> set[str]:
         """Names of the masks that belong to none of the photos."""
@@ -110,6 +121,16 @@ class ImageFiles:
     @cached_property
     def _pairs(self) -> dict[str, str]:
         return paired(self.photos, self.masks)
+
+    @cached_property
+    def _masks_by_end(self) -> dict[tuple[str, ...], list[str]]:
+        """Names of the masks by each number of their last parts."""
+        index: dict[tuple[str, ...], list[str]] = {}
+        for name in self.masks:
+            parts = folded(name).split("/")
+            for start in range(len(parts)):
+                index.setdefault(tuple(parts[start:]), []).append(name)
+        return index
 
     def _fitting(self, name: str) -> list[str]:
         """The photos that the very `name` fits equally well."""

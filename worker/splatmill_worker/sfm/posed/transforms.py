@@ -78,6 +78,7 @@ def load(
         listed_in = parts.of_lists(path, document)
         warnings += parts.unknown(path, listed_in, document["frames"])
         without = 0
+        unmasked: list[str] = []
         faults: list[ValueError] = []
         for index, frame in enumerate(document["frames"]):
             if _has_no_pose(frame):
@@ -100,6 +101,8 @@ def load(
                 continue
             where[len(given)] = f"frame {index} of {path.name}"
             given[len(given)] = view
+            if view.mask is None and frame.get("mask_path"):
+                unmasked.append(str(frame["mask_path"]))
             own = {part} if part else listed_in.get(parts.plain(name), set())
             named.setdefault(view.image, set()).update(own)
         if without == len(document["frames"]) > 0:
@@ -108,6 +111,11 @@ def load(
             warnings.append(
                 f"Frames without a transform_matrix are left out: {without} of {len(document['frames'])} in "
                 f"{path.name}."
+            )
+        if unmasked:
+            warnings.append(
+                f"Masks that {path.name} names are not in the capture, so that these photos have none: "
+                f"{len(unmasked)}, such as {unmasked[0]}."
             )
         if document.get("ply_file_path"):
             points, note = _sparse_points(path.parent / _local(str(document["ply_file_path"])), capture)
@@ -203,12 +211,17 @@ def _view(
         raise ValueError(f"Frame {index} of {path.name} ({name}): {plain(error)}.") from error
     mask = files.mask(relative)
     if mask is None and isinstance(frame.get("mask_path"), str):
-        beside = path.parent / _local(frame["mask_path"])
-        mask = beside if _within(beside, capture) and beside.is_file() else None
+        mask = _named_mask(path, frame["mask_path"], files, capture)
     view, *other = [
         fit_to_file(camera_and_lens(camera, viewmat), relative, photo, mask) for camera in cameras
     ]
     return name, replace(view, other=other[0]) if other else view
+
+
+def _named_mask(path: Path, name: str, files: ImageFiles, capture: Path) -> Path | None:
+    """The mask that a frame of the file `path` names; None where the capture has none."""
+    beside = path.parent / _local(name)
+    return beside if _within(beside, capture) and beside.is_file() else files.named_mask(_local(name))
 
 
 def _has_no_pose(frame: Any) -> bool:
@@ -241,7 +254,7 @@ def world_to_camera(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """The OpenCV world-to-camera matrix [4,4] of an OpenGL camera-to-world matrix [4,4] or [3,4].
 
     A uniform scale of the rotation part is taken out. Raises ValueError for a matrix that is not finite, is singular or
-    mirrored, or shears.
+    mirrored, transposed, or shears.
     """
     if matrix.shape not in ((4, 4), (3, 4)):
         raise ValueError(f"transform_matrix has the shape {matrix.shape}; it must be 4 x 4 or 3 x 4")
@@ -249,6 +262,11 @@ def world_to_camera(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         raise ValueError("transform_matrix has values that are not finite")
     if not np.abs(matrix).max() <= MAX_DISTANCE:
         raise ValueError(f"transform_matrix has values above {MAX_DISTANCE:.0e}")
+    if matrix.shape == (4, 4) and np.abs(matrix[3, :3]).max() > MAX_SHEAR * max(1.0, abs(matrix[3, 3])):
+        raise ValueError(
+            f"the fourth row of transform_matrix is {', '.join(f'{value:.4g}' for value in matrix[3])}; it must be "
+            "0, 0, 0, 1. The matrix is probably transposed: its fourth column is the place of the camera"
+        )
     rotation = matrix[:3, :3]
     determinant = float(np.linalg.det(rotation))
     if not determinant > MIN_DETERMINANT:
