@@ -97,8 +97,8 @@ def _photos() -> list[str]:
         the chunks sRGB, gAMA and cHRM of PNG, or EXIF (Adobe RGB, other primaries, a power); in a PNG, cICP comes
         first. A video is read by its tags. PQ and HLG are converted by one rule, which
         [Photographing](photographing.md#what-can-be-given) has. CMYK and LAB are converted too. Grey floating-point
-        numbers are taken as sRGB from 0 to 1; coloured ones are refused, since they may be linear light as well. The
-        report says what was converted or assumed.""",
+        numbers are taken as sRGB from 0 to 1, and left out if they reach further; coloured ones are refused, since they
+        may be linear light as well. The report says what was converted or assumed.""",
         "### Zips\n",
         f"""{choices(ARCHIVE_SUFFIXES)} files hold photos or a whole data set. All zips and videos of a capture together
         hold up to {archive.MAX_ENTRIES:,} files. A zip in a zip is not unpacked.

@@ -43,8 +43,8 @@ def plain(error: BaseException) -> str:
             return f"{str(error.args[0])[:80]!r} is missing"
         case FileNotFoundError():
             return "there is no such file"
-        case OSError() if error.strerror:
-            return error.strerror
+        case OSError() | ValueError() if isinstance(said := getattr(error, "strerror", None), str):
+            return said  # some errors of FFmpeg are ValueErrors
         case TypeError() | AttributeError() | IndexError():
             return "a value in it is of another kind than its format has"
     said = (str(error).strip().splitlines() or [type(error).__name__])[0]

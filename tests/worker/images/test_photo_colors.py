@@ -21,7 +21,8 @@ import pillow_heif
 import pytest
 from PIL import Image, ImageCms
 
-from splatmill_worker.images import decode, decoders
+from splatmill_worker.errors import UnusablePicture
+from splatmill_worker.images import decode, decoders, examine
 from splatmill_worker.images.colors import Colors, _rgb_to_xyz, _to_srgb
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.sfm import posed
@@ -343,6 +344,14 @@ def test_lab_and_cmyk_without_a_profile(tmp_path: Path) -> None:
     Image.fromarray(chart()[..., 0].astype(np.float32) / 255).save(tmp_path / "float.tif")
     assert (read(tmp_path / "float.tif")[..., 0] == chart()[..., 0]).all()
     assert "taken as values of sRGB" in decoders.photo_colors(tmp_path / "float.tif", "a")
+
+
+def test_floats_beyond_white_are_left_out(tmp_path: Path) -> None:
+    Image.fromarray(chart()[..., 0].astype(np.float32)).save(tmp_path / "float.tif")
+    reason = f"its floating-point numbers reach {chart()[..., 0].max()}, and are read from 0 to 1"
+    with pytest.raises(UnusablePicture, match=reason):
+        read(tmp_path / "float.tif")
+    assert str(examine.examine(tmp_path / "float.tif", "float.tif")).startswith(reason)
 
 
 @pytest.mark.parametrize(("suffix", "codec"), [("png", "png"), ("tif", "tiff")])

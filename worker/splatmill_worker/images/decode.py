@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import guarded, transparency
 from splatmill_worker.images.photo_colors import PhotoColors
 
@@ -32,6 +33,11 @@ TURNED = (5, 6, 7, 8)
 
 MAX_REDUCTION = 64
 """Largest factor by which a decoded photo is reduced."""
+
+
+LARGEST_WHITE = 2.0
+"""Largest of the floating-point numbers of a photo that count as going from 0 to 1: a little above is light beyond
+white, which is cut off."""
 
 
 def upright_size(image: Image.Image) -> tuple[int, int]:
@@ -111,6 +117,7 @@ def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool
                 image.draft(None, (image.width // factor, image.height // factor))
         with guarded.room(image):
             photo = whole(image, path.name)
+            check_numbers(image, path.name)
             if turn is not None:
                 photo = photo.transpose(turn)
             # Pillow would reduce RGBA in premultiplied steps of 8 bits, which loses colour.
@@ -149,6 +156,20 @@ def whole(image: Image.Image, name: str) -> Image.Image:
     with guarded.damage(name):
         image.load()
         return _plain_mode(image)
+
+
+def check_numbers(image: Image.Image, name: str) -> None:
+    """Raise UnusablePicture where the floating-point numbers of a decoded photo do not go from 0 to 1."""
+    if image.mode != "F":
+        return
+    largest = float(np.nan_to_num(np.asarray(image)).max(initial=0.0))
+    if largest > LARGEST_WHITE:
+        raise UnusablePicture(
+            "not_an_image",
+            name,
+            f"its floating-point numbers reach {largest:.4g}, and are read from 0 to 1; save it with 8 or 16 bits per "
+            "channel, as sRGB",
+        )
 
 
 def _factor(size: tuple[int, int], at_least: tuple[int, int], choices: Iterable[int]) -> int:

@@ -15,7 +15,15 @@ from splatmill.schema.photos import MIN_PHOTO_SIDE
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import exif, guarded, transparency
 from splatmill_worker.images.copies import SMALL_SIDE, small_grey
-from splatmill_worker.images.decode import UPRIGHT, Pixels, orientation, tags, upright_size, whole
+from splatmill_worker.images.decode import (
+    UPRIGHT,
+    Pixels,
+    check_numbers,
+    orientation,
+    tags,
+    upright_size,
+    whole,
+)
 from splatmill_worker.images.photo_colors import PhotoColors
 from splatmill_worker.wording import plain
 
@@ -83,6 +91,7 @@ def examine(path: Path, name: str) -> Picture | str:
                     image.draft(None, (SMALL_SIDE, SMALL_SIDE))
                 with guarded.room(image):
                     photo = whole(image, name)
+                    check_numbers(image, name)
                 closed = wide and _is_closed(photo)
                 alpha = transparency.extent(photo)
                 small = small_grey(photo)

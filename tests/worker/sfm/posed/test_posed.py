@@ -162,6 +162,7 @@ def test_a_blender_set_keeps_its_own_split(tmp_path: Path) -> None:
         (np.diag([1.0, 1.0, -1.0, 1.0]), "determinant"),
         (np.diag([1.0, 2.0, 1.0, 1.0]), "rigid"),
         (np.eye(2), "shape"),
+        (np.array(opengl([1.0, 2.0, 3.0])).T, "probably transposed"),
     ],
 )
 def test_what_cannot_be_a_camera_is_refused_by_name(tmp_path: Path, matrix: np.ndarray, words: str) -> None:
