@@ -211,9 +211,10 @@ def _points() -> list[str]:
     return [
         "## Points\n",
         f"""Points are those of the COLMAP model, or of the `.ply` in the data set that `ply_file_path` in
-        `transforms.json` names, whose faces and lists are left out. Points with tracks are used. Those without, such as
-        a laser scan (up to {points.MOST_LOOSE:,} of them), are used where photos show their colours; if photos show
-        these hardly more often than by chance, none is used, and the log says so. With fewer than
+        `transforms.json` names, whose faces and lists are left out. Points with tracks are used; if the photos
+        that the tracks name do not show their colours, photos are matched to check the cameras. Points without tracks,
+        such as a laser scan (up to {points.MOST_LOOSE:,} of them), are used where photos show their colours; if photos
+        show these hardly more often than by chance, none is used, and the log says so. With fewer than
         {points.LEAST_POINTS}, points are triangulated with the given cameras. A warning says when the cameras explain
         less than {triangulation.CONTRADICTED:.0%} of the matches between photos: then the poses or the intrinsics are
         wrong, or belong to other photos. It names another convention of axes or matrices in which they fit, if one

@@ -278,6 +278,34 @@ def test_wrong_cameras_are_named_and_the_random_start_says_why(bare: Scene, tmp_
         assert plan.reasons["initial"].startswith("The given cameras explain only")
 
 
+def test_points_with_tracks_are_checked_in_the_photos_that_the_tracks_name(
+    bare: Scene, tmp_path: Path
+) -> None:
+    given = posed.with_points(bare, tmp_path)
+    assert given.point_views is not None
+    assert posed.with_points(given, tmp_path / "right").warnings == ()
+    files = [view.image for view in given.views]
+    exchanged = tuple(
+        replace(view, image=files[(index + 5) % len(files)]) for index, view in enumerate(given.views)
+    )
+    wrong = posed.with_points(replace(given, views=exchanged), tmp_path / "wrong")
+    [warning] = wrong.warnings
+    assert warning.startswith("The given cameras explain only")
+    assert "belong to other photos" in warning
+    assert len(wrong.points) >= len(given.points)
+
+
+def test_cameras_that_are_all_in_one_place_explain_only_what_their_turn_does(bare: Scene) -> None:
+    def at(view: View, turn: np.ndarray, center: np.ndarray) -> View:
+        return replace(view, camera=replace(view.camera, viewmat=viewmat_of(turn, center)))
+
+    place = bare.views[0].camera.center
+    views = [at(view, view.camera.viewmat[:3, :3], place) for view in bare.views[:5]]
+    found = triangulate(views, LEAN)
+    assert found.matches > 0
+    assert found.agreeing < 0.5 * found.matches
+
+
 @pytest.mark.parametrize(
     ("source", "named", "misread"),
     [

@@ -49,6 +49,9 @@ PLAIN = 0.5
 """Share of the photos that show a point's colour from which it does not matter that others would agree as well: in a
 scene of one colour, all do."""
 
+CHECKED = 24
+"""Photos in which the colours of points with tracks are compared, at most."""
+
 LOOKED_AT = 4
 """Photos that tell whether a data set has transparent ones: this many, and less than twice as many."""
 
@@ -72,15 +75,15 @@ def with_points(
     scene = orientation.decided(scene, seed=seed, on_progress=on_progress, cancelled=cancelled)
     scene = _with_loose_points(scene, cancelled)
     if not _lacks_points(scene):
+        if _shows_others(scene, cancelled):
+            found = _search(scene, workdir, seed, on_progress, cancelled)
+            scene = replace(scene, warnings=(*scene.warnings, *_contradiction(scene, found)))
         return _with_stereo(scene, workdir, on_progress, cancelled)
     if _transparent(scene, cancelled):
         swept = _with_stereo(scene, workdir, on_progress, cancelled)
         if not _lacks_points(swept):
             return swept
-    stored = workdir / "sfm" / f"triangulated-{_digest(scene)}-{seed}.npz"
-    if not stored.is_file():
-        _save(_searched(scene, seed, on_progress, cancelled), stored)
-    found = _load(stored)
+    found = _search(scene, workdir, seed, on_progress, cancelled)
     scene = _with_triangulated(scene, found, cancelled)
     scene = _with_stereo(scene, workdir, on_progress, cancelled)
     if len(scene.points) >= LEAST_POINTS:
@@ -127,9 +130,30 @@ def _with_loose_points(scene: Scene, cancelled: Callable[[], bool]) -> Scene:
 
 
 def _elsewhere(evidence: Evidence) -> bool:
-    agreement = evidence.agreement
     unseen = float((evidence.shown == 0).mean())
-    return unseen > 0.5 or not (agreement >= PLAIN or agreement > ABOVE_CHANCE * evidence.chance)
+    return unseen > 0.5 or _by_chance(evidence.agreement, evidence.chance)
+
+
+def _by_chance(agreement: float, chance: float) -> bool:
+    """Whether photos show the colours of points hardly more often than exchanged ones."""
+    return not (agreement >= PLAIN or agreement > ABOVE_CHANCE * chance)
+
+
+def _shows_others(scene: Scene, cancelled: Callable[[], bool]) -> bool:
+    """Whether the photos do not show the colours of the points whose tracks name them, so that the cameras or the
+    points may be those of other photos. Some photos are compared, evenly chosen."""
+    if scene.point_views is None or (scene.colors == scene.colors[0]).all():
+        return False
+    owners = np.repeat(np.arange(len(scene.points)), np.diff(scene.point_views.offsets))
+    used = [index for index, view in enumerate(scene.views) if view.split != "test"]
+    shown, agreeing, by_chance = 0, 0, 0
+    for index in used[:: -(-len(used) // CHECKED)]:
+        rows = owners[scene.point_views.views == index]
+        evidence = evidence_of(scene.points[rows], scene.colors[rows], [scene.views[index]], cancelled)
+        shown += int(evidence.shown.sum())
+        agreeing += int(evidence.agreeing.sum())
+        by_chance += int(evidence.by_chance.sum())
+    return _by_chance(agreeing / max(1, shown), by_chance / max(1, shown))
 
 
 def _loose_note(given: int, judged: int, kept: int, evidence: Evidence, plain: bool) -> str:
@@ -154,6 +178,16 @@ def _transparent(scene: Scene, cancelled: Callable[[], bool]) -> bool:
     some = views[:: max(1, len(views) // LOOKED_AT)]
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     return evidence_of(*nothing, some, cancelled).transparent > 0
+
+
+def _search(
+    scene: Scene, workdir: Path, seed: int, on_progress: OnProgress, cancelled: Callable[[], bool]
+) -> Triangulated:
+    """What triangulation finds, kept in `workdir`."""
+    stored = workdir / "sfm" / f"triangulated-{_digest(scene)}-{seed}.npz"
+    if not stored.is_file():
+        _save(_searched(scene, seed, on_progress, cancelled), stored)
+    return _load(stored)
 
 
 def _searched(
@@ -196,14 +230,7 @@ def _with_triangulated(scene: Scene, found: Triangulated, cancelled: Callable[[]
         "seconds": found.seconds,
     }
     messages = [_triangulated_note(given, len(kept), found)]
-    warnings = list(scene.warnings)
-    if contradicted(found.agreeing, found.matches):
-        warnings.append(
-            f"The given cameras explain only {100 * found.agreeing / found.matches:.0f} % of the {found.matches} "
-            f"matches between the photos; half of them are off by {found.disagreement:.1f} pixels or more. The poses "
-            "or the intrinsics are wrong: correct them, or remove them to have the cameras recovered from the photos."
-            + _suggestion(scene.source, found)
-        )
+    warnings = [*scene.warnings, *_contradiction(scene, found)]
     if len(kept) < LEAST_POINTS or len(kept) <= given:
         return replace(
             scene, facts=scene.facts | facts, notes=(*scene.notes, *messages), warnings=tuple(warnings)
@@ -222,6 +249,18 @@ def _with_triangulated(scene: Scene, found: Triangulated, cancelled: Callable[[]
         notes=(*scene.notes, *messages),
         warnings=tuple(warnings),
     )
+
+
+def _contradiction(scene: Scene, found: Triangulated) -> list[str]:
+    """A warning where the cameras explain few of the matches; else none."""
+    if not contradicted(found.agreeing, found.matches):
+        return []
+    return [
+        f"The given cameras explain only {100 * found.agreeing / found.matches:.0f} % of the {found.matches} "
+        f"matches between the photos; half of them are off by {found.disagreement:.1f} pixels or more. The poses "
+        "or the intrinsics are wrong, or belong to other photos: correct them, or remove them to have the cameras "
+        "recovered from the photos." + _suggestion(scene.source, found)
+    ]
 
 
 def _suggestion(source: Source, found: Triangulated) -> str:

@@ -27,6 +27,10 @@ OPAQUE = 250
 """Alpha (0 to 255) from which a feature counts: on the outline of an object it lies at no fixed place."""
 
 
+SAME_PLACE = 1e-9
+"""Distance between two cameras, over that from the origin, below which they are in one place."""
+
+
 @dataclass(frozen=True)
 class Searched:
     """A photo's features, their colours [n,3], the pinhole camera at the size of the search, and its transparency."""
@@ -134,6 +138,8 @@ def epipolar_errors(
 ) -> Float:
     """Sampson errors, in pixels of the searched photos, of all verified matches under the given cameras [n].
 
+    Cameras in one place have no epipolar lines: the error is the distance to the pixel that the turn leads to.
+
     in_front: make the error of a match infinite where its rays do not meet in front of both cameras.
 
     Hartley and Zisserman, "Multiple View Geometry", 2nd edition, equation 11.9.
@@ -152,6 +158,9 @@ def epipolar_errors(
         line, back = left @ fundamental.T, right @ fundamental
         across = (line[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
         error = np.abs((right * line).sum(axis=1)) / np.sqrt(np.maximum(across, 1e-300))
+        if np.linalg.norm(motion[:3, 3]) <= SAME_PLACE * (1.0 + np.linalg.norm(a.center)):
+            turned = left @ (b.K @ motion[:3, :3] @ np.linalg.inv(a.K)).T
+            error = np.linalg.norm(turned[:, :2] / turned[:, 2:] - right[:, :2], axis=1)
         errors.append(np.where(_meet_in_front(a, b, left, right), error, np.inf) if in_front else error)
     return np.concatenate(errors)
 
