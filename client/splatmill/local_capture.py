@@ -188,7 +188,13 @@ def find_files(path: str | os.PathLike[str]) -> Found:
             kinds = ", ".join(sorted(suffix.removeprefix(".") for suffix in PHOTO_SUFFIXES))
             raise NothingToUpload(
                 f"{root} contains no photos, no video and no zip archive.",
-                " ".join([*_left_out(unreadable), *(unread(ignored) or [f"Photos are {kinds} files."])]),
+                " ".join(
+                    [
+                        *_results(outputs),
+                        *_left_out(unreadable),
+                        *(unread(ignored) or [f"Photos are {kinds} files."]),
+                    ]
+                ),
             )
     found = Found.of(files, ignored)
     if not found.count(Role.images):
@@ -199,6 +205,12 @@ def find_files(path: str | os.PathLike[str]) -> Found:
         remarks.append(f"Videos and zips are not used where there are photos: {listed(beside)}.")
     remarks += _cameras_beside(root, cameras)
     return replace(found, top=cameras.top, outputs=tuple(sorted(outputs)), remarks=tuple(remarks))
+
+
+def _results(outputs: Iterable[str]) -> list[str]:
+    """A sentence about results of Splatmill, which are no photos; none where there are none."""
+    named = sorted(outputs)
+    return [f"Results of an earlier training are not read as photos: {listed(named)}."] if named else []
 
 
 def _left_out(unreadable: Mapping[str, str]) -> list[str]:

@@ -267,6 +267,13 @@ def test_photos_beside_the_folder_images_are_used_where_cameras_name_them(
     assert [name for name in found if not name.startswith("images_4")] == photos
 
 
+def test_a_folder_of_results_alone_is_called_that(tmp_path: Path):
+    tree(tmp_path, "model.ply", "report.json", "cameras.json", "preview.jpg")
+    with pytest.raises(NothingToUpload, match="no photos") as error:
+        find_files(tmp_path)
+    assert "Results of an earlier training are not read as photos: preview.jpg." in str(error.value)
+
+
 def test_paths_with_nothing_to_train(tmp_path: Path):
     with pytest.raises(NothingToUpload, match="does not exist"):
         find_files(tmp_path / "nowhere")

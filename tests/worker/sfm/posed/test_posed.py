@@ -177,6 +177,15 @@ def test_what_cannot_be_a_camera_is_refused_by_name(tmp_path: Path, matrix: np.n
     assert "a.png" in str(error.value)
 
 
+def test_an_empty_list_of_frames_is_called_that(tmp_path: Path) -> None:
+    write_photos(tmp_path / "images", ["a.png"])
+    write_transforms(tmp_path / "transforms.json", [], camera_angle_x=1.0)
+    found = posed.find(tmp_path)
+    assert found is not None
+    with pytest.raises(ValueError, match=r"transforms\.json has no frames: it places no photo\."):
+        found.load()
+
+
 def colmap_model() -> pycolmap.Reconstruction:
     """Two photos of 128 x 96, a metre apart, and three points both see."""
     options = pycolmap.SyntheticDatasetOptions()

@@ -127,6 +127,8 @@ def load(
     warnings += remarks
     if not views and unusable:
         raise none_usable(list(unusable.items()))
+    if not views and not left_out:
+        raise ValueError(f"{listed([path.name for path in paths])} has no frames: it places no photo.")
     if not views:
         first = f" (such as {left_out[0][0]!r})" if left_out else ""
         several = readings(left_out[0][0], files) if left_out else ""
