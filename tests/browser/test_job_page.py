@@ -126,7 +126,7 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
     service: Up, capture: str, open_window: Open
 ) -> None:
     page = open_window(service, viewport={"width": 800, "height": 500}).page
-    job_id = submit(service, capture, time_budget="12s")
+    job_id = submit(service, capture, time_budget="20s")
     page.goto(f"/jobs/{job_id}")
     expect(page.get_by_role("heading", level=1)).to_have_text("watched")
     snapshots(page, 1)
@@ -340,8 +340,7 @@ def test_a_job_that_is_not_there_says_so(page: Page, visit: Any) -> None:
 
 
 COURSE = """async (records) => {
-  const script = document.querySelector('script[type=module]').src;
-  const { Course } = await import(new URL('course.js', script));
+  const { Course } = await import('/page/any/job/course.js');
   const course = new Course();
   for (const [seconds, event, attempt = 1] of records) {
     course.apply({ event, attempt, at: new Date(1e12 + 1000 * seconds).toISOString() });
