@@ -116,6 +116,7 @@ async function afterEnd() {
     if (!placement) await fetchCameras();
   }
   showPhotos();
+  showWarnings();
 }
 
 async function fetchCameras() {
