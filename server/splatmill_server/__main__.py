@@ -16,7 +16,7 @@ import uvicorn
 from fastapi import FastAPI
 from pydantic import ValidationError
 
-from splatmill.backplane import private_files
+from splatmill.backplane import layout, private_files
 from splatmill.backplane.connection import InvalidRedisUrl
 from splatmill.backplane.log_lines import LogFormat
 from splatmill.backplane.redact import redacted
@@ -97,11 +97,12 @@ def _options() -> argparse.ArgumentParser:
 
 
 def _check_modes(storage: Storage, settings: Settings) -> None:
-    """Log which folders other users of the machine may read."""
+    """Log which folders other users of the machine may read, and close that with secrets."""
     for folder in (settings.data.expanduser().absolute(), storage.root):
         exposed = private_files.exposure(folder, settings.file_mask) if folder is not None else None
         if exposed is not None:
             log.warning(exposed)
+    private_files.close(storage.local_path(layout.webhooks()), settings.file_mask)
 
 
 def listen(settings: Settings) -> socket.socket:

@@ -134,7 +134,8 @@ def test_only_the_same_command_goes_on_and_a_second_ctrl_c_loses_only_what_follo
     command.script["do"] = "nothing"
     other = tmp_path / "other"
     other.mkdir()
-    (other / "0.jpg").write_text("photo 0")
+    for n in range(3):
+        (other / f"{n}.jpg").write_text(f"photo {n}")
     code, said = command.run(photos=other)
     assert code == Exit.no_service
     assert f"{command.data} holds an unfinished training of other photos, {command.photos}" in said

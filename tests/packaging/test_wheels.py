@@ -127,7 +127,8 @@ for command in set(COMMANDS) - {"up", "doctor", "bench"}:  # which pass --help o
 def test_a_missing_part_is_a_sentence_with_the_command_that_installs_it(
     alone: Path, command: str, tmp_path: Path
 ) -> None:
-    (tmp_path / "a.jpg").write_bytes(b"x")
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        (tmp_path / name).write_bytes(b"x")
     arguments: list[str | Path] = [tmp_path, "-o", tmp_path / "out"] if command == "train" else []
     done = run(alone / "splatmill", command, *arguments)
     assert done.returncode == 8

@@ -10,6 +10,7 @@ import os
 import re
 import shlex
 import socket
+import stat
 from pathlib import Path
 
 PRIVATE = 0o077
@@ -42,6 +43,15 @@ def exposure(folder: Path, mask: int) -> str | None:
         f"Close it with: chmod {mode & ~mask:04o} {shlex.quote(str(folder))} . If they are meant to, set "
         "SPLATMILL_UMASK, such as 027 for the group."
     )
+
+
+def close(folder: Path | None, mask: int) -> None:
+    """Take away the rights to a folder with secrets that a copy or a restored backup gave, and that `mask` does not."""
+    if folder is None or not folder.is_dir():
+        return
+    found = folder.stat()
+    if found.st_uid == os.geteuid() and found.st_mode & mask:
+        folder.chmod(stat.S_IMODE(found.st_mode) & ~mask)
 
 
 def listen(path: Path, advice: str) -> socket.socket:

@@ -80,7 +80,7 @@ OTHERS = (
     Hostile(
         AREA,
         "the first follower of a job sends a `Last-Event-ID` that no stream reaches",
-        lambda b: _followed(b, f"{_FAR}_{_FAR}_1"),
+        lambda b: _followed(b, f"{_FAR}_{_FAR}_1" + f"_{_FAR}" * 3),
         "200",
         "queued, preparing, succeeded",
     ),

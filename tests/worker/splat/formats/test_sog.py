@@ -193,5 +193,6 @@ def test_a_long_list_is_refused_wherever_its_length_stands(tmp_path: Path, hidde
         file.seek(0)
         file.write(content[:start] + bytes(200_000) + content[start:])
     _with_zip64(path, 200_000, hidden=hidden)
-    with pytest.raises(ModelUnreadable, match="its list of files has 200000 bytes"):
+    # Pythons that compare the records of zip64 with each other refuse them before.
+    with pytest.raises(ModelUnreadable, match=r"its list of files has 200000 bytes|it is no zip archive"):
         sog.read(path)
