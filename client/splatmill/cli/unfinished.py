@@ -1,4 +1,4 @@
-"""What `splatmill train` keeps of a training on this machine until it has succeeded, and how it goes on with it.
+"""What `splatmill train` keeps of a training on this machine until it has succeeded, and how it resumes it.
 
     DIR/.splatmill/training.json     which photos and options belong to which capture and job
     DIR/.splatmill/...               the data folder of the embedded service

@@ -1,4 +1,4 @@
-"""Work that goes on after a restart: each piece has a mark in storage until it has ended. Any API process takes it up.
+"""Work resumed after a restart: each piece has a mark in storage until it has ended. Any API process takes it up.
 
 The name of a mark is made of ids with dots between them. Pieces wait in lines, one for each owner, which take turns. A
 piece that waits for something else, such as a pause before another attempt, holds no slot meanwhile.

@@ -1,4 +1,4 @@
-"""Snapshots of a training run on disk, written atomically, so that a killed attempt goes on from the last one."""
+"""Snapshots of a training run on disk, written atomically, so that a killed attempt resumes from the last one."""
 
 from __future__ import annotations
 

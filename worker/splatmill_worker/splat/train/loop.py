@@ -250,7 +250,7 @@ def _scene_depth(engine: Engine, views: Sequence[TrainingView], plan: Plan) -> f
 
 
 def _reason_to_stop(run: TrainingRun) -> str:
-    """Why the run ends after its last evaluation; empty where it goes on. May cut the budget."""
+    """Why the run ends after its last evaluation; empty where it continues. May cut the budget."""
     plan, gain = run.plan, last_gain(run.curve)
     if run.progress >= 1.0:
         why = (
