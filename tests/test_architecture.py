@@ -141,7 +141,7 @@ def test_header_fields_and_addresses_of_others_are_parsed_in_one_place_each():
             "server/splatmill_server/access/browsers.py",
         },
         r"httpx\.URL\(": {
-            "client/splatmill/connection.py",  # of the user
+            "client/splatmill/transfer/connection.py",  # of the user
             "server/splatmill_server/background/imports.py",  # after it was checked
             "server/splatmill_server/base/outgoing.py",
             "server/splatmill_server/base/settings.py",  # of the operator

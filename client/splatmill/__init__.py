@@ -10,30 +10,30 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from splatmill.aio import AsyncClient
-    from splatmill.client import Client, JobHandle, ModelHandle
     from splatmill.errors import JobCancelled, JobFailed, SplatmillError, WaitTimeout
-    from splatmill.job import AsyncJobHandle
-    from splatmill.model import AsyncModelHandle
     from splatmill.schema import CameraSpec, OrbitRequest, RenderRequest, TrainOptions
-    from splatmill.webhook_signature import InvalidWebhook, verify_webhook
+    from splatmill.sdk.aio import AsyncClient
+    from splatmill.sdk.client import Client, JobHandle, ModelHandle
+    from splatmill.sdk.job import AsyncJobHandle
+    from splatmill.sdk.model import AsyncModelHandle
+    from splatmill.sdk.webhook_signature import InvalidWebhook, verify_webhook
 
 _MODULES = {
-    "AsyncClient": "splatmill.aio",
-    "AsyncJobHandle": "splatmill.job",
-    "AsyncModelHandle": "splatmill.model",
+    "AsyncClient": "splatmill.sdk.aio",
+    "AsyncJobHandle": "splatmill.sdk.job",
+    "AsyncModelHandle": "splatmill.sdk.model",
     "CameraSpec": "splatmill.schema",
-    "Client": "splatmill.client",
+    "Client": "splatmill.sdk.client",
     "JobCancelled": "splatmill.errors",
     "JobFailed": "splatmill.errors",
-    "JobHandle": "splatmill.client",
-    "ModelHandle": "splatmill.client",
+    "JobHandle": "splatmill.sdk.client",
+    "ModelHandle": "splatmill.sdk.client",
     "OrbitRequest": "splatmill.schema",
     "RenderRequest": "splatmill.schema",
     "SplatmillError": "splatmill.errors",
     "TrainOptions": "splatmill.schema",
-    "InvalidWebhook": "splatmill.webhook_signature",
-    "verify_webhook": "splatmill.webhook_signature",
+    "InvalidWebhook": "splatmill.sdk.webhook_signature",
+    "verify_webhook": "splatmill.sdk.webhook_signature",
     "WaitTimeout": "splatmill.errors",
 }
 

@@ -32,7 +32,7 @@ from splatmill.schema import (
     WebhookPayload,
     WebhookWithSecret,
 )
-from splatmill.webhook_signature import SECRET_PREFIX
+from splatmill.sdk.webhook_signature import SECRET_PREFIX
 from splatmill_server.base.leases import exclusive
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.jobs.records import Jobs

@@ -20,8 +20,8 @@ import pytest
 from PIL import Image, ImageFilter
 from playwright.sync_api import Locator, Page, Request, expect
 
-from splatmill.local_capture import find_files
 from splatmill.schema import MIN_PHOTOS, describe_options
+from splatmill.transfer.local_capture import find_files
 from splatmill_worker.images.prepare import prepare
 from tests.browser.conftest import Open, SmallModel, Visit
 from tests.support import still_life

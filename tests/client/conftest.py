@@ -49,7 +49,7 @@ def _no_settings_of_the_person(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def _short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     # Not a mock: the same code waits, for milliseconds, so that the tests stay quick.
-    monkeypatch.setattr("splatmill.connection.FIRST_PAUSE", 0.002)
+    monkeypatch.setattr("splatmill.transfer.connection.FIRST_PAUSE", 0.002)
 
 
 @dataclass

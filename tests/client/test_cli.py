@@ -22,7 +22,6 @@ from splatmill.cli.app import COMMANDS
 from splatmill.cli.exits import Exit
 from splatmill.cli.follow import ONE_SIGNAL_SECONDS
 from splatmill.cli.models import FILES, OPTIONAL_FILES
-from splatmill.client import Client
 from splatmill.schema import (
     JobState,
     LogEvent,
@@ -32,6 +31,7 @@ from splatmill.schema import (
     StateEvent,
     describe_options,
 )
+from splatmill.sdk.client import Client
 from tests.support.command_line import invoke, spawn
 from tests.support.waiting import wait_for
 
@@ -121,7 +121,7 @@ def test_the_options_of_train_are_those_of_the_schema():
     ],
 )
 def test_wrong_arguments_of_train(photos: Path, tmp_path: Path, monkeypatch, arguments, code, sentence):
-    monkeypatch.setattr("splatmill.connection.FIRST_PAUSE", 0.001)
+    monkeypatch.setattr("splatmill.transfer.connection.FIRST_PAUSE", 0.001)
     done = invoke("train", photos, "-o", tmp_path / "out", *arguments)
     assert done.exit_code == code, done.output
     assert sentence in " ".join(done.output.replace("│", " ").split())
@@ -268,7 +268,7 @@ def test_cancel(service, photos: Path, tmp_path: Path):
 
 
 def test_rendering_asks_the_server_as_it_should(service, photos: Path, tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("splatmill.connection.FIRST_PAUSE", 0.001)
+    monkeypatch.setattr("splatmill.transfer.connection.FIRST_PAUSE", 0.001)
     at = ("--server", service.url)
     job_id = invoke("train", photos, "-o", tmp_path / "out", "--detach", *at).stdout.split()[-1]
     service.begin(job_id)

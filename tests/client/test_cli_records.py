@@ -15,8 +15,8 @@ import pytest
 
 from splatmill.backplane import layout
 from splatmill.cli.exits import Exit
-from splatmill.client import Client
 from splatmill.schema import EventRecord, JobState, LogEvent, Problem, ProgressEvent, StateEvent
+from splatmill.sdk.client import Client
 from tests.support.command_line import invoke, on_terminal, spawn
 
 PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n\0\0\0\0"

@@ -9,9 +9,9 @@ from datetime import UTC, datetime, timedelta
 
 from typer.testing import CliRunner
 
-from splatmill.aio import AsyncClient
 from splatmill.cli.app import app
-from splatmill.client import Client
+from splatmill.sdk.aio import AsyncClient
+from splatmill.sdk.client import Client
 from tests.client.conftest import Service
 
 WIDE = {"COLUMNS": "250", "TERM": "dumb", "NO_COLOR": "1"}

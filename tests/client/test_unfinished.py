@@ -19,8 +19,8 @@ from splatmill.cli.exits import Exit
 from splatmill.cli.follow import ONE_SIGNAL_SECONDS
 from splatmill.cli.unfinished import Unfinished
 from splatmill.errors import ServiceFailed
-from splatmill.local_capture import find_files
 from splatmill.schema import TrainOptions
+from splatmill.transfer.local_capture import find_files
 from splatmill_worker.synthetic import capture
 from tests.support.up import STANDIN
 from tests.support.waiting import wait_for

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from splatmill import chunked_uploads
 from splatmill.backplane import bucket, entries, events, leases, memory, storage
 from splatmill.backplane import keys as redis_keys
 from splatmill.schema import MAX_PHOTO_PIXELS, MIN_PHOTO_SIDE, CreateJob, TrainOptions
+from splatmill.transfer import chunked_uploads
 from splatmill_server import webhooks
 from splatmill_server.access import keys
 from splatmill_server.background import deliveries, imports, orbits, sweeper

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.local_capture import find_files
 from splatmill.schema import Role
+from splatmill.transfer.local_capture import find_files
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.sfm import posed
 from tests.inputs.conftest import Build

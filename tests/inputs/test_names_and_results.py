@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.local_capture import find_files
 from splatmill.schema import Role
+from splatmill.transfer.local_capture import find_files
 from splatmill_worker.images.prepare import prepare
 from tests.inputs.conftest import Build
 from tests.support.command_line import spawn

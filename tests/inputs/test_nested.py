@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatmill.local_capture import find_files
 from splatmill.schema import Role
+from splatmill.transfer.local_capture import find_files
 from splatmill_worker.scene import Scene
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.posed import zipped

@@ -96,7 +96,7 @@ import importlib.util, sys
 assert not [name for name in {FOREIGN} if importlib.util.find_spec(name)], "the environment is not a bare one"
 import splatmill
 assert "pydantic" not in sys.modules, "import splatmill must cost nothing"
-import splatmill.schema, splatmill.client, splatmill.aio, splatmill.cli.app, splatmill.cli.train
+import splatmill.schema, splatmill.sdk.client, splatmill.sdk.aio, splatmill.cli.app, splatmill.cli.train
 for name in splatmill.__all__:
     getattr(splatmill, name)
 assert not [name for name in {FOREIGN} if name in sys.modules]

@@ -1,7 +1,7 @@
 """Webhooks over real HTTP: each end of a job arrives once, signed, and is repeated until it is taken.
 
 The receiver is a real server that is scripted. Not proved here: which addresses are refused (test_outgoing), and the
-signature itself (tests/client/test_webhook_signature.py).
+signature itself (tests/client/sdk/test_webhook_signature.py).
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""The text of `splatmill/arguments.py` as it follows from the schema. `python -m tests.support.arguments` writes it."""
+"""The text of `splatmill/sdk/arguments.py`, from the schema. `python -m tests.support.arguments` writes it."""
 
 import json
 import types
@@ -12,7 +12,7 @@ from splatmill.schema import OrbitRequest, RenderRequest, TrainOptions
 from splatmill.schema.base import Request
 from tests.support.paths import ROOT
 
-PATH = ROOT / "client" / "splatmill" / "arguments.py"
+PATH = ROOT / "client" / "splatmill" / "sdk" / "arguments.py"
 
 CLASSES: tuple[tuple[str, type[Request], str], ...] = (
     ("TrainArguments", TrainOptions, "The settings of a training: the fields of `TrainOptions`."),

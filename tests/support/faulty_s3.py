@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from splatmill.loop import BackgroundLoop
+from splatmill.sdk.loop import BackgroundLoop
 from tests.support.bucket import bucket
 
 Fault = Literal["stall", "wait", "cut", "deaf"] | int | None

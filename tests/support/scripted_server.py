@@ -5,7 +5,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from splatmill.loop import BackgroundLoop
+from splatmill.sdk.loop import BackgroundLoop
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """The synchronous SDK as it follows from the asynchronous one. `python -m tests.support.synchronous` writes it.
 
-A synchronous method waits for the asynchronous one of its name, on a loop of its own (`splatmill.loop`). A copy without
-`async` and `await`, as unasync writes, would be no client of the same interface: transports such as
+A synchronous method waits for the asynchronous one of its name, on a loop of its own (`splatmill.sdk.loop`). A copy
+without `async` and `await`, as unasync writes, would be no client of the same interface: transports such as
 `httpx.ASGITransport` are asynchronous, files are sent several at a time, and waits end by `asyncio.timeout`.
 """
 
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from tests.support.paths import ROOT
 
-PACKAGE = ROOT / "client" / "splatmill"
+PACKAGE = ROOT / "client" / "splatmill" / "sdk"
 
 SOURCES = {
     "client_records.py": ("imports", "keys", "orbits", "shares", "webhooks"),
@@ -46,9 +46,9 @@ def text(name: str) -> str:
     sources = {module: (PACKAGE / f"{module}.py").read_text() for module in SOURCES[name]}
     made = f'"""The synchronous twins of the classes in {", ".join(f"`{module}`" for module in sources)}.\n\n'
     made += 'Generated from these by `python -m tests.support.synchronous`.\n"""\n'
-    made += "from collections.abc import Iterator\nfrom splatmill.loop import BackgroundLoop\n"
+    made += "from collections.abc import Iterator\nfrom splatmill.sdk.loop import BackgroundLoop\n"
     if name == "client.py":
-        made += "from splatmill.client_records import Imports, Keys, Orbits, Shares, Webhooks\n"
+        made += "from splatmill.sdk.client_records import Imports, Keys, Orbits, Shares, Webhooks\n"
     classes = []
     for module, source in sources.items():
         for node in ast.parse(source).body:
@@ -56,9 +56,9 @@ def text(name: str) -> str:
                 case ast.Import() | ast.ImportFrom():
                     made += ast.unparse(node) + "\n"
                 case ast.Assign(targets=[ast.Name(id=constant)]) if constant.isupper():
-                    made += f"from splatmill.{module} import {constant}\n"
+                    made += f"from splatmill.sdk.{module} import {constant}\n"
                 case ast.ClassDef(name=kind) if kind.startswith("Async"):
-                    made += f"from splatmill.{module} import {kind}\n"
+                    made += f"from splatmill.sdk.{module} import {kind}\n"
                     classes.append(_twin(source, node))
     made += "".join(classes)
     for command in (("check", "--fix", "--select", "F401,I"), ("format",)):

@@ -11,8 +11,8 @@ from splatmill.cli.servers import ServerOption, open_client
 from splatmill.cli.tables import printable
 
 if TYPE_CHECKING:
-    from splatmill.client import JobHandle
     from splatmill.schema import EventRecord, LogLine
+    from splatmill.sdk.client import JobHandle
 
 
 def follow(

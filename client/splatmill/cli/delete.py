@@ -10,8 +10,8 @@ from splatmill.cli.servers import ServerOption, open_client
 from splatmill.cli.tables import printable
 
 if TYPE_CHECKING:
-    from splatmill.client import Client, JobHandle
     from splatmill.schema import Capture
+    from splatmill.sdk.client import Client, JobHandle
 
 
 def delete(

@@ -15,9 +15,9 @@ from queue import Empty, SimpleQueue
 from types import FrameType
 
 from splatmill.cli.progress import Display, make_display, show
-from splatmill.client import JobHandle, ModelHandle
 from splatmill.errors import Conflict
 from splatmill.schema import EventRecord
+from splatmill.sdk.client import JobHandle, ModelHandle
 
 SIGNAL_SECONDS = 0.25
 """Longest time for which a signal is not noticed. One that arrives just before a wait in C begins does not end it, nor

@@ -11,7 +11,7 @@ from splatmill.cli.servers import ServerOption, open_client
 from splatmill.cli.transfers import make_transfer_display
 
 if TYPE_CHECKING:
-    from splatmill.client import ModelHandle
+    from splatmill.sdk.client import ModelHandle
 
 ModelId = Annotated[
     str,

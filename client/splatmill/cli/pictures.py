@@ -9,8 +9,8 @@ from splatmill.cli.local_model import is_local, local_cameras, orbit_local, rend
 from splatmill.cli.servers import ServerOption, open_client
 
 if TYPE_CHECKING:
-    from splatmill.client import ModelHandle
     from splatmill.schema import CameraSpec, ModelCamera
+    from splatmill.sdk.client import ModelHandle
 
 ModelOrFile = Annotated[
     str,

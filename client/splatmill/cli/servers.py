@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from splatmill.client import Client
+    from splatmill.sdk.client import Client
 
 ServerOption = Annotated[
     str | None,
@@ -28,7 +28,7 @@ _chosen: ContextVar[dict[str, Any] | None] = ContextVar("chosen", default=None)
 
 
 def _complete() -> list[str]:
-    from splatmill.profiles import profile_names
+    from splatmill.transfer.profiles import profile_names
 
     return profile_names()
 
@@ -57,7 +57,7 @@ def with_profile(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(command)
     def call(*, profile: str | None = None, **arguments: Any) -> Any:
-        from splatmill.profiles import PROFILE_VARIABLE, read_profile
+        from splatmill.transfer.profiles import PROFILE_VARIABLE, read_profile
 
         server = arguments["server"]
         if profile is not None and server not in (None, os.environ.get("SPLATMILL_SERVER")):
@@ -81,7 +81,7 @@ def with_profile(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def open_client(server: str | None) -> "Client":
     """Return a client of the profile that was chosen, else of `server`, else of the server on this machine."""
-    from splatmill.client import Client
+    from splatmill.sdk.client import Client
 
     chosen = _chosen.get()
     try:

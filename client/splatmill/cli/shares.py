@@ -29,7 +29,7 @@ def create(
     server: ServerOption = None,
 ) -> None:
     """Create a link to a model, and print its address, which the server cannot show again."""
-    from splatmill.connection import own_path
+    from splatmill.transfer.connection import own_path
 
     with open_client(server) as client:
         made = client.model(model_id).shares.create(expires_in=expires_in, name=name, photos=photos)

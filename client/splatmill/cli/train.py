@@ -20,11 +20,11 @@ from splatmill.cli.progress import make_display
 from splatmill.cli.schema_options import with_training_options
 from splatmill.cli.servers import open_client
 from splatmill.cli.unfinished import Unfinished, size_text
-from splatmill.client import Client, JobHandle, ModelHandle
 from splatmill.errors import JobCancelled, NothingToUpload
-from splatmill.local_capture import Found, LocalFile, find_files, printable, start_model
 from splatmill.schema import Capture, TrainOptions, format_bytes
 from splatmill.schema.quantities import listed
+from splatmill.sdk.client import Client, JobHandle, ModelHandle
+from splatmill.transfer.local_capture import Found, LocalFile, find_files, printable, start_model
 
 DATA = ".splatmill"
 """Name of the folder for the data of a training on this machine, in the folder of its results."""
@@ -94,7 +94,7 @@ def train(
     Without a server, a training that is interrupted (Ctrl-C, kill, power cut) is kept in DIR/.splatmill, and the same
     command goes on where it stopped.
     """
-    from splatmill.aio import train_options, with_start_model
+    from splatmill.sdk.aio import train_options, with_start_model
 
     given = {key: value for key, value in options.items() if value is not None and value != []}
     if server is None:

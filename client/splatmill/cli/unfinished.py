@@ -18,11 +18,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from splatmill.client import Client, JobHandle
 from splatmill.errors import Conflict, NotFound, ServiceFailed
 from splatmill.files import atomic_write
-from splatmill.local_capture import LocalFile
 from splatmill.schema import Capture, Role, TrainOptions, format_bytes
+from splatmill.sdk.client import Client, JobHandle
+from splatmill.transfer.local_capture import LocalFile
 
 RECORD = "training.json"
 FORMAT = 1

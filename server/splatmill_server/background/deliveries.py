@@ -22,7 +22,7 @@ from splatmill.backplane import layout
 from splatmill.backplane.storage import StorageError
 from splatmill.schema import DeliveryAttempt, DeliveryState, format_duration
 from splatmill.schema.headers import read_retry_after
-from splatmill.webhook_signature import sign
+from splatmill.sdk.webhook_signature import sign
 from splatmill_server.base.leases import lease
 from splatmill_server.base.metrics import Metrics
 from splatmill_server.base.outgoing import Outgoing, OutgoingError

@@ -13,7 +13,7 @@ import pytest
 from starlette.datastructures import Headers
 
 from splatmill.backplane import keys
-from splatmill.client import Client
+from splatmill.sdk.client import Client
 from splatmill_server.access.browsers import check_host, check_origin
 from splatmill_server.access.sessions import COOKIE
 from splatmill_server.base.problems import ProblemError

@@ -1,6 +1,6 @@
 """The limits of a key: requests a minute, over all API processes, and unfinished jobs at once.
 
-Not proved here: bytes in storage, and that the SDK waits (tests/client/test_connection.py).
+Not proved here: bytes in storage, and that the SDK waits (tests/client/transfer/test_connection.py).
 """
 
 import time
@@ -12,7 +12,7 @@ import pytest
 
 from splatmill.backplane import keys
 from splatmill.backplane.connection import connect_async
-from splatmill.client import Client
+from splatmill.sdk.client import Client
 from splatmill_server.access.rate import Rate
 from tests.support.served_app import Serve, ServedApp, problem
 

@@ -18,7 +18,6 @@ import httpx
 import pytest
 
 from splatmill.backplane import layout
-from splatmill.client import Client
 from splatmill.errors import NotFound
 from splatmill.schema import (
     CONVERSION_HEADER,
@@ -28,6 +27,7 @@ from splatmill.schema import (
     ModelCamera,
     ModelCameras,
 )
+from splatmill.sdk.client import Client
 from splatmill_server.answers.single_file import WEB
 from splatmill_worker.splat.formats import registry
 from tests.support.ball import write_ply

@@ -19,9 +19,9 @@ import av
 import pytest
 
 from splatmill.backplane import keys, layout
-from splatmill.client import Client
 from splatmill.errors import InvalidRequest, NotFound, ServerError, WaitTimeout
 from splatmill.schema import Progress
+from splatmill.sdk.client import Client
 from splatmill_server.background import orbits
 from splatmill_server.space import usage
 from tests.support.ball import write_ply

@@ -22,8 +22,8 @@ import pytest
 import structlog
 from pydantic import ValidationError
 
-from splatmill.chunked_uploads import PIECE
-from splatmill.client import Client
+from splatmill.sdk.client import Client
+from splatmill.transfer.chunked_uploads import PIECE
 from splatmill_server.access.sessions import COOKIE
 from splatmill_server.base.root_path import HEADER, OWN_PATHS, checked
 from splatmill_server.base.settings import Settings

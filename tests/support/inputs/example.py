@@ -11,8 +11,8 @@ from typing import Literal
 
 from splatmill.data_sets import TwoDataSets
 from splatmill.errors import NothingToUpload
-from splatmill.local_capture import find_files
 from splatmill.schema import Role
+from splatmill.transfer.local_capture import find_files
 from splatmill_worker.errors import WorkerError
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.images.prepare import names_remark, prepare

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from splatmill.data_sets import TwoDataSets
-from splatmill.local_capture import find_files
 from splatmill.schema import TrainOptions
+from splatmill.transfer.local_capture import find_files
 from splatmill_worker.capture import posed_scene
 from splatmill_worker.errors import Refusal
 from splatmill_worker.images.archive import UnsafeArchive, unpack

@@ -1,5 +1,5 @@
 // Which of the given files are photos, masks, poses, videos or archives, and the names they get in the capture. The rules
-// are those of the command line (client/splatmill/local_capture.py and data_sets.py); a test compares the two.
+// are those of the command line (client/splatmill/transfer/local_capture.py and data_sets.py); a test compares the two.
 
 /** @typedef {"images" | "masks" | "poses"} Role */
 

@@ -1,5 +1,5 @@
 // Remarks on files before they are sent: those that are not read, and what is probably wrong with masks. The sentences
-// are those of the command line (client/splatmill/local_capture.py) and of the worker (images/masks.py); tests compare them.
+// are those of the command line (client/splatmill/transfer/local_capture.py) and of the worker (images/masks.py); tests compare them.
 
 import { MAX_DEPTH, stem, suffix, unmarked } from "./kinds.js";
 

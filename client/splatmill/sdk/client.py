@@ -9,14 +9,6 @@ from typing import Any, Self, Unpack
 
 import httpx
 
-from splatmill.aio import AsyncClient
-from splatmill.arguments import OrbitArguments, RenderArguments, TrainArguments
-from splatmill.client_records import Imports, Keys, Orbits, Shares, Webhooks
-from splatmill.connection import RETRIES, TIMEOUT
-from splatmill.downloads import AnyPath, OnBytes
-from splatmill.job import MOST_LINES, AsyncJobHandle
-from splatmill.loop import BackgroundLoop
-from splatmill.model import AsyncModelHandle
 from splatmill.schema import (
     Box,
     CameraSpec,
@@ -41,8 +33,16 @@ from splatmill.schema import (
     StorageUse,
     TrainOptions,
 )
-from splatmill.server_choice import Verify
-from splatmill.uploads import OnProgress, Uploaded
+from splatmill.sdk.aio import AsyncClient
+from splatmill.sdk.arguments import OrbitArguments, RenderArguments, TrainArguments
+from splatmill.sdk.client_records import Imports, Keys, Orbits, Shares, Webhooks
+from splatmill.sdk.job import MOST_LINES, AsyncJobHandle
+from splatmill.sdk.loop import BackgroundLoop
+from splatmill.sdk.model import AsyncModelHandle
+from splatmill.transfer.connection import RETRIES, TIMEOUT
+from splatmill.transfer.downloads import AnyPath, OnBytes
+from splatmill.transfer.server_choice import Verify
+from splatmill.transfer.uploads import OnProgress, Uploaded
 
 
 class ModelHandle:

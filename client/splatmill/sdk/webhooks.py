@@ -4,7 +4,6 @@ from collections.abc import Iterable
 
 from pydantic import ValidationError
 
-from splatmill.connection import Connection, read_answer
 from splatmill.errors import invalid_request
 from splatmill.schema import (
     CreateWebhook,
@@ -15,6 +14,7 @@ from splatmill.schema import (
     WebhookList,
     WebhookWithSecret,
 )
+from splatmill.transfer.connection import Connection, read_answer
 
 PATH = "/v1/webhooks"
 

@@ -10,9 +10,9 @@ import httpx
 import pytest
 
 from splatmill import Client
-from splatmill.connection import own_path, retry_after
 from splatmill.errors import ConnectionFailed, NotFound, Refused, ServerError, TooManyRequests, Unavailable
 from splatmill.schema import IDEMPOTENCY_HEADER, Problem
+from splatmill.transfer.connection import own_path, retry_after
 
 JOB = {
     "id": "j1",
@@ -233,7 +233,7 @@ def test_a_server_that_asks_for_patience_gets_it(peer, reply, monkeypatch):
     async def note(seconds: float) -> None:
         waits.append(seconds)
 
-    monkeypatch.setattr("splatmill.connection.asyncio.sleep", note)
+    monkeypatch.setattr("splatmill.transfer.connection.asyncio.sleep", note)
     peer.script(reply(status=503, headers={"Retry-After": "7"}), reply(body=JOB_BYTES))
     with Client(peer.url) as client:
         client.job("j1")

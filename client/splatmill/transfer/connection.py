@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from splatmill.errors import ConnectionFailed, error_for
 from splatmill.schema.headers import read_retry_after
 from splatmill.schema.problems import PROBLEM_MEDIA_TYPE, Problem, code_for_status
-from splatmill.server_choice import (
+from splatmill.transfer.server_choice import (
     API_KEY_VARIABLE,
     CA_BUNDLE_VARIABLE,
     DEFAULT_SERVER,

@@ -2,9 +2,9 @@
 
 from pydantic import ValidationError
 
-from splatmill.connection import Connection, read_answer
 from splatmill.errors import invalid_request
 from splatmill.schema import CreateShare, Share, ShareList, ShareWithToken
+from splatmill.transfer.connection import Connection, read_answer
 
 
 class AsyncShares:

@@ -16,8 +16,8 @@ import pytest
 from splatmill import Client
 from splatmill.cli.exits import Exit
 from splatmill.errors import ConfigurationInvalid, ConnectionFailed
-from splatmill.profiles import config_path, profile_names, read_profile
-from splatmill.server_choice import choose_server
+from splatmill.transfer.profiles import config_path, profile_names, read_profile
+from splatmill.transfer.server_choice import choose_server
 from tests.support.command_line import invoke
 from tests.support.programs import program
 

@@ -7,12 +7,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Unpack
 
-from splatmill.arguments import OrbitArguments
-from splatmill.downloads import AnyPath
-from splatmill.imports import AsyncImports
-from splatmill.keys import AsyncKeys
-from splatmill.loop import BackgroundLoop
-from splatmill.orbits import AsyncOrbits
 from splatmill.schema import (
     DEFAULT_OWNER,
     Delivery,
@@ -29,9 +23,15 @@ from splatmill.schema import (
     WebhookEvent,
     WebhookWithSecret,
 )
-from splatmill.shares import AsyncShares
-from splatmill.uploads import OnProgress
-from splatmill.webhooks import AsyncWebhooks
+from splatmill.sdk.arguments import OrbitArguments
+from splatmill.sdk.imports import AsyncImports
+from splatmill.sdk.keys import AsyncKeys
+from splatmill.sdk.loop import BackgroundLoop
+from splatmill.sdk.orbits import AsyncOrbits
+from splatmill.sdk.shares import AsyncShares
+from splatmill.sdk.webhooks import AsyncWebhooks
+from splatmill.transfer.downloads import AnyPath
+from splatmill.transfer.uploads import OnProgress
 
 
 class Imports:

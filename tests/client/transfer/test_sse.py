@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from splatmill import Client
 from splatmill.errors import ConnectionFailed, NotFound
 from splatmill.schema import EventRecord, LogEvent, StateEvent
-from splatmill.sse import Message, read_messages
+from splatmill.transfer.sse import Message, read_messages
 
 SSE = {"Content-Type": "text/event-stream"}
 
@@ -120,8 +120,8 @@ def test_a_job_that_is_gone_ends_the_following(peer, reply):
 
 
 def test_patience_has_an_end(peer, reply, monkeypatch):
-    from splatmill.connection import Connection
-    from splatmill.sse import follow_events
+    from splatmill.transfer.connection import Connection
+    from splatmill.transfer.sse import follow_events
 
     peer.answer = lambda _: reply(dropped=True)
 
@@ -154,8 +154,8 @@ def test_leaving_the_loop_early_closes_the_stream(peer, reply):
 
 
 def test_heartbeats_show_that_a_quiet_connection_lives():
-    from splatmill.connection import Connection
-    from splatmill.sse import follow_events
+    from splatmill.transfer.connection import Connection
+    from splatmill.transfer.sse import follow_events
 
     connections = 0
     head = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\n\r\n"

@@ -10,13 +10,13 @@ from pathlib import Path
 from time import monotonic
 from urllib.parse import quote
 
-from splatmill.chunked_uploads import PIECE, OnPosition, read_range, send_in_pieces
-from splatmill.connection import Connection, read_answer
 from splatmill.errors import InvalidRequest, NothingToUpload, SplatmillError
-from splatmill.local_capture import LocalFile
 from splatmill.schema.captures import SHA256_HEADER, CaptureFile, Role
 from splatmill.schema.events import Progress
 from splatmill.schema.problems import Problem
+from splatmill.transfer.chunked_uploads import PIECE, OnPosition, read_range, send_in_pieces
+from splatmill.transfer.connection import Connection, read_answer
+from splatmill.transfer.local_capture import LocalFile
 
 CONCURRENT = 4
 

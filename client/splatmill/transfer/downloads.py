@@ -8,11 +8,11 @@ from pathlib import Path
 
 import httpx
 
-from splatmill.connection import LONGEST_WISH, Connection, backoff
 from splatmill.errors import DownloadFailed, InvalidRequest, Unavailable
 from splatmill.files import move_into_place
 from splatmill.schema.captures import SHA256_HEADER
 from splatmill.schema.headers import read_integer, read_token
+from splatmill.transfer.connection import LONGEST_WISH, Connection, backoff
 
 AnyPath = str | os.PathLike[str]
 OnBytes = Callable[[int, int | None], None]

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from splatmill import InvalidWebhook, verify_webhook
-from splatmill.webhook_signature import sign
+from splatmill.sdk.webhook_signature import sign
 
 # The example of the specification's reference libraries (MIT), for which they publish the signature.
 SECRET = "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw"
@@ -66,7 +66,7 @@ def test_missing_headers_other_secrets_and_other_bodies_are_named() -> None:
 
 
 def test_it_needs_the_standard_library_alone() -> None:
-    code = "import sys, json, splatmill.webhook_signature; print(json.dumps(list(sys.modules)))"
+    code = "import sys, json, splatmill.sdk.webhook_signature; print(json.dumps(list(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = {name.partition(".")[0] for name in json.loads(done.stdout)}
     assert loaded.isdisjoint({"httpx", "pydantic", "typer", "rich", "redis"})

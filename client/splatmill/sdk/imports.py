@@ -4,10 +4,10 @@ import asyncio
 
 from pydantic import ValidationError
 
-from splatmill.connection import Connection, read_answer
 from splatmill.errors import Refused, invalid_request
 from splatmill.schema import Capture, CreateImport, Import, ImportList, Progress, Role
-from splatmill.uploads import OnProgress
+from splatmill.transfer.connection import Connection, read_answer
+from splatmill.transfer.uploads import OnProgress
 
 _POLL_SECONDS = 0.5
 _LONGEST_POLL = 5.0

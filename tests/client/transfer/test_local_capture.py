@@ -13,9 +13,9 @@ import pytest
 from splatmill.cli.models import FILES, OPTIONAL_FILES
 from splatmill.data_sets import find_cameras, walk
 from splatmill.errors import NothingToUpload
-from splatmill.local_capture import find_files, printable
 from splatmill.schema import OUTPUT_MARKS, OUTPUT_MEDIA, Role, safe_name
 from splatmill.schema.masks import paired
+from splatmill.transfer.local_capture import find_files, printable
 from tests.support.paths import DATA
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the shared data sets are not on this machine")

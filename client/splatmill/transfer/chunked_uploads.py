@@ -10,7 +10,6 @@ from pathlib import Path
 
 import httpx
 
-from splatmill.connection import TRANSIENT, Connection, backoff, own_path, read_answer
 from splatmill.errors import (
     Conflict,
     ConnectionFailed,
@@ -30,6 +29,7 @@ from splatmill.schema.uploads import (
     read_boolean,
     write_boolean,
 )
+from splatmill.transfer.connection import TRANSIENT, Connection, backoff, own_path, read_answer
 
 CHUNK = 256 * 1024
 """Bytes read and sent at a time."""

@@ -9,15 +9,7 @@ from typing import Any, Self, TypeVar, Unpack
 import httpx
 from pydantic import ValidationError
 
-from splatmill.arguments import TrainArguments
-from splatmill.connection import RETRIES, TIMEOUT, Connection, read_answer
-from splatmill.downloads import AnyPath
 from splatmill.errors import invalid_request
-from splatmill.imports import AsyncImports
-from splatmill.job import AsyncJobHandle
-from splatmill.keys import AsyncKeys
-from splatmill.local_capture import find_files, printable, start_model
-from splatmill.model import AsyncModelHandle, find_model
 from splatmill.schema import (
     IDEMPOTENCY_HEADER,
     Capture,
@@ -37,9 +29,17 @@ from splatmill.schema import (
     TrainOptions,
 )
 from splatmill.schema.formats import is_model_file
-from splatmill.server_choice import Verify
-from splatmill.uploads import OnProgress, Uploaded, key_of, upload
-from splatmill.webhooks import AsyncWebhooks
+from splatmill.sdk.arguments import TrainArguments
+from splatmill.sdk.imports import AsyncImports
+from splatmill.sdk.job import AsyncJobHandle
+from splatmill.sdk.keys import AsyncKeys
+from splatmill.sdk.model import AsyncModelHandle, find_model
+from splatmill.sdk.webhooks import AsyncWebhooks
+from splatmill.transfer.connection import RETRIES, TIMEOUT, Connection, read_answer
+from splatmill.transfer.downloads import AnyPath
+from splatmill.transfer.local_capture import find_files, printable, start_model
+from splatmill.transfer.server_choice import Verify
+from splatmill.transfer.uploads import OnProgress, Uploaded, key_of, upload
 
 PAGE = 100
 """Largest number of entries that are requested at once of a list."""

@@ -17,10 +17,11 @@ import time
 
 import pytest
 
-from splatmill import Client, chunked_uploads, uploads
+from splatmill import Client
 from splatmill.errors import ConnectionFailed, InvalidRequest, NothingToUpload
-from splatmill.loop import BackgroundLoop
 from splatmill.schema import Progress, storable_name
+from splatmill.sdk.loop import BackgroundLoop
+from splatmill.transfer import chunked_uploads, uploads
 from tests.support.waiting import wait_for
 
 SIZE = 3_000_000

@@ -9,9 +9,9 @@ import pytest
 from pydantic import ValidationError
 
 from splatmill import Client
-from splatmill.arguments import TrainArguments
 from splatmill.errors import InvalidRequest
 from splatmill.schema import TrainOptions
+from splatmill.sdk.arguments import TrainArguments
 from tests.support import arguments
 
 

@@ -5,9 +5,7 @@ import time
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
 
-from splatmill.connection import Connection, backoff, read_answer
 from splatmill.errors import Conflict, ConnectionFailed, JobCancelled, JobFailed, Unavailable, WaitTimeout
-from splatmill.model import AsyncModelHandle, find_model
 from splatmill.schema import (
     Curve,
     CurveRow,
@@ -24,8 +22,10 @@ from splatmill.schema import (
     StateEvent,
     Watch,
 )
-from splatmill.sse import GIVE_UP_SECONDS, follow_events
-from splatmill.uploads import OnProgress
+from splatmill.sdk.model import AsyncModelHandle, find_model
+from splatmill.transfer.connection import Connection, backoff, read_answer
+from splatmill.transfer.sse import GIVE_UP_SECONDS, follow_events
+from splatmill.transfer.uploads import OnProgress
 
 MOST_LINES = 10_000
 """Number of log lines that the server returns at most."""

@@ -10,9 +10,10 @@ import random
 
 import pytest
 
-from splatmill import Client, uploads
+from splatmill import Client
 from splatmill.errors import ConnectionFailed, DownloadFailed, InvalidRequest, NotFound, Unavailable
 from splatmill.schema import SHA256_HEADER, Problem, Progress
+from splatmill.transfer import uploads
 
 DATA = random.Random(0).randbytes(300_000)
 SHA256 = hashlib.sha256(DATA).hexdigest()

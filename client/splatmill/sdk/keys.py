@@ -5,7 +5,6 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from splatmill.connection import Connection, read_answer
 from splatmill.errors import invalid_request
 from splatmill.schema import (
     DEFAULT_OWNER,
@@ -17,6 +16,7 @@ from splatmill.schema import (
     RotateKey,
     Scope,
 )
+from splatmill.transfer.connection import Connection, read_answer
 
 R = TypeVar("R", CreateKey, RotateKey)
 

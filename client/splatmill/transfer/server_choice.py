@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatmill.errors import ConfigurationInvalid
-from splatmill.profiles import PROFILE_VARIABLE, read_profile
 from splatmill.schema.port import DEFAULT_PORT
+from splatmill.transfer.profiles import PROFILE_VARIABLE, read_profile
 
 DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
 SERVER_VARIABLE = "SPLATMILL_SERVER"

@@ -6,12 +6,12 @@ from typing import Unpack
 
 from pydantic import ValidationError
 
-from splatmill.arguments import OrbitArguments
-from splatmill.connection import Connection, read_answer
-from splatmill.downloads import AnyPath, download, target_of
 from splatmill.errors import error_for, invalid_request
 from splatmill.schema import Orbit, OrbitList, OrbitRequest, Progress
-from splatmill.uploads import OnProgress
+from splatmill.sdk.arguments import OrbitArguments
+from splatmill.transfer.connection import Connection, read_answer
+from splatmill.transfer.downloads import AnyPath, download, target_of
+from splatmill.transfer.uploads import OnProgress
 
 _POLL_SECONDS = 0.2
 _LONGEST_POLL = 2.0

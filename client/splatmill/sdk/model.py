@@ -9,12 +9,8 @@ from urllib.parse import quote
 import httpx
 from pydantic import ValidationError
 
-from splatmill.arguments import OrbitArguments, RenderArguments
-from splatmill.connection import Connection, read_answer
-from splatmill.downloads import AnyPath, OnBytes, download, target_of
 from splatmill.errors import WaitTimeout, invalid_request
 from splatmill.files import atomic_write
-from splatmill.orbits import AsyncOrbits, orbit_request
 from splatmill.schema import (
     Box,
     CameraSpec,
@@ -28,8 +24,12 @@ from splatmill.schema import (
     OrbitRequest,
     RenderRequest,
 )
-from splatmill.shares import AsyncShares
-from splatmill.uploads import OnProgress
+from splatmill.sdk.arguments import OrbitArguments, RenderArguments
+from splatmill.sdk.orbits import AsyncOrbits, orbit_request
+from splatmill.sdk.shares import AsyncShares
+from splatmill.transfer.connection import Connection, read_answer
+from splatmill.transfer.downloads import AnyPath, OnBytes, download, target_of
+from splatmill.transfer.uploads import OnProgress
 
 # Longer than the server waits for its renderer, so that the server's problem arrives before this timeout.
 RENDER_TIMEOUT = httpx.Timeout(30.0, read=150.0)

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import httpx
 from pydantic import ValidationError
 
-from splatmill.connection import LONGEST_WISH, Connection, backoff
 from splatmill.errors import Unavailable
 from splatmill.schema.events import EventRecord
 from splatmill.schema.headers import read_token
+from splatmill.transfer.connection import LONGEST_WISH, Connection, backoff
 
 GIVE_UP_SECONDS = 300.0
 """Time without any data after which the connection counts as lost for good; replacing a server may take this long."""

@@ -1,0 +1,1 @@
+"""The SDK: clients, and the jobs, models and other records that they return."""

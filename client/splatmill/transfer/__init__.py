@@ -1,0 +1,1 @@
+"""What a client sends and receives: its connection to a server, uploads, downloads and streams of events."""
