@@ -137,7 +137,7 @@ def test_header_fields_and_addresses_of_others_are_parsed_in_one_place_each():
     parsers = {
         r"parsedate\w*|mktime_tz": {"client/splatmill/schema/headers.py"},
         r"urlsplit|urlparse|urlunsplit": {
-            "client/splatmill/backplane/storage.py",  # of the operator
+            "client/splatmill/backplane/storage/storage.py",  # of the operator
             "server/splatmill_server/access/browsers.py",
         },
         r"httpx\.URL\(": {

@@ -43,7 +43,7 @@ from _studies.study import Study
 
 from splatmill.backplane import keys, memory
 from splatmill.backplane.connection import connect
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage.storage import Storage
 from splatmill_server.app import create_app
 from splatmill_server.base.paging import write_cursor
 from splatmill_server.base.settings import Settings

@@ -41,9 +41,10 @@ from _private_redis import running
 from _rows import Row, footer
 from _studies.study import Study
 
-from splatmill.backplane import keys, leases
+from splatmill.backplane import keys
 from splatmill.backplane.connection import connect
-from splatmill.backplane.entries import open_queue, split_rq_id
+from splatmill.backplane.queue import leases
+from splatmill.backplane.queue.entries import open_queue, split_rq_id
 from splatmill_server.base.settings import Settings
 
 HERE = Path(__file__).resolve().parent

@@ -16,11 +16,12 @@ import uvicorn
 from fastapi import FastAPI
 from pydantic import ValidationError
 
-from splatmill.backplane import layout, private_files
+from splatmill.backplane import private_files
 from splatmill.backplane.connection import InvalidRedisUrl
 from splatmill.backplane.log_lines import LogFormat
 from splatmill.backplane.redact import redacted
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill_server.access.exposure import NeedsKey
 from splatmill_server.app import create_app
 from splatmill_server.base.settings import Settings

@@ -11,8 +11,9 @@ from typing import cast
 
 import redis
 
-from splatmill.backplane import keys, layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane import keys
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import PHOTO_SUFFIXES, CreateJob, Job, Role, StoredKind, TrainOptions
 from splatmill.schema.formats import is_model_file
 from splatmill_server.access.caller import Caller

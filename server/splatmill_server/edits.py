@@ -6,9 +6,9 @@ from typing import Any
 
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import layout
-from splatmill.backplane.row import now
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.jobs.row import now
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import HELD_OUT, Edited, EditModel
 from splatmill_server.space.quota import Arrival
 

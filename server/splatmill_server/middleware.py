@@ -16,7 +16,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from splatmill.backplane.storage import StorageError
+from splatmill.backplane.storage.storage import StorageError
 from splatmill.schema import Problem, format_bytes
 from splatmill.schema.headers import read_integer
 from splatmill_server.access.caller import NOBODY, Caller

@@ -11,9 +11,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from splatmill.backplane import layout, lists
-from splatmill.backplane.records import UnreadableRecord, warn
-from splatmill.backplane.storage import Entry, Storage
+from splatmill.backplane import lists
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import UnreadableRecord, warn
+from splatmill.backplane.storage.storage import Entry, Storage
 from splatmill.schema import (
     DEFAULT_OWNER,
     Job,

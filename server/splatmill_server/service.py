@@ -14,7 +14,7 @@ from redis.asyncio import Redis as AsyncRedis
 
 from splatmill.backplane import rendering
 from splatmill.backplane.connection import connect, connect_async
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill_server.access.authentication import Authentication
 from splatmill_server.access.keys import Keys
 from splatmill_server.access.rate import Rate

@@ -16,9 +16,9 @@ from datetime import UTC, datetime, timedelta
 
 from pydantic import ValidationError
 
-from splatmill.backplane import layout
-from splatmill.backplane.records import FORMAT, check_format, reason, warn
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import FORMAT, check_format, reason, warn
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import (
     HELD_OUT,
     CreateShare,

@@ -17,9 +17,9 @@ from datetime import UTC, datetime, timedelta
 
 import structlog
 
-from splatmill.backplane import layout
-from splatmill.backplane.records import FORMAT, warn
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import FORMAT, warn
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import (
     CreateWebhook,
     Delivery,

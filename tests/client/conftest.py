@@ -16,11 +16,12 @@ import structlog
 import uvicorn
 from redis import Redis
 
-from splatmill.backplane import layout, lists
+from splatmill.backplane import lists
 from splatmill.backplane.connection import connect
-from splatmill.backplane.events import append, begin_attempt
-from splatmill.backplane.row import read
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.jobs.events import append, begin_attempt
+from splatmill.backplane.jobs.row import read
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Event, Job, JobState, Problem, StateEvent
 from splatmill_server.app import create_app
 from splatmill_server.base.settings import Settings

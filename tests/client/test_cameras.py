@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill.schema import Job, JobState, TrainOptions
 from tests.client.conftest import Service
 from tests.support.ball import store_ball

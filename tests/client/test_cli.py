@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill.cli.app import COMMANDS
 from splatmill.cli.exits import Exit
 from splatmill.cli.follow import ONE_SIGNAL_SECONDS

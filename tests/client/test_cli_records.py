@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill.cli.exits import Exit
 from splatmill.schema import EventRecord, JobState, LogEvent, Problem, ProgressEvent, StateEvent
 from splatmill.sdk.client import Client

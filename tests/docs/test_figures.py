@@ -13,8 +13,11 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import bucket, entries, events, leases, memory, storage
 from splatmill.backplane import keys as redis_keys
+from splatmill.backplane import memory
+from splatmill.backplane.jobs import events
+from splatmill.backplane.queue import entries, leases
+from splatmill.backplane.storage import bucket, storage
 from splatmill.schema import MAX_PHOTO_PIXELS, MIN_PHOTO_SIDE, CreateJob, TrainOptions
 from splatmill.transfer import chunked_uploads
 from splatmill_server import webhooks

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill.schema.quantities import parse_duration
 from splatmill_worker.service.rq_worker import STOP_GRACE
 from tests.support.wheels import ROOT

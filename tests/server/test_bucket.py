@@ -15,17 +15,17 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.backplane import layout
-from splatmill.backplane.bucket import BLOCK, Patience
-from splatmill.backplane.slots import NoSlot, Slots
-from splatmill.backplane.storage import SLOTS, Storage
-from splatmill.backplane.storage_errors import (
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.bucket import BLOCK, Patience
+from splatmill.backplane.storage.errors import (
     StorageBusyError,
     StorageChangedError,
     StorageError,
     StorageStalledError,
     StorageUnreachableError,
 )
+from splatmill.backplane.storage.slots import NoSlot, Slots
+from splatmill.backplane.storage.storage import SLOTS, Storage
 from splatmill.schema import Role
 from tests.support.faulty_s3 import Fault, FaultyS3, Request, faulty_s3
 from tests.support.served_app import Serve, problem

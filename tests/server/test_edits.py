@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from splatmill import AsyncClient, Client
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill.cli.exits import Exit
 from splatmill.errors import InvalidRequest, NotFound
 from splatmill.schema import CameraSpec

@@ -13,7 +13,9 @@ from typing import Any, cast
 import pytest
 import redis
 
-from splatmill.backplane import entries, keys, layout, queue
+from splatmill.backplane import keys
+from splatmill.backplane.queue import entries, queue
+from splatmill.backplane.storage import layout
 from splatmill.schema import EVENT, JobState, LogEvent, StateEvent
 from tests.support.formats import job_ids, restore_redis, restore_storage
 from tests.support.queue_entries import waiting

@@ -8,7 +8,7 @@ import json
 
 import pytest
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from tests.support.served_app import ServedApp, problem, store_model
 
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.backplane import layout, lists
+from splatmill.backplane import lists
 from splatmill.backplane.connection import connect
+from splatmill.backplane.storage import layout
 from splatmill_server.access.sessions import COOKIE
 from tests.support.redis_server import RedisServer, empty_redis
 from tests.support.served_app import Serve, ServedApp, problem, served_app, store_model

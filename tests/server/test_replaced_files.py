@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Entry
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Entry
 from tests.support.bucket import bucket
 from tests.support.served_app import Serve, ServedApp
 

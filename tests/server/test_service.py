@@ -11,7 +11,7 @@ import pytest
 import redis
 from prometheus_client.parser import text_string_to_metric_families
 
-from splatmill.backplane.storage import StorageError
+from splatmill.backplane.storage.storage import StorageError
 from splatmill.schema import MAX_PHOTO_PIXELS, MAX_RENDER_PIXELS, TrainOptions
 from splatmill_server import app as app_module
 from splatmill_server.app import create_app

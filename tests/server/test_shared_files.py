@@ -15,7 +15,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from splatmill.backplane import row
+from splatmill.backplane.jobs import row
 from splatmill.schema import Switch, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.service.attempt import Attempt

@@ -17,7 +17,7 @@ import pytest
 import structlog
 from structlog.testing import CapturingLogger
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill_server.routes import shared
 from splatmill_server.shares import KEPT_ENDED, MAX_SHARES
 from tests.support.served_app import Serve, ServedApp, problem, store_model, stored

@@ -28,9 +28,12 @@ from _soak.clients import Clients, Promise
 from _soak.orphans import Adoption
 from _soak.proxy import Proxy
 
-from splatmill.backplane import entries, events, keys, layout, leases, lists, queue
+from splatmill.backplane import keys, lists
+from splatmill.backplane.jobs import events
 from splatmill.backplane.process import start_time
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.queue import entries, leases, queue
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import JobState, Problem, StateEvent
 from tests.support.served_app import Serve, ServedApp
 from tests.support.waiting import wait_for

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage, StorageError
 from tests.support.bucket import bucket
 
 
@@ -150,7 +150,7 @@ def test_what_only_reads_needs_no_right_to_write(folder: Storage, tmp_path: Path
             above.chmod(0o755)  # pytest makes the folders that hold it for its user alone
     program = """
 import os, sys
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.storage.storage import Storage, StorageError
 os.setuid(65534)
 try:
     Storage(sys.argv[1])

@@ -16,8 +16,10 @@ from typing import Any
 import pytest
 
 from splatmill import verify_webhook
-from splatmill.backplane import keys, layout, row
-from splatmill.backplane.storage import StorageFullError
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import row
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import StorageFullError
 from splatmill.schema import Job, JobState, Problem, StateEvent
 from splatmill_server.background import deliveries
 from splatmill_server.base.leases import exclusive

@@ -10,7 +10,8 @@ import signal
 import httpx
 import pytest
 
-from splatmill.backplane import entries, layout, leases
+from splatmill.backplane.queue import entries, leases
+from splatmill.backplane.storage import layout
 from tests.support.up import Up
 from tests.support.waiting import gone, wait_for
 

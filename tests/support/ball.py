@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 
 BALL = "ball0000"
 

@@ -4,9 +4,10 @@ from typing import Any, cast
 
 import redis
 
-from splatmill.backplane import events, keys
-from splatmill.backplane.fold import fold
-from splatmill.backplane.row import JobRow, now, read
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events
+from splatmill.backplane.jobs.fold import fold
+from splatmill.backplane.jobs.row import JobRow, now, read
 from splatmill.schema import Job, TrainOptions
 
 CAPTURE = "capture1"

@@ -2,9 +2,10 @@
 
 import redis
 
-from splatmill.backplane import keys, lines
-from splatmill.backplane.leases import Lease
-from splatmill.backplane.lines import LINES, Line
+from splatmill.backplane import keys
+from splatmill.backplane.queue import lines
+from splatmill.backplane.queue.leases import Lease
+from splatmill.backplane.queue.lines import LINES, Line
 
 
 def waiting(connection: redis.Redis) -> int:

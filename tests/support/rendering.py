@@ -13,7 +13,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill.schema import CameraSpec, ModelCamera, ModelCameras
 from tests.support.served_app import ServedApp
 from tests.support.waiting import wait_for

@@ -15,7 +15,9 @@ import redis
 import uvicorn
 from fastapi import FastAPI
 
-from splatmill.backplane import events, layout, lists, row
+from splatmill.backplane import lists
+from splatmill.backplane.jobs import events, row
+from splatmill.backplane.storage import layout
 from splatmill.schema import DEFAULT_OWNER, Event, JobState, StateEvent, TrainOptions
 from splatmill_server.app import create_app
 from splatmill_server.base.settings import Settings

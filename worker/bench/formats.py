@@ -27,8 +27,8 @@ from _train import scenes
 from _train.child import prepared
 from _train.run import rounded
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import DOWNLOADS, Event, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.errors import Refusal

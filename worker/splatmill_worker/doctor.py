@@ -225,7 +225,7 @@ def _redis() -> Iterator[Finding]:
 
 def _storage() -> Iterator[Finding]:
     from splatmill.backplane.redact import redacted
-    from splatmill.backplane.storage import Storage, StorageError
+    from splatmill.backplane.storage.storage import Storage, StorageError
 
     url = settings.storage_url()
     if url.startswith("file:") and not os.environ.get("SPLATMILL_STORAGE"):

@@ -10,8 +10,8 @@ from typing import Any, cast
 import httpx
 import psutil
 
-from splatmill.backplane import events
 from splatmill.backplane.connection import connect
+from splatmill.backplane.jobs import events
 from splatmill.schema import JobState, LogEvent, ProgressEvent, StateEvent
 
 EVENTS = 40

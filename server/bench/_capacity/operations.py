@@ -11,7 +11,7 @@ from typing import Any
 
 import redis.connection
 
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage.storage import Storage
 
 _STORAGE = ("head", "get", "put", "put_new", "rename", "entries", "walk", "children", "delete", "download")
 """The methods of storage that make requests by themselves. `stream_get` and `stream_put` are not counted."""

@@ -13,10 +13,10 @@ from datetime import UTC, datetime, timedelta
 
 from _one_gaussian import ply
 
-from splatmill.backplane import layout
-from splatmill.backplane.records import FORMAT
-from splatmill.backplane.row import JobRow
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.jobs.row import JobRow
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import FORMAT
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Job, JobState, Problem, Progress, TrainOptions
 
 FIRST = datetime(2026, 1, 1, tzinfo=UTC)

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from _rows import Row, footer, lines
 
-from splatmill.backplane import events, keys
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events
 
 MINUTES = 10
 """Minutes that a job takes in the examples."""

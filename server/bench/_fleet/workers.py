@@ -29,8 +29,8 @@ from rq.timeouts import BaseDeathPenalty
 from rq.utils import now
 
 from _fleet import pipeline
-from splatmill.backplane import entries
 from splatmill.backplane.connection import connect
+from splatmill.backplane.queue import entries
 from splatmill_worker.images import decoders
 from splatmill_worker.service.lock import JobLock
 from splatmill_worker.service.process_exit import ProcessExit

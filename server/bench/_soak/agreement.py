@@ -6,9 +6,12 @@ from typing import Any, cast
 
 import redis
 
-from splatmill.backplane import events, keys, layout, leases, lines, lists, row
-from splatmill.backplane.fold import fold
-from splatmill.backplane.storage import Storage
+from splatmill.backplane import keys, lists
+from splatmill.backplane.jobs import events, row
+from splatmill.backplane.jobs.fold import fold
+from splatmill.backplane.queue import leases, lines
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 
 Listed = Mapping[str, Sequence[str]]
 """The ids that the API lists, by kind: captures, jobs and models."""

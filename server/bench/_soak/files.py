@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from _soak.clients import Promise
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Entry, Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Entry, Storage
 from splatmill.schema import Role
 
 _ID = r"[0-9a-f]{16}"

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import Event, ProgressEvent, StateEvent, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.settings import storage_url

@@ -13,9 +13,9 @@ from _soak.clients import CAMERA, FINAL, Clients
 from _soak.orphans import command
 from _soak.service import Service, wait_for
 from _soak.target import STARTED_BY_THE_SOAK, Target
-from splatmill.backplane import events
-from splatmill.backplane.records import UnreadableRecord
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.jobs import events
+from splatmill.backplane.storage.records import UnreadableRecord
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import StateEvent
 
 SETTLE_SECONDS = 90.0

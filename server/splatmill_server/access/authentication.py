@@ -10,7 +10,7 @@ from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.types import Scope
 
-from splatmill.backplane.storage import StorageError
+from splatmill.backplane.storage.storage import StorageError
 from splatmill_server.access.browsers import check_host, check_origin
 from splatmill_server.access.caller import BOOTSTRAP, KEYLESS, Caller
 from splatmill_server.access.keys import CACHE_SECONDS, Keys, digest

@@ -20,10 +20,10 @@ from datetime import UTC, datetime, timedelta
 from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import layout
-from splatmill.backplane.records import FORMAT, check_format, reason, warn
-from splatmill.backplane.storage import Storage
-from splatmill.backplane.storage_errors import StorageBusyError, StorageStalledError
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.errors import StorageBusyError, StorageStalledError
+from splatmill.backplane.storage.records import FORMAT, check_format, reason, warn
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import CreateKey, Key, KeyWithSecret, Scope, Time
 from splatmill_server.base.problems import ProblemError
 

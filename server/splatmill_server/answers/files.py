@@ -9,8 +9,8 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
-from splatmill.backplane.storage import Entry, Storage, joined
-from splatmill.backplane.storage_errors import StorageChangedError
+from splatmill.backplane.storage.errors import StorageChangedError
+from splatmill.backplane.storage.storage import Entry, Storage, joined
 from splatmill_server.base.problems import ProblemError
 
 _RANGE = re.compile(r"\s*bytes\s*=\s*([0-9]{0,19})-([0-9]{0,19})\s*", re.ASCII | re.IGNORECASE)

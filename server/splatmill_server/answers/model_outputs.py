@@ -6,7 +6,8 @@ from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from splatmill.backplane import layout, rendering
+from splatmill.backplane import rendering
+from splatmill.backplane.storage import layout
 from splatmill.schema import RenderRequest
 from splatmill_server.access.caller import Caller
 from splatmill_server.answers.files import file_response

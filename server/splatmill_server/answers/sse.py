@@ -14,11 +14,12 @@ from typing import Any, cast
 import redis
 from prometheus_client import Gauge
 
-from splatmill.backplane import events, keys
-from splatmill.backplane.events import START, stream_order
-from splatmill.backplane.fold import Fold
-from splatmill.backplane.records import UnreadableRecord, warn
-from splatmill.backplane.row import JobRow
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events
+from splatmill.backplane.jobs.events import START, stream_order
+from splatmill.backplane.jobs.fold import Fold
+from splatmill.backplane.jobs.row import JobRow
+from splatmill.backplane.storage.records import UnreadableRecord, warn
 from splatmill.schema import EventRecord, Job, JobState, StateEvent, Time
 from splatmill_server.base.feed import Batch, Row, is_beyond
 from splatmill_server.service import Service

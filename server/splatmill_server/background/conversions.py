@@ -9,8 +9,9 @@ from pydantic import ValidationError
 from redis import Redis
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import layout, rendering
-from splatmill.backplane.storage import Entry, Storage
+from splatmill.backplane import rendering
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Entry, Storage
 from splatmill.schema import (
     CONVERSION_HEADER,
     CONVERSION_VERSION,

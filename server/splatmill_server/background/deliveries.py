@@ -18,8 +18,8 @@ import redis
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import StorageError
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import StorageError
 from splatmill.schema import DeliveryAttempt, DeliveryState, format_duration
 from splatmill.schema.headers import read_retry_after
 from splatmill.sdk.webhook_signature import sign

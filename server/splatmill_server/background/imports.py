@@ -21,9 +21,9 @@ import redis
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import layout
-from splatmill.backplane.records import FORMAT, UnreadableRecord, warn
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import FORMAT, UnreadableRecord, warn
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import (
     DEFAULT_OWNER,
     CreateImport,

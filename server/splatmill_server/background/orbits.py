@@ -16,9 +16,10 @@ from redis import Redis
 from redis.exceptions import RedisError
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import layout, rendering
-from splatmill.backplane.records import FORMAT, reason, warn
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane import rendering
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import FORMAT, reason, warn
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import (
     DEFAULT_OWNER,
     PROBLEMS,

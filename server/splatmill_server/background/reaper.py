@@ -15,10 +15,11 @@ import redis
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import entries, expiry, keys, leases, lines, queue
-from splatmill.backplane.published import is_published
-from splatmill.backplane.row import JobRow
-from splatmill.backplane.storage import StorageError
+from splatmill.backplane import expiry, keys
+from splatmill.backplane.jobs.published import is_published
+from splatmill.backplane.jobs.row import JobRow
+from splatmill.backplane.queue import entries, leases, lines, queue
+from splatmill.backplane.storage.storage import StorageError
 from splatmill.schema import Problem
 from splatmill_server.base.metrics import Metrics
 from splatmill_server.base.problems import ProblemError

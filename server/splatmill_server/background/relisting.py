@@ -7,8 +7,9 @@ import redis
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import keys, layout, lists
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane import keys, lists
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.records import Captures
 from splatmill_server.models import Models

@@ -8,8 +8,9 @@ import redis
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import keys, layout
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane import keys
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import StoredKind
 from splatmill_server.base.leases import lease
 from splatmill_server.base.problems import ProblemError

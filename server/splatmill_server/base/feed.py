@@ -19,8 +19,9 @@ import redis
 import structlog
 from redis.asyncio import Redis as AsyncRedis
 
-from splatmill.backplane import events, keys
-from splatmill.backplane.events import START, StoredEvent, stream_order
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events
+from splatmill.backplane.jobs.events import START, StoredEvent, stream_order
 
 log = structlog.get_logger()
 

@@ -11,7 +11,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
-from splatmill.backplane.storage import StorageError
+from splatmill.backplane.storage.storage import StorageError
 
 MEDIA_TYPE = CONTENT_TYPE_LATEST
 

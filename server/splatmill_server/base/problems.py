@@ -15,7 +15,7 @@ from starlette.responses import Response
 from starlette.routing import Match
 from starlette.types import Scope
 
-from splatmill.backplane.storage import StorageError, StorageFullError
+from splatmill.backplane.storage.storage import StorageError, StorageFullError
 from splatmill.schema import PROBLEM_MEDIA_TYPE, PROBLEMS, Problem, UnsafeName, code_for_status
 from splatmill_server.base.root_path import own_path
 from splatmill_server.base.validation import problem_of_validation

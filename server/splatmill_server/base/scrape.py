@@ -12,12 +12,13 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.metrics_core import Metric
 from rq.worker_registration import REDIS_WORKER_KEYS
 
-from splatmill.backplane import keys, lines, lists, memory, totals, workers
-from splatmill.backplane.lines import LINES, Waiting
+from splatmill.backplane import keys, lists, memory, totals
 from splatmill.backplane.memory import RedisMemory
+from splatmill.backplane.queue import lines, workers
+from splatmill.backplane.queue.lines import LINES, Waiting
+from splatmill.backplane.queue.workers import WorkerRecord
 from splatmill.backplane.rendering import RendererState
 from splatmill.backplane.totals import Counted, Distribution, Total
-from splatmill.backplane.workers import WorkerRecord
 from splatmill_server.base.metrics import SAME, SMALLEST
 
 _STATES = ("idle", "busy", "suspended")

@@ -13,8 +13,8 @@ import redis
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill_server.base.leases import keep_for, lease
 from splatmill_server.base.turns import Turns
 

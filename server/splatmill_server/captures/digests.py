@@ -17,9 +17,9 @@ from datetime import UTC, datetime
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import layout
-from splatmill.backplane.records import FORMAT, check_format, reason, warn
-from splatmill.backplane.storage import Entry, Storage, StorageError
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import FORMAT, check_format, reason, warn
+from splatmill.backplane.storage.storage import Entry, Storage, StorageError
 from splatmill.schema import Capture, CaptureFile, Role
 
 log = structlog.get_logger()

@@ -4,7 +4,7 @@ This is the part of the IETF draft "Resumable Uploads for HTTP" that a client ne
 offset, append and cancellation. Not offered are interim responses (status 104), which uvicorn cannot send.
 
 An upload is known by what it will be: with a digest and a length, the same file of the same capture is the same upload,
-also for a client that has forgotten its address. The bytes are held by `splatmill.backplane.parts`.
+also for a client that has forgotten its address. The bytes are held by `splatmill.backplane.storage.parts`.
 """
 
 import asyncio
@@ -19,10 +19,10 @@ from weakref import WeakValueDictionary
 
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import layout
-from splatmill.backplane.parts import EndMoved, Part, open_part
-from splatmill.backplane.records import FORMAT
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.parts import EndMoved, Part, open_part
+from splatmill.backplane.storage.records import FORMAT
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import CaptureFile, Response, Role, Time
 from splatmill.schema.uploads import UPLOAD_COMPLETE, UPLOAD_OFFSET, write_boolean
 from splatmill_server.base.problems import ProblemError, problem_of_storage

@@ -13,11 +13,12 @@ import redis
 import structlog
 from starlette.concurrency import run_in_threadpool
 
-from splatmill.backplane import keys, layout, lists
-from splatmill.backplane.bucket import BLOCK
-from splatmill.backplane.records import FORMAT, UnreadableRecord, check_format, reason, warn
-from splatmill.backplane.storage import Storage, StorageError, StorageFullError
-from splatmill.backplane.storage_errors import StorageBusyError
+from splatmill.backplane import keys, lists
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.bucket import BLOCK
+from splatmill.backplane.storage.errors import StorageBusyError
+from splatmill.backplane.storage.records import FORMAT, UnreadableRecord, check_format, reason, warn
+from splatmill.backplane.storage.storage import Storage, StorageError, StorageFullError
 from splatmill.schema import (
     DEFAULT_OWNER,
     Capture,

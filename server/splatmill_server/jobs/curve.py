@@ -7,9 +7,11 @@ A job that ended before it measured anything has no such file.
 
 import redis
 
-from splatmill.backplane import events, keys, layout
-from splatmill.backplane.records import reason, warn
-from splatmill.backplane.storage import Storage
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import reason, warn
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import CurveRow
 
 

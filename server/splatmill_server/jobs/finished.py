@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from splatmill.backplane import layout, lists
-from splatmill.backplane.storage import Storage
+from splatmill.backplane import lists
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill_server.base.lists import Lists
 
 NEWEST = 40

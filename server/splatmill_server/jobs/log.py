@@ -11,9 +11,11 @@ from dataclasses import dataclass
 
 import redis
 
-from splatmill.backplane import events, keys, layout
-from splatmill.backplane.records import FORMAT, check_format, reason, warn
-from splatmill.backplane.storage import Storage
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import FORMAT, check_format, reason, warn
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Job, LogEvent, LogLine
 from splatmill.schema.tolerant import keep_readable
 

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from splatmill.backplane import keys, totals
-from splatmill.backplane.events import StoredEvent
-from splatmill.backplane.fold import Fold, fold
-from splatmill.backplane.row import JobRow
+from splatmill.backplane.jobs.events import StoredEvent
+from splatmill.backplane.jobs.fold import Fold, fold
+from splatmill.backplane.jobs.row import JobRow
 from splatmill.schema import PROBLEMS, JobState, StateEvent
 
 # KEYS: unfinished jobs, totals. ARGV: job, then fields of the totals and their increments.

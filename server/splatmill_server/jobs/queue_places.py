@@ -6,11 +6,11 @@ from datetime import UTC, datetime, timedelta
 
 import redis
 
-from splatmill.backplane import leases, lines, workers
-from splatmill.backplane.entries import rq_id
-from splatmill.backplane.lines import Line, Waiting
+from splatmill.backplane.queue import leases, lines, workers
+from splatmill.backplane.queue.entries import rq_id
+from splatmill.backplane.queue.lines import Line, Waiting
+from splatmill.backplane.queue.workers import WorkerRecord
 from splatmill.backplane.refusal import RedisRefuses
-from splatmill.backplane.workers import WorkerRecord
 from splatmill.schema import Job, JobState
 
 _FRESH_SECONDS_EACH = 0.001

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 import redis
 
-from splatmill.backplane import events, keys
-from splatmill.backplane.events import StoredEvent
-from splatmill.backplane.fold import fold
-from splatmill.backplane.records import UnreadableRecord, warn
-from splatmill.backplane.row import JobRow
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events
+from splatmill.backplane.jobs.events import StoredEvent
+from splatmill.backplane.jobs.fold import fold
+from splatmill.backplane.jobs.row import JobRow
+from splatmill.backplane.storage.records import UnreadableRecord, warn
 from splatmill.schema import Job, JobState
 
 

@@ -13,11 +13,14 @@ from typing import Any, cast
 import redis
 import structlog
 
-from splatmill.backplane import events, keys, layout, lists, queue, row
-from splatmill.backplane.fold import fold
-from splatmill.backplane.records import UnreadableRecord, check_format, reason, warn
-from splatmill.backplane.row import JobRow, Verdict
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane import keys, lists
+from splatmill.backplane.jobs import events, row
+from splatmill.backplane.jobs.fold import fold
+from splatmill.backplane.jobs.row import JobRow, Verdict
+from splatmill.backplane.queue import queue
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import UnreadableRecord, check_format, reason, warn
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import DEFAULT_OWNER, CreateJob, Job, JobPage, JobState, Problem
 from splatmill.schema.tolerant import keep_readable
 from splatmill_server.access.caller import Caller

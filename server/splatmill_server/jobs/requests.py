@@ -9,10 +9,11 @@ from datetime import datetime
 
 import redis
 
-from splatmill.backplane import layout, row
-from splatmill.backplane.records import UnreadableRecord, reason, warn
-from splatmill.backplane.row import JobRow
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.jobs import row
+from splatmill.backplane.jobs.row import JobRow
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import UnreadableRecord, reason, warn
+from splatmill.backplane.storage.storage import Storage
 
 
 def save(storage: Storage, begun: JobRow) -> None:

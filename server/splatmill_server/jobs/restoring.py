@@ -10,10 +10,13 @@ from typing import Any, cast
 import redis
 import structlog
 
-from splatmill.backplane import events, keys, layout, leases, lists
-from splatmill.backplane.records import FORMAT
-from splatmill.backplane.row import JobRow, Verdict
-from splatmill.backplane.storage import Storage
+from splatmill.backplane import keys, lists
+from splatmill.backplane.jobs import events
+from splatmill.backplane.jobs.row import JobRow, Verdict
+from splatmill.backplane.queue import leases
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import FORMAT
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Event, Job, JobState, PlanEvent, ProgressEvent, StateEvent, StoredKind
 from splatmill_server.base.lists import Ended, Lists, each
 from splatmill_server.jobs import log as job_log

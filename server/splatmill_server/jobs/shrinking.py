@@ -9,11 +9,12 @@ from typing import Any, cast
 
 import redis
 
-from splatmill.backplane import events, keys, row
-from splatmill.backplane.events import StoredEvent
-from splatmill.backplane.fold import fold
-from splatmill.backplane.records import UnreadableRecord
-from splatmill.backplane.row import JobRow
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events, row
+from splatmill.backplane.jobs.events import StoredEvent
+from splatmill.backplane.jobs.fold import fold
+from splatmill.backplane.jobs.row import JobRow
+from splatmill.backplane.storage.records import UnreadableRecord
 from splatmill.schema import PlanEvent, StateEvent
 
 WHOLE_SECONDS = 60.0

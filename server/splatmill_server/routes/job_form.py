@@ -8,7 +8,7 @@ from pydantic_core import from_json
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 
-from splatmill.backplane import events, row
+from splatmill.backplane.jobs import events, row
 from splatmill.schema import CaptureFile, CreateJob, Job, LogEvent, Role, storable_name
 from splatmill_server.access.caller import Caller
 from splatmill_server.base.problems import ProblemError

@@ -7,7 +7,8 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response
 
-from splatmill.backplane import keys, layout
+from splatmill.backplane import keys
+from splatmill.backplane.storage import layout
 from splatmill.schema import SNAPSHOT_MEDIA_TYPE, Placement, Scope, Watch
 from splatmill_server.access.permission import needs
 from splatmill_server.answers.files import file_response, matches

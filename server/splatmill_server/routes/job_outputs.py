@@ -8,8 +8,9 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 
-from splatmill.backplane import events, layout
-from splatmill.backplane.records import check_format
+from splatmill.backplane.jobs import events
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import check_format
 from splatmill.schema import Curve, LogPage, Report
 from splatmill_server.access.caller import Who
 from splatmill_server.answers.files import file_response

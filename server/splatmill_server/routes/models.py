@@ -6,7 +6,8 @@ from fastapi import APIRouter, Body, Path, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from splatmill.backplane import layout, rendering
+from splatmill.backplane import rendering
+from splatmill.backplane.storage import layout
 from splatmill.schema import (
     DOWNLOADS,
     Model,

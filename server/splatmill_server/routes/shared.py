@@ -7,7 +7,7 @@ from fastapi import APIRouter, Depends, Path, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill.schema import DOWNLOADS, KeyLimits, ModelCameras, ModelDownloads, SharedModel
 from splatmill_server.access.caller import Caller
 from splatmill_server.answers.model_outputs import model_file, model_in_format, rendered_by_query

@@ -13,10 +13,11 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
 import splatmill
-from splatmill.backplane import entries, lines, memory, rendering, workers
-from splatmill.backplane.lines import Waiting
+from splatmill.backplane import memory, rendering
+from splatmill.backplane.queue import entries, lines, workers
+from splatmill.backplane.queue.lines import Waiting
+from splatmill.backplane.queue.workers import WorkerRecord
 from splatmill.backplane.rendering import RendererState
-from splatmill.backplane.workers import WorkerRecord
 from splatmill.data_sets import OTHER_CAMERAS
 from splatmill.schema import (
     ARCHIVE_SUFFIXES,

@@ -11,9 +11,10 @@ from typing import cast
 
 import redis
 
-from splatmill.backplane import keys, layout, lists
-from splatmill.backplane.records import UnreadableRecord
-from splatmill.backplane.storage import Storage
+from splatmill.backplane import keys, lists
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import UnreadableRecord
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Capture, StoredKind
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.records import Captures

@@ -7,8 +7,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Entry, Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Entry, Storage
 from splatmill.schema import DEFAULT_OWNER, StoredKind
 from splatmill_server.base.lists import each
 

@@ -7,8 +7,9 @@ from typing import Any, cast
 
 import redis
 
-from splatmill.backplane import keys, layout, lists
-from splatmill.backplane.storage import Storage
+from splatmill.backplane import keys, lists
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Role
 from splatmill_server.jobs.restoring import without_row
 

@@ -12,7 +12,7 @@ from redis.exceptions import LockError
 from redis.lock import Lock
 
 from splatmill.backplane import expiry, keys
-from splatmill.backplane.storage import Entry, Storage
+from splatmill.backplane.storage.storage import Entry, Storage
 from splatmill.schema import OwnerUse, StoredBytes, StoredKind, StoredRecord
 from splatmill_server.space.holdings import Holding, folder, scan
 from splatmill_server.space.job_uses import JobUse, all_jobs

@@ -136,7 +136,7 @@ def _check_exposure(address: str, data: Path) -> None:
     """Raise UpError if other machines could reach a server without keys."""
     if ipaddress.ip_address(address).is_loopback:
         return
-    from splatmill.backplane.storage import Storage, StorageError
+    from splatmill.backplane.storage.storage import Storage, StorageError
     from splatmill_server.access.exposure import check_exposure
     from splatmill_server.access.keys import Keys
     from splatmill_server.base.settings import Settings

@@ -15,7 +15,8 @@ import pytest
 from pydantic import SecretStr
 
 from splatmill import AsyncClient, Client, JobCancelled, JobFailed, WaitTimeout
-from splatmill.backplane import keys, layout
+from splatmill.backplane import keys
+from splatmill.backplane.storage import layout
 from splatmill.errors import Conflict, InvalidRequest, NotFound, NothingToUpload, Unauthorized
 from splatmill.schema import (
     JobState,

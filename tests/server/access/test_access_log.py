@@ -7,7 +7,7 @@ import pytest
 import structlog
 from structlog.testing import CapturingLogger
 
-from splatmill.backplane.row import request_of
+from splatmill.backplane.jobs.row import request_of
 from splatmill_server.jobs import requests as job_requests
 from tests.support.served_app import Serve
 

@@ -12,8 +12,8 @@ import httpx
 import pytest
 from pydantic import SecretStr
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill_server.access.exposure import NeedsKey
 from splatmill_server.access.keys import CACHE_SECONDS, digest
 from splatmill_server.app import create_app

@@ -11,7 +11,8 @@ import httpx
 import pytest
 from starlette.datastructures import Headers
 
-from splatmill.backplane import keys, layout
+from splatmill.backplane import keys
+from splatmill.backplane.storage import layout
 from splatmill.schema import Scope
 from splatmill_server.access import caller
 from tests.support.served_app import Serve, ServedApp, problem

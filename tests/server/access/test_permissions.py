@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill.schema import Scope
 from splatmill_server.app import create_app
 from splatmill_server.base.settings import Settings

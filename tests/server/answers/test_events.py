@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import events, keys
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events
 from splatmill.schema import JobState, LogEvent, MetricEvent, PlanEvent, Problem, ProgressEvent, StateEvent
 from splatmill_server.jobs.shrinking import shrink
 from tests.support.served_app import Serve, ServedApp, problem

@@ -15,8 +15,9 @@ import pytest
 import redis
 from starlette.datastructures import Headers
 
-from splatmill.backplane import events, keys
+from splatmill.backplane import keys
 from splatmill.backplane.connection import connect_async
+from splatmill.backplane.jobs import events
 from splatmill.schema import JobState, LogEvent, ProgressEvent, StateEvent
 from splatmill_server.access.caller import Caller
 from splatmill_server.base import feed

@@ -17,7 +17,7 @@ from typing import Any
 import httpx
 import pytest
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill.errors import NotFound
 from splatmill.schema import (
     CONVERSION_HEADER,

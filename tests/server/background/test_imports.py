@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import keys, layout
+from splatmill.backplane import keys
+from splatmill.backplane.storage import layout
 from splatmill.schema import Role
 from splatmill_server.background import imports
 from tests.support.scripted_server import Reply, ScriptedServer, scripted_server

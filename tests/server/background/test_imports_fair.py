@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import keys, layout
+from splatmill.backplane import keys
+from splatmill.backplane.storage import layout
 from splatmill_server.background import imports
 from splatmill_server.base import least_rate, unfinished
 from splatmill_server.space import usage

@@ -18,7 +18,8 @@ from typing import Any
 import av
 import pytest
 
-from splatmill.backplane import keys, layout
+from splatmill.backplane import keys
+from splatmill.backplane.storage import layout
 from splatmill.errors import InvalidRequest, NotFound, ServerError, WaitTimeout
 from splatmill.schema import Progress
 from splatmill.sdk.client import Client

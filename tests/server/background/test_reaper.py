@@ -16,7 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.backplane import entries, keys, leases, queue, row
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import row
+from splatmill.backplane.queue import entries, leases, queue
 from splatmill.schema import JobState, ProgressEvent, StateEvent
 from tests.support.queue_entries import take, waiting
 from tests.support.served_app import Serve, ServedApp, store_model

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill.schema import CreateWebhook, Job
 from splatmill_server.background import deliveries
 from tests.support.scripted_server import Reply, ScriptedServer, Seen, scripted_server

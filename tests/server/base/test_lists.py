@@ -13,7 +13,7 @@ from _capacity.operations import counted
 from _capacity.seed import OWNERS, Seeded, seed
 
 from splatmill.backplane import keys, lists
-from splatmill.backplane.storage import StorageError, StorageFullError
+from splatmill.backplane.storage.storage import StorageError, StorageFullError
 from splatmill.schema import JobState
 from splatmill_server.base.filters import Filter, JobFilter
 from splatmill_server.base.settings import Settings
@@ -28,7 +28,7 @@ PAGE = 10
 @pytest.fixture(scope="module")
 def storage_folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Seeded]:
     """Storage with COUNT captures, jobs and models."""
-    from splatmill.backplane.storage import Storage
+    from splatmill.backplane.storage.storage import Storage
 
     folder = tmp_path_factory.mktemp("seeded")
     return folder, seed(Storage((folder / "storage").as_uri()), COUNT)

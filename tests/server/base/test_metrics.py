@@ -12,9 +12,10 @@ import pytest
 import redis
 from prometheus_client.parser import text_string_to_metric_families
 
-from splatmill.backplane import keys, leases, lines, queue, totals, workers
-from splatmill.backplane.events import StoredEvent
-from splatmill.backplane.row import JobRow, Verdict
+from splatmill.backplane import keys, totals
+from splatmill.backplane.jobs.events import StoredEvent
+from splatmill.backplane.jobs.row import JobRow, Verdict
+from splatmill.backplane.queue import leases, lines, queue, workers
 from splatmill.schema import JobState, Problem, StateEvent, TrainOptions
 from splatmill_server.base.metrics import OF_PROCESS, SAME, SMALLEST, Metrics
 from splatmill_server.base.scrape import families, of_disk, of_renderer

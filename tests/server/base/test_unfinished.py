@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import redis
 
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage.storage import Storage
 from splatmill_server.base.turns import Turns
 from splatmill_server.base.unfinished import Unfinished
 

@@ -17,7 +17,7 @@ from urllib.parse import quote
 import httpx
 import pytest
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill.schema import Role
 from splatmill_server.captures import records
 from tests.support.served_app import Serve, ServedApp, problem, raw, stored

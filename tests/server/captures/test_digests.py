@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill.schema import Role
 from splatmill_server.captures import digests
 from tests.support.faulty_s3 import FaultyS3, Request, faulty_s3

@@ -16,9 +16,9 @@ from concurrent.futures import ThreadPoolExecutor
 import httpx
 import pytest
 
-from splatmill.backplane import layout
-from splatmill.backplane.parts import EndMoved, open_part
-from splatmill.backplane.storage import Entry
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.parts import EndMoved, open_part
+from splatmill.backplane.storage.storage import Entry
 from splatmill.schema import SHA256_HEADER, Role
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures import unfinished_uploads

@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import layout, lists
-from splatmill.backplane.row import now
+from splatmill.backplane import lists
+from splatmill.backplane.jobs.row import now
+from splatmill.backplane.storage import layout
 from splatmill.schema import EstimateJob
 from splatmill_server.jobs.estimate import estimate
 from splatmill_server.jobs.finished import Figures, figures

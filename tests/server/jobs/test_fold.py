@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from splatmill.backplane.events import StoredEvent
-from splatmill.backplane.fold import Fold, fold
-from splatmill.backplane.row import JobRow, Verdict
+from splatmill.backplane.jobs.events import StoredEvent
+from splatmill.backplane.jobs.fold import Fold, fold
+from splatmill.backplane.jobs.row import JobRow, Verdict
 from splatmill.schema import Job, JobState, PlanEvent, Problem, ProgressEvent, StateEvent, TrainOptions
 
 MOMENT = datetime(2026, 1, 1, tzinfo=UTC)

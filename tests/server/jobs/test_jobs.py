@@ -11,7 +11,10 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import keys, layout, queue, row
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import row
+from splatmill.backplane.queue import queue
+from splatmill.backplane.storage import layout
 from splatmill.schema import JobState, PlanEvent, Problem, ProgressEvent, StateEvent, storable_name
 from splatmill_server.base import lists
 from tests.support.served_app import ServedApp, problem, raw, stored

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 import redis
 
-from splatmill.backplane import leases, lines, queue
 from splatmill.backplane.connection import connect
-from splatmill.backplane.leases import Lease, Reclaim
+from splatmill.backplane.queue import leases, lines, queue
+from splatmill.backplane.queue.leases import Lease, Reclaim
 from tests.support.jobs import write_row
 from tests.support.queue_entries import take, waiting
 from tests.support.redis_server import RedisServer

@@ -11,8 +11,9 @@ from _capacity.operations import counted
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from splatmill.backplane import entries, keys, leases, lines, queue, workers
-from splatmill.backplane.lines import LINES, Line
+from splatmill.backplane import keys
+from splatmill.backplane.queue import entries, leases, lines, queue, workers
+from splatmill.backplane.queue.lines import LINES, Line
 from splatmill.schema import Backend, TrainOptions
 from splatmill_server.jobs import queue_places
 from splatmill_server.jobs.queue_places import start_after

@@ -6,7 +6,8 @@ The test plays the worker. Not proved here: what a worker shows (tests/worker/te
 
 import redis
 
-from splatmill.backplane import keys, layout
+from splatmill.backplane import keys
+from splatmill.backplane.storage import layout
 from splatmill.schema import CamerasEvent, JobState, Placement, SnapshotEvent, StateEvent
 from splatmill_server.routes.job_live import WATCH_SECONDS
 from tests.support.served_app import ServedApp, problem

@@ -8,7 +8,10 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import entries, keys, layout, leases, lists, queue, row
+from splatmill.backplane import keys, lists
+from splatmill.backplane.jobs import row
+from splatmill.backplane.queue import entries, leases, queue
+from splatmill.backplane.storage import layout
 from splatmill.schema import (
     CreateJob,
     JobState,

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 import redis
 
-from splatmill.backplane import events, keys, row
-from splatmill.backplane.events import LATEST
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events, row
+from splatmill.backplane.jobs.events import LATEST
 from splatmill.schema import (
     JobState,
     LogEvent,

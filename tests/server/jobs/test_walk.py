@@ -15,7 +15,10 @@ from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, rule, 
 from rq.job import Job as QueueJob
 from rq.job import JobStatus
 
-from splatmill.backplane import entries, events, keys, layout, lines, queue, row
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events, row
+from splatmill.backplane.queue import entries, lines, queue
+from splatmill.backplane.storage import layout
 from splatmill.schema import CreateJob, Job, JobState, StateEvent
 from splatmill_server.access.caller import KEYLESS
 from splatmill_server.base.problems import ProblemError

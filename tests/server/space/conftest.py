@@ -9,7 +9,7 @@ import pytest
 from obstore.store import MemoryStore
 from starlette.datastructures import Headers
 
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import KeyLimits, Scope
 from splatmill_server.access import caller
 from tests.support.bucket import bucket

@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from splatmill.backplane import keys, layout
-from splatmill.backplane.storage import StorageError
+from splatmill.backplane import keys
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import StorageError
 from splatmill.schema import CreateJob, TrainOptions
 from splatmill_server import admission
 from splatmill_server.access.caller import Caller

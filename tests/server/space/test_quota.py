@@ -11,7 +11,8 @@ from collections.abc import Iterator
 import httpx
 import pytest
 
-from splatmill.backplane import keys, layout
+from splatmill.backplane import keys
+from splatmill.backplane.storage import layout
 from splatmill.schema import KeyLimits, Scope
 from splatmill_server.access.caller import Caller
 from splatmill_server.base.problems import ProblemError

@@ -14,9 +14,10 @@ import httpx
 import pytest
 import redis
 
-from splatmill.backplane import keys, layout, reservations
+from splatmill.backplane import keys, reservations
 from splatmill.backplane.reservations import NoRoom
-from splatmill.backplane.storage import Entry
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Entry
 from splatmill.schema import DOWNLOADS, CameraSpec, StoredKind
 from splatmill_server.space.quota import JOB_ROOM
 from tests.server.space.conftest import Clock, Person, ServePeople

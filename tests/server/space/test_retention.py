@@ -8,7 +8,9 @@ import time
 import pytest
 import redis
 
-from splatmill.backplane import events, keys, layout
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events
+from splatmill.backplane.storage import layout
 from splatmill.schema import JobState, LogEvent, Problem, StateEvent
 from splatmill_server.background.sweeper import Sweeper
 from splatmill_server.space.retention import Ages

@@ -8,9 +8,10 @@ import threading
 
 import pytest
 
-from splatmill.backplane import keys, layout
+from splatmill.backplane import keys
 from splatmill.backplane.reservations import UPLOAD_SECONDS
-from splatmill.backplane.storage import Entry
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Entry
 from splatmill.schema import StoredKind
 from splatmill_server.routes import storage as route
 from splatmill_server.space import usage as usage_module

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 from contextlib import ExitStack
 
-from splatmill.backplane import layout
+from splatmill.backplane.storage import layout
 from splatmill.schema import Role
 from tests.support.hostile.bench import MAX_FILES, Answer, Bench
 from tests.support.hostile.entry import Hostile

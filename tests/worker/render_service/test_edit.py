@@ -12,8 +12,8 @@ import pytest
 import torch
 from PIL import Image
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import CameraSpec, EditModel
 from splatmill_worker.render_service.edit import NothingLeft, edit, kept
 from splatmill_worker.render_service.encoding import camera_of

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill_worker.errors import ModelNotFound
 from splatmill_worker.render_service.model_cache import ModelCache
 from tests.support.ball import store_ball

@@ -19,8 +19,9 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
-from splatmill.backplane import layout, rendering
-from splatmill.backplane.storage import Storage
+from splatmill.backplane import rendering
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import DEPTH_SCALE_HEADER, CameraSpec, Format, OrbitRequest, Output, RenderRequest
 from tests.support.ball import BALL, store_ball
 from tests.support.waiting import wait_for

@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from splatmill.backplane import rendering
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import CameraSpec, OrbitRequest, RenderRequest
 from splatmill_worker.render_service.app import RenderApp
 from splatmill_worker.render_service.model_cache import LoadedModel, ModelCache

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import redis
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Role
 from splatmill_worker.service.room import Room
 from tests.support.jobs import CAPTURE

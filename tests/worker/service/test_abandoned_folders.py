@@ -10,7 +10,7 @@ import pytest
 import redis
 
 from splatmill.backplane import keys
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage.storage import Storage
 from splatmill_worker.service import abandoned_folders, job_folder
 from splatmill_worker.service.abandoned_folders import KEEP_SECONDS, remove_abandoned
 from splatmill_worker.service.job_folder import JobFolder

@@ -16,8 +16,9 @@ import psutil
 import pytest
 import redis
 
-from splatmill.backplane import layout, queue
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.queue import queue
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Job, Role
 from splatmill_worker import memory
 from splatmill_worker.service import attempt_limits, command

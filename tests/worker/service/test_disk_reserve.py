@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 from rq import Worker
 
-from splatmill.backplane import entries, keys, layout, queue
-from splatmill.backplane.storage import Storage
+from splatmill.backplane import keys
+from splatmill.backplane.queue import entries, queue
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Role
 from splatmill_worker.errors import DiskReserveReached
 from splatmill_worker.service import disk_reserve

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.backplane import layout
-from splatmill.backplane.bucket import Patience
-from splatmill.backplane.storage import Storage, StorageError
-from splatmill.backplane.storage_errors import StorageUnreachableError
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.bucket import Patience
+from splatmill.backplane.storage.errors import StorageUnreachableError
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import Role
 from splatmill_worker.errors import CaptureIncomplete, FolderInUse, StartNotStored
 from splatmill_worker.service import job_folder, mirror, sfm_cache

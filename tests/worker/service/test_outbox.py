@@ -6,7 +6,7 @@ Does not prove how the server reads them: tests/server does.
 import redis
 from _capacity.operations import counted
 
-from splatmill.backplane import events
+from splatmill.backplane.jobs import events
 from splatmill.schema import Event, JobState, LogEvent, PlanEvent, ProgressEvent, StateEvent
 from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.lock import JobLock

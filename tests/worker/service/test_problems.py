@@ -11,7 +11,7 @@ import sys
 import pytest
 import redis
 
-from splatmill.backplane.storage import StorageError, StorageFullError
+from splatmill.backplane.storage.storage import StorageError, StorageFullError
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.service.problems import is_transient, problem_of
 

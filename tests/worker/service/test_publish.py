@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import redis
 
-from splatmill.backplane import layout
-from splatmill.backplane.published import is_published
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.jobs.published import is_published
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import JobState, StateEvent
 from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.lock import JobLock

@@ -9,7 +9,8 @@ import pytest
 import redis
 from _capacity.operations import counted
 
-from splatmill.backplane import keys, leases, lines, queue, workers
+from splatmill.backplane import keys
+from splatmill.backplane.queue import leases, lines, queue, workers
 from splatmill_worker.service import recovery
 from splatmill_worker.service.command import _pipeline
 from splatmill_worker.service.rq_worker import AttemptWorker

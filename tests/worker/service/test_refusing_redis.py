@@ -16,10 +16,12 @@ from typing import Any
 import pytest
 import redis
 
-from splatmill.backplane import events, layout, leases, queue
 from splatmill.backplane.connection import connect
+from splatmill.backplane.jobs import events
+from splatmill.backplane.queue import leases, queue
 from splatmill.backplane.refusal import RedisRefuses
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import JobState, LogEvent, Role, StateEvent
 from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.lock import JobLock

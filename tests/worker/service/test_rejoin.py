@@ -7,7 +7,7 @@ from typing import Any
 
 import redis
 
-from splatmill.backplane import entries, leases, lines, queue
+from splatmill.backplane.queue import entries, leases, lines, queue
 from tests.support.jobs import write_row
 from tests.support.queue_entries import take, waiting
 

@@ -20,9 +20,11 @@ import psutil
 import pytest
 import redis
 
-from splatmill.backplane import keys, layout, queue, reservations
-from splatmill.backplane.row import now
-from splatmill.backplane.storage import Storage
+from splatmill.backplane import keys, reservations
+from splatmill.backplane.jobs.row import now
+from splatmill.backplane.queue import queue
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import JobState, Role, StateEvent
 from splatmill_worker.errors import QuotaReached
 from splatmill_worker.images import archive, unpacked_room

@@ -17,9 +17,11 @@ from typing import IO, Any, cast
 import pytest
 from rq.job import Callback
 
-from splatmill.backplane import entries, keys, layout, leases, queue, totals, workers
-from splatmill.backplane.row import now
-from splatmill.backplane.storage import Storage
+from splatmill.backplane import keys, totals
+from splatmill.backplane.jobs.row import now
+from splatmill.backplane.queue import entries, leases, queue, workers
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Backend, Job, Role, TrainOptions
 from tests.support.jobs import CAPTURE, read_job, write_row
 from tests.support.queue_entries import waiting

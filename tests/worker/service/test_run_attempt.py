@@ -19,8 +19,8 @@ import pytest
 import redis
 from PIL import Image
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import Role
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import decoders

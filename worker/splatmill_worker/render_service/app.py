@@ -22,8 +22,9 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from splatmill.backplane import layout, rendering
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane import rendering
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import (
     CONVERSION_HEADER,
     DOWNLOADS,

@@ -14,7 +14,7 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor
 
-from splatmill.backplane.records import reason
+from splatmill.backplane.storage.records import reason
 from splatmill.data_sets import TwoDataSets
 from splatmill.schema import EditModel, ModelCameras
 from splatmill_worker.errors import ModelUnreadable, Refusal, StartUnusable

@@ -8,7 +8,7 @@ import uvicorn
 
 from splatmill.backplane import log_lines
 from splatmill.backplane.private_files import listen
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import parse_bytes
 from splatmill_worker.render_service.app import RenderApp
 from splatmill_worker.settings import log_format, storage_url, umask

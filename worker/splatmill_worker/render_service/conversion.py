@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import (
     CONVERSION_VERSION,
     ComparedWith,

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Edited, EditedView, EditModel, ModelCameras
 from splatmill_worker.images.guarded import own_picture
 from splatmill_worker.render_service.conversion import background_of

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Entry, Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Entry, Storage
 from splatmill_worker.errors import ModelNotFound
 
 if TYPE_CHECKING:

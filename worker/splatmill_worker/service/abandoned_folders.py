@@ -10,10 +10,12 @@ from pathlib import Path
 
 import redis
 
-from splatmill.backplane import events, keys, layout
-from splatmill.backplane import row as rows
-from splatmill.backplane.fold import fold
-from splatmill.backplane.records import UnreadableRecord
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events
+from splatmill.backplane.jobs import row as rows
+from splatmill.backplane.jobs.fold import fold
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import UnreadableRecord
 from splatmill_worker.service.job_folder import LOCK_SECONDS, bytes_in, hold, remove_remade
 from splatmill_worker.service.room import is_counted, leave
 from splatmill_worker.settings import data_folder, keep_work, work_folder

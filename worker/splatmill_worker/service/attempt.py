@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import redis
 
-from splatmill.backplane import events, keys
-from splatmill.backplane.entries import split_rq_id
+from splatmill.backplane import keys
+from splatmill.backplane.jobs import events
 from splatmill.backplane.process import ProcessIdentity
+from splatmill.backplane.queue.entries import split_rq_id
 from splatmill.schema import Event, JobState, LogEvent, Problem, StateEvent
 from splatmill_worker.service import hand_back
 from splatmill_worker.service.lock import JobLock

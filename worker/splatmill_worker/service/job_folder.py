@@ -16,8 +16,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Entry, Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Entry, Storage
 from splatmill.schema import TIME_LAPSE
 from splatmill_worker.errors import CaptureIncomplete, FolderInUse, StartNotStored
 from splatmill_worker.service.disk_reserve import shortage

@@ -5,8 +5,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import StorageError
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import StorageError
 from splatmill_worker.errors import QuotaReached
 from splatmill_worker.service.job_folder import CHECKPOINTS, ENDED, FILM, SNAPSHOTS, START, JobFolder
 from splatmill_worker.service.room import Room

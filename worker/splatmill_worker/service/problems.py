@@ -6,7 +6,7 @@ import traceback
 
 from redis.exceptions import RedisError
 
-from splatmill.backplane.storage import StorageError, StorageFullError
+from splatmill.backplane.storage.storage import StorageError, StorageFullError
 from splatmill.schema import Problem
 from splatmill_worker.errors import DiskReserveReached, FolderInUse, QuotaReached, WorkerError
 

@@ -4,11 +4,13 @@ import hashlib
 import json
 from pathlib import Path
 
-from splatmill.backplane import events, layout, lists
-from splatmill.backplane.fold import fold
-from splatmill.backplane.records import FORMAT
-from splatmill.backplane.row import JobRow, now
-from splatmill.backplane.storage import Storage
+from splatmill.backplane import lists
+from splatmill.backplane.jobs import events
+from splatmill.backplane.jobs.fold import fold
+from splatmill.backplane.jobs.row import JobRow, now
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.records import FORMAT
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import JobState
 from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.redis_patience import patiently

@@ -16,10 +16,11 @@ from rq import Worker
 from rq.executions import Execution
 from rq.worker_registration import REDIS_WORKER_KEYS, get_keys
 
-from splatmill.backplane import keys, leases, lines
-from splatmill.backplane.entries import split_rq_id
-from splatmill.backplane.leases import Lease
+from splatmill.backplane import keys
 from splatmill.backplane.process import ProcessIdentity, wait_gone
+from splatmill.backplane.queue import leases, lines
+from splatmill.backplane.queue.entries import split_rq_id
+from splatmill.backplane.queue.leases import Lease
 from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.lock import Holder, JobLock
 

@@ -27,11 +27,12 @@ from rq.utils import now
 from rq.worker.base import WorkerStatus
 from rq.worker_registration import clean_worker_registry, register
 
-from splatmill.backplane import entries, keys, leases, lines, log_lines, totals, workers
-from splatmill.backplane.leases import Lease, Reclaim
-from splatmill.backplane.lines import Line
+from splatmill.backplane import keys, log_lines, totals
+from splatmill.backplane.jobs.row import request_of
 from splatmill.backplane.process import die_with_parent
-from splatmill.backplane.row import request_of
+from splatmill.backplane.queue import entries, leases, lines, workers
+from splatmill.backplane.queue.leases import Lease, Reclaim
+from splatmill.backplane.queue.lines import Line
 from splatmill_worker.service import hand_back, recovery
 from splatmill_worker.service.abandoned_folders import remove_abandoned, tidy
 from splatmill_worker.service.attempt import Attempt, start_attempt

@@ -15,12 +15,13 @@ from typing import Any, NoReturn, Protocol, cast
 
 import redis
 
-from splatmill.backplane import events, layout
-from splatmill.backplane import row as rows
-from splatmill.backplane.fold import fold
-from splatmill.backplane.published import is_published
-from splatmill.backplane.row import JobRow
-from splatmill.backplane.storage import Storage, StorageError
+from splatmill.backplane.jobs import events
+from splatmill.backplane.jobs import row as rows
+from splatmill.backplane.jobs.fold import fold
+from splatmill.backplane.jobs.published import is_published
+from splatmill.backplane.jobs.row import JobRow
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import (
     CamerasEvent,
     Event,

@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from splatmill.backplane.lines import LINES, Line
+from splatmill.backplane.queue.lines import LINES, Line
 
 _DEVICES = ("nvidia[0-9]*", "nvidiactl", "dxg", "kfd")
 """Device files in /dev of which there is one where a driver of NVIDIA (also in WSL) or AMD is loaded."""

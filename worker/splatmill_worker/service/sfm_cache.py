@@ -8,8 +8,8 @@ import json
 import logging
 from pathlib import Path
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Entry, Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Entry, Storage
 from splatmill_worker.service import staging
 from splatmill_worker.service.room import Room
 

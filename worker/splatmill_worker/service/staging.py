@@ -6,7 +6,7 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import suppress
 from pathlib import Path
 
-from splatmill.backplane.storage import Entry, Storage
+from splatmill.backplane.storage.storage import Entry, Storage
 from splatmill_worker.service.own_copy import link_or_copy
 
 DOWNLOADS = 8

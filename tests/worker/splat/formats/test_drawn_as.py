@@ -15,8 +15,8 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import CameraSpec, EditModel
 from splatmill.schema.formats import MODEL_FORMATS
 from splatmill_worker.render_service.clean import Wanted, clean_file

@@ -13,9 +13,9 @@ import os
 from collections.abc import AsyncIterator, Iterator
 from typing import Protocol
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import CHUNK, Storage
-from splatmill.backplane.storage_errors import storage_errors
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.errors import storage_errors
+from splatmill.backplane.storage.storage import CHUNK, Storage
 from splatmill.files import sync_to_disk
 
 

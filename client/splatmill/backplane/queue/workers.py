@@ -8,7 +8,7 @@ from typing import cast
 import redis
 from rq.worker_registration import REDIS_WORKER_KEYS
 
-from splatmill.backplane.lines import LINES, Line
+from splatmill.backplane.queue.lines import LINES, Line
 
 _LINES_FIELD = "splatmill_lines"
 _SPARE_FIELD = "splatmill_spare"

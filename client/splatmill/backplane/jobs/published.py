@@ -2,8 +2,8 @@
 
 import json
 
-from splatmill.backplane import layout
-from splatmill.backplane.storage import Storage
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
 
 
 def is_published(storage: Storage, job_id: str, generation: int) -> bool:

@@ -14,8 +14,8 @@ from rq.command import send_stop_job_command
 from rq.exceptions import DuplicateJobError, InvalidJobOperation, NoSuchJobError
 from rq.job import Job, JobStatus
 
-from splatmill.backplane import lines
-from splatmill.backplane.entries import (
+from splatmill.backplane.queue import lines
+from splatmill.backplane.queue.entries import (
     ATTEMPT,
     JOB_TIMEOUT,
     KEEP_FINISHED,

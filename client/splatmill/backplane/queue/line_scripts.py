@@ -5,8 +5,9 @@ Each begins by sorting what has arrived, and returns first the entries that it r
 
 from string import Template
 
-from splatmill.backplane import keys, leases, totals
-from splatmill.backplane.entries import TRAIN
+from splatmill.backplane import keys, totals
+from splatmill.backplane.queue import leases
+from splatmill.backplane.queue.entries import TRAIN
 from splatmill.schema import DEFAULT_OWNER
 
 _BELLS = 100

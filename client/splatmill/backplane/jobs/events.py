@@ -17,7 +17,7 @@ from typing import Any, cast
 import redis
 
 from splatmill.backplane import keys
-from splatmill.backplane.records import FORMAT, check_format, reason, warn
+from splatmill.backplane.storage.records import FORMAT, check_format, reason, warn
 from splatmill.schema import (
     EVENT,
     CamerasEvent,

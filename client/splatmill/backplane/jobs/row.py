@@ -9,7 +9,7 @@ import redis
 from pydantic import BaseModel
 
 from splatmill.backplane import keys
-from splatmill.backplane.records import FORMAT, UnreadableRecord, check_format, reason, warn
+from splatmill.backplane.storage.records import FORMAT, UnreadableRecord, check_format, reason, warn
 from splatmill.schema import DEFAULT_OWNER, Owner, Problem, Time, TrainOptions
 from splatmill.schema.tolerant import keep_readable
 

@@ -20,9 +20,9 @@ from uuid import uuid4
 import redis
 
 from splatmill.backplane import keys
-from splatmill.backplane import line_scripts as scripts
-from splatmill.backplane.entries import KEEP_FINISHED
-from splatmill.backplane.leases import LEASE, Lease
+from splatmill.backplane.queue import line_scripts as scripts
+from splatmill.backplane.queue.entries import KEEP_FINISHED
+from splatmill.backplane.queue.leases import LEASE, Lease
 
 Line = Literal["any", "cpu", "gpu"]
 """What a job asks of its worker, by its option `backend`. `any`: auto. `cpu`: cpu or reference. `gpu`: a usable GPU."""

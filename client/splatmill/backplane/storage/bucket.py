@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from obstore.store import ObjectStore, from_url
 
-from splatmill.backplane.storage_errors import StorageError, StorageStalledError, StorageUnreachableError
+from splatmill.backplane.storage.errors import StorageError, StorageStalledError, StorageUnreachableError
 
 if TYPE_CHECKING:  # These names exist in its stubs alone.
     import obstore

@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from datetime import datetime
 from typing import Any
 
-from splatmill.backplane.events import StoredEvent, stream_order
-from splatmill.backplane.row import JobRow
+from splatmill.backplane.jobs.events import StoredEvent, stream_order
+from splatmill.backplane.jobs.row import JobRow
 from splatmill.schema import Job, JobState, PlanEvent, Problem, Progress, ProgressEvent, StateEvent
 
 

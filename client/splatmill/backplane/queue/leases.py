@@ -16,7 +16,7 @@ import redis
 from rq.registry import StartedJobRegistry
 
 from splatmill.backplane import keys, totals
-from splatmill.backplane.entries import (
+from splatmill.backplane.queue.entries import (
     HEARTBEAT_SLACK,
     KEEP_FINISHED,
     MONITORING_INTERVAL,

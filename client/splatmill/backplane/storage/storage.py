@@ -1,9 +1,9 @@
 """Storage of captures, checkpoints and models through obstore: a local folder or an S3-compatible bucket.
 
 Every write is atomic: a reader sees the old file, the new one, or none. Paths are those of
-`splatmill.backplane.layout`. The synchronous methods are for workers and threads; at most SLOTS of these wait for a
-bucket. The asynchronous ones (`stream_*`) let the API pass files through without holding them in memory, and hold no
-thread.
+`splatmill.backplane.storage.layout`. The synchronous methods are for workers and threads; at most SLOTS of these wait
+for a bucket. The asynchronous ones (`stream_*`) let the API pass files through without holding them in memory, and hold
+no thread.
 """
 
 import asyncio
@@ -21,12 +21,12 @@ import obstore
 from obstore.exceptions import AlreadyExistsError
 from obstore.store import LocalStore, ObjectStore
 
-from splatmill.backplane.bucket import BLOCK, Patience, Resumption, open_bucket
 from splatmill.backplane.redact import redacted
-from splatmill.backplane.slots import NoSlot, Slots
-from splatmill.backplane.storage_errors import StorageBusyError, StorageStalledError, storage_errors
-from splatmill.backplane.storage_errors import StorageError as StorageError
-from splatmill.backplane.storage_errors import StorageFullError as StorageFullError
+from splatmill.backplane.storage.bucket import BLOCK, Patience, Resumption, open_bucket
+from splatmill.backplane.storage.errors import StorageBusyError, StorageStalledError, storage_errors
+from splatmill.backplane.storage.errors import StorageError as StorageError
+from splatmill.backplane.storage.errors import StorageFullError as StorageFullError
+from splatmill.backplane.storage.slots import NoSlot, Slots
 from splatmill.files import replacing
 
 CHUNK = 1 << 20
