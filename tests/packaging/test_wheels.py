@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.cli.embedded import ALL_PARTS
+from splatmill.cli.local.programs import ALL_PARTS
 from tests.support.wheels import PARTS, ROOT, Built, build, environment, metadata, run, watch
 
 pytestmark = pytest.mark.slow
@@ -96,7 +96,7 @@ import importlib.util, sys
 assert not [name for name in {FOREIGN} if importlib.util.find_spec(name)], "the environment is not a bare one"
 import splatmill
 assert "pydantic" not in sys.modules, "import splatmill must cost nothing"
-import splatmill.schema, splatmill.sdk.client, splatmill.sdk.aio, splatmill.cli.app, splatmill.cli.train
+import splatmill.schema, splatmill.sdk.client, splatmill.sdk.aio, splatmill.cli.app, splatmill.cli.commands.train
 for name in splatmill.__all__:
     getattr(splatmill, name)
 assert not [name for name in {FOREIGN} if name in sys.modules]

@@ -1,7 +1,7 @@
 """Proves what `clean-file` removes from a file: by a box, by weight, and what its photos do not support.
 
 The photos are renderings of the model before anything was planted, so that all that it had is supported. Does not prove
-the evidence (tests/worker/splat/test_evidence.py) nor the command's own checks (tests/client/test_clean.py).
+the evidence (tests/worker/splat/test_evidence.py) nor the command's own checks (tests/client/cli/test_clean.py).
 """
 
 from __future__ import annotations

@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from splatmill.cli.embedded import require
-from splatmill.cli.service import exec_module
+from splatmill.cli.local.programs import exec_module, require
 
 
 def convert(

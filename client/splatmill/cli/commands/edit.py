@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from splatmill.cli.models import ModelId
+from splatmill.cli.commands.models import ModelId
+from splatmill.cli.display.tables import JsonRecord
 from splatmill.cli.servers import ServerOption, open_client
-from splatmill.cli.tables import JsonRecord
 
 if TYPE_CHECKING:
     from splatmill.schema import Edited

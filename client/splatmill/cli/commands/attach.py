@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from splatmill.cli.jobs import JobId
+from splatmill.cli.commands.jobs import JobId
+from splatmill.cli.display.tables import printable
 from splatmill.cli.servers import ServerOption, open_client
-from splatmill.cli.tables import printable
 
 if TYPE_CHECKING:
     from splatmill.schema import EventRecord, LogLine
@@ -36,8 +36,8 @@ def follow(
     server: ServerOption = None,
 ) -> None:
     """Show the progress of a job until it ends, from its beginning. Ctrl-C ends this command and not the job."""
+    from splatmill.cli.commands.models import download_files, print_summary
     from splatmill.cli.exits import Exit
-    from splatmill.cli.models import download_files, print_summary
     from splatmill.errors import JobCancelled
 
     with open_client(server) as client:
@@ -62,7 +62,7 @@ def follow(
 
 
 def _show(events: Iterable["EventRecord"], verbose: bool) -> None:
-    from splatmill.cli.progress import make_display, show
+    from splatmill.cli.display.progress import make_display, show
 
     with make_display() as display:
         for record in events:

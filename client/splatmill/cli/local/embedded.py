@@ -1,6 +1,5 @@
 """The embedded service: the whole service as a child process, for the duration of one command."""
 
-import importlib.util
 import json
 import os
 import secrets
@@ -16,14 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from splatmill.cli.follow import ONE_SIGNAL_SECONDS
+from splatmill.cli.display.follow import ONE_SIGNAL_SECONDS
+from splatmill.cli.local.programs import require
 from splatmill.errors import ServiceFailed
 
 SUPERVISOR = "splatmill_server.up"
 START_SECONDS = 90.0  # a first start may read several hundred megabytes of libraries from disk
 STOP_SECONDS = 45.0  # a worker that is stopped first writes a checkpoint, and then Redis is stopped
-
-ALL_PARTS = "pip install splatmill 'splatmill-server[embedded]' splatmill-worker"
 
 
 @dataclass(frozen=True)
@@ -32,15 +30,6 @@ class ServiceAddress:
 
     url: str
     api_key: str | None
-
-
-def require(part: str, needed_for: str) -> None:
-    """Raise ServiceFailed, with the command that installs it, if the package `part` is not installed."""
-    if importlib.util.find_spec(part) is None:
-        raise ServiceFailed(
-            f"{needed_for} needs the package {part.replace('_', '-')}, which is not installed.",
-            f"Install all packages ({ALL_PARTS}), or give the address of a server with --server.",
-        )
 
 
 @contextmanager

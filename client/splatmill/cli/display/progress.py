@@ -171,7 +171,7 @@ def show(record: EventRecord, display: Display, *, verbose: bool = False) -> Non
     elif isinstance(event, LogEvent) and (verbose or event.level == "warning"):
         display.print(f"{event.level}: {event.message}")
     elif isinstance(event, PlanEvent) and verbose:
-        from splatmill.cli.plan import plan_lines
+        from splatmill.cli.display.plan import plan_lines
 
         for line in plan_lines(event.plan):
             display.print(f"plan: {line}")

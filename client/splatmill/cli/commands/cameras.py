@@ -74,8 +74,7 @@ def _write(path: Path, out: Path, format: str) -> None:
             f"{path} has none of this format: the lens has no counterpart in it.", param_hint="--format"
         )
     if format == "colmap-text":
-        from splatmill.cli.embedded import require
-        from splatmill.cli.service import exec_module
+        from splatmill.cli.local.programs import exec_module, require
 
         require("splatmill_worker", "A COLMAP model as text")
         exec_module("splatmill_worker", "model-text", str(out / COLMAP))

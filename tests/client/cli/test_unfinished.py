@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
+from splatmill.cli.display.follow import ONE_SIGNAL_SECONDS
 from splatmill.cli.exits import Exit
-from splatmill.cli.follow import ONE_SIGNAL_SECONDS
-from splatmill.cli.unfinished import Unfinished
+from splatmill.cli.local.unfinished import Unfinished
 from splatmill.errors import ServiceFailed
 from splatmill.schema import TrainOptions
 from splatmill.transfer.local_capture import find_files

@@ -5,9 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
-from splatmill.cli.embedded import require
+from splatmill.cli.local.programs import exec_module, require
 from splatmill.cli.schema_options import with_options_of
-from splatmill.cli.service import exec_module
 from splatmill.schema.fit_image import FitImageOptions
 
 

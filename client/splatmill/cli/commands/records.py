@@ -4,8 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from splatmill.cli.servers import ServerOption, open_client
-from splatmill.cli.tables import (
+from splatmill.cli.display.tables import (
     JsonLines,
     local_time,
     print_facts,
@@ -13,6 +12,7 @@ from splatmill.cli.tables import (
     print_record,
     print_table,
 )
+from splatmill.cli.servers import ServerOption, open_client
 
 if TYPE_CHECKING:
     from splatmill.schema import Capture, Model

@@ -17,9 +17,9 @@ import psutil
 import pytest
 
 from splatmill import Client
-from splatmill.cli.embedded import ServiceAddress, embedded_service
 from splatmill.cli.exits import Exit
-from splatmill.cli.folder_lock import locked
+from splatmill.cli.local.embedded import ServiceAddress, embedded_service
+from splatmill.cli.local.folder_lock import locked
 from splatmill.errors import ServiceFailed, Unauthorized
 
 pytestmark = pytest.mark.slow
@@ -66,7 +66,7 @@ def test_it_comes_up_and_leaves_nothing(tmp_path: Path, monkeypatch):
 
 
 def test_a_start_that_fails_shows_the_end_of_its_log(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("splatmill.cli.embedded.SUPERVISOR", "splatmill_server.no_such_module")
+    monkeypatch.setattr("splatmill.cli.local.embedded.SUPERVISOR", "splatmill_server.no_such_module")
     with (
         pytest.raises(ServiceFailed, match="ended while it started, with exit code 1") as failed,
         service_on(tmp_path / "d"),
@@ -79,8 +79,8 @@ def test_it_ends_with_its_caller(tmp_path: Path):
     code = f"""
 import json, os, psutil, sys
 from pathlib import Path
-from splatmill.cli.embedded import embedded_service
-from splatmill.cli.folder_lock import locked
+from splatmill.cli.local.embedded import embedded_service
+from splatmill.cli.local.folder_lock import locked
 data = Path({str(tmp_path / "data")!r})
 data.mkdir()
 with locked(data) as lock, embedded_service(data, lock) as service:

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatmill.cli.embedded import ALL_PARTS
 from splatmill.cli.exits import Exit
+from splatmill.cli.local.programs import ALL_PARTS
 from splatmill.schema import CameraSpec
 from splatmill_worker.__main__ import main as worker
 from tests.support.ball import write_ply
@@ -71,7 +71,7 @@ def run_here(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, str, s
         assert module == "splatmill_worker"
         sys.exit(worker([*arguments]))
 
-    monkeypatch.setattr("splatmill.cli.local_model.exec_module", become)
+    monkeypatch.setattr("splatmill.cli.local.local_model.exec_module", become)
 
     def call(*arguments: str | Path) -> tuple[int, str, str]:
         done = invoke(*arguments)

@@ -14,7 +14,7 @@ from datetime import datetime
 from queue import Empty, SimpleQueue
 from types import FrameType
 
-from splatmill.cli.progress import Display, make_display, show
+from splatmill.cli.display.progress import Display, make_display, show
 from splatmill.errors import Conflict
 from splatmill.schema import EventRecord
 from splatmill.sdk.client import JobHandle, ModelHandle

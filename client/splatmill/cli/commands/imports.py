@@ -30,7 +30,7 @@ def import_file(
 
     If this command is stopped, the server goes on with the import.
     """
-    from splatmill.cli.progress import make_display
+    from splatmill.cli.display.progress import make_display
     from splatmill.errors import error_for
     from splatmill.schema import format_bytes
 

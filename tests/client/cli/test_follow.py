@@ -7,7 +7,7 @@ import signal
 import threading
 from queue import SimpleQueue
 
-from splatmill.cli import follow
+from splatmill.cli.display import follow
 
 
 def test_a_signal_that_another_thread_receives_is_noticed() -> None:

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 
-from splatmill.cli.embedded import require
-from splatmill.cli.service import exec_module
+from splatmill.cli.local.programs import exec_module, require
 from splatmill.schema.formats import format_of
 
 if TYPE_CHECKING:

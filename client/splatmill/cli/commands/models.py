@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from splatmill.cli.display.transfers import make_transfer_display
 from splatmill.cli.servers import ServerOption, open_client
-from splatmill.cli.transfers import make_transfer_display
 
 if TYPE_CHECKING:
     from splatmill.sdk.client import ModelHandle

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from splatmill.cli.display.tables import printable
 from splatmill.cli.servers import ServerOption, open_client
-from splatmill.cli.tables import printable
 
 if TYPE_CHECKING:
     from splatmill.schema import Capture

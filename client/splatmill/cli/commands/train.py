@@ -11,15 +11,15 @@ from typing import Annotated, Any
 
 import typer
 
-from splatmill.cli.embedded import embedded_service
+from splatmill.cli.commands.models import download_files, print_summary, write_novel_view
+from splatmill.cli.display.follow import Interrupted, StoppedWaiting, follow_job
+from splatmill.cli.display.progress import make_display
 from splatmill.cli.exits import Exit
-from splatmill.cli.folder_lock import locked
-from splatmill.cli.follow import Interrupted, StoppedWaiting, follow_job
-from splatmill.cli.models import download_files, print_summary, write_novel_view
-from splatmill.cli.progress import make_display
+from splatmill.cli.local.embedded import embedded_service
+from splatmill.cli.local.folder_lock import locked
+from splatmill.cli.local.unfinished import Unfinished, size_text
 from splatmill.cli.schema_options import with_training_options
 from splatmill.cli.servers import open_client
-from splatmill.cli.unfinished import Unfinished, size_text
 from splatmill.errors import JobCancelled, NothingToUpload
 from splatmill.schema import Capture, TrainOptions, format_bytes
 from splatmill.schema.quantities import listed

@@ -1,12 +1,9 @@
 """`splatmill up`, `doctor` and `bench`: programs of the server and the worker, run by the one command line."""
 
-import os
-import sys
-from typing import NoReturn
-
 import typer
 
-from splatmill.cli.embedded import SUPERVISOR, require
+from splatmill.cli.local.embedded import SUPERVISOR
+from splatmill.cli.local.programs import exec_module, require
 
 
 def up(context: typer.Context) -> None:
@@ -26,10 +23,3 @@ def bench(context: typer.Context) -> None:
     service: soak, load, abuse, capacity, fleet, openapi, fuzz, and their summary."""
     require("splatmill_worker", "`splatmill bench`")
     exec_module("splatmill_worker", "bench", *context.args)
-
-
-def exec_module(module: str, *arguments: str) -> NoReturn:
-    """Replace this process by `python -m module`, so that signals and the exit code are those of that program."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os.execv(sys.executable, [sys.executable, "-m", module, *arguments])

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from splatmill.cli.local_model import is_local, local_cameras, orbit_local, render_local
+from splatmill.cli.local.local_model import is_local, local_cameras, orbit_local, render_local
 from splatmill.cli.servers import ServerOption, open_client
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def orbit(
 
 def _kept(model: "ModelHandle", out: Path, options: dict[str, Any]) -> Path:
     """Let the server render a video, show how far it is, and download it."""
-    from splatmill.cli.progress import make_display
+    from splatmill.cli.display.progress import make_display
 
     begun = model.orbits.start(**options)
     try:

@@ -4,8 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from splatmill.cli.servers import ServerOption, open_client
-from splatmill.cli.tables import (
+from splatmill.cli.display.tables import (
     JsonLines,
     JsonRecord,
     local_time,
@@ -14,6 +13,7 @@ from splatmill.cli.tables import (
     print_record,
     print_table,
 )
+from splatmill.cli.servers import ServerOption, open_client
 from splatmill.schema import JobState
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def status(
     if as_json:
         print_record(job)
         return
-    from splatmill.cli.plan import plan_lines
+    from splatmill.cli.display.plan import plan_lines
     from splatmill.schema import format_duration
 
     took = (job.finished_at - job.started_at).total_seconds() if job.started_at and job.finished_at else None
@@ -155,6 +155,6 @@ def _brief_progress(job: "Job") -> str:
 
 
 def _progress(job: "Job") -> str:
-    from splatmill.cli.progress import progress_text
+    from splatmill.cli.display.progress import progress_text
 
     return progress_text(job.progress) if job.progress else ""

@@ -5,7 +5,7 @@ Does not prove how the moving line on a terminal looks.
 
 import pytest
 
-from splatmill.cli import progress as cli
+from splatmill.cli.display import progress as cli
 from splatmill.schema import Progress
 
 
