@@ -1,8 +1,9 @@
 """The page of a job: a whole small job watched from its beginning to its model, cancelled, and resumed after a lost
 connection.
 
-The service, the worker and the browser are real. Not proved here: what a snapshot holds (tests/worker/test_live.py),
-how the viewer draws it (test_viewer.py), and what watching costs (`splatmill bench live`).
+The service, the worker and the browser are real. Not proved here: what a snapshot holds
+(tests/worker/pipeline/test_live.py), how the viewer draws it (test_viewer.py), and what watching costs
+(`splatmill bench live`).
 """
 
 from __future__ import annotations

@@ -32,9 +32,10 @@ from splatmill_server.jobs import records as jobs
 from splatmill_server.routes import job_live
 from splatmill_server.space import usage
 from splatmill_server.up import supervisor
-from splatmill_worker import live, settings, time_lapse
 from splatmill_worker import memory as worker_memory
+from splatmill_worker import settings
 from splatmill_worker.images import archive, guarded, video
+from splatmill_worker.pipeline import live, time_lapse
 from splatmill_worker.render_service import edit
 from splatmill_worker.service import mirror, redis_patience, rq_worker
 from splatmill_worker.sfm import checks

@@ -15,8 +15,8 @@ from PIL import Image
 
 from splatmill.files import replacing
 from splatmill_worker.film import Film, with_even_sides
+from splatmill_worker.pipeline.progress_film import HELD, ProgressFilm
 from splatmill_worker.splat.plan.plan import Plan
-from splatmill_worker.splat.report.progress_film import HELD, ProgressFilm
 from splatmill_worker.splat.views import TrainingView
 
 GREY = np.full((16, 32, 3), 128, np.uint8)

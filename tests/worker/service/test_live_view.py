@@ -1,6 +1,7 @@
 """Proves that a worker learns from Redis whether anybody looks, and that snapshots reach Redis and are announced.
 
-Does not prove what is in a snapshot (tests/worker/test_live.py), nor how it is served (tests/server/jobs/test_live.py).
+Does not prove what is in a snapshot (tests/worker/pipeline/test_live.py), nor
+how it is served (tests/server/jobs/test_live.py).
 """
 
 import redis

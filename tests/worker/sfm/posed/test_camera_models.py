@@ -14,9 +14,9 @@ import pytest
 from PIL import Image
 
 from splatmill.schema import TrainOptions
-from splatmill_worker.capture import posed_scene
 from splatmill_worker.errors import Refusal, SfmFailed
 from splatmill_worker.images.prepare import prepare
+from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.scene import Lens, Scene
 from splatmill_worker.sfm import SfmOptions, reconstruct
 from splatmill_worker.sfm.posed import camera_models

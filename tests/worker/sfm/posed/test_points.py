@@ -15,8 +15,8 @@ from PIL import Image
 
 from splatmill.schema import TrainOptions
 from splatmill_worker import synthetic
-from splatmill_worker.capture import posed_scene
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.scene import Camera, Float, Lens, Scene, Source, View, viewmat_of
 from splatmill_worker.sfm import posed, stereo
 from splatmill_worker.sfm.matching.overlap import by_overlap

@@ -13,9 +13,9 @@ from PIL import Image
 
 from splatmill.schema import TrainOptions
 from splatmill_worker import synthetic
-from splatmill_worker.capture import posed_scene
 from splatmill_worker.errors import Cancelled, UnusablePicture
 from splatmill_worker.images.load import load_views
+from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.scene import Scene, View
 from splatmill_worker.sfm import stereo
 from splatmill_worker.sfm.stereo.plane_sweep import GreyView, sweep

@@ -1,6 +1,6 @@
 """Proves that a stored plan is read back for the same options only, and that one of another version is not.
 
-Does not prove that the pipeline resumes with it; tests/worker/test_pipeline.py does.
+Does not prove that the pipeline resumes with it; tests/worker/pipeline/test_job.py does.
 """
 
 from __future__ import annotations

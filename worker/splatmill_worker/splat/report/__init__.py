@@ -1,1 +1,1 @@
-"""The files of a finished training: the model, its cameras, the report and the progress video."""
+"""The files of a finished training: the model, its cameras and the report."""

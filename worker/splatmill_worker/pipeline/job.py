@@ -1,4 +1,4 @@
-"""The whole path of a capture: photos -> cameras -> plan -> training -> evaluation -> files."""
+"""One job: each stage in turn, from the photos of a capture to the files of its model."""
 
 from __future__ import annotations
 
@@ -22,12 +22,22 @@ from splatmill.schema import (
     TrainOptions,
 )
 from splatmill_worker import memory
-from splatmill_worker.capture import choose_kernels, honest_split, posed_scene, start_model_path
 from splatmill_worker.errors import Cancelled, Refusal
-from splatmill_worker.events import Emit, TrainingEvents, progress_events
 from splatmill_worker.images.load import load_views
 from splatmill_worker.kernels.gpu.device import absence, describe
-from splatmill_worker.live import LiveCameras, LiveScene, Looks, Onlookers, placement_of, store_placement
+from splatmill_worker.pipeline.capture import choose_kernels, honest_split, posed_scene, start_model_path
+from splatmill_worker.pipeline.events import Emit, TrainingEvents, progress_events
+from splatmill_worker.pipeline.live import (
+    LiveCameras,
+    LiveScene,
+    Looks,
+    Onlookers,
+    placement_of,
+    store_placement,
+)
+from splatmill_worker.pipeline.progress_film import ProgressFilm
+from splatmill_worker.pipeline.stage_times import Stages
+from splatmill_worker.pipeline.time_lapse import TimeLapse
 from splatmill_worker.scene import Normalization, Scene, View, omissions
 from splatmill_worker.sfm.posed.written import write_cameras
 from splatmill_worker.splat.engine.open import open_engine
@@ -42,9 +52,7 @@ from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.plan_file import read_plan, write_plan
 from splatmill_worker.splat.plan.probe import probe
 from splatmill_worker.splat.report.export import ExportWorld, export
-from splatmill_worker.splat.report.progress_film import ProgressFilm
 from splatmill_worker.splat.report.report import FinishedTraining, PlannedScene, write_report
-from splatmill_worker.splat.report.stages import Stages
 from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS, sample_frusta
 from splatmill_worker.splat.start.given_model import LEAST_ASSESSED, GivenModel, assess, read_given_model
 from splatmill_worker.splat.start.hull import Hull, NoHull, at_first, visual_hull
@@ -55,7 +63,6 @@ from splatmill_worker.splat.train.loop import Hooks, Trained, train
 from splatmill_worker.splat.train.renderer import renderer
 from splatmill_worker.splat.train.snapshot import Snapshot
 from splatmill_worker.splat.views import TrainingView
-from splatmill_worker.time_lapse import TimeLapse
 
 EXTENT = 1.1
 """Scene extent, which scales the learning rate of the positions, in units of the training world: the farthest camera is

@@ -14,7 +14,8 @@ import pytest
 import torch
 
 from splatmill.schema import CamerasEvent, Event, ModelCameras, Placement, SnapshotEvent, TrainOptions
-from splatmill_worker import live, pipeline, sfm, synthetic
+from splatmill_worker import pipeline, sfm, synthetic
+from splatmill_worker.pipeline import live
 from splatmill_worker.scene import Camera, Normalization, Scene, View
 from splatmill_worker.splat.formats import compressed_ply
 from splatmill_worker.splat.gaussians import Gaussians

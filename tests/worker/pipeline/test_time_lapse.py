@@ -17,12 +17,13 @@ import pytest
 import torch
 
 from splatmill.schema import TrainOptions
-from splatmill_worker import pipeline, time_lapse
+from splatmill_worker import pipeline
+from splatmill_worker.pipeline import time_lapse
+from splatmill_worker.pipeline.time_lapse import MOST, SHARE, TAKEN_AT, TimeLapse
 from splatmill_worker.scene import Normalization
 from splatmill_worker.splat.formats import compressed_ply
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.report.export import ExportWorld
-from splatmill_worker.time_lapse import MOST, SHARE, TAKEN_AT, TimeLapse
 from tests.support import still_life
 
 WORLD = ExportWorld(Normalization(2.0, np.array([1.0, 0.0, 0.0])), np.zeros(3))

@@ -13,7 +13,7 @@ import torch
 
 from splatmill.files import atomic_write
 from splatmill.schema import TIME_LAPSE
-from splatmill_worker.live import most_covering
+from splatmill_worker.pipeline.live import most_covering
 from splatmill_worker.splat.engine.open import gaussians_of
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.formats import compressed_ply

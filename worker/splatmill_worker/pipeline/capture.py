@@ -16,7 +16,7 @@ from splatmill_worker.images.copies import warning as copies_warning
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.images.prepare import names_remark
 from splatmill_worker.kernels.gpu.device import absence
-from splatmill_worker.near_copies import near_copies, same_photos
+from splatmill_worker.pipeline.near_copies import near_copies, same_photos
 from splatmill_worker.scene import Scene, View, split
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.placed import PlacingObserver
