@@ -17,10 +17,10 @@ from splatmill.schema.photos import (
     UNREAD_KINDS,
     VIDEO_FORMATS,
 )
-from splatmill_worker.colmap_files import MODELS
 from splatmill_worker.images import archive, guarded, mask_levels, overlay, prepare, zip_names
 from splatmill_worker.images.colors import PRIMARIES, TRANSFERS
 from splatmill_worker.images.lens import PINHOLE_MODELS
+from splatmill_worker.readers.colmap_files import MODELS
 from splatmill_worker.scene import MIN_SHOWN
 from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam, triangulation
 from splatmill_worker.sfm.posed.camera_models import is_panoramic

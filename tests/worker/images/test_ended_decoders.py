@@ -21,7 +21,7 @@ import pytest
 from PIL import Image
 
 from splatmill.schema import TrainOptions
-from splatmill_worker import pipeline, reader_memory, synthetic
+from splatmill_worker import pipeline, synthetic
 from splatmill_worker.errors import Cancelled, DecoderNotStarted, Refusal, UnusablePicture, UnusableVideo
 from splatmill_worker.images import decode as here
 from splatmill_worker.images import decoders
@@ -31,6 +31,7 @@ from splatmill_worker.images.decoder_process import Call, DecoderProcess
 from splatmill_worker.images.decoders import STARTS, Decoders, confined
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.images.turns import Turns
+from splatmill_worker.readers import reader_memory
 from splatmill_worker.service.problems import is_transient, keeps_progress, problem_of
 from splatmill_worker.sfm import posed
 from tests.support.acting import acts

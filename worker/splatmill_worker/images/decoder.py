@@ -49,8 +49,8 @@ def main() -> None:
         return
     held = confine([*map(Path, first["read"]), *program_files()], int(first["memory"]))
     # Imported after that: their libraries start threads, and confinement must come before these.
-    from splatmill_worker import reader_memory
     from splatmill_worker.images import guarded, messages
+    from splatmill_worker.readers import reader_memory
 
     reader_memory.set_limit(int(first["limit"]))
     guarded.share_room(int(first["pixels"]), int(first["room"]))

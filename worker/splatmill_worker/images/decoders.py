@@ -24,7 +24,7 @@ from pydantic import Field, TypeAdapter
 
 from splatmill.schema import format_bytes
 from splatmill.schema.photos import MAX_PHOTO_PIXELS
-from splatmill_worker import memory, reader_memory, settings
+from splatmill_worker import memory, settings
 from splatmill_worker.errors import DecoderNotStarted, UnusablePicture, UnusableVideo
 from splatmill_worker.images import decode as decode_here
 from splatmill_worker.images import examine as examine_here
@@ -40,6 +40,7 @@ from splatmill_worker.images.decoder_process import (
 from splatmill_worker.images.ended_files import EndedFiles
 from splatmill_worker.images.examine import Picture
 from splatmill_worker.images.turns import Turns
+from splatmill_worker.readers import reader_memory
 
 PROCESSES = min(os.cpu_count() or 1, 8)
 """Decoding processes of an attempt."""

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatmill_worker import colmap_files, point_file
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.readers import colmap_files, point_file
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.posed import model_files
 from tests.support.hostile import model_bombs, models, pictures
@@ -116,7 +116,7 @@ def test_points_and_transforms_that_would_fill_the_memory_are_refused(tmp_path: 
     write(tmp_path / "small.ply", models.ply(3))
     write(tmp_path / "points.ply", model_bombs.ply_of_bytes(1_000_000))
     ((size, said),) = peaks(
-        "splatmill_worker.point_file:read", [tmp_path / "small.ply", tmp_path / "points.ply"]
+        "splatmill_worker.readers.point_file:read", [tmp_path / "small.ply", tmp_path / "points.ply"]
     )
     assert said == "read"
     assert size < point_file.POINT_BYTES * 1_000_000

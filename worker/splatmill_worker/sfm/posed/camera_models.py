@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from splatmill_worker.colmap_files import MODELS
 from splatmill_worker.images.prepare import CUT_PANORAMAS
+from splatmill_worker.readers.colmap_files import MODELS
 
 PERSPECTIVE = ("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Names of camera_model in transforms.json for a pinhole with the distortion k1 to k6, p1 and p2."""

@@ -18,10 +18,10 @@ import numpy.typing as npt
 
 from splatmill.data_sets import keyframes
 from splatmill.schema.quantities import format_bytes, listed
-from splatmill_worker import point_file
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.images import decoders
+from splatmill_worker.readers import point_file
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed import parts, polycam
 from splatmill_worker.sfm.posed.camera_models import UnreadModel, is_fisheye

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from splatmill.files import replacing
 from splatmill_worker.errors import ModelUnreadable
-from splatmill_worker.reader_memory import check, check_gaussians
+from splatmill_worker.readers.reader_memory import check, check_gaussians
 from splatmill_worker.splat.formats.contents import (
     NO_OFFSET,
     Contents,

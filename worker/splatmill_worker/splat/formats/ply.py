@@ -9,9 +9,9 @@ import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from splatmill.files import replacing
-from splatmill_worker import ply_document
 from splatmill_worker.errors import ModelUnreadable
-from splatmill_worker.reader_memory import check_gaussians
+from splatmill_worker.readers import ply_document
+from splatmill_worker.readers.reader_memory import check_gaussians
 from splatmill_worker.splat.formats import ply_columns, ply_comments
 from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, finite, unit, visible
 from splatmill_worker.splat.gaussians import Gaussians

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from splatmill_worker.errors import ModelUnreadable
-from splatmill_worker.reader_memory import check_gaussians
+from splatmill_worker.readers.reader_memory import check_gaussians
 from splatmill_worker.splat.formats.contents import Contents, finite, logits
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 

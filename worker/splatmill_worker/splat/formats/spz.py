@@ -20,7 +20,7 @@ from torch import Tensor
 
 from splatmill.files import atomic_write
 from splatmill_worker.errors import ModelUnreadable
-from splatmill_worker.reader_memory import check, check_gaussians
+from splatmill_worker.readers.reader_memory import check, check_gaussians
 from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, finite, logits, unit, visible
 from splatmill_worker.splat.formats.expansion import Gunzip, unzstd
 from splatmill_worker.splat.formats.frames import turned_about_x

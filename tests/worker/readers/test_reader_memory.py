@@ -13,7 +13,7 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
-from splatmill_worker import reader_memory
+from splatmill_worker.readers import reader_memory
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import Gaussians
 from tests.support.gaussians import some_gaussians

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from plyfile import PlyElement, PlyParseError
 
-from splatmill_worker import ply_document, reader_memory
+from splatmill_worker.readers import ply_document, reader_memory
 from splatmill_worker.wording import plain
 
 POINT_BYTES = 150

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatmill_worker import point_file
 from splatmill_worker.errors import ModelUnreadable
+from splatmill_worker.readers import point_file
 from splatmill_worker.splat.formats import ply, registry
 
 NAMES = ["x", "y", "z", *ply.property_names(0)[6:]]

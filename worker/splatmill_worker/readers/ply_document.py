@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from plyfile import PlyData, PlyElement
 
-from splatmill_worker import ply_header, reader_memory
-from splatmill_worker.ply_header import TYPES, Element, Header, Property
+from splatmill_worker.readers import ply_header, reader_memory
+from splatmill_worker.readers.ply_header import TYPES, Element, Header, Property
 
 _CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I"}
 """The codes of `struct` for lengths of lists."""

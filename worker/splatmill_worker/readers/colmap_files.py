@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from splatmill_worker import reader_memory
+from splatmill_worker.readers import reader_memory
 from splatmill_worker.wording import plain
 
 STEMS = ("cameras", "images", "points3D")
