@@ -78,7 +78,7 @@ def test_every_backend_has_the_same_stems(backend: str):
         ("splatmill_worker.kernels", {"triton", "pycolmap", "redis", "splatmill"}),
         # The processes that decode photos import this: each attempt starts some, which know neither Redis nor messages.
         (
-            "splatmill_worker.images.video",
+            "splatmill_worker.images.video.video",
             {"torch", "pycolmap", "redis", "rq", "obstore", "httpx", "pydantic"},
         ),
     ],

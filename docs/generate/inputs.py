@@ -17,7 +17,8 @@ from splatmill.schema.photos import (
     UNREAD_KINDS,
     VIDEO_FORMATS,
 )
-from splatmill_worker.images import archive, guarded, mask_levels, overlay, prepare, zip_names
+from splatmill_worker.images import guarded, mask_levels, overlay, prepare
+from splatmill_worker.images.archives import archive, zip_names
 from splatmill_worker.images.colors import PRIMARIES, TRANSFERS
 from splatmill_worker.images.lens import PINHOLE_MODELS
 from splatmill_worker.readers.colmap_files import MODELS

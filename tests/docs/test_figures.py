@@ -34,7 +34,9 @@ from splatmill_server.space import usage
 from splatmill_server.up import supervisor
 from splatmill_worker import memory as worker_memory
 from splatmill_worker import settings
-from splatmill_worker.images import archive, guarded, video
+from splatmill_worker.images import guarded
+from splatmill_worker.images.archives import archive
+from splatmill_worker.images.video import video
 from splatmill_worker.pipeline import live, time_lapse
 from splatmill_worker.render_service import edit
 from splatmill_worker.service import mirror, redis_patience, rq_worker

@@ -36,7 +36,7 @@ TRAIN = [PYTHON, "-m", "splatmill_worker", "train", "--stop-grace", "15"]
         ([PYTHON, "-m", "splatmill_server.up.api", "5"], UP, "supervisor", "API"),
         (TRAIN, UP, "supervisor", "worker"),
         (TRAIN, TRAIN, "worker", "trainer"),
-        ([PYTHON, "-I", "-m", "splatmill_worker.images.decoder"], TRAIN, "trainer", "decoder"),
+        ([PYTHON, "-I", "-m", "splatmill_worker.images.decoding.decoder"], TRAIN, "trainer", "decoder"),
         ([PYTHON, "-m", "splatmill_worker", "renderer", "--uds", "x"], UP, "supervisor", "renderer"),
         # What no list has is called by its own name.
         ([PYTHON, "-m", "some.module", "--flag"], TRAIN, "trainer", "some.module"),

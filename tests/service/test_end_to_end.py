@@ -164,7 +164,7 @@ def test_cancel_during_reconstruction_takes_under_two_seconds(
         return [child.pid for child in up.tree() if child.ppid() == up.worker] if busy else []
 
     processes = wait_for(inside, 60)
-    decoders = [child for child in up.tree() if "splatmill_worker.images.decoder" in child.cmdline()]
+    decoders = [child for child in up.tree() if "splatmill_worker.images.decoding.decoder" in child.cmdline()]
     assert decoders
     assert not {"REDIS_URL", "SPLATMILL_API_KEY"} & {name for child in decoders for name in child.environ()}
     began = time.monotonic()

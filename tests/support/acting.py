@@ -8,7 +8,7 @@ from types import ModuleType
 
 import pytest
 
-from splatmill_worker.images import decoder_process
+from splatmill_worker.images.decoding import decoder_process
 
 _PROGRAM = """
 import importlib.util, sys
@@ -16,7 +16,7 @@ spec = importlib.util.spec_from_file_location("splatmill_worker.acts", {path!r})
 acts = importlib.util.module_from_spec(spec)
 sys.modules["splatmill_worker.acts"] = acts
 spec.loader.exec_module(acts)
-from splatmill_worker.images import decoder
+from splatmill_worker.images.decoding import decoder
 decoder.main()
 """
 

@@ -21,9 +21,9 @@ import pytest
 
 from splatmill_worker import seccomp
 from splatmill_worker.errors import UnusablePicture
-from splatmill_worker.images import decoders
-from splatmill_worker.images.decoder import program_files
-from splatmill_worker.images.decoders import Decoders, confined
+from splatmill_worker.images.decoding import decoders
+from splatmill_worker.images.decoding.decoder import program_files
+from splatmill_worker.images.decoding.decoders import Decoders, confined
 from tests.support import forbidden_acts
 from tests.support.acting import acts
 
@@ -157,7 +157,11 @@ def test_the_filter_fits_the_kernel_on_each_architecture(machine: str) -> None:
 def test_the_decoding_program_confines_itself_before_it_loads_a_library() -> None:
     """Threads that run already would not be limited to files."""
     loaded = subprocess.run(
-        [sys.executable, "-c", "import sys, splatmill_worker.images.decoder as d; print(*sys.modules)"],
+        [
+            sys.executable,
+            "-c",
+            "import sys, splatmill_worker.images.decoding.decoder as d; print(*sys.modules)",
+        ],
         capture_output=True,
         text=True,
         check=True,

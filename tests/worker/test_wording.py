@@ -18,7 +18,8 @@ import pytest
 from PIL import Image
 
 from splatmill_worker.errors import Refusal, WorkerError
-from splatmill_worker.images import archive, guarded, signatures
+from splatmill_worker.images import guarded, signatures
+from splatmill_worker.images.archives import archive
 from splatmill_worker.images.examine import examine
 from splatmill_worker.splat.formats import registry
 from tests.support.posed_sets import frames, loaded, model, photos

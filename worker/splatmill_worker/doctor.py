@@ -170,7 +170,7 @@ def _disk() -> Iterator[Finding]:
 
 
 def _decoders() -> Iterator[Finding]:
-    from splatmill_worker.images.decoders import confined
+    from splatmill_worker.images.decoding.decoders import confined
 
     with confined([]) as decoders:
         lacking = decoders.lacking()

@@ -31,7 +31,7 @@ from rq.utils import now
 from _fleet import pipeline
 from splatmill.backplane.connection import connect
 from splatmill.backplane.queue import entries
-from splatmill_worker.images import decoders
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.service.lock import JobLock
 from splatmill_worker.service.process_exit import ProcessExit
 from splatmill_worker.service.rq_worker import AttemptWorker

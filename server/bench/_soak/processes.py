@@ -24,7 +24,7 @@ _WORDS = {
     "splatmill_server.up.api": "API",
     "splatmill_worker train": WORKER,
     "splatmill_worker renderer": "renderer",
-    "splatmill_worker.images.decoder": "decoder",
+    "splatmill_worker.images.decoding.decoder": "decoder",
 }
 """Shorter names of programs. A program that is not among these is called by its own name."""
 

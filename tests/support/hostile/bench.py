@@ -22,7 +22,7 @@ from splatmill.backplane.connection import connect
 from splatmill.schema import TrainOptions
 from splatmill_server.base.settings import Settings
 from splatmill_worker.errors import WorkerError
-from splatmill_worker.images import decoders
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.scene import Normalization

@@ -16,9 +16,9 @@ import pytest
 
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import decode
-from splatmill_worker.images.decoder import LENGTHS
-from splatmill_worker.images.decoder_process import Call
-from splatmill_worker.images.decoders import Decoders
+from splatmill_worker.images.decoding.decoder import LENGTHS
+from splatmill_worker.images.decoding.decoder_process import Call
+from splatmill_worker.images.decoding.decoders import Decoders
 from splatmill_worker.seccomp import ARCHITECTURES
 from tests.support.acting import acts
 from tests.support.hostile.bench import Answer, Bench

@@ -16,7 +16,9 @@ from PIL import Image
 
 from splatmill_worker import memory
 from splatmill_worker.errors import Refusal, UnusablePicture, UnusableVideo
-from splatmill_worker.images import archive, decode, decoders, guarded
+from splatmill_worker.images import decode, guarded
+from splatmill_worker.images.archives import archive
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.service.problems import problem_of
 from tests.support.hostile import archives, pictures, videos

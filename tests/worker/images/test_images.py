@@ -17,8 +17,9 @@ import pytest
 from PIL import Image
 
 from splatmill_worker.errors import CaptureIncomplete
-from splatmill_worker.images import archive, decode, lens
+from splatmill_worker.images import decode, lens
 from splatmill_worker.images import prepare as prepare_module
+from splatmill_worker.images.archives import archive
 from splatmill_worker.images.load import load_view
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.scene import Camera, Lens, View

@@ -22,11 +22,22 @@ import pytest
 from PIL import Image, ImageCms
 
 from splatmill_worker.errors import UnusablePicture
-from splatmill_worker.images import decode, decoders, examine
+from splatmill_worker.images import decode, examine
 from splatmill_worker.images.colors import Colors, _rgb_to_xyz, _to_srgb
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.sfm import posed
-from tests.worker.images.test_video_frame import KR_KB, TO_BT2020, TO_P3, chart, gamma, hlg, linear, pq, yuv
+from tests.worker.images.video.test_video_frame import (
+    KR_KB,
+    TO_BT2020,
+    TO_P3,
+    chart,
+    gamma,
+    hlg,
+    linear,
+    pq,
+    yuv,
+)
 
 Values = npt.NDArray[np.float64]
 

@@ -27,7 +27,7 @@ from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import JobState, Role, StateEvent
 from splatmill_worker.errors import QuotaReached
-from splatmill_worker.images import archive, unpacked_room
+from splatmill_worker.images.archives import archive, unpacked_room
 from splatmill_worker.service.abandoned_folders import remove_abandoned, tidy
 from splatmill_worker.service.attempt import Attempt
 from splatmill_worker.service.job_folder import JobFolder
@@ -207,7 +207,8 @@ def test_maintenance_removes_what_dead_workers_have_left_and_counts_the_rest(
 UNPACKING = '''
 import time
 from types import SimpleNamespace
-from splatmill_worker.images import archive, prepare
+from splatmill_worker.images import prepare
+from splatmill_worker.images.archives import archive
 
 def run(capture, workdir, options, emit, cancelled, *, onlookers=None):
     """Unpack the zip of the capture, and wait for ever."""

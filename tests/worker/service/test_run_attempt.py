@@ -23,7 +23,7 @@ from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import Role
 from splatmill_worker.errors import UnusablePicture
-from splatmill_worker.images import decoders
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.service import run_attempt as module
 from splatmill_worker.service.attempt import Attempt, start_attempt
 from splatmill_worker.service.command import _pipeline

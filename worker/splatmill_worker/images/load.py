@@ -18,7 +18,7 @@ from PIL import Image
 
 from splatmill_worker.images import lens as lenses
 from splatmill_worker.images.decode import Pixels
-from splatmill_worker.images.decoders import decode
+from splatmill_worker.images.decoding.decoders import decode
 from splatmill_worker.images.masks import shown_part
 from splatmill_worker.scene import MIN_SHOWN, Camera, Lens, View
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from splatmill.schema.quantities import counted, listed
 from splatmill_worker.errors import Refusal, UnusablePicture
-from splatmill_worker.images import decoders
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.scene import MIN_SHOWN
 
 MAX_HIDDEN = 0.5

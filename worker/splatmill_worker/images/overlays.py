@@ -13,8 +13,8 @@ import numpy.typing as npt
 from PIL import Image
 
 from splatmill.files import replacing
-from splatmill_worker.images import decoders
 from splatmill_worker.images.copies import SMALL_SIDE, small_grey
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.load import training_size
 from splatmill_worker.images.masks import shown_part
 from splatmill_worker.images.overlay import MIN_PHOTOS, still

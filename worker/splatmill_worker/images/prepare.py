@@ -19,18 +19,10 @@ from splatmill.schema.outputs import own_outputs
 from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES, unread, unread_kind
 from splatmill.schema.quantities import counted
 from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
-from splatmill_worker.images import (
-    archive,
-    copies,
-    decoders,
-    exif,
-    mask_levels,
-    overlays,
-    photo_colors,
-    transparency,
-    unpacked_room,
-)
+from splatmill_worker.images import copies, exif, mask_levels, overlays, photo_colors, transparency
+from splatmill_worker.images.archives import archive, unpacked_room
 from splatmill_worker.images.copies import SmallPicture
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.masks import masks_under, unfit
 from splatmill_worker.scene import MIN_SHOWN, Overlay
 from splatmill_worker.wording import plain

@@ -10,13 +10,13 @@ from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
-from splatmill_worker.images import decoders
 from splatmill_worker.images.copies import SMALL_SIDE, SmallPicture, is_copy, small_grey
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.scene import Float, Scene, View, looked_at
 
 PARALLAX = 0.003
 """Median shift of the scene between the places of two photos up to which they are near copies, as a share of the longer
-side: a third of the least spacing of the frames that are taken of a video (`images.video.STILL`), and of what lies
+side: a third of the least spacing of the frames that are taken of a video (`video.STILL`), and of what lies
 between any two photos of captures around a thing."""
 
 OVERLAP = 0.8

@@ -1,4 +1,4 @@
-"""Reads the files of a COLMAP model into arrays, in a process of its own: see `images.decoders.call_once`.
+"""Reads the files of a COLMAP model into arrays, in a process of its own: see `images.decoding.decoders.call_once`.
 
 COLMAP's own readers believe the counts in binary files, and allocate for them. They also keep the features of all
 photos, which nothing here uses. https://colmap.github.io/format.html describes the files.

@@ -1,4 +1,4 @@
-"""Reads the points of a `.ply` file into arrays, in a process of its own: see `images.decoders.call_once`."""
+"""Reads the points of a `.ply` file into arrays, in a process of its own: see `images.decoding.decoders.call_once`."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from splatmill.backplane.storage.records import reason
 from splatmill.data_sets import TwoDataSets
 from splatmill.schema import EditModel, ModelCameras
 from splatmill_worker.errors import ModelUnreadable, Refusal, StartUnusable
-from splatmill_worker.images.archive import UnsafeArchive, unpack
+from splatmill_worker.images.archives.archive import UnsafeArchive, unpack
 from splatmill_worker.images.load import load_views
 from splatmill_worker.render_service.edit import kept
 from splatmill_worker.render_service.encoding import camera_of

@@ -33,7 +33,7 @@ START, FILM, CHECKPOINTS, SNAPSHOTS = "start.ply", "film", "checkpoints", TIME_L
 of the time-lapse."""
 
 ENDED = "ended_decoders.json"
-"""Name in the run folder of the list of files that are not opened again (`images.decoders`)."""
+"""Name in the run folder of the list of files that are not opened again (`images.decoding.decoders`)."""
 
 _CAMERAS = "sfm"
 

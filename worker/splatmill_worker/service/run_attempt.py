@@ -235,7 +235,8 @@ def _train(
     live = LiveView(attempt, outbox.put)
     try:
         # Not imported by the worker that forks this process: numpy and the decoders start threads.
-        from splatmill_worker.images import decoders, unpacked_room
+        from splatmill_worker.images.archives import unpacked_room
+        from splatmill_worker.images.decoding import decoders
 
         folder.run.mkdir(parents=True, exist_ok=True)
         with (

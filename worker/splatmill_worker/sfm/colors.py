@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.images.decoders import decode
+from splatmill_worker.images.decoding.decoders import decode
 from splatmill_worker.scene import View
 
 SIDE = 320

@@ -16,7 +16,7 @@ from PIL import Image
 
 from splatmill.files import replacing
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.images.decoders import decode
+from splatmill_worker.images.decoding.decoders import decode
 from splatmill_worker.images.load import training_size
 from splatmill_worker.images.masks import shown_part
 from splatmill_worker.images.prepare import UsablePhoto

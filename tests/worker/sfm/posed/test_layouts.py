@@ -13,7 +13,7 @@ from splatmill.data_sets import TwoDataSets
 from splatmill.schema import TrainOptions
 from splatmill.transfer.local_capture import find_files
 from splatmill_worker.errors import Refusal
-from splatmill_worker.images.archive import UnsafeArchive, unpack
+from splatmill_worker.images.archives.archive import UnsafeArchive, unpack
 from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.posed import zipped

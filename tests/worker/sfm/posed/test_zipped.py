@@ -14,7 +14,7 @@ from PIL import Image
 
 from splatmill.schema import TrainOptions
 from splatmill_worker.errors import Refusal
-from splatmill_worker.images.archive import Allowance
+from splatmill_worker.images.archives.archive import Allowance
 from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.sfm.posed import zipped
 from tests.support import still_life

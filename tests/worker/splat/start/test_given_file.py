@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from splatmill_worker.errors import StartUnusable, WorkerError
-from splatmill_worker.images import decoders
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.scene import Normalization
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import Gaussians
@@ -40,7 +40,11 @@ def given(path: Path, most: int = 10**6) -> tuple[Gaussians, int]:
 def children() -> list[int]:
     """The ids of this process's decoding processes."""
     found = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
-    return [pid for pid in map(int, found) if b"images.decoder" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    return [
+        pid
+        for pid in map(int, found)
+        if b"images.decoding.decoder" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    ]
 
 
 @pytest.fixture

@@ -13,8 +13,9 @@ from splatmill.data_sets import MODEL_FILES, Cameras, find_cameras, keyframes, w
 from splatmill.schema.photos import PHOTO_FORMATS, PHOTO_SUFFIXES
 from splatmill.schema.quantities import listed
 from splatmill_worker.errors import UnusablePicture
-from splatmill_worker.images import decoders, lens, mask_levels, transparency
-from splatmill_worker.images.decoders import mask_fault, photo_colors
+from splatmill_worker.images import lens, mask_levels, transparency
+from splatmill_worker.images.decoding import decoders
+from splatmill_worker.images.decoding.decoders import mask_fault, photo_colors
 from splatmill_worker.images.masks import unfit
 from splatmill_worker.images.photo_colors import sentences
 from splatmill_worker.images.prepare import names_remark

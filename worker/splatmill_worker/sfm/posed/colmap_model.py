@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import UnusablePicture
-from splatmill_worker.images import decoders
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.lens import lens_of, pinhole, without_distortion
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
 from splatmill_worker.sfm.posed import model_files

@@ -18,7 +18,7 @@ from splatmill.schema.masks import masks_beside, paired, without_mask_folder
 from splatmill.schema.photos import PHOTO_SUFFIXES
 from splatmill.schema.quantities import counted
 from splatmill_worker.errors import Refusal, UnusablePicture
-from splatmill_worker.images import decoders
+from splatmill_worker.images.decoding import decoders
 
 SIZED = re.compile(r"(images|input|rgb)(_\d+)?", re.ASCII | re.IGNORECASE)
 """Folders in which tools put the photos of a data set, and those reduced so many times."""

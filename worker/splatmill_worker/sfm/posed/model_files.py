@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import Refusal
-from splatmill_worker.images import decoders
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.readers import colmap_files
 from splatmill_worker.readers.colmap_files import Arrays
 from splatmill_worker.sfm.posed import camera_models

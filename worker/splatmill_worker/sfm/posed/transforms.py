@@ -20,7 +20,7 @@ from splatmill.data_sets import keyframes
 from splatmill.schema.quantities import format_bytes, listed
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import Refusal, UnusablePicture
-from splatmill_worker.images import decoders
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.readers import point_file
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed import parts, polycam

@@ -9,7 +9,7 @@ from splatmill.data_sets import MAX_DEPTH, TwoDataSets
 from splatmill.schema.formats import is_model_file
 from splatmill.schema.photos import ARCHIVE_SUFFIXES
 from splatmill_worker.images import prepare
-from splatmill_worker.images.archive import REMARK, Allowance
+from splatmill_worker.images.archives.archive import REMARK, Allowance
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.sfm.posed.capture import find
 

@@ -25,7 +25,7 @@ from torch import Tensor
 from splatmill.files import replacing
 from splatmill_worker.errors import ModelUnreadable, UnusablePicture
 from splatmill_worker.images import guarded
-from splatmill_worker.images.archive import DAMAGED
+from splatmill_worker.images.archives.archive import DAMAGED
 from splatmill_worker.readers.reader_memory import check_gaussians
 from splatmill_worker.splat.formats import palette, sog_files
 from splatmill_worker.splat.formats.contents import (

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import IO, Protocol, cast
 
-from splatmill_worker.images.archive import BoundedReads
+from splatmill_worker.images.archives.archive import BoundedReads
 
 MAX_LIST_BYTES = 2**17
 """Bytes of an archive's list of its members, of which a model has up to eight; `zipfile` reads half as many to find the

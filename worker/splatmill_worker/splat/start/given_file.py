@@ -1,4 +1,4 @@
-"""Reads the file of a given model into arrays, in a process of its own: see `images.decoders.call_once`."""
+"""Reads the file of a given model into arrays, in a process of its own: see `images.decoding.decoders.call_once`."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.errors import ModelUnreadable, Refusal, StartUnusable
-from splatmill_worker.images import decoders
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.scene import Normalization
 from splatmill_worker.splat.evaluate import benchmark_background, compare
 from splatmill_worker.splat.gaussians import Gaussians

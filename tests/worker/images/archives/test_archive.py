@@ -17,8 +17,11 @@ from pathlib import Path
 import pytest
 
 from splatmill_worker.errors import Refusal, UnusableVideo
-from splatmill_worker.images import archive, decoders, prepare, video
-from splatmill_worker.images.archive import Allowance, UnsafeArchive, unpack
+from splatmill_worker.images import prepare
+from splatmill_worker.images.archives import archive
+from splatmill_worker.images.archives.archive import Allowance, UnsafeArchive, unpack
+from splatmill_worker.images.decoding import decoders
+from splatmill_worker.images.video import video
 from tests.support import unmarked_zip
 from tests.support.hostile import archives, pictures, videos
 

@@ -19,9 +19,10 @@ import numpy as np
 from PIL import Image
 
 from splatmill_worker.errors import Cancelled, UnusableVideo
-from splatmill_worker.images import guarded, video_frame
+from splatmill_worker.images import guarded
 from splatmill_worker.images.flow import Grey, displacement
-from splatmill_worker.images.video_times import Passed
+from splatmill_worker.images.video import video_frame
+from splatmill_worker.images.video.video_times import Passed
 from splatmill_worker.wording import plain
 
 SHARPNESS_SIDE = 480

@@ -16,7 +16,7 @@ from PIL import Image
 
 from splatmill_worker.images.colors import SRGB, Colors, srgb_table
 from splatmill_worker.images.flow import Grey
-from splatmill_worker.images.video_tags import Tags, tags_of
+from splatmill_worker.images.video.video_tags import Tags, tags_of
 
 MAX_ASPECT = 4
 """Largest aspect ratio of a pixel, or of its inverse, that is followed. Those of broadcasts are at most 32:11 (H.264,

@@ -24,13 +24,13 @@ from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline, synthetic
 from splatmill_worker.errors import Cancelled, DecoderNotStarted, Refusal, UnusablePicture, UnusableVideo
 from splatmill_worker.images import decode as here
-from splatmill_worker.images import decoders
-from splatmill_worker.images import video as video_here
-from splatmill_worker.images.decoder import LENGTHS
-from splatmill_worker.images.decoder_process import Call, DecoderProcess
-from splatmill_worker.images.decoders import STARTS, Decoders, confined
+from splatmill_worker.images.decoding import decoders
+from splatmill_worker.images.decoding.decoder import LENGTHS
+from splatmill_worker.images.decoding.decoder_process import Call, DecoderProcess
+from splatmill_worker.images.decoding.decoders import STARTS, Decoders, confined
+from splatmill_worker.images.decoding.turns import Turns
 from splatmill_worker.images.prepare import prepare
-from splatmill_worker.images.turns import Turns
+from splatmill_worker.images.video import video as video_here
 from splatmill_worker.readers import reader_memory
 from splatmill_worker.service.problems import is_transient, keeps_progress, problem_of
 from splatmill_worker.sfm import posed
@@ -355,14 +355,15 @@ def test_a_process_that_never_starts_says_why_and_the_job_is_tried_again(
 
 def test_why_it_does_not_start_is_its_last_line(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "splatmill_worker.images.decoder_process._COMMAND", (sys.executable, "-c", "import no_such_part")
+        "splatmill_worker.images.decoding.decoder_process._COMMAND",
+        (sys.executable, "-c", "import no_such_part"),
     )
     with (
         confined([photos]),
         pytest.raises(DecoderNotStarted, match="exit status 1: ModuleNotFoundError: No module named"),
     ):
         decoders.decode(photos / "a.png")
-    monkeypatch.setattr("splatmill_worker.images.decoder_process._COMMAND", ("/no/such/program",))
+    monkeypatch.setattr("splatmill_worker.images.decoding.decoder_process._COMMAND", ("/no/such/program",))
     with confined([photos]), pytest.raises(DecoderNotStarted, match="No such file"):
         decoders.decode(photos / "a.png")
 
@@ -378,9 +379,11 @@ def test_a_process_that_is_not_ready_in_time_is_started_once(
         starts.append(process)
         return original(process)
 
-    program = "import sys; sys.stdin.read()  # images.decoder"
-    monkeypatch.setattr("splatmill_worker.images.decoder_process._COMMAND", (sys.executable, "-c", program))
-    monkeypatch.setattr("splatmill_worker.images.decoder_process.PICTURE_SECONDS", 0.5)
+    program = "import sys; sys.stdin.read()  # images.decoding.decoder"
+    monkeypatch.setattr(
+        "splatmill_worker.images.decoding.decoder_process._COMMAND", (sys.executable, "-c", program)
+    )
+    monkeypatch.setattr("splatmill_worker.images.decoding.decoder_process.PICTURE_SECONDS", 0.5)
     monkeypatch.setattr(DecoderProcess, "ready", ready)
     with confined([photos]):
         with pytest.raises(DecoderNotStarted, match="it was not ready after"):
@@ -541,8 +544,10 @@ def test_what_a_function_raises_costs_no_process(photos: Path, confinement: Deco
 def test_a_first_answer_that_is_not_valid_is_no_fault_of_the_file(
     photos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    program = "import os, sys; os.write(1, b'x' * 64); sys.stdin.read()  # images.decoder"
-    monkeypatch.setattr("splatmill_worker.images.decoder_process._COMMAND", (sys.executable, "-c", program))
+    program = "import os, sys; os.write(1, b'x' * 64); sys.stdin.read()  # images.decoding.decoder"
+    monkeypatch.setattr(
+        "splatmill_worker.images.decoding.decoder_process._COMMAND", (sys.executable, "-c", program)
+    )
     with confined([photos]):
         with pytest.raises(DecoderNotStarted, match="its first answer is not valid"):
             decoders.decode(photos / "a.png")
@@ -560,4 +565,8 @@ def test_what_a_decoder_says_of_a_file_is_cut(photos: Path, monkeypatch: pytest.
 def children() -> list[int]:
     """The ids of this process's decoding processes."""
     found = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
-    return [pid for pid in map(int, found) if b"images.decoder" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    return [
+        pid
+        for pid in map(int, found)
+        if b"images.decoding.decoder" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    ]

@@ -17,9 +17,10 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
-from splatmill_worker.images import decoders, video_frame
 from splatmill_worker.images.colors import Colors, srgb
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.prepare import prepare
+from splatmill_worker.images.video import video_frame
 
 Pixels = npt.NDArray[np.uint8]
 Values = npt.NDArray[np.float64]

@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import IO, cast
 
 from splatmill_worker.errors import Cancelled, Refusal
-from splatmill_worker.images import unpacked_room, zip_names
+from splatmill_worker.images.archives import unpacked_room, zip_names
 from splatmill_worker.images.signatures import recognised
 from splatmill_worker.settings import max_unpacked
 from splatmill_worker.wording import plain

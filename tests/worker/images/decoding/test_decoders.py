@@ -15,9 +15,9 @@ from PIL import Image
 
 from splatmill_worker.errors import Cancelled, UnusablePicture
 from splatmill_worker.images import decode as here
-from splatmill_worker.images import decoders
 from splatmill_worker.images import examine as examine_here
-from splatmill_worker.images.decoders import Decoders, confined
+from splatmill_worker.images.decoding import decoders
+from splatmill_worker.images.decoding.decoders import Decoders, confined
 from splatmill_worker.images.prepare import prepare
 from tests.support.hostile.videos import video
 from tests.support.waiting import wait_for
@@ -135,7 +135,11 @@ def test_no_process_is_left(photos: Path) -> None:
 def children() -> list[int]:
     """The ids of this process's decoding processes."""
     found = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
-    return [pid for pid in map(int, found) if b"images.decoder" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    return [
+        pid
+        for pid in map(int, found)
+        if b"images.decoding.decoder" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    ]
 
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the processes are found in /proc")

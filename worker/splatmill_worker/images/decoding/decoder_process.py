@@ -20,8 +20,8 @@ import numpy.typing as npt
 
 from splatmill.schema.photos import MAX_PHOTO_PIXELS
 from splatmill_worker.errors import Cancelled
-from splatmill_worker.images import messages
-from splatmill_worker.images.decoder import LENGTHS, write_message
+from splatmill_worker.images.decoding import messages
+from splatmill_worker.images.decoding.decoder import LENGTHS, write_message
 
 MAX_TEXT = 2**20
 """Bytes of an answer besides its arrays."""
@@ -42,7 +42,7 @@ POLL_MILLISECONDS = 200
 _KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "LD_LIBRARY_PATH")
 """Environment variables that a decoding process is given."""
 
-_COMMAND = (sys.executable, "-IB", "-m", "splatmill_worker.images.decoder")
+_COMMAND = (sys.executable, "-IB", "-m", "splatmill_worker.images.decoding.decoder")
 
 
 @dataclass(frozen=True)

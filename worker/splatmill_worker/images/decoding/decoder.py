@@ -1,4 +1,4 @@
-"""The process that reads strangers' files: `python -IB -m splatmill_worker.images.decoder`.
+"""The process that reads strangers' files: `python -IB -m splatmill_worker.images.decoding.decoder`.
 
 It confines itself before it reads the first byte of a file, and then answers the calls of `decoders`, one after the
 other, on standard input and output. It has no secrets, no network, no file to write, and only the folders that it was
@@ -49,7 +49,8 @@ def main() -> None:
         return
     held = confine([*map(Path, first["read"]), *program_files()], int(first["memory"]))
     # Imported after that: their libraries start threads, and confinement must come before these.
-    from splatmill_worker.images import guarded, messages
+    from splatmill_worker.images import guarded
+    from splatmill_worker.images.decoding import messages
     from splatmill_worker.readers import reader_memory
 
     reader_memory.set_limit(int(first["limit"]))
@@ -83,7 +84,7 @@ def _read_call(stream: IO[bytes]) -> dict[str, Any] | None:
 
 def _answer(call: dict[str, Any], answers: IO[bytes]) -> None:
     """Write the answers to a call. None of their arrays is left in memory while the next call is waited for."""
-    from splatmill_worker.images import messages
+    from splatmill_worker.images.decoding import messages
 
     try:
         for answer in _answered(call):

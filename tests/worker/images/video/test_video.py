@@ -16,9 +16,11 @@ from hypothesis import strategies as st
 from PIL import Image, ImageFilter
 
 from splatmill_worker.errors import Cancelled, UnusableVideo
-from splatmill_worker.images import decoders, flow, video
+from splatmill_worker.images import flow
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.prepare import prepare
-from splatmill_worker.images.video import Candidate
+from splatmill_worker.images.video import video
+from splatmill_worker.images.video.video import Candidate
 
 WIDTH, HEIGHT = 320, 240
 

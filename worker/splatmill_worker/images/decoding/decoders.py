@@ -28,8 +28,9 @@ from splatmill_worker import memory, settings
 from splatmill_worker.errors import DecoderNotStarted, UnusablePicture, UnusableVideo
 from splatmill_worker.images import decode as decode_here
 from splatmill_worker.images import examine as examine_here
-from splatmill_worker.images import guarded, masks, messages, transparency, video
-from splatmill_worker.images.decoder_process import (
+from splatmill_worker.images import guarded, masks, transparency
+from splatmill_worker.images.decoding import messages
+from splatmill_worker.images.decoding.decoder_process import (
     MAX_ARRAYS,
     PICTURE_SECONDS,
     Call,
@@ -37,9 +38,10 @@ from splatmill_worker.images.decoder_process import (
     Ended,
     TimeIsUp,
 )
-from splatmill_worker.images.ended_files import EndedFiles
+from splatmill_worker.images.decoding.ended_files import EndedFiles
+from splatmill_worker.images.decoding.turns import Turns
 from splatmill_worker.images.examine import Picture
-from splatmill_worker.images.turns import Turns
+from splatmill_worker.images.video import video
 from splatmill_worker.readers import reader_memory
 
 PROCESSES = min(os.cpu_count() or 1, 8)
@@ -208,7 +210,7 @@ def keyframes(
 ) -> list[Path]:
     """Write at most `count` frames of the video at `path` as JPEGs in `target`, and return their paths in order.
 
-    The files are called <stem>_<frame number>.jpg. The frames are those of `splatmill_worker.images.video.keyframes`,
+    The files are called <stem>_<frame number>.jpg. The frames are those of `images.video.video.keyframes`,
     which raises the same errors.
     """
     target.mkdir(parents=True, exist_ok=True)
@@ -227,7 +229,7 @@ def keyframes(
 
 
 def video_remarks(path: Path) -> list[str]:
-    """Like `splatmill_worker.images.video.remarks`."""
+    """Like `splatmill_worker.images.video.video.remarks`."""
     return call(
         video.remarks,
         path,

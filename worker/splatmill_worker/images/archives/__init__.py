@@ -1,0 +1,1 @@
+"""Unpacks zips, and counts what that takes."""
