@@ -39,7 +39,8 @@ from splatmill_worker.images.archives import archive
 from splatmill_worker.images.video import video
 from splatmill_worker.pipeline import live, time_lapse
 from splatmill_worker.render_service import edit
-from splatmill_worker.service import mirror, redis_patience, rq_worker
+from splatmill_worker.service import redis_patience, rq_worker
+from splatmill_worker.service.attempts import mirror
 from splatmill_worker.sfm import checks
 from splatmill_worker.splat.plan import photos
 from splatmill_worker.splat.report import report

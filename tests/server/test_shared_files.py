@@ -18,9 +18,9 @@ import pytest
 from splatmill.backplane.jobs import row
 from splatmill.schema import Switch, TrainOptions
 from splatmill_worker import pipeline
-from splatmill_worker.service.attempt import Attempt
+from splatmill_worker.service.attempts.attempt import Attempt
+from splatmill_worker.service.attempts.publish import publish
 from splatmill_worker.service.lock import JobLock
-from splatmill_worker.service.publish import publish
 from splatmill_worker.service.room import Room
 from splatmill_worker.splat.machine import machine
 from tests.support import still_life

@@ -13,7 +13,7 @@ import pytest
 from splatmill.schema import PROBLEMS, Problem, code_for_status
 from splatmill_worker import errors
 from splatmill_worker.errors import FailureName, ModelUnreadable, TrainingFailed, WorkerError
-from splatmill_worker.service.problems import problem_of
+from splatmill_worker.service.attempts.problems import problem_of
 from tests.support.paths import ROOT
 
 

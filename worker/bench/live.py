@@ -85,8 +85,8 @@ def _measure(job: Row) -> int:
     """One run, in this process."""
     from splatmill_worker import pipeline
     from splatmill_worker.__main__ import return_freed_memory
-    from splatmill_worker.service.attempt import Attempt
-    from splatmill_worker.service.live_view import LiveView
+    from splatmill_worker.service.attempts.attempt import Attempt
+    from splatmill_worker.service.attempts.live_view import LiveView
     from splatmill_worker.service.lock import JobLock
 
     return_freed_memory()

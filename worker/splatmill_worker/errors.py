@@ -20,7 +20,7 @@
     Cancelled                the caller requested to stop; not a failure
 
 Each code is one of `splatmill.schema.PROBLEMS`. `WorkerError.problem` is the one place that makes a problem document
-from these errors; `service/problems.py` adds those of storage, Redis and the operating system.
+from these errors; `service/attempts/problems.py` adds those of storage, Redis and the operating system.
 """
 
 from __future__ import annotations

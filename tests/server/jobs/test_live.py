@@ -1,7 +1,7 @@
 """The live view of a job over HTTP: who watches is written down for the worker, and what it shows is served.
 
 The test plays the worker. Not proved here: what a worker shows (tests/worker/pipeline/test_live.py), and when
-(tests/worker/service/test_live_view.py).
+(tests/worker/service/attempts/test_live_view.py).
 """
 
 import redis

@@ -175,7 +175,7 @@ def bench() -> Iterator[Bench]:
         )
         captures = place / "captures"
         captures.mkdir()
-        # As in an attempt: see service/run_attempt.
+        # As in an attempt: see service/attempts/run_attempt.
         stack.enter_context(decoders.confined([captures]))
         yield Bench(stack.enter_context(served_app(settings, client)), captures / "one")
 

@@ -20,7 +20,7 @@ from splatmill_worker.images import decode, guarded
 from splatmill_worker.images.archives import archive
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.prepare import prepare
-from splatmill_worker.service.problems import problem_of
+from splatmill_worker.service.attempts.problems import problem_of
 from tests.support.hostile import archives, pictures, videos
 from tests.support.hostile.pictures import write
 

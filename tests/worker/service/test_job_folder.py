@@ -18,11 +18,12 @@ from splatmill.backplane.storage.errors import StorageUnreachableError
 from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import Role
 from splatmill_worker.errors import CaptureIncomplete, FolderInUse, StartNotStored
-from splatmill_worker.service import job_folder, mirror, sfm_cache
+from splatmill_worker.service import job_folder
+from splatmill_worker.service.attempts import mirror, sfm_cache
+from splatmill_worker.service.attempts.mirror import Mirror
+from splatmill_worker.service.attempts.problems import is_transient, problem_of
 from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.job_folder import JobFolder, hold
-from splatmill_worker.service.mirror import Mirror
-from splatmill_worker.service.problems import is_transient, problem_of
 from splatmill_worker.service.room import Room
 from splatmill_worker.service.staging import DOWNLOADS
 from tests.support.faulty_s3 import FaultyS3, faulty_s3

@@ -1,6 +1,6 @@
 """A real Redis that answers and refuses writes: a job goes on, all its events arrive, and none is requeued beside it.
 
-Does not prove what happens while Redis is away: tests/worker/service/test_outbox.py and tests/service do.
+Does not prove what happens while Redis is away: tests/worker/service/attempts/test_outbox.py and tests/service do.
 """
 
 import contextlib
@@ -23,9 +23,9 @@ from splatmill.backplane.refusal import RedisRefuses
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import JobState, LogEvent, Role, StateEvent
-from splatmill_worker.service.attempt import Attempt
+from splatmill_worker.service.attempts.attempt import Attempt
+from splatmill_worker.service.attempts.outbox import Outbox
 from splatmill_worker.service.lock import JobLock
-from splatmill_worker.service.outbox import Outbox
 from tests.support.jobs import CAPTURE, messages, read_job, write_row
 from tests.support.queue_entries import take
 from tests.support.redis_server import RedisServer

@@ -29,12 +29,12 @@ from splatmill.schema import JobState, Role, StateEvent
 from splatmill_worker.errors import QuotaReached
 from splatmill_worker.images.archives import archive, unpacked_room
 from splatmill_worker.service.abandoned_folders import remove_abandoned, tidy
-from splatmill_worker.service.attempt import Attempt
+from splatmill_worker.service.attempts.attempt import Attempt
+from splatmill_worker.service.attempts.mirror import Mirror
+from splatmill_worker.service.attempts.problems import is_transient, keeps_progress
+from splatmill_worker.service.attempts.publish import publish
 from splatmill_worker.service.job_folder import JobFolder
 from splatmill_worker.service.lock import JobLock
-from splatmill_worker.service.mirror import Mirror
-from splatmill_worker.service.problems import is_transient, keeps_progress
-from splatmill_worker.service.publish import publish
 from splatmill_worker.service.room import Room
 from tests.support.jobs import CAPTURE, write_row
 from tests.support.paths import ROOT
@@ -58,7 +58,7 @@ def published(storage: Storage) -> int:
 def test_of_many_jobs_that_end_at_once_those_are_stored_that_fit(
     local: Storage, connection: redis.Redis, limited: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("splatmill_worker.service.publish.RECORD_BYTES", 4096)
+    monkeypatch.setattr("splatmill_worker.service.attempts.publish.RECORD_BYTES", 4096)
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "model.ply").write_bytes(b"g" * 30_000)
     jobs = [f"job0000{number}" for number in range(8)]

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from splatmill_worker.colmap import pycolmap, write_model
-from splatmill_worker.service.problems import keeps_progress, problem_of
+from splatmill_worker.service.attempts.problems import keeps_progress, problem_of
 
 LIMITED = """
 import resource, signal, sys

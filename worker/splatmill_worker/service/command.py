@@ -16,8 +16,8 @@ from splatmill.backplane.redact import redacted
 from splatmill.garbage import uncollected
 from splatmill_worker import settings
 from splatmill_worker.service.attempt_limits import Limits
+from splatmill_worker.service.attempts.run_attempt import Pipeline
 from splatmill_worker.service.rq_worker import STOP_GRACE, AttemptWorker
-from splatmill_worker.service.run_attempt import Pipeline
 from splatmill_worker.service.served_lines import served_lines
 
 REDIS_WAIT = 60.0

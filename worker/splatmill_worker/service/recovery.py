@@ -21,7 +21,7 @@ from splatmill.backplane.process import ProcessIdentity, wait_gone
 from splatmill.backplane.queue import leases, lines
 from splatmill.backplane.queue.entries import split_rq_id
 from splatmill.backplane.queue.leases import Lease
-from splatmill_worker.service.attempt import Attempt
+from splatmill_worker.service.attempts.attempt import Attempt
 from splatmill_worker.service.lock import Holder, JobLock
 
 _PROCESS_FIELD = "splatmill_process"

@@ -35,8 +35,9 @@ from splatmill.backplane.queue.leases import Lease, Reclaim
 from splatmill.backplane.queue.lines import Line
 from splatmill_worker.service import hand_back, recovery
 from splatmill_worker.service.abandoned_folders import remove_abandoned, tidy
-from splatmill_worker.service.attempt import Attempt, start_attempt
 from splatmill_worker.service.attempt_limits import Exceeded, Limits, LimitWatch, RunTimeExceeded, die_first
+from splatmill_worker.service.attempts.attempt import Attempt, start_attempt
+from splatmill_worker.service.attempts.run_attempt import LoadPipeline, run_attempt
 from splatmill_worker.service.disk_reserve import shortage_text, spare_bytes
 from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.lock import JobLock, LockState
@@ -46,7 +47,6 @@ from splatmill_worker.service.process_exit import (
     ProcessExit,
     oom_kill_count,
 )
-from splatmill_worker.service.run_attempt import LoadPipeline, run_attempt
 from splatmill_worker.service.saved_progress import SavedProgress
 
 STOP_GRACE = 50.0

@@ -32,7 +32,7 @@ from splatmill_worker.images.decoding.turns import Turns
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.images.video import video as video_here
 from splatmill_worker.readers import reader_memory
-from splatmill_worker.service.problems import is_transient, keeps_progress, problem_of
+from splatmill_worker.service.attempts.problems import is_transient, keeps_progress, problem_of
 from splatmill_worker.sfm import posed
 from tests.support.acting import acts
 from tests.support.hostile.videos import video

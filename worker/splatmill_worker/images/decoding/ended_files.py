@@ -46,6 +46,6 @@ class EndedFiles:
             return had
 
     def _write(self) -> None:
-        # Written also when it is empty: a copy of it in storage is then replaced, too (`service.mirror`).
+        # Written also when it is empty: a copy of it in storage is then replaced, too (`service.attempts.mirror`).
         if self._kept is not None:
             atomic_write(self._kept, json.dumps(self._reasons))

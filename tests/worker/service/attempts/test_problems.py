@@ -13,7 +13,7 @@ import redis
 
 from splatmill.backplane.storage.storage import StorageError, StorageFullError
 from splatmill_worker.errors import SfmFailed
-from splatmill_worker.service.problems import is_transient, problem_of
+from splatmill_worker.service.attempts.problems import is_transient, problem_of
 
 NO_PARALLAX = SfmFailed(
     "sfm_no_parallax", "The camera only turned.", {"parallax_deg": 0.2}, "Walk around the scene."

@@ -8,9 +8,9 @@ from _capacity.operations import counted
 
 from splatmill.backplane.jobs import events
 from splatmill.schema import Event, JobState, LogEvent, PlanEvent, ProgressEvent, StateEvent
-from splatmill_worker.service.attempt import Attempt
+from splatmill_worker.service.attempts.attempt import Attempt
+from splatmill_worker.service.attempts.outbox import Outbox
 from splatmill_worker.service.lock import JobLock
-from splatmill_worker.service.outbox import Outbox
 from tests.support.redis_server import RedisServer
 
 

@@ -13,7 +13,7 @@ import redis
 
 from splatmill.backplane import keys
 from splatmill.schema import Event, SnapshotEvent
-from splatmill_worker.service.attempt import Attempt
+from splatmill_worker.service.attempts.attempt import Attempt
 
 POLL_SECONDS = 1.0
 """Seconds between two questions whether anybody looks."""

@@ -14,9 +14,9 @@ from splatmill.backplane.jobs.published import is_published
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import JobState, StateEvent
-from splatmill_worker.service.attempt import Attempt
+from splatmill_worker.service.attempts.attempt import Attempt
+from splatmill_worker.service.attempts.publish import publish
 from splatmill_worker.service.lock import JobLock
-from splatmill_worker.service.publish import publish
 from splatmill_worker.service.room import Room
 from tests.support.jobs import write_row
 

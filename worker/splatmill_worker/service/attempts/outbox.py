@@ -13,7 +13,7 @@ from collections import deque
 import redis
 
 from splatmill.schema import Event, PlanEvent, ProgressEvent, StateEvent
-from splatmill_worker.service.attempt import Attempt
+from splatmill_worker.service.attempts.attempt import Attempt
 from splatmill_worker.service.redis_patience import PATIENCE
 
 PROGRESS_SECONDS = 0.25

@@ -33,16 +33,22 @@ from splatmill.schema import (
     TrainOptions,
 )
 from splatmill_worker.errors import EmptyCapture, QuotaReached
-from splatmill_worker.service import hand_back, publish, sfm_cache
-from splatmill_worker.service.attempt import LONGEST_MESSAGE, Attempt
+from splatmill_worker.service import hand_back
+from splatmill_worker.service.attempts import publish, sfm_cache
+from splatmill_worker.service.attempts.attempt import LONGEST_MESSAGE, Attempt
+from splatmill_worker.service.attempts.live_view import LiveView
+from splatmill_worker.service.attempts.mirror import Mirror
+from splatmill_worker.service.attempts.outbox import Outbox
+from splatmill_worker.service.attempts.problems import (
+    is_decoder_end,
+    is_transient,
+    keeps_progress,
+    problem_of,
+)
 from splatmill_worker.service.disk_reserve import DiskWatch
 from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.job_folder import ENDED, JobFolder, remove_remade
-from splatmill_worker.service.live_view import LiveView
 from splatmill_worker.service.lock import LockState
-from splatmill_worker.service.mirror import Mirror
-from splatmill_worker.service.outbox import Outbox
-from splatmill_worker.service.problems import is_decoder_end, is_transient, keeps_progress, problem_of
 from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, UNREPORTED_STATUS, WITHDRAWN_STATUS
 from splatmill_worker.service.redis_patience import PATIENCE, patiently
 from splatmill_worker.service.room import Room

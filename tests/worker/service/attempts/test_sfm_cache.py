@@ -6,7 +6,7 @@ Does not prove that the names of the models tell different settings apart: tests
 from pathlib import Path
 
 from splatmill.backplane.storage.storage import Storage
-from splatmill_worker.service import sfm_cache
+from splatmill_worker.service.attempts import sfm_cache
 from splatmill_worker.service.room import Room
 from tests.support.jobs import CAPTURE
 

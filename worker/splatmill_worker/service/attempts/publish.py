@@ -12,7 +12,7 @@ from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.records import FORMAT
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import JobState
-from splatmill_worker.service.attempt import Attempt
+from splatmill_worker.service.attempts.attempt import Attempt
 from splatmill_worker.service.redis_patience import patiently
 from splatmill_worker.service.room import Room
 

@@ -24,16 +24,16 @@ from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import Role
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images.decoding import decoders
-from splatmill_worker.service import run_attempt as module
-from splatmill_worker.service.attempt import Attempt, start_attempt
+from splatmill_worker.service.attempts import run_attempt as module
+from splatmill_worker.service.attempts.attempt import Attempt, start_attempt
+from splatmill_worker.service.attempts.outbox import Outbox
+from splatmill_worker.service.attempts.run_attempt import run_attempt
 from splatmill_worker.service.command import _pipeline
 from splatmill_worker.service.disk_reserve import DiskWatch
 from splatmill_worker.service.job_folder import ENDED, JobFolder
 from splatmill_worker.service.lock import JobLock
-from splatmill_worker.service.outbox import Outbox
 from splatmill_worker.service.process_exit import HANDED_BACK_STATUS
 from splatmill_worker.service.room import Room
-from splatmill_worker.service.run_attempt import run_attempt
 from tests.support.jobs import CAPTURE, messages, read_job, write_row
 
 if TYPE_CHECKING:

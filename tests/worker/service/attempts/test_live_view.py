@@ -8,8 +8,8 @@ import redis
 
 from splatmill.backplane import keys
 from splatmill.schema import Event, SnapshotEvent
-from splatmill_worker.service.attempt import Attempt
-from splatmill_worker.service.live_view import KEPT_SECONDS, LiveView
+from splatmill_worker.service.attempts.attempt import Attempt
+from splatmill_worker.service.attempts.live_view import KEPT_SECONDS, LiveView
 from splatmill_worker.service.lock import JobLock
 from tests.support.redis_server import RedisServer
 from tests.support.waiting import wait_for
