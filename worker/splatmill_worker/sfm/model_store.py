@@ -16,10 +16,10 @@ from splatmill_worker.scene import Scene, View
 from splatmill_worker.sfm import features, stereo
 from splatmill_worker.sfm.colors import color_points
 from splatmill_worker.sfm.final_model import FinalModel
-from splatmill_worker.sfm.frame import choose, in_frame
 from splatmill_worker.sfm.posed.colmap_model import posed_view, scene_of
 from splatmill_worker.sfm.posed.model_files import ModelPoints
 from splatmill_worker.sfm.run import SfmRun, torch_threads
+from splatmill_worker.sfm.world.frame import choose, in_frame
 
 STEREO = "stereo.npz"
 FRAME = "frame.json"

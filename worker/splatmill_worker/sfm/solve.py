@@ -22,13 +22,13 @@ from splatmill_worker.sfm import cameras, lenses, stereo
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if
 from splatmill_worker.sfm.effort import solve_at
 from splatmill_worker.sfm.final_model import final_model
-from splatmill_worker.sfm.frame import require_photos
 from splatmill_worker.sfm.model_store import is_stored, load_model, store_model
 from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions, fitted
 from splatmill_worker.sfm.placed import PlacingObserver
 from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest, torch_threads
 from splatmill_worker.sfm.trials import ENOUGH_REGISTERED, registered_counts
 from splatmill_worker.sfm.unfold import unfold
+from splatmill_worker.sfm.world.frame import require_photos
 
 log = logging.getLogger("splatmill_worker")
 

@@ -11,7 +11,7 @@ import math
 import numpy as np
 import pytest
 
-from splatmill_worker.sfm.upright import down_of, focus_of
+from splatmill_worker.sfm.world.upright import down_of, focus_of
 
 Float = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 

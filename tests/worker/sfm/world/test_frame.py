@@ -17,8 +17,8 @@ from splatmill.schema import KnownDistance
 from splatmill_worker.errors import Refusal
 from splatmill_worker.images.exif import Exif
 from splatmill_worker.scene import Camera, Scene, Similarity, View, viewmat_of
-from splatmill_worker.sfm import geodesy
-from splatmill_worker.sfm.frame import choose, in_frame, require_photos
+from splatmill_worker.sfm.world import geodesy
+from splatmill_worker.sfm.world.frame import choose, in_frame, require_photos
 
 Float = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 LUND = np.array([55.7045, 13.1935, 40.0])

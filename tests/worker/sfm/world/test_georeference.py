@@ -11,7 +11,7 @@ import math
 import numpy as np
 import pytest
 
-from splatmill_worker.sfm import geodesy, georeference
+from splatmill_worker.sfm.world import geodesy, georeference
 
 Float = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 LUND = np.array([55.7045, 13.1935, 40.0])

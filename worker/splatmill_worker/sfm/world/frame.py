@@ -12,8 +12,8 @@ from splatmill.schema import GeographicOrigin, KnownDistance, ModelFrame
 from splatmill_worker.errors import Refusal
 from splatmill_worker.images.exif import Exif
 from splatmill_worker.scene import Float, Scene, Similarity
-from splatmill_worker.sfm import geodesy, georeference
-from splatmill_worker.sfm.upright import Down, down_of, focus_of
+from splatmill_worker.sfm.world import geodesy, georeference
+from splatmill_worker.sfm.world.upright import Down, down_of, focus_of
 
 HEADING = 0.3
 """Length of the mean of the photos' horizontal directions, below which they were taken from all around."""

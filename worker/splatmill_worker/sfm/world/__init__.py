@@ -1,0 +1,1 @@
+"""The world of a reconstruction: its origin, its scale and where up is, from GPS or from how people hold cameras."""
