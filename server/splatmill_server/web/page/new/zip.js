@@ -7,8 +7,8 @@ const LONGEST_COMMENT = 65535;
 
 const UTF8 = 0x800;
 
-/** Encodings of names without the flag of UTF-8. The server chooses among more (images/zip_names.py): here, folders and
- * suffixes count, which a wrong one breaks where the second byte of a character is a backslash. */
+/** Encodings of names without the flag of UTF-8. The worker chooses among more (images/archives/zip_names.py): here,
+ * folders and suffixes count, which a wrong one breaks where the second byte of a character is a backslash. */
 const ENCODINGS = ["utf-8", "shift_jis", "euc-kr", "gb18030", "big5", "ibm866"];
 
 /** Bytes of the list that are read at most. */
