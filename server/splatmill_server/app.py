@@ -15,7 +15,7 @@ from starlette.routing import BaseRoute
 import splatmill
 from splatmill.schema import CreateJob, EventRecord, Problem
 from splatmill_server.access.cors import pages_of_others
-from splatmill_server.access.exposure import check_exposure
+from splatmill_server.access.exposure import check_exposure, unbounded_trust
 from splatmill_server.access.permission import PERMITTED, is_open
 from splatmill_server.access.sessions import COOKIE
 from splatmill_server.base import problems, root_path
@@ -66,12 +66,15 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     settings = settings or Settings()
     service = Service.of(settings)
     check_exposure(settings, service.keys)
+    if (warning := unbounded_trust(settings)) is not None:
+        log.warning(warning)
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         root_path.use(settings.root_path)  # what is sent without a request, such as webhooks, has it too
         loops = (
             service.reaper.run,
+            service.ends.run,
             service.imports.run,
             service.orbits.run,
             service.deliveries.run,

@@ -149,7 +149,7 @@ class RequestMiddleware:
                 raise ProblemError(found.code, found.detail, advice=found.advice) from error
             except redis.RedisError as error:
                 log.warning("sessions cannot be read", error=str(error))
-                found = problem_of_redis(error, known=False)
+                found = problem_of_redis(error, admin=False)
                 raise ProblemError(
                     found.code, found.detail, advice=found.advice, headers={"Retry-After": "5"}
                 ) from error

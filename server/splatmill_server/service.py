@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, cast
 
 import httpx
+import structlog
 from fastapi import Depends, Request
 from redis import Redis
 from redis.asyncio import Redis as AsyncRedis
@@ -22,6 +23,7 @@ from splatmill_server.access.sessions import Sessions
 from splatmill_server.admission import Admission
 from splatmill_server.background.conversions import Conversions
 from splatmill_server.background.deliveries import Deliveries
+from splatmill_server.background.ends import Ends
 from splatmill_server.background.imports import Imports
 from splatmill_server.background.orbits import Orbits
 from splatmill_server.background.reaper import Reaper
@@ -31,6 +33,7 @@ from splatmill_server.base.feed import Feed
 from splatmill_server.base.lists import Lists
 from splatmill_server.base.metrics import Metrics
 from splatmill_server.base.outgoing import Outgoing
+from splatmill_server.base.problems import storage_trouble
 from splatmill_server.base.renderer import CountingTransport
 from splatmill_server.base.settings import Settings
 from splatmill_server.captures.partial_uploads import PartialUploads
@@ -46,6 +49,8 @@ from splatmill_server.space.retention import Ages
 from splatmill_server.space.usage import Usage
 from splatmill_server.webhooks import Webhooks
 
+log = structlog.get_logger()
+
 CHECK_SECONDS = 5.0
 """Seconds for which a check of storage holds: everybody may request `/readyz`, and each check writes a file."""
 
@@ -54,7 +59,10 @@ _CHECK_WAIT = 1.0
 
 
 class StorageCheck:
-    """Checks by a write whether storage can be used, at most once in CHECK_SECONDS."""
+    """Checks by a write whether storage can be used, at most once in CHECK_SECONDS.
+
+    Anybody may read the result; the message of an error, which may name folders, hosts and buckets, is logged.
+    """
 
     def __init__(self, storage: Storage) -> None:
         self._storage = storage
@@ -72,7 +80,8 @@ class StorageCheck:
                     self._storage.check()
                     self._result = "ok"
                 except StorageError as error:
-                    self._result = str(error)
+                    log.warning("storage is not ready", error=str(error))
+                    self._result = storage_trouble(error)
                 self._checked = time.monotonic()
             return self._result
         finally:
@@ -109,6 +118,7 @@ class Service:
     sessions: Sessions
     rate: Rate
     reaper: Reaper
+    ends: Ends
     usage: Usage
     quota: Quota
     admission: Admission
@@ -138,7 +148,7 @@ class Service:
         outgoing = Outgoing(settings.outgoing_allow)
         webhooks = Webhooks(storage, jobs)
         renderer = _renderer(settings, metrics)
-        stored_keys = Keys(storage, bootstrap=settings.api_key is not None)
+        stored_keys = Keys(storage, connection, bootstrap=settings.api_key is not None)
         sessions = Sessions(redis_async, settings.session_seconds, settings.redis_timeout)
         return cls(
             settings=settings,
@@ -159,7 +169,7 @@ class Service:
             lists=lists,
             finished=Finished(storage, lists),
             models=models,
-            shares=Shares(storage, models),
+            shares=Shares(storage, connection, models),
             conversions=Conversions(storage, connection, models, renderer, quota, settings.orbit_timeout),
             orbits=Orbits(storage, connection, models, renderer, quota, settings.orbit_timeout),
             keys=stored_keys,
@@ -167,6 +177,7 @@ class Service:
             sessions=sessions,
             rate=Rate(redis_async),
             reaper=Reaper(connection, jobs, metrics, settings),
+            ends=Ends(redis_async, jobs),
             usage=usage,
             quota=quota,
             admission=Admission(storage, captures, jobs, models, quota),

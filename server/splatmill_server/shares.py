@@ -14,6 +14,7 @@ import secrets
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 
+import redis
 from pydantic import ValidationError
 
 from splatmill.backplane.storage import layout
@@ -29,6 +30,7 @@ from splatmill.schema import (
     ShareWithToken,
     Time,
 )
+from splatmill_server.base.leases import exclusive
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.root_path import address
 from splatmill_server.models import Models
@@ -88,13 +90,21 @@ class StoredShare(Response):
 class Shares:
     """All operations on links. Methods raise ProblemError and StorageError."""
 
-    def __init__(self, storage: Storage, models: Models) -> None:
+    def __init__(self, storage: Storage, connection: redis.Redis, models: Models) -> None:
         self.storage = storage
+        self.connection = connection
         self.models = models
 
     def create(self, model_id: str, request: CreateShare) -> ShareWithToken:
-        """Create a link to a finished model, and forget links to it that ended long ago."""
+        """Create a link to a finished model, and forget links to it that ended long ago.
+
+        Links to a model are created one at a time, so that many at once are counted. Raises redis.RedisError.
+        """
         self.models.check(model_id)
+        with exclusive(self.connection, "shares", model_id):
+            return self._create(model_id, request)
+
+    def _create(self, model_id: str, request: CreateShare) -> ShareWithToken:
         now = datetime.now(UTC)
         known = self._stored(model_id)
         if sum(share.active for share in known) >= MAX_SHARES:

@@ -100,6 +100,8 @@ class Webhooks:
         self.connection = jobs.connection
         self.on_delete: list[Callable[[str], None]] = []
         """Called with the id of a webhook once its record is deleted."""
+        self.on_mark: list[Callable[[], None]] = []
+        """Called once a delivery is marked as due."""
         jobs.on_end.append(self.announce)
 
     def create(self, request: CreateWebhook, owner: str) -> WebhookWithSecret:
@@ -221,8 +223,7 @@ class Webhooks:
         """Make a delivery that is over pending again, unless another request has."""
         found = self.get_delivery(webhook_id, delivery_id)
         if found is not None and found.state is not DeliveryState.pending:
-            now = datetime.now(UTC)
-            update = {"state": DeliveryState.pending, "next_at": now, "tries": 0, "reason": None}
+            update = {"state": DeliveryState.pending, "next_at": _at_once(), "tries": 0, "reason": None}
             found = found.model_copy(update=update)
             self.save_delivery(found)
             self.mark(found)
@@ -237,6 +238,8 @@ class Webhooks:
     def mark(self, record: DeliveryRecord) -> None:
         """Mark a pending delivery as due at its next time."""
         self.storage.put(mark_of(record), b"{}")
+        for marked in self.on_mark:
+            marked()
 
     def announce(self, job: Job, generation: int) -> None:
         """Record the deliveries of a job that has ended. Repeated calls for the same end have no further effect."""
@@ -262,7 +265,7 @@ class Webhooks:
                     message=f"msg_{delivery_id}",
                     state=DeliveryState.pending,
                     created_at=now,
-                    next_at=now,
+                    next_at=_at_once(),
                     body=payload.model_dump_json(exclude_none=True),
                 )
                 path = layout.delivery_record(webhook.id, delivery_id)
@@ -295,6 +298,11 @@ class Webhooks:
     def _write(self, record: WebhookRecord) -> None:
         path = layout.webhook_record(record.id)
         self.storage.put(path, record.model_dump_json(exclude_none=True).encode())
+
+
+def _at_once() -> datetime:
+    """Return the time of an attempt that is due now: a whole second, since marks are named by those."""
+    return datetime.now(UTC).replace(microsecond=0)
 
 
 def mark_of(record: DeliveryRecord) -> str:

@@ -131,7 +131,8 @@ def test_readiness_writes_to_storage_once_in_a_while(
     monkeypatch.setattr(service, "CHECK_SECONDS", 0.0)
     answer = app.http.get("/readyz")
     assert answer.status_code == 503
-    assert "Storage could not write" in answer.json()["checks"]["storage"]
+    said = "Storage cannot be read or written; the log of the server has the reason."
+    assert answer.json()["checks"]["storage"] == said
 
 
 def test_the_page_of_endpoints_loads_nothing(app: ServedApp) -> None:

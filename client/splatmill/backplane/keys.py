@@ -11,6 +11,10 @@ JOBS = PREFIX + "jobs"
 ACTIVE = PREFIX + "active"
 """Set of the ids of unfinished jobs, which the reaper checks. It may still hold jobs that have ended."""
 
+ENDS = PREFIX + "ends"
+"""List of jobs whose worker has reported their end, on which API processes wait: each end goes to one of them. Workers
+add to it. Where one is lost, the reaper finds the end among `ACTIVE`."""
+
 LISTED = PREFIX + "listed"
 """String that exists while the lists hold all records of storage (see `lists`). Only the server writes it."""
 

@@ -17,6 +17,7 @@ import threading
 import time
 from datetime import UTC, datetime, timedelta
 
+import redis
 from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
@@ -25,6 +26,7 @@ from splatmill.backplane.storage.errors import StorageBusyError, StorageStalledE
 from splatmill.backplane.storage.records import FORMAT, check_format, reason, warn
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import CreateKey, Key, KeyWithSecret, Scope, Time
+from splatmill_server.base.leases import exclusive
 from splatmill_server.base.problems import ProblemError
 
 CACHE_SECONDS = 2.0
@@ -75,11 +77,13 @@ class StoredKey(Key):
 class Keys:
     """All operations on keys. The records in storage are the truth, of which every process keeps a copy for a moment.
 
+    connection: Redis, for the lease under which the key of an admin is revoked.
     bootstrap: whether the server has SPLATMILL_API_KEY, which is an admin's key that is not stored.
     """
 
-    def __init__(self, storage: Storage, *, bootstrap: bool) -> None:
+    def __init__(self, storage: Storage, connection: redis.Redis, *, bootstrap: bool) -> None:
         self.storage = storage
+        self.connection = connection
         self.bootstrap = bootstrap
         self._lock = threading.Lock()
         self._reading: asyncio.Task[None] | None = None
@@ -206,22 +210,34 @@ class Keys:
 
         The revocation is a file of its own, which counts more than the record: a rotation at the same moment, which
         writes the record again, does not bring the key back.
+
+        Keys of admins are revoked one at a time, which needs Redis: of the last two, one is left. Raises
+        redis.RedisError. Other keys can be revoked without Redis.
         """
         key = self.get(key_id)
-        if Scope.admin in key.scopes and not self._admin_besides(key_id):
-            raise ProblemError(
-                "admin_key_needed",
-                f"{key.name!r} is the last key with the scope admin; without it, nobody could make or revoke keys.",
-                advice="Create another key with the scope admin first, or start the server with SPLATMILL_API_KEY.",
-            )
+        if Scope.admin not in key.scopes or self.bootstrap:
+            self._revoke(key)
+            return
+        with exclusive(self.connection, "keys", "admin") as keep:
+            key = self.get(key_id)
+            if not self._admin_besides(key_id):
+                raise ProblemError(
+                    "admin_key_needed",
+                    f"{key.name!r} is the last key with the scope admin; without it, nobody could make or revoke keys.",
+                    advice="Create another key with the scope admin first, or start the server with SPLATMILL_API_KEY.",
+                )
+            keep()  # storage may have taken long to list the keys
+            self._revoke(key)
+
+    def _revoke(self, key: StoredKey) -> None:
         revoked = {
             "id": key.id,
             "name": key.name,
             "owner": key.owner,
             "revoked_at": datetime.now(UTC).isoformat(),
         }
-        self.storage.put(layout.key_revocation(key_id), json.dumps(revoked | {"format": FORMAT}).encode())
-        self.storage.delete(layout.key_record(key_id))
+        self.storage.put(layout.key_revocation(key.id), json.dumps(revoked | {"format": FORMAT}).encode())
+        self.storage.delete(layout.key_record(key.id))
         self.read()
 
     def _admin_besides(self, key_id: str | None) -> bool:

@@ -11,6 +11,7 @@ import asyncio
 import random
 import time
 from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 
@@ -76,21 +77,28 @@ class Deliveries:
         self._running: dict[tuple[str, str], asyncio.Task[None]] = {}
         self._owners: dict[str, str] = {}
         webhooks.on_delete.append(self._forget)
+        webhooks.on_mark.append(self.wake)
         self._looked_at = float("-inf")
+        self._due_at = float("inf")
+        """Time, in seconds since the epoch, at which the first delivery is due that was not due at the last look."""
         self._wake = asyncio.Event()
 
     def wake(self) -> None:
-        """Look for deliveries now."""
-        self._wake.set()
+        """Look for deliveries now. Any thread may call."""
+        self._call(self._wake.set)
+
+    def _call(self, function: Callable[..., None], *arguments: object) -> None:
+        """Call a function in the loop that sends, if it runs."""
+        if self._loop is not None:
+            with suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(function, *arguments)
 
     def _forget(self, webhook_id: str) -> None:
         """End the attempts for a webhook that was deleted; those of other processes end within ANSWER_SECONDS.
 
         Any thread may call.
         """
-        if self._loop is not None:
-            with suppress(RuntimeError):  # the loop has ended
-                self._loop.call_soon_threadsafe(self._cancel, webhook_id)
+        self._call(self._cancel, webhook_id)
 
     def _cancel(self, webhook_id: str) -> None:
         for key, task in self._running.items():
@@ -109,8 +117,9 @@ class Deliveries:
                     log.warning("deliveries cannot be looked for", error=str(error))
                 except Exception:
                     log.exception("deliveries cannot be looked for")
+                pause = min(_LOOK_SECONDS, max(0.0, self._due_at - time.time()))
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(self._wake.wait(), _LOOK_SECONDS)
+                    await asyncio.wait_for(self._wake.wait(), pause)
         finally:
             tasks = list(self._running.values())
             for task in tasks:
@@ -118,6 +127,7 @@ class Deliveries:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _look(self) -> None:
+        self._due_at = float("inf")
         if time.monotonic() - self._looked_at >= _OLD_SECONDS:
             self._looked_at = time.monotonic()
             await run_in_threadpool(self.webhooks.delete_old)
@@ -132,6 +142,7 @@ class Deliveries:
             if not (due.isdigit() and layout.is_id(webhook_id) and layout.is_id(delivery_id)):
                 continue
             if int(due) > time.time():
+                self._due_at = int(due)
                 break
             if key not in self._running and key not in waiting and of_webhook[webhook_id] < _CONCURRENT_EACH:
                 of_webhook[webhook_id] += 1

@@ -33,6 +33,7 @@ from splatmill.schema import (
     UnsafeName,
     safe_name,
 )
+from splatmill_server.base.leases import exclusive
 from splatmill_server.base.least_rate import TooSlow, at_least
 from splatmill_server.base.outgoing import AddressRefused, Answer, NoAnswer, Outgoing
 from splatmill_server.base.problems import ProblemError, problem_of_storage
@@ -81,6 +82,7 @@ class Imports:
         outgoing: Outgoing,
         settings: Settings,
     ) -> None:
+        self.connection = connection
         self.storage = storage
         self.captures = captures
         self.quota = quota
@@ -127,9 +129,17 @@ class Imports:
 
     def _accept(self, made: Import) -> None:
         self.captures.check_room(made.capture, None)
-        marks = [entry.path.split("/")[-1] for entry in self.storage.entries(layout.unfinished_imports())]
         mark = layout.unfinished_import(made.capture, made.id)
         owner = self.unfinished.line_of(mark.split("/")[-1])
+        # Until the mark is there: of many requests at once, each counts those before it.
+        with exclusive(self.connection, "imports", owner):
+            self._check_number(made, owner)
+            self._write(made)
+            self.storage.put(mark, b"{}")
+
+    def _check_number(self, made: Import, owner: str) -> None:
+        """Raise a 429 problem if the capture or its owner has too many imports that have not ended."""
+        marks = [entry.path.split("/")[-1] for entry in self.storage.entries(layout.unfinished_imports())]
         for count, most, whose in (
             (sum(name.startswith(f"{made.capture}.") for name in marks), MAX_UNFINISHED, "The capture"),
             (sum(self.unfinished.line_of(name) == owner for name in marks), MAX_OF_OWNER, "The owner"),
@@ -140,8 +150,6 @@ class Imports:
                     f"{whose} has {most} imports that have not ended.",
                     advice="Wait until some have ended, or import one zip archive in place of many files.",
                 )
-        self._write(made)
-        self.storage.put(mark, b"{}")
 
     def get(self, capture_id: str, import_id: str) -> Import:
         """Return an import. Raises a 404 problem."""
@@ -209,7 +217,11 @@ class Imports:
         except AddressRefused as error:
             return _failed(found, "url_refused", str(error))
         except (ProblemError, StorageError) as error:
-            problem = error.problem if isinstance(error, ProblemError) else problem_of_storage(error)
+            if isinstance(error, ProblemError):
+                problem = error.problem
+            else:
+                log.warning("storage error", error=str(error), id=found.id)
+                problem = problem_of_storage(error)
             # A 503 problem may pass, such as that of a storage that has not been listed yet.
             if problem.status == 503 and found.attempts < MAX_ATTEMPTS:
                 return _tried(found, problem.detail)

@@ -31,6 +31,7 @@ from splatmill.schema import (
     Problem,
 )
 from splatmill_server.access.caller import Caller
+from splatmill_server.base.leases import exclusive
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.renderer import no_renderer, post
 from splatmill_server.base.root_path import address
@@ -96,6 +97,7 @@ class Orbits:
         seconds: float,
     ) -> None:
         self._storage = storage
+        self._connection = connection
         self._models = models
         self._renderer = renderer
         self._quota = quota
@@ -135,6 +137,15 @@ class Orbits:
         if found is not None and found.state is OrbitState.succeeded:
             return found
         owner = self._owner(model_id)
+        # Until the mark is there: of many requests at once, each counts those before it.
+        with exclusive(self._connection, "orbits", _line_of(owner)):
+            return self._mark(model_id, orbit_id, request, who, owner)
+
+    def _mark(self, model_id: str, orbit_id: str, request: OrbitRequest, who: Caller, owner: str) -> Orbit:
+        """Record and mark an orbit video, unless another request has. Raises the problems of `create`."""
+        found = self._read(model_id, orbit_id)
+        if found is not None and found.state is OrbitState.succeeded:
+            return found
         mark = layout.unfinished_orbit(_line_of(owner), model_id, orbit_id)
         if found is None or found.state is OrbitState.failed:
             self._check_number(model_id, _line_of(owner), new=found is None)

@@ -210,6 +210,7 @@ class Reaper:
 
     def _give_up(self, row: JobRow, found: queue.QueueStatus) -> None:
         if self._has_succeeded(row):
+            self.jobs.retire(row.id)
             return
         job = self.jobs.get(row.id)
         facts = {"attempts": job.attempt, "stage": last_stage(job), "reason": found.reason}
@@ -246,6 +247,7 @@ class Reaper:
         if self.jobs.give_verdict(row, "failed", problem):
             self.metrics.ended.labels(problem.code).inc()
             log.warning("job given up", job=row.id, code=problem.code, reason=found.reason)
+            self.jobs.retire(row.id)
 
 
 def _safely(step: Callable[[JobRow], T], row: JobRow, otherwise: T) -> T:

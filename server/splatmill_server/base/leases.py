@@ -2,7 +2,7 @@
 
 import asyncio
 import secrets
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 
 import redis
@@ -51,8 +51,10 @@ async def lease(connection: redis.Redis, kind: str, name: str) -> AsyncIterator[
 
 
 @contextmanager
-def exclusive(connection: redis.Redis, kind: str, name: str) -> Iterator[None]:
+def exclusive(connection: redis.Redis, kind: str, name: str) -> Iterator[Callable[[], object]]:
     """Hold the lease on a record, from its reading to its writing, and wait for others that do. For threads.
+
+    Yield a function that lets the lease last SECONDS from then on, and raises LockError if it has expired.
 
     Raises redis.RedisError, LockError among them, if the lease cannot be taken.
     """
@@ -62,7 +64,7 @@ def exclusive(connection: redis.Redis, kind: str, name: str) -> Iterator[None]:
         expiry.shorten(connection, key, SECONDS)
         raise LockError("The record is being changed by other requests")
     try:
-        yield
+        yield lock.reacquire
     finally:
         with suppress(redis.RedisError):
             lock.release()

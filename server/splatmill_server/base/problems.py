@@ -127,13 +127,14 @@ def install(app: FastAPI, missing_page: Callable[[Request], Response]) -> None:
     @app.exception_handler(redis.RedisError)
     def on_redis(request: Request, error: redis.RedisError) -> Response:
         log.warning("queue unavailable", error=str(error), path=shown_path(request.scope))
-        problem = problem_of_redis(error, known=bool(request.state.caller.scopes))
+        problem = problem_of_redis(error, admin=request.state.caller.admin)
         return ProblemResponse(problem, request.url.path, {"Retry-After": "5"})
 
     @app.exception_handler(StorageError)
     def on_storage(request: Request, error: StorageError) -> Response:
         log.warning("storage error", error=str(error), path=shown_path(request.scope))
-        return ProblemResponse(problem_of_storage(error), request.url.path)
+        problem = problem_of_storage(error, admin=request.state.caller.admin)
+        return ProblemResponse(problem, request.url.path)
 
     @app.exception_handler(ClientDisconnect)
     def on_disconnect(request: Request, _: ClientDisconnect) -> Response:
@@ -146,13 +147,17 @@ def shown_path(scope: Scope) -> str:
     return _SHARED.sub("/s/...", own_path(scope))
 
 
-def problem_of_redis(error: redis.RedisError, *, known: bool) -> Problem:
-    """Return the problem for an error of Redis: it cannot be reached, or refuses the command.
+LOGGED = "the log of the server has the reason"
+"""What those read who may not read the reason: it may name hosts, folders and users."""
 
-    known: whether the caller is, and so may read Redis' own words, which may name hosts and users.
+
+def problem_of_redis(error: redis.RedisError, *, admin: bool) -> Problem:
+    """Return the problem for an error of Redis, which the caller logs: it cannot be reached, or refuses the command.
+
+    admin: whether it is for an admin, who may read Redis' own words, which may name hosts and users.
     """
     cause = " ".join(str(error).split())[:300].removesuffix(".") or type(error).__name__
-    cause = cause if known else "the log of the server has the reason"
+    cause = cause if admin else LOGGED
     if isinstance(error, redis.ResponseError):
         return Problem.of(
             "queue_unavailable",
@@ -166,16 +171,25 @@ def problem_of_redis(error: redis.RedisError, *, known: bool) -> Problem:
     )
 
 
-def problem_of_storage(error: StorageError) -> Problem:
-    """Return the problem for an error of storage: full, not writable, or not available."""
+def problem_of_storage(error: StorageError, *, admin: bool = False) -> Problem:
+    """Return the problem for an error of storage, which the caller logs: full, not writable, or not available.
+
+    admin: whether it is for an admin, who may read the message, which may name folders, hosts and buckets.
+    """
     text = str(error)
+    detail = text if admin else storage_trouble(error)
     if isinstance(error, StorageFullError):
         advice = "Delete captures or jobs that are no longer needed, or extend the storage."
-        return Problem.of("storage_full", text, advice=advice)
+        return Problem.of("storage_full", detail, advice=advice)
     if "Permission denied" in text or "os error 13" in text or "os error 30" in text:
         advice = "Give the user that the server runs as write access to the storage folder."
-        return Problem.of("storage_unwritable", text, advice=advice)
-    return Problem.of("storage_unavailable", text, advice="Check SPLATMILL_STORAGE and try again.")
+        return Problem.of("storage_unwritable", detail, advice=advice)
+    return Problem.of("storage_unavailable", detail, advice="Check SPLATMILL_STORAGE and try again.")
+
+
+def storage_trouble(error: StorageError) -> str:
+    """Return what anybody may read of an error of storage, which is logged."""
+    return f"{error.summary.removesuffix('.')}; {LOGGED}."
 
 
 def body_cut_off(seen: int | None = None, announced: int | None = None) -> Problem:

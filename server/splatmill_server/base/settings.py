@@ -75,7 +75,8 @@ class Settings(BaseSettings):
         default="127.0.0.1",
         validation_alias="FORWARDED_ALLOW_IPS",
         description="Trusted proxies: addresses or networks, separated by commas, or `*` for all. They are believed "
-        "about a client's address (`X-Forwarded-For`), its scheme (`X-Forwarded-Proto`) and the root path.",
+        "about a client's address (`X-Forwarded-For`), its scheme (`X-Forwarded-Proto`) and the root path. With `*`, "
+        "every client is, unless only the proxy can connect to the server.",
     )
     cors_origins: str = Field(
         default="",

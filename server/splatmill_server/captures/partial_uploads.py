@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from weakref import WeakValueDictionary
 
+import structlog
 from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane.storage import layout
@@ -35,6 +36,8 @@ from splatmill_server.captures.records import (
     too_large,
 )
 from splatmill_server.captures.unfinished_uploads import UnfinishedUploads
+
+log = structlog.get_logger()
 
 _Key = tuple[str, str]
 """Ids of a capture and of an upload. The id of an upload alone is the same in every capture that gets the same file."""
@@ -362,6 +365,7 @@ async def _named(file: str) -> AsyncIterator[None]:
     except ProblemError as error:
         raise error.about_file(file) from error
     except StorageError as error:
+        log.warning("storage error", error=str(error), file=file)
         found = problem_of_storage(error)
         problem = ProblemError(found.code, found.detail, advice=found.advice, facts=found.facts)
         raise problem.about_file(file) from error

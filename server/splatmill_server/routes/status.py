@@ -50,6 +50,7 @@ from splatmill_server.access.caller import Caller, Who
 from splatmill_server.access.permission import needs
 from splatmill_server.answers.docs_page import CONTENT_SECURITY_POLICY, docs_page
 from splatmill_server.base import metrics, scrape
+from splatmill_server.base.problems import LOGGED
 from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.service import Service, Shared
 
@@ -222,7 +223,7 @@ def _redis_checks(service: Service) -> tuple[str, str, bool]:
         )  # anybody may ask, and the text may name hosts and users
         refused = isinstance(error, redis.ResponseError | redis.AuthenticationError)
         said = "Redis refuses the request" if refused else "Redis cannot be reached"
-        return f"{said}; the log of the server has the reason", "not known", False
+        return f"{said}; {LOGGED}", "not known", False
     return "ok", " ".join(found.trouble() or ["ok"]), found.full
 
 

@@ -111,6 +111,4 @@ async def repeat_delivery(
     delivery_id: Annotated[str, Path(description="Id of the delivery.")],
 ) -> Delivery:
     """Send a delivery that is over once more, with the same `webhook-id`."""
-    found = await run_in_threadpool(service.webhooks.repeat, webhook_id, delivery_id)
-    service.deliveries.wake()
-    return found
+    return await run_in_threadpool(service.webhooks.repeat, webhook_id, delivery_id)

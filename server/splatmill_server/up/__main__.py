@@ -136,6 +136,7 @@ def _check_exposure(address: str, data: Path) -> None:
     """Raise UpError if other machines could reach a server without keys."""
     if ipaddress.ip_address(address).is_loopback:
         return
+    from splatmill.backplane.connection import connect
     from splatmill.backplane.storage.storage import Storage, StorageError
     from splatmill_server.access.exposure import check_exposure
     from splatmill_server.access.keys import Keys
@@ -143,7 +144,9 @@ def _check_exposure(address: str, data: Path) -> None:
 
     try:
         settings = Settings(data=data, host=address)
-        check_exposure(settings, Keys(Storage(settings.storage), bootstrap=settings.api_key is not None))
+        # Only whether there are keys is read, for which no connection is opened.
+        keys = Keys(Storage(settings.storage), connect(), bootstrap=settings.api_key is not None)
+        check_exposure(settings, keys)
     except (ValueError, StorageError) as error:
         raise UpError(str(error)) from error
 

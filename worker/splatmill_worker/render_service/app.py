@@ -175,8 +175,11 @@ class RenderApp:
             )
             return _problem_response(problem, {"Retry-After": str(RETRY_AFTER)})
         except StorageError as error:
+            log.warning("storage error: %s", error)
+            # Without the message, which may name folders and hosts: visitors of a shared link read this too.
+            detail = f"{error.summary.removesuffix('.')}; the log of the renderer has the reason."
             advice = "Check SPLATMILL_STORAGE and try again."
-            return _problem_response(Problem.of("storage_unavailable", str(error), advice=advice))
+            return _problem_response(Problem.of("storage_unavailable", detail, advice=advice))
         except Exception as error:
             # The client receives a problem document for any error, and the log receives the traceback.
             said = {"request": request.headers.get(rendering.REQUEST_HEADER, "")[:64]}

@@ -51,8 +51,12 @@ LATEST: dict[type, str] = {ProgressEvent: "progress", PreviewEvent: "preview"}
 """The types of events whose newest entry is in the hash `keys.latest` too, each with its field. So no reader looks for
 them in a stream of thousands of entries."""
 
-# KEYS: stream, hash of the newest entries, states. ARGV: generation, attempt, event, format, bound or "", field or "",
-# "1" if nothing is to be appended where there are no states.
+ENDS_KEPT = 1000
+"""Ends of jobs that wait in `keys.ENDS` for a server at most. The reaper finds the others."""
+
+# KEYS: stream, hash of the newest entries, states, ends. ARGV: generation, attempt, event, format, bound or "",
+# field or "", "1" if nothing is to be appended where there are no states, the job if the event is its end or "",
+# ENDS_KEPT.
 _APPEND = """
 if ARGV[7] == '1' and redis.call('EXISTS', KEYS[3]) == 0 then return false end
 local bound = ARGV[5] == '' and {} or {'MAXLEN', '~', ARGV[5]}
@@ -61,6 +65,10 @@ for _, part in ipairs(entry) do bound[#bound + 1] = part end
 local id = redis.call('XADD', KEYS[1], unpack(bound))
 if ARGV[6] ~= '' then
   redis.call('HSET', KEYS[2], ARGV[6], table.concat({id, ARGV[1], ARGV[2], ARGV[4], ARGV[3]}, ' '))
+end
+if ARGV[8] ~= '' then
+  redis.call('LPUSH', KEYS[4], ARGV[8])
+  redis.call('LTRIM', KEYS[4], 0, ARGV[9] - 1)
 end
 return id
 """
@@ -138,8 +146,10 @@ def _append(
     bound, field = BOUNDS[stream], LATEST.get(type(event), "")
     entry = generation, attempt, event.model_dump_json(exclude_none=True), FORMAT
     script = connection.register_script(_APPEND)
-    names = [stream(job_id), keys.latest(job_id), keys.states(job_id)]
-    return cast("bytes | None", script(keys=names, args=[*entry, bound or "", field, int(known)]))
+    names = [stream(job_id), keys.latest(job_id), keys.states(job_id), keys.ENDS]
+    ended = job_id if isinstance(event, StateEvent) and event.state.final else ""
+    arguments = [*entry, bound or "", field, int(known), ended, ENDS_KEPT]
+    return cast("bytes | None", script(keys=names, args=arguments))
 
 
 Entries = Iterable[tuple[bytes, Mapping[bytes, bytes]]]

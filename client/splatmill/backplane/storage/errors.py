@@ -28,39 +28,46 @@ class StorageError(Exception):
     """Storage cannot be read or written. The message says what was tried, and the reason.
 
     kind: what happened, in a word.
+    summary: what happened, in a sentence without names of files, addresses and buckets. Anybody may read it.
     """
 
     kind = "failed"
+    summary = "Storage cannot be read or written."
 
 
 class StorageFullError(StorageError):
     """Storage is full (disk, quota or file size limit). Nothing was stored."""
 
     kind = "full"
+    summary = "Storage is full."
 
 
 class StorageStalledError(StorageError):
     """Storage has not answered, or has sent no further byte, for too long, also when it was asked again."""
 
     kind = "stalled"
+    summary = "Storage does not answer in time."
 
 
 class StorageUnreachableError(StorageError):
     """Storage cannot be reached, breaks connections, or answers that it cannot serve, also when it was asked again."""
 
     kind = "unreachable"
+    summary = "Storage cannot be reached."
 
 
 class StorageBusyError(StorageError):
     """As many operations as may wait for storage wait already; this one was not begun."""
 
     kind = "busy"
+    summary = "Storage does not answer, and as many operations as may wait for it wait already."
 
 
 class StorageChangedError(StorageError):
     """A file was replaced while it was read, so that the rest of the bytes would be of another file."""
 
     kind = "changed"
+    summary = "A file was replaced while it was read."
 
 
 @contextmanager
