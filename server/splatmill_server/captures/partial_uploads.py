@@ -220,6 +220,7 @@ class PartialUploads:
                 if self._writers.get(key) is not me:
                     block.clear()
                     raise _superseded(end)
+                await run_in_threadpool(self.captures.check_disk)
                 end = await run_in_threadpool(part.append, end, bytes(block))
             block.clear()
 

@@ -48,6 +48,9 @@ _LISTED_TOGETHER = 500
 _RECENT_SECONDS = 5.0
 """Seconds for which uploads use a record that was read before. Their end looks whether the capture is still there."""
 
+DISK_STEP = 8 << 20
+"""Bytes of a file that arrive between two looks at the room on the disk."""
+
 STALE_SECONDS = 24 * 3600
 """Age at which an unfinished upload counts as abandoned."""
 
@@ -306,7 +309,7 @@ class Captures:
         if announced_size is None or announced_size > BLOCK:
             # A smaller body is read before storage gets any of it, and then finds out whether its name is free.
             taken = await run_in_threadpool(self.digests.of, capture_id, role, name)
-        body = _Counted(chunks, self.settings.max_file_bytes)
+        body = _Counted(chunks, self.settings.max_file_bytes, self.check_disk)
         empty_allowed = may_be_empty(role, name)
 
         def checked() -> CaptureFile:
@@ -402,9 +405,16 @@ class Captures:
             )
         if announced_size is not None and announced_size > self.settings.max_file_bytes:
             raise too_large(announced_size, self.settings.max_file_bytes)
+        self.check_disk(max((announced_size or 0) - held, 0))
+
+    def check_disk(self, size: int = 0) -> None:
+        """Raise a 507 problem if the disk has not so many bytes left beyond the reserve.
+
+        It is asked again while a file arrives: of many files at once, each finds the same room before its first byte.
+        """
         if self.storage.root is not None:
             free = shutil.disk_usage(self.storage.root).free
-            needed = max((announced_size or 0) - held, 0) + self.settings.min_free_bytes
+            needed = size + self.settings.min_free_bytes
             if free < needed:
                 raise ProblemError(
                     "storage_full",
@@ -420,11 +430,16 @@ class _NameClaimed(Exception):
 
 
 class _Counted:
-    """Passes chunks on, counts and hashes them, and raises a 413 problem above the limit."""
+    """Passes chunks on, counts and hashes them, and raises a 413 problem above the limit.
 
-    def __init__(self, chunks: AsyncIterator[bytes], limit: int) -> None:
+    check_disk: raises what keeps more bytes from being stored; called every DISK_STEP bytes.
+    """
+
+    def __init__(self, chunks: AsyncIterator[bytes], limit: int, check_disk: Callable[[], None]) -> None:
         self._chunks = chunks
         self._limit = limit
+        self._check_disk = check_disk
+        self._checked = 0
         self._first: bytes | None = None
         self.size = 0
         self.digest = hashlib.sha256()
@@ -447,6 +462,9 @@ class _Counted:
         self.size += len(chunk)
         if self.size > self._limit:
             raise too_large(self.size, self._limit)
+        if self.size - self._checked >= DISK_STEP:
+            self._checked = self.size
+            await run_in_threadpool(self._check_disk)
         self.digest.update(chunk)
         return chunk
 

@@ -200,6 +200,26 @@ def test_a_capture_that_a_job_uses_cannot_be_deleted(app: ServedApp) -> None:
     assert app.http.delete(f"/v1/captures/{capture_id}").status_code == 204
 
 
+@pytest.mark.parametrize("pieces", [False, True])
+def test_the_reserve_of_the_disk_is_kept_while_a_file_arrives(app: ServedApp, pieces: bool) -> None:
+    """Of files that come at once, each finds the same room before its first byte; here the room goes later."""
+    capture_id = app.http.post("/v1/captures", json={}).json()["id"]
+
+    def body() -> Iterator[bytes]:
+        yield b"a" * records.DISK_STEP
+        app.settings.min_free_bytes = 1 << 60
+        for _ in range(4):
+            yield b"b" * records.DISK_STEP
+
+    headers = {"Upload-Complete": "?0"} if pieces else {}
+    answer = app.http.put(f"/v1/captures/{capture_id}/images/a.mp4", content=body(), headers=headers)
+    assert "reserve" in problem(answer, 507, "storage_full")["detail"]
+    app.settings.min_free_bytes = 0
+    assert app.http.get(f"/v1/captures/{capture_id}").json()["files"] == []
+    held = sum((app.service.storage.root / name).stat().st_size for name in stored(app))
+    assert held < (2 * records.DISK_STEP if pieces else 10_000)
+
+
 def test_a_disk_without_room_for_it_refuses_an_upload(serve: Serve) -> None:
     app = serve(min_free_bytes=1 << 60)
     capture_id = app.http.post("/v1/captures", json={}).json()["id"]
