@@ -31,7 +31,7 @@ WORKER = textwrap.dedent(
     import os, pathlib, sys, time
     from rq import Worker
     from rq.executions import Execution
-    from splatmill.backplane import entries, lines
+    from splatmill.backplane.queue import entries, lines
     from splatmill.backplane.connection import connect
     class Entry(entries.QueueEntry):
         def func(self, job_id):

@@ -27,7 +27,7 @@ shifted = lambda: real_now() + datetime.timedelta(seconds=ahead)
 time.time = lambda: real_time() + ahead
 for module in (rq.utils, rq.registry, rq.executions, rq.job):
     module.now = shifted
-from splatmill.backplane import leases
+from splatmill.backplane.queue import leases
 from splatmill.backplane.connection import connect
 connection = connect(sys.argv[1])
 """

@@ -207,7 +207,7 @@ def test_a_worker_whose_clock_is_off_runs_its_job_once(
 
 KILLED = """
 import os, signal, sys
-from splatmill.backplane import lines
+from splatmill.backplane.queue import lines
 from splatmill_worker.service import rq_worker
 real = lines.take
 def take_and_die(*arguments):
