@@ -112,7 +112,11 @@ def test_one_of_several_processes_announces_an_end(
         job_id = app.job()
         app.begin(job_id)
         app.say(job_id, FAILED)
-        wait_for(lambda number=number: len(peer.seen) == number)
+
+        def all_came(number: int = number) -> bool:
+            return len(peer.seen) == number
+
+        wait_for(all_came)
     assert len(retired) == len(set(retired)) == 4
 
 

@@ -216,7 +216,9 @@ def test_the_reserve_of_the_disk_is_kept_while_a_file_arrives(app: ServedApp, pi
     assert "reserve" in problem(answer, 507, "storage_full")["detail"]
     app.settings.min_free_bytes = 0
     assert app.http.get(f"/v1/captures/{capture_id}").json()["files"] == []
-    held = sum((app.service.storage.root / name).stat().st_size for name in stored(app))
+    root = app.service.storage.root
+    assert root is not None
+    held = sum((root / name).stat().st_size for name in stored(app))
     assert held < (2 * records.DISK_STEP if pieces else 10_000)
 
 
