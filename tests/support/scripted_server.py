@@ -80,6 +80,8 @@ class ScriptedServer:
                 await writer.drain()
         except ConnectionError:
             self.left += 1
+        except asyncio.CancelledError:
+            pass  # the server stops; in Python 3.11, asyncio logs a cancelled handler as an error
         finally:
             writer.close()
 
