@@ -12,7 +12,7 @@ import sys
 from graphlib import TopologicalSorter
 from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
+from pkgutil import walk_packages
 
 import pytest
 
@@ -93,7 +93,7 @@ def test_importing_stays_cheap(module: str, forbidden: set[str]):
 
 def test_a_name_of_the_schema_is_one_thing_in_all_its_modules():
     """The package takes its names from its modules when the first is used, from whichever has them."""
-    modules = [import_module(f"splatmill.schema.{found.name}") for found in iter_modules(schema.__path__)]
+    modules = [import_module(each.name) for each in walk_packages(schema.__path__, "splatmill.schema.")]
     for name in schema.__all__:
         found = {id(vars(module)[name]) for module in modules if name in vars(module)}
         assert found == {id(getattr(schema, name))}, name

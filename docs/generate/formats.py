@@ -1,8 +1,8 @@
-"""The table of the formats of models, from `splatmill.schema.formats`: a part of the page about formats."""
+"""The table of the formats of models, from `splatmill.schema.files.formats`: a part of the page about formats."""
 
 from docs.generate.markdown import code, table
 
-from splatmill.schema.formats import MODEL_FORMATS
+from splatmill.schema.files.formats import MODEL_FORMATS
 
 
 def page() -> str:

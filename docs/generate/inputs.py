@@ -5,11 +5,11 @@ import textwrap
 from docs.generate.markdown import choices, code, table
 
 from splatmill.data_sets import CAMERA_PROGRAMS, MAX_DEPTH, OTHER_CAMERAS, PLACES
-from splatmill.schema.captures import MAX_PART_BYTES, MAX_PARTS
-from splatmill.schema.formats import MODEL_FORMATS
-from splatmill.schema.masks import MASK_BEGINNINGS, MASK_ENDINGS, MASK_FOLDERS
-from splatmill.schema.outputs import OUTPUT_MARKS, OUTPUT_MEDIA
-from splatmill.schema.photos import (
+from splatmill.schema.files.formats import MODEL_FORMATS
+from splatmill.schema.files.masks import MASK_BEGINNINGS, MASK_ENDINGS, MASK_FOLDERS
+from splatmill.schema.files.names import MAX_PART_BYTES, MAX_PARTS
+from splatmill.schema.files.outputs import OUTPUT_MARKS, OUTPUT_MEDIA
+from splatmill.schema.files.photos import (
     ARCHIVE_SUFFIXES,
     MAX_PHOTO_PIXELS,
     MIN_PHOTO_SIDE,

@@ -15,7 +15,7 @@ from splatmill.backplane import keys
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import PHOTO_SUFFIXES, CreateJob, Job, Role, StoredKind, TrainOptions
-from splatmill.schema.formats import is_model_file
+from splatmill.schema.files.formats import is_model_file
 from splatmill_server.access.caller import Caller
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.records import Captures

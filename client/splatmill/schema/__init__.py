@@ -1,29 +1,14 @@
 """The wire schema: every request, response, event, option and problem of the service.
 
-All of it is imported when the first name of this package is used. `masks`, `outputs`, `photos`, `port` and
-`quantities`, which define no messages, can be imported without the others: so `splatmill up`, and the processes that
-decode photos, start with half of the work.
+All of it is imported when the first name of this package is used. `port`, `quantities` and the modules of `files`
+but `names` load no message: with them alone, `splatmill up` and the processes that decode photos start sooner.
 """
 
 from importlib import import_module
-from pkgutil import iter_modules
+from pkgutil import walk_packages
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from splatmill.schema.access import (
-        DEFAULT_OWNER,
-        CreateKey,
-        Key,
-        KeyLimits,
-        KeyList,
-        KeyWithSecret,
-        Me,
-        NewKeyLimits,
-        Owner,
-        RotateKey,
-        Scope,
-        Use,
-    )
     from splatmill.schema.base import (
         ByteSize,
         Duration,
@@ -48,101 +33,34 @@ if TYPE_CHECKING:
         RenderRequest,
         Side,
     )
-    from splatmill.schema.captures import (
-        MAX_NAME_BYTES,
-        MAX_PART_BYTES,
-        MAX_PARTS,
-        SHA256_HEADER,
-        Capture,
-        CaptureFile,
-        CapturePage,
-        CreateCapture,
-        FileName,
-        Role,
-        UnsafeName,
-        may_be_empty,
-        safe_name,
-        storable_name,
-    )
-    from splatmill.schema.conversions import (
-        CONVERSION_HEADER,
-        CONVERSION_VERSION,
-        ComparedWith,
-        Conversion,
-        ConversionRequest,
-        ModelDownload,
-        ModelDownloads,
-    )
-    from splatmill.schema.edits import EDIT_HEADER, Box, Edited, EditedView, EditModel
-    from splatmill.schema.estimates import Estimate, EstimateJob, StageEstimate
-    from splatmill.schema.events import (
-        EVENT,
-        FINAL_STATES,
-        CamerasEvent,
-        Curve,
-        CurveRow,
-        Event,
-        EventRecord,
-        JobState,
-        LogEvent,
-        MetricEvent,
-        PlanEvent,
-        PreviewEvent,
-        Progress,
-        ProgressEvent,
-        SnapshotEvent,
-        StateEvent,
-    )
-    from splatmill.schema.fit_image import FitImageOptions
-    from splatmill.schema.formats import DOWNLOADS, MODEL_FORMATS, ModelFormat
-    from splatmill.schema.frames import GeographicOrigin, KnownDistance, ModelFrame, known_distance
-    from splatmill.schema.imports import (
-        CreateImport,
-        Import,
-        ImportList,
-        ImportState,
-    )
-    from splatmill.schema.info import (
-        Accepted,
-        Health,
-        Info,
-        Limits,
-        QueueInfo,
-        Ready,
-        Unread,
-        WorkerInfo,
-    )
-    from splatmill.schema.jobs import (
-        IDEMPOTENCY_HEADER,
-        CreateJob,
-        Job,
-        JobPage,
-        LogLine,
-        LogPage,
-    )
-    from splatmill.schema.live import (
-        SNAPSHOT_MEDIA_TYPE,
-        PlacedCamera,
-        Placement,
-        UnusedPhoto,
-        Watch,
-    )
-    from splatmill.schema.masks import (
+    from splatmill.schema.files.formats import DOWNLOADS, MODEL_FORMATS, ModelFormat
+    from splatmill.schema.files.masks import (
         MASK_BEGINNINGS,
         MASK_ENDINGS,
         MASK_FOLDERS,
     )
-    from splatmill.schema.models import (
-        HELD_OUT,
-        TIME_LAPSE,
-        Model,
-        ModelCamera,
-        ModelCameras,
-        ModelFile,
-        ModelPage,
-        Report,
-        StageSeconds,
+    from splatmill.schema.files.names import (
+        MAX_NAME_BYTES,
+        MAX_PART_BYTES,
+        MAX_PARTS,
+        FileName,
+        UnsafeName,
+        safe_name,
+        storable_name,
     )
+    from splatmill.schema.files.outputs import OUTPUT_MARKS, OUTPUT_MEDIA
+    from splatmill.schema.files.photos import (
+        ARCHIVE_SUFFIXES,
+        MASK_SUFFIXES,
+        MAX_PHOTO_PIXELS,
+        MIN_PHOTO_SIDE,
+        MIN_PHOTOS,
+        PHOTO_SUFFIXES,
+        UNREAD_KINDS,
+        VIDEO_SUFFIXES,
+    )
+    from splatmill.schema.fit_image import FitImageOptions
+    from splatmill.schema.frames import GeographicOrigin, KnownDistance, ModelFrame, known_distance
     from splatmill.schema.options import (
         PRESET_GAIN,
         PRESET_STEPS,
@@ -161,24 +79,6 @@ if TYPE_CHECKING:
         describe_options,
         preset_steps,
     )
-    from splatmill.schema.orbits import (
-        JoinOrbit,
-        Orbit,
-        OrbitFrames,
-        OrbitList,
-        OrbitState,
-    )
-    from splatmill.schema.outputs import OUTPUT_MARKS, OUTPUT_MEDIA
-    from splatmill.schema.photos import (
-        ARCHIVE_SUFFIXES,
-        MASK_SUFFIXES,
-        MAX_PHOTO_PIXELS,
-        MIN_PHOTO_SIDE,
-        MIN_PHOTOS,
-        PHOTO_SUFFIXES,
-        UNREAD_KINDS,
-        VIDEO_SUFFIXES,
-    )
     from splatmill.schema.port import DEFAULT_PORT
     from splatmill.schema.problems import (
         PROBLEM_MEDIA_TYPE,
@@ -193,7 +93,108 @@ if TYPE_CHECKING:
         parse_bytes,
         parse_duration,
     )
-    from splatmill.schema.shares import (
+    from splatmill.schema.resources.access import (
+        DEFAULT_OWNER,
+        CreateKey,
+        Key,
+        KeyLimits,
+        KeyList,
+        KeyWithSecret,
+        Me,
+        NewKeyLimits,
+        Owner,
+        RotateKey,
+        Scope,
+        Use,
+    )
+    from splatmill.schema.resources.captures import (
+        SHA256_HEADER,
+        Capture,
+        CaptureFile,
+        CapturePage,
+        CreateCapture,
+        Role,
+        may_be_empty,
+    )
+    from splatmill.schema.resources.conversions import (
+        CONVERSION_HEADER,
+        CONVERSION_VERSION,
+        ComparedWith,
+        Conversion,
+        ConversionRequest,
+        ModelDownload,
+        ModelDownloads,
+    )
+    from splatmill.schema.resources.edits import EDIT_HEADER, Box, Edited, EditedView, EditModel
+    from splatmill.schema.resources.estimates import Estimate, EstimateJob, StageEstimate
+    from splatmill.schema.resources.events import (
+        EVENT,
+        FINAL_STATES,
+        CamerasEvent,
+        Curve,
+        CurveRow,
+        Event,
+        EventRecord,
+        JobState,
+        LogEvent,
+        MetricEvent,
+        PlanEvent,
+        PreviewEvent,
+        Progress,
+        ProgressEvent,
+        SnapshotEvent,
+        StateEvent,
+    )
+    from splatmill.schema.resources.imports import (
+        CreateImport,
+        Import,
+        ImportList,
+        ImportState,
+    )
+    from splatmill.schema.resources.info import (
+        Accepted,
+        Health,
+        Info,
+        Limits,
+        QueueInfo,
+        Ready,
+        Unread,
+        WorkerInfo,
+    )
+    from splatmill.schema.resources.jobs import (
+        IDEMPOTENCY_HEADER,
+        CreateJob,
+        Job,
+        JobPage,
+        LogLine,
+        LogPage,
+    )
+    from splatmill.schema.resources.live import (
+        SNAPSHOT_MEDIA_TYPE,
+        PlacedCamera,
+        Placement,
+        UnusedPhoto,
+        Watch,
+    )
+    from splatmill.schema.resources.models import (
+        HELD_OUT,
+        TIME_LAPSE,
+        Model,
+        ModelCamera,
+        ModelCameras,
+        ModelFile,
+        ModelPage,
+        Report,
+        StageSeconds,
+    )
+    from splatmill.schema.resources.orbits import (
+        JoinOrbit,
+        Orbit,
+        OrbitFrames,
+        OrbitList,
+        OrbitState,
+    )
+    from splatmill.schema.resources.shares import (
         LONGEST_SHARE,
         CreateShare,
         Share,
@@ -201,7 +202,7 @@ if TYPE_CHECKING:
         ShareList,
         ShareWithToken,
     )
-    from splatmill.schema.storage import (
+    from splatmill.schema.resources.storage import (
         OwnerUse,
         PlannedDeletion,
         StorageUse,
@@ -209,7 +210,7 @@ if TYPE_CHECKING:
         StoredKind,
         StoredRecord,
     )
-    from splatmill.schema.webhooks import (
+    from splatmill.schema.resources.webhooks import (
         CreateWebhook,
         Delivery,
         DeliveryAttempt,
@@ -414,7 +415,7 @@ if not TYPE_CHECKING:  # a type checker would take any name for one of this pack
     def __getattr__(name: str) -> Any:
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        for module in iter_modules(__path__):
-            found = vars(import_module(f"{__name__}.{module.name}"))
-            globals().update({each: found[each] for each in __all__ if each in found})
+        for module in walk_packages(__path__, f"{__name__}."):
+            names = vars(import_module(module.name))
+            globals().update({each: names[each] for each in __all__ if each in names})
         return globals()[name]

@@ -12,8 +12,8 @@ from pydantic import Field, field_validator
 from pydantic.fields import FieldInfo
 
 from splatmill.schema.base import ByteSize, Duration, Request, Response, without_controls
-from splatmill.schema.captures import safe_name
-from splatmill.schema.formats import is_model_file, readable_suffixes
+from splatmill.schema.files.formats import is_model_file, readable_suffixes
+from splatmill.schema.files.names import safe_name
 from splatmill.schema.frames import known_distance
 from splatmill.schema.ids import ID
 

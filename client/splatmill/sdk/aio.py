@@ -28,7 +28,7 @@ from splatmill.schema import (
     StorageUse,
     TrainOptions,
 )
-from splatmill.schema.formats import is_model_file
+from splatmill.schema.files.formats import is_model_file
 from splatmill.sdk.arguments import TrainArguments
 from splatmill.sdk.imports import AsyncImports
 from splatmill.sdk.job import AsyncJobHandle

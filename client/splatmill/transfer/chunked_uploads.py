@@ -19,9 +19,9 @@ from splatmill.errors import (
     ServerError,
     Unavailable,
 )
-from splatmill.schema.captures import CaptureFile
 from splatmill.schema.headers import read_integer, read_token
-from splatmill.schema.uploads import (
+from splatmill.schema.resources.captures import CaptureFile
+from splatmill.schema.resources.uploads import (
     PARTIAL_UPLOAD,
     UPLOAD_COMPLETE,
     UPLOAD_LENGTH,

@@ -10,8 +10,8 @@ import httpx
 
 from splatmill.errors import DownloadFailed, InvalidRequest, Unavailable
 from splatmill.files import move_into_place
-from splatmill.schema.captures import SHA256_HEADER
 from splatmill.schema.headers import read_integer, read_token
+from splatmill.schema.resources.captures import SHA256_HEADER
 from splatmill.transfer.connection import LONGEST_WISH, Connection, backoff
 
 AnyPath = str | os.PathLike[str]

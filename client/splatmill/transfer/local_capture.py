@@ -19,11 +19,12 @@ from splatmill.data_sets import (
     walk,
 )
 from splatmill.errors import NothingToUpload
-from splatmill.schema.captures import Role, UnsafeName, safe_name, storable_name
-from splatmill.schema.masks import masks_beside, without_mask_folder
-from splatmill.schema.outputs import own_outputs
-from splatmill.schema.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES, VIDEO_SUFFIXES, unread
+from splatmill.schema.files.masks import masks_beside, without_mask_folder
+from splatmill.schema.files.names import UnsafeName, safe_name, storable_name
+from splatmill.schema.files.outputs import own_outputs
+from splatmill.schema.files.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES, VIDEO_SUFFIXES, unread
 from splatmill.schema.quantities import counted, listed
+from splatmill.schema.resources.captures import Role
 
 MODEL_SUFFIXES = frozenset({".bin", ".txt"})
 MODEL_STEMS = frozenset({"cameras", "images", "points3d", "rigs", "frames"})  # in lower case
@@ -122,10 +123,10 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     In a folder, the photos are those under `images/`, named relative to it. Without `images/`, or where transforms
     files name photos beside it, they are all photos in the folder, named relative to it, so that `train/r_0.png` keeps
     its name in `transforms_train.json`. Masks lie in a folder such as `masks/`, beside their photos
-    (`splatmill.schema.masks`), or where frames name them; poses are `transforms*.json`, the `.ply` files of points that
-    they name, and COLMAP models. All of this may lie some folders down: see `data_sets.find_cameras`. Hidden files and
-    folders are ignored. Videos and zip archives are used only where there are no photos. Pictures in a folder of
-    results are no photos (`splatmill.schema.outputs`).
+    (`splatmill.schema.files.masks`), or where frames name them; poses are `transforms*.json`, the `.ply` files of
+    points that they name, and COLMAP models. All of this may lie some folders down: see `data_sets.find_cameras`.
+    Hidden files and folders are ignored. Videos and zip archives are used only where there are no photos. Pictures in
+    a folder of results are no photos (`splatmill.schema.files.outputs`).
 
     A file whose name the service does not accept gets another one, or is left out. What is no regular file, or cannot
     be read, is left out too (`data_sets.walk`).

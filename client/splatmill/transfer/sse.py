@@ -12,8 +12,8 @@ import httpx
 from pydantic import ValidationError
 
 from splatmill.errors import Unavailable
-from splatmill.schema.events import EventRecord
 from splatmill.schema.headers import read_token
+from splatmill.schema.resources.events import EventRecord
 from splatmill.transfer.connection import LONGEST_WISH, Connection, backoff
 
 GIVE_UP_SECONDS = 300.0

@@ -7,7 +7,7 @@ from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
 
 from splatmill.schema import CONVERSION_HEADER, DEPTH_SCALE_HEADER, EDIT_HEADER, SHA256_HEADER
-from splatmill.schema.uploads import UPLOAD_COMPLETE, UPLOAD_LENGTH, UPLOAD_LIMIT, UPLOAD_OFFSET
+from splatmill.schema.resources.uploads import UPLOAD_COMPLETE, UPLOAD_LENGTH, UPLOAD_LIMIT, UPLOAD_OFFSET
 from splatmill_server.base.problems import METHODS
 
 EXPOSED = (

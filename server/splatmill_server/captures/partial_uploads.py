@@ -25,7 +25,7 @@ from splatmill.backplane.storage.parts import EndMoved, Part, open_part
 from splatmill.backplane.storage.records import FORMAT
 from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import CaptureFile, Response, Role, Time
-from splatmill.schema.uploads import UPLOAD_COMPLETE, UPLOAD_OFFSET, write_boolean
+from splatmill.schema.resources.uploads import UPLOAD_COMPLETE, UPLOAD_OFFSET, write_boolean
 from splatmill_server.base.problems import ProblemError, problem_of_storage
 from splatmill_server.captures.records import (
     STALE_SECONDS,

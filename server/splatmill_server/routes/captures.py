@@ -8,7 +8,7 @@ from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import SHA256_HEADER, Capture, CaptureFile, CapturePage, CreateCapture, Role, safe_name
 from splatmill.schema.headers import read_integer
-from splatmill.schema.uploads import UPLOAD_COMPLETE, UPLOAD_LENGTH, read_boolean
+from splatmill.schema.resources.uploads import UPLOAD_COMPLETE, UPLOAD_LENGTH, read_boolean
 from splatmill_server.access.caller import Who
 from splatmill_server.base.filters import Filter
 from splatmill_server.base.paging import DEFAULT_LIMIT

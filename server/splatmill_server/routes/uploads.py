@@ -13,7 +13,7 @@ from starlette.responses import JSONResponse, Response
 
 from splatmill.schema import SHA256_HEADER, CaptureFile, Role
 from splatmill.schema.headers import read_integer
-from splatmill.schema.uploads import (
+from splatmill.schema.resources.uploads import (
     PARTIAL_UPLOAD,
     UPLOAD_COMPLETE,
     UPLOAD_LENGTH,

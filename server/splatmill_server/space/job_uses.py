@@ -10,7 +10,7 @@ import redis
 
 from splatmill.backplane import keys
 from splatmill.schema import DEFAULT_OWNER, StoredKind
-from splatmill.schema.formats import is_model_file
+from splatmill.schema.files.formats import is_model_file
 from splatmill_server.jobs.reading import read_jobs
 from splatmill_server.space.holdings import Holding
 

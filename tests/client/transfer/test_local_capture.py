@@ -14,7 +14,7 @@ from splatmill.cli.commands.models import FILES, OPTIONAL_FILES
 from splatmill.data_sets import find_cameras, walk
 from splatmill.errors import NothingToUpload
 from splatmill.schema import OUTPUT_MARKS, OUTPUT_MEDIA, Role, safe_name
-from splatmill.schema.masks import paired
+from splatmill.schema.files.masks import paired
 from splatmill.transfer.local_capture import find_files, printable
 from tests.support.paths import DATA
 

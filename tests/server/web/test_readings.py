@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatmill.schema.masks import MASK_BEGINNINGS, MASK_ENDINGS
+from splatmill.schema.files.masks import MASK_BEGINNINGS, MASK_ENDINGS
 from splatmill_worker.images.mask_levels import judged
 from tests.support import unmarked_zip
 from tests.support.paths import ROOT

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from splatmill.schema import OrbitRequest
-from splatmill.schema.formats import MODEL_FORMATS
+from splatmill.schema.files.formats import MODEL_FORMATS
 from splatmill_worker.render_service import orbit
 from splatmill_worker.render_service.encoding import camera_of, render_frame
 from splatmill_worker.render_service.local import load, overview

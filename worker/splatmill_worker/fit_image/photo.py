@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatmill.schema.photos import MIN_PHOTO_SIDE
+from splatmill.schema.files.photos import MIN_PHOTO_SIDE
 from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.fit_image.plane import camera_before
 from splatmill_worker.images import guarded

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 from pydantic import PlainValidator
 
-from splatmill.schema.photos import MIN_PHOTO_SIDE
+from splatmill.schema.files.photos import MIN_PHOTO_SIDE
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import exif, guarded, transparency
 from splatmill_worker.images.copies import SMALL_SIDE, small_grey

@@ -24,7 +24,7 @@ import av
 import pillow_heif
 from PIL import Image, UnidentifiedImageError
 
-from splatmill.schema.photos import MAX_PHOTO_PIXELS, PHOTO_FORMATS, VIDEO_FORMATS
+from splatmill.schema.files.photos import MAX_PHOTO_PIXELS, PHOTO_FORMATS, VIDEO_FORMATS
 from splatmill_worker import memory
 from splatmill_worker.errors import UnusablePicture, UnusableVideo
 from splatmill_worker.images.signatures import recognised

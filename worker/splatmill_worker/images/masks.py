@@ -1,4 +1,4 @@
-"""Masks of photos: whether they fit, and which levels they have. Their names: `splatmill.schema.masks`."""
+"""Masks of photos: whether they fit, and which levels they have. Their names: `splatmill.schema.files.masks`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from splatmill.schema.masks import MASK_FOLDERS, without_mask_folder
-from splatmill.schema.photos import MASK_SUFFIXES
+from splatmill.schema.files.masks import MASK_FOLDERS, without_mask_folder
+from splatmill.schema.files.photos import MASK_SUFFIXES
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import guarded
 from splatmill_worker.images.decode import decode, upright_size

@@ -14,9 +14,9 @@ from pathlib import Path, PurePosixPath
 from PIL import Image
 
 from splatmill.data_sets import MAX_DEPTH, unread_cameras
-from splatmill.schema.masks import masks_beside, paired, without_mask_folder
-from splatmill.schema.outputs import own_outputs
-from splatmill.schema.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES, unread, unread_kind
+from splatmill.schema.files.masks import masks_beside, paired, without_mask_folder
+from splatmill.schema.files.outputs import own_outputs
+from splatmill.schema.files.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES, unread, unread_kind
 from splatmill.schema.quantities import counted
 from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
 from splatmill_worker.images import copies, exif, mask_levels, overlays, photo_colors, transparency
@@ -142,7 +142,7 @@ def prepare(
     a size (they are then not decoded), and when they are copies of another photo (`images.copies`), of which the
     largest is kept. Of a file with several pictures, the first is used.
 
-    masks: folder of the masks, if there is one; others may lie among the photos (`splatmill.schema.masks`).
+    masks: folder of the masks, if there is one; others may lie among the photos (`splatmill.schema.files.masks`).
     on_progress: called as ("images", files examined, files in all, name of the file).
 
     Raises Refusal for a mask that is too large to be decoded, for masks that hide all of every photo, and for archives

@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from splatmill.schema import ModelCameras, OrbitRequest
-from splatmill.schema.formats import format_of
+from splatmill.schema.files.formats import format_of
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.render_service.local import REFUSED, STOPPED, UNWRITABLE, read

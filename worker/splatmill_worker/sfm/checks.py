@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from splatmill.schema.photos import MIN_PHOTOS
+from splatmill.schema.files.photos import MIN_PHOTOS
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.sfm.cameras import FOCAL_BOUNDS

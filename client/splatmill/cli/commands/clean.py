@@ -55,7 +55,7 @@ def clean(
 
     from splatmill.errors import invalid_request
     from splatmill.schema import EditModel
-    from splatmill.schema.formats import MODEL_FORMATS, format_of
+    from splatmill.schema.files.formats import MODEL_FORMATS, format_of
 
     if capture is None and box is None and min_weight is None:
         raise typer.BadParameter("Say what to clean by: give --capture, --box or --min-weight.")

@@ -31,7 +31,7 @@ def convert(
 
     The views are those of the cameras.json beside MODEL; without one, the cameras circle the scene.
     """
-    from splatmill.schema.formats import MODEL_FORMATS, format_of
+    from splatmill.schema.files.formats import MODEL_FORMATS, format_of
 
     if not model.is_file():
         raise typer.BadParameter(f"There is no file {model}.", param_hint="MODEL")

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from splatmill.cli.servers import ServerOption, open_client
-from splatmill.schema.captures import Role
+from splatmill.schema.resources.captures import Role
 
 
 def import_file(

@@ -5,7 +5,8 @@ import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
-from splatmill.schema.events import (
+from splatmill.schema.quantities import format_bytes, format_duration
+from splatmill.schema.resources.events import (
     EventRecord,
     JobState,
     LogEvent,
@@ -14,7 +15,6 @@ from splatmill.schema.events import (
     ProgressEvent,
     StateEvent,
 )
-from splatmill.schema.quantities import format_bytes, format_duration
 
 if TYPE_CHECKING:
     from rich.progress import TaskID

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import typer
 
 from splatmill.cli.local.programs import exec_module, require
-from splatmill.schema.formats import format_of
+from splatmill.schema.files.formats import format_of
 
 if TYPE_CHECKING:
     from splatmill.schema import CameraSpec, ModelCamera

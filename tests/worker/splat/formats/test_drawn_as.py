@@ -18,7 +18,7 @@ from plyfile import PlyData
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import CameraSpec, EditModel
-from splatmill.schema.formats import MODEL_FORMATS
+from splatmill.schema.files.formats import MODEL_FORMATS
 from splatmill_worker.render_service.clean import Wanted, clean_file
 from splatmill_worker.render_service.convert import convert
 from splatmill_worker.render_service.edit import edit

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.schema.formats import MODEL_FORMATS, format_of
+from splatmill.schema.files.formats import MODEL_FORMATS, format_of
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.formats import compressed_ply, ply, registry
 from tests.support.gaussians import some_gaussians

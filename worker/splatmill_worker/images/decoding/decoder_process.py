@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from splatmill.schema.photos import MAX_PHOTO_PIXELS
+from splatmill.schema.files.photos import MAX_PHOTO_PIXELS
 from splatmill_worker.errors import Cancelled
 from splatmill_worker.images.decoding import messages
 from splatmill_worker.images.decoding.decoder import LENGTHS, write_message

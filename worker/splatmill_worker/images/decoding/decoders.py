@@ -23,7 +23,7 @@ from PIL import Image
 from pydantic import Field, TypeAdapter
 
 from splatmill.schema import format_bytes
-from splatmill.schema.photos import MAX_PHOTO_PIXELS
+from splatmill.schema.files.photos import MAX_PHOTO_PIXELS
 from splatmill_worker import memory, settings
 from splatmill_worker.errors import DecoderNotStarted, UnusablePicture, UnusableVideo
 from splatmill_worker.images import decode as decode_here

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatmill.data_sets import MODEL_FILES, Cameras, find_cameras, keyframes, walk
-from splatmill.schema.photos import PHOTO_FORMATS, PHOTO_SUFFIXES
+from splatmill.schema.files.photos import PHOTO_FORMATS, PHOTO_SUFFIXES
 from splatmill.schema.quantities import listed
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import lens, mask_levels, transparency

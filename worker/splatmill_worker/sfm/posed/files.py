@@ -13,9 +13,9 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from splatmill.data_sets import walk
-from splatmill.schema.captures import UnsafeName, storable_name
-from splatmill.schema.masks import masks_beside, paired, without_mask_folder
-from splatmill.schema.photos import PHOTO_SUFFIXES
+from splatmill.schema.files.masks import masks_beside, paired, without_mask_folder
+from splatmill.schema.files.names import UnsafeName, storable_name
+from splatmill.schema.files.photos import PHOTO_SUFFIXES
 from splatmill.schema.quantities import counted
 from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.images.decoding import decoders

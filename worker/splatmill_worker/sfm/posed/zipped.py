@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from splatmill.data_sets import MAX_DEPTH, TwoDataSets
-from splatmill.schema.formats import is_model_file
-from splatmill.schema.photos import ARCHIVE_SUFFIXES
+from splatmill.schema.files.formats import is_model_file
+from splatmill.schema.files.photos import ARCHIVE_SUFFIXES
 from splatmill_worker.images import prepare
 from splatmill_worker.images.archives.archive import REMARK, Allowance
 from splatmill_worker.images.masks import mask_folder

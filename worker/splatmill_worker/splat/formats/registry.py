@@ -1,4 +1,4 @@
-"""The formats by suffix: `read` and `write` choose the one of a path. What they are is `splatmill.schema.formats`."""
+"""The formats by suffix: `read` and `write` choose the one of a path. `splatmill.schema.files.formats` lists them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from splatmill.schema.formats import MODEL_FORMATS, format_of
+from splatmill.schema.files.formats import MODEL_FORMATS, format_of
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.formats import compressed_ply, glb, ksplat, ply, sog, splat, spz
 from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset

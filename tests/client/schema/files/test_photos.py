@@ -15,7 +15,7 @@ from splatmill.schema import (
 from tests.support.paths import ROOT
 
 PARTS = ("client/splatmill", "server/splatmill_server", "worker/splatmill_worker")
-HERE_ALONE = Path("client/splatmill/schema/photos.py")
+HERE_ALONE = Path("client/splatmill/schema/files/photos.py")
 
 
 def spelling(*texts: str) -> set[str]:

@@ -5,8 +5,9 @@ from enum import StrEnum
 from pydantic import Field
 
 from splatmill.schema.base import Request, Response, Time
-from splatmill.schema.captures import CaptureFile, FileName, Role
+from splatmill.schema.files.names import FileName
 from splatmill.schema.problems import Problem
+from splatmill.schema.resources.captures import CaptureFile, Role
 
 
 class CreateImport(Request):

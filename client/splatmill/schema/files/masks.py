@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable
 from os.path import splitext
 
-from splatmill.schema.photos import MASK_SUFFIXES
+from splatmill.schema.files.photos import MASK_SUFFIXES
 
 MASK_FOLDERS = ("masks", "mask", "segmentation", "segmentations")
 """Names, in lower case, of folders that hold masks."""

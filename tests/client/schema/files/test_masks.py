@@ -6,7 +6,7 @@ Does not prove what a mask hides; the worker's tests of images do.
 import pytest
 
 from splatmill.schema import MASK_BEGINNINGS, MASK_ENDINGS, MASK_FOLDERS
-from splatmill.schema.masks import masks_beside, paired, without_mask_folder
+from splatmill.schema.files.masks import masks_beside, paired, without_mask_folder
 
 
 @pytest.mark.parametrize(

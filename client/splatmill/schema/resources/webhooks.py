@@ -4,9 +4,9 @@ from enum import StrEnum
 
 from pydantic import Field
 
-from splatmill.schema.access import DEFAULT_OWNER, Owner
 from splatmill.schema.base import Label, Request, Response, Time
-from splatmill.schema.jobs import Job
+from splatmill.schema.resources.access import DEFAULT_OWNER, Owner
+from splatmill.schema.resources.jobs import Job
 
 
 class WebhookEvent(StrEnum):

@@ -1,0 +1,1 @@
+"""The files of captures and models: their names, their kinds and their formats."""
