@@ -159,6 +159,16 @@ def test_header_fields_and_addresses_of_others_are_parsed_in_one_place_each():
         assert found == allowed, pattern
 
 
+def test_keys_of_rq_are_named_in_one_place():
+    named = {
+        path.relative_to(ROOT).as_posix()
+        for part in PARTS.values()
+        for path in part.rglob("*.py")
+        if re.search(r"\brq:|REDIS_WORKER_KEYS|WORKERS_BY_QUEUE_KEY", path.read_text())
+    }
+    assert named == {"client/splatmill/backplane/queue/rq_keys.py"}
+
+
 def test_every_test_file_says_what_it_proves():
     mute = [
         str(p.relative_to(ROOT))

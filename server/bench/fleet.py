@@ -43,7 +43,7 @@ from _studies.study import Study
 
 from splatmill.backplane import keys
 from splatmill.backplane.connection import connect
-from splatmill.backplane.queue import leases
+from splatmill.backplane.queue import leases, rq_keys
 from splatmill.backplane.queue.entries import open_queue, split_rq_id
 from splatmill_server.base.settings import Settings
 
@@ -228,7 +228,7 @@ def _training(fleet: Fleet, api: Api, connection: redis.Redis, folder: Path, sec
 
     def begun() -> bool:
         api.require_none_failed()
-        return connection.zcard(leases.key()) == jobs and _under_way(connection)
+        return connection.zcard(rq_keys.STARTED) == jobs and _under_way(connection)
 
     _until(begun)
     time.sleep(1.0)  # for streams of more than one entry

@@ -31,7 +31,7 @@ from _soak.proxy import Proxy
 from splatmill.backplane import keys, lists
 from splatmill.backplane.jobs import events
 from splatmill.backplane.process import start_time
-from splatmill.backplane.queue import entries, leases, queue
+from splatmill.backplane.queue import entries, queue, rq_keys
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import JobState, Problem, StateEvent
@@ -261,7 +261,7 @@ def test_a_list_that_tells_twice_or_not_at_all_is_found(ended: Ended) -> None:
 
 LEFT: dict[str, Callable[[Ended], Any]] = {
     "unfinished jobs": lambda e: e.redis.sadd(keys.ACTIVE, e.job),
-    "leases": lambda e: e.redis.zadd(leases.key(), {f"{entries.rq_id(e.job, 1)}:x": 9e9}),
+    "leases": lambda e: e.redis.zadd(rq_keys.STARTED, {f"{entries.rq_id(e.job, 1)}:x": 9e9}),
     "waiting entries": lambda e: e.app.job(e.capture),
     "locks": lambda e: e.redis.hset(keys.lock(e.job), "token", "x"),
     "marks of work in storage": lambda e: e.storage.put(layout.watched_job(e.job), b"{}"),

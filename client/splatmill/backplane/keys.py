@@ -1,4 +1,4 @@
-"""The names of all keys of Splatmill in Redis. RQ keeps its own under `rq:`.
+"""The names of all keys of Splatmill in Redis. Those of RQ are in `queue.rq_keys`.
 
 The keys of a job are deleted with the job; where keys expire, their functions say so.
 """

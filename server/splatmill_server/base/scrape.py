@@ -10,11 +10,10 @@ from dataclasses import dataclass
 import redis
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric
-from rq.worker_registration import REDIS_WORKER_KEYS
 
 from splatmill.backplane import keys, lists, memory, totals
 from splatmill.backplane.memory import RedisMemory
-from splatmill.backplane.queue import lines, workers
+from splatmill.backplane.queue import lines, rq_keys, workers
 from splatmill.backplane.queue.lines import LINES, Waiting
 from splatmill.backplane.queue.workers import WorkerRecord
 from splatmill.backplane.rendering import RendererState
@@ -84,7 +83,7 @@ def read(connection: redis.Redis) -> Seen:
         pipe.time()
         lines.ask(pipe)
         pipe.zrange(keys.ARRIVED, 0, 0, withscores=True)
-        pipe.smembers(REDIS_WORKER_KEYS)
+        pipe.smembers(rq_keys.WORKERS)
         pipe.info("memory")
         pipe.hgetall(keys.TOTALS)
         for kind in _KINDS:

@@ -18,7 +18,7 @@ import pytest
 
 from splatmill.backplane import keys
 from splatmill.backplane.jobs import row
-from splatmill.backplane.queue import entries, leases, queue
+from splatmill.backplane.queue import entries, leases, queue, rq_keys
 from splatmill.schema import JobState, ProgressEvent, StateEvent
 from tests.support.queue_entries import take, waiting
 from tests.support.served_app import Serve, ServedApp, store_model
@@ -221,7 +221,7 @@ def test_what_seems_to_run_and_is_held_by_nobody_is_queued_again(app: ServedApp)
     app.redis.delete(f"rq:job:{lease.entry}")
     app.redis.hset(f"rq:job:{lease.entry}", mapping={"status": "started", "worker_name": "killed"})
     assert [look() for _ in range(3)] == [["running"]] * 3, "the lease has not expired"
-    app.redis.zrem(leases.key(), lease.member)
+    app.redis.zrem(rq_keys.STARTED, lease.member)
     app.redis.sadd(keys.RESTORED, job_id)
     app.redis.expire(keys.RESTORED, 15)
     assert look() == ["running"], "a worker may take the lease again"
@@ -242,7 +242,7 @@ def test_a_wish_that_outlived_the_server_is_fulfilled_by_the_next_one(serve: Ser
 def test_two_reapers_at_once_requeue_an_attempt_once(app: ServedApp, quick_leases: None) -> None:
     app.job()
     lease = take(app.redis)
-    app.redis.zadd(leases.key(), {lease.member: 1})
+    app.redis.zadd(rq_keys.STARTED, {lease.member: 1})
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda _: leases.Reclaim(app.redis).run(), range(8)))
     assert [became for runs in found for _, became in runs] == ["waiting"]

@@ -13,7 +13,7 @@ import pytest
 import redis
 
 from splatmill.backplane.connection import connect
-from splatmill.backplane.queue import leases, lines, queue
+from splatmill.backplane.queue import leases, lines, queue, rq_keys
 from splatmill.backplane.queue.leases import Lease, Reclaim
 from tests.support.jobs import write_row
 from tests.support.queue_entries import take, waiting
@@ -52,13 +52,13 @@ def taken(connection: redis.Redis, monkeypatch: pytest.MonkeyPatch) -> Lease:
 
 def expires(connection: redis.Redis, lease: Lease) -> float:
     """The time at which a lease ends, in seconds by the clock of Redis."""
-    score = connection.zscore(leases.key(), lease.member)
+    score = connection.zscore(rq_keys.STARTED, lease.member)
     assert score is not None
     return float(score)
 
 
 def expire(connection: redis.Redis, lease: Lease) -> None:
-    connection.zadd(leases.key(), {lease.member: 1})
+    connection.zadd(rq_keys.STARTED, {lease.member: 1})
 
 
 @pytest.mark.slow
@@ -67,7 +67,7 @@ def test_a_server_with_another_clock_requeues_no_running_attempt(
     taken: Lease, connection: redis.Redis, redis_url: str, ahead: float
 ) -> None:
     reclaim = "leases.LEASE = 2; print(leases.Reclaim(connection).run())"
-    connection.zadd(leases.key(), {taken.member: connection.time()[0] + 15})
+    connection.zadd(rq_keys.STARTED, {taken.member: connection.time()[0] + 15})
     assert shifted(redis_url, ahead, reclaim).strip() == "[]"
     assert queue.status(connection, "job00001", 1).state == "running"
     # An expired one is requeued, also where the server's clock is behind.
@@ -111,7 +111,7 @@ def test_a_lease_lasts_no_longer_where_the_clock_of_redis_is_set_back(
 ) -> None:
     reclaim = Reclaim(connection)
     half_an_hour_back = connection.time()[0] + 1800
-    connection.zadd(leases.key(), {taken.member: half_an_hour_back})
+    connection.zadd(rq_keys.STARTED, {taken.member: half_an_hour_back})
     assert reclaim.run() == []
     assert 0 < expires(connection, taken) - connection.time()[0] <= leases.LEASE
 
@@ -137,9 +137,9 @@ def test_an_entry_whose_worker_is_lost_again_and_again_fails(taken: Lease, conne
 
 
 def test_a_member_of_another_form_is_removed(taken: Lease, connection: redis.Redis) -> None:
-    connection.zadd(leases.key(), {"nonsense": 1, "nonsense:x": 1})
+    connection.zadd(rq_keys.STARTED, {"nonsense": 1, "nonsense:x": 1})
     assert leases.held(connection) == [taken]
-    assert connection.zrange(leases.key(), 0, -1) == [taken.member.encode()]
+    assert connection.zrange(rq_keys.STARTED, 0, -1) == [taken.member.encode()]
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from splatmill.backplane import keys
-from splatmill.backplane.queue import entries, leases, lines, queue, workers
+from splatmill.backplane.queue import entries, leases, lines, queue, rq_keys, workers
 from splatmill.backplane.queue.lines import LINES, Line
 from splatmill.schema import Backend, TrainOptions
 from splatmill_server.jobs import queue_places
@@ -77,7 +77,7 @@ def test_what_was_interrupted_goes_on_before_another_owner_begins(connection: re
         assert leases.requeue(connection, lease, if_expired=False) == "waiting"
     else:
         leases.to_the_front(connection, lease.entry)
-        connection.zrem(leases.key(), lease.member)
+        connection.zrem(rq_keys.STARTED, lease.member)
         connection.hset(f"rq:job:{lease.entry}", "status", "queued")
         connection.rpush(entries.open_queue(connection).key, lease.entry)
     assert lines.look(connection, [lease.entry]).position(lease.entry, LINES) == 0

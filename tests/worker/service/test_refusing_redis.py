@@ -18,7 +18,7 @@ import redis
 
 from splatmill.backplane.connection import connect
 from splatmill.backplane.jobs import events
-from splatmill.backplane.queue import leases, queue
+from splatmill.backplane.queue import leases, queue, rq_keys
 from splatmill.backplane.refusal import RedisRefuses
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
@@ -118,7 +118,7 @@ def test_nothing_is_requeued_while_heartbeats_are_refused_nor_right_after(
     with pytest.raises(RedisRefuses):
         reclaim.run()
     allow(connection)
-    connection.zadd(leases.key(), {lease.member: 0})  # expired meanwhile
+    connection.zadd(rq_keys.STARTED, {lease.member: 0})  # expired meanwhile
     assert reclaim.run() == []
     assert leases.prolong(connection, lease)
 

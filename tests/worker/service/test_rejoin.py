@@ -7,7 +7,7 @@ from typing import Any
 
 import redis
 
-from splatmill.backplane.queue import entries, leases, lines, queue
+from splatmill.backplane.queue import entries, leases, lines, queue, rq_keys
 from tests.support.jobs import write_row
 from tests.support.queue_entries import take, waiting
 
@@ -54,9 +54,9 @@ def test_a_lease_that_another_worker_has_is_not_taken_again(connection: redis.Re
 
 def test_a_lease_that_is_held_stays_as_it_is(connection: redis.Redis) -> None:
     lease, record = taken(connection)
-    before = connection.zscore(leases.key(), lease.member)
+    before = connection.zscore(rq_keys.STARTED, lease.member)
     assert leases.rejoin(connection, lease, "tester", record)
-    assert connection.zscore(leases.key(), lease.member) == before
+    assert connection.zscore(rq_keys.STARTED, lease.member) == before
 
 
 def test_an_attempt_that_began_after_the_loss_takes_its_lease_again(connection: redis.Redis) -> None:

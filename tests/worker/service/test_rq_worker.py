@@ -19,7 +19,7 @@ from rq.job import Callback
 
 from splatmill.backplane import keys, totals
 from splatmill.backplane.jobs.row import now
-from splatmill.backplane.queue import entries, leases, queue, workers
+from splatmill.backplane.queue import entries, leases, queue, rq_keys, workers
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Backend, Job, Role, TrainOptions
@@ -173,14 +173,14 @@ def test_an_entry_that_belongs_to_no_job_is_removed_and_the_next_one_runs(
     foreign = ["nonsense", "job-x", "-1"]
     for entry in foreign:
         entries.open_queue(connection).enqueue_call(entries.ATTEMPT, args=["?"], job_id=entry)
-    connection.zadd(leases.key(), {"nonsense:x": 1, "more nonsense": 1})
+    connection.zadd(rq_keys.STARTED, {"nonsense:x": 1, "more nonsense": 1})
     write_row(connection, "job00001")
     assert queue.enqueue(connection, "job00001", 1)
     with worker(redis_server, storage, tmp_path) as process:
         assert wait_for(partial(ended, redis_server, "job00001")).state == "succeeded"
         assert process.poll() is None
     assert waiting(connection) == 0
-    assert connection.zcard(leases.key()) == 0
+    assert connection.zcard(rq_keys.STARTED) == 0
     assert not any(connection.exists(f"rq:job:{entry}") for entry in foreign)
 
 
@@ -195,11 +195,11 @@ def test_a_worker_whose_clock_is_off_runs_its_job_once(
     write_row(connection, "job00001")
     assert queue.enqueue(connection, "job00001", 1)
     with worker(redis_server, storage, tmp_path, clock_ahead=ahead):
-        wait_for(lambda: connection.zcard(leases.key()))
-        first = connection.zrange(leases.key(), 0, -1, withscores=True)
-        wait_for(lambda: connection.zrange(leases.key(), 0, -1, withscores=True) != first)
+        wait_for(lambda: connection.zcard(rq_keys.STARTED))
+        first = connection.zrange(rq_keys.STARTED, 0, -1, withscores=True)
+        wait_for(lambda: connection.zrange(rq_keys.STARTED, 0, -1, withscores=True) != first)
         # Prolonged by a heartbeat, by the clock of Redis.
-        expires = cast(list[Any], connection.zrange(leases.key(), 0, -1, withscores=True))[0][1]
+        expires = cast(list[Any], connection.zrange(rq_keys.STARTED, 0, -1, withscores=True))[0][1]
         assert 0 < expires - connection.time()[0] <= leases.LEASE
         job = wait_for(partial(ended, redis_server, "job00001"))
     assert (job.state, job.attempt) == ("succeeded", 1)

@@ -14,11 +14,11 @@ from typing import Any, cast
 import redis
 from rq import Worker
 from rq.executions import Execution
-from rq.worker_registration import REDIS_WORKER_KEYS, get_keys
+from rq.worker_registration import get_keys
 
 from splatmill.backplane import keys
 from splatmill.backplane.process import ProcessIdentity, wait_gone
-from splatmill.backplane.queue import leases, lines
+from splatmill.backplane.queue import leases, lines, rq_keys
 from splatmill.backplane.queue.entries import split_rq_id
 from splatmill.backplane.queue.leases import Lease
 from splatmill_worker.service.attempts.attempt import Attempt
@@ -40,7 +40,7 @@ def is_recorded(worker: Worker) -> bool:
     """
     with worker.connection.pipeline(transaction=False) as pipe:
         pipe.hexists(worker.key, _PROCESS_FIELD)
-        pipe.sismember(REDIS_WORKER_KEYS, worker.key)
+        pipe.sismember(rq_keys.WORKERS, worker.key)
         return all(pipe.execute())
 
 
@@ -78,7 +78,7 @@ def requeue_orphans(worker: Worker) -> None:
     for key in dead:
         with worker.connection.pipeline() as pipeline:
             pipeline.srem(worker.redis_workers_keys, key)
-            pipeline.srem(f"rq:workers:{queue.name}", key)
+            pipeline.srem(rq_keys.LISTENING, key)
             pipeline.delete(key)
             pipeline.execute()
 

@@ -13,14 +13,13 @@ from dataclasses import dataclass
 from typing import Any, Literal, cast
 
 import redis
-from rq.registry import StartedJobRegistry
 
 from splatmill.backplane import keys, totals
+from splatmill.backplane.queue import rq_keys
 from splatmill.backplane.queue.entries import (
     HEARTBEAT_SLACK,
     KEEP_FINISHED,
     MONITORING_INTERVAL,
-    TRAIN,
     split_rq_id,
 )
 
@@ -90,26 +89,26 @@ end
 return redis.call('ZRANGEBYSCORE', KEYS[1], '-inf', now)
 """
 
-# KEYS: leases, RQ's record of the entry, queue, totals. ARGV: member, entry, whether only if expired, limit, seconds to
-# keep, name of the total.
+# KEYS: leases, RQ's records of the entry and of the execution, queue, totals. ARGV: member, entry, whether only if
+# expired, limit, seconds to keep, name of the total.
 _REQUEUE = """
 local expires = redis.call('ZSCORE', KEYS[1], ARGV[1])
 if not expires then return 'kept' end
 if ARGV[3] == '1' and tonumber(expires) > tonumber(redis.call('TIME')[1]) then return 'kept' end
 redis.call('ZREM', KEYS[1], ARGV[1])
-redis.call('DEL', 'rq:execution:' .. ARGV[1])
+redis.call('DEL', KEYS[3])
 if redis.call('EXISTS', KEYS[2]) == 0 then return 'absent' end
 local lost = redis.call('HINCRBY', KEYS[2], 'splatmill_lost', 1)
 if lost >= tonumber(ARGV[4]) then
   redis.call('HSET', KEYS[2], 'status', 'failed')
   redis.call('EXPIRE', KEYS[2], ARGV[5])
-  redis.call('HINCRBY', KEYS[4], ARGV[6] .. '|failed', 1)
+  redis.call('HINCRBY', KEYS[5], ARGV[6] .. '|failed', 1)
   return 'failed'
 end
 redis.call('HSET', KEYS[2], 'status', 'queued', 'worker_name', '')
 if lost == 1 then redis.call('HSET', KEYS[2], 'splatmill_front', 1) end
-redis.call('RPUSH', KEYS[3], ARGV[2])
-redis.call('HINCRBY', KEYS[4], ARGV[6] .. '|waiting', 1)
+redis.call('RPUSH', KEYS[4], ARGV[2])
+redis.call('HINCRBY', KEYS[5], ARGV[6] .. '|waiting', 1)
 return 'waiting'
 """
 
@@ -128,15 +127,10 @@ class Lease:
         return f"{self.entry}:{self.execution}"
 
 
-def key() -> str:
-    """Return the key of the leases: RQ's sorted set of started entries."""
-    return StartedJobRegistry.key_template.format(TRAIN)
-
-
 def prolong(connection: redis.Redis, lease: Lease) -> bool:
     """Prolong a lease by a heartbeat. Return False if it is not held any more: another worker may run the entry."""
-    execution = f"rq:execution:{lease.member}"
-    return bool(connection.eval(_PROLONG, 2, key(), execution, lease.member, LEASE))
+    execution = rq_keys.execution(lease.member)
+    return bool(connection.eval(_PROLONG, 2, rq_keys.STARTED, execution, lease.member, LEASE))
 
 
 def rejoin(connection: redis.Redis, lease: Lease, worker: str, record: Mapping[Any, Any]) -> bool:
@@ -149,31 +143,31 @@ def rejoin(connection: redis.Redis, lease: Lease, worker: str, record: Mapping[A
     started by this worker: as waiting, for example.
     """
     fields = [part for field in record.items() for part in field]
-    execution, entry = f"rq:execution:{lease.member}", f"rq:job:{lease.entry}"
+    execution, entry = rq_keys.execution(lease.member), rq_keys.record(lease.entry)
     arguments = lease.member, LEASE, lease.entry, lease.execution, worker, *fields
-    return bool(connection.eval(_REJOIN, 4, key(), execution, entry, keys.PLACES, *arguments))
+    return bool(connection.eval(_REJOIN, 4, rq_keys.STARTED, execution, entry, keys.PLACES, *arguments))
 
 
 def advanced(connection: redis.Redis, entry: str) -> None:
     """Record that an attempt has stored a new checkpoint: workers that were lost before it do not count any more."""
-    connection.hdel(f"rq:job:{entry}", "splatmill_lost")
+    connection.hdel(rq_keys.record(entry), "splatmill_lost")
 
 
 def to_the_front(connection: redis.Redis, entry: str) -> None:
     """Have an entry come in front of its owner's others when it next waits."""
-    connection.hset(f"rq:job:{entry}", "splatmill_front", 1)
+    connection.hset(rq_keys.record(entry), "splatmill_front", 1)
 
 
 def lost(connection: redis.Redis, entry: str) -> int:
     """Return how many attempts in a row have ended with their worker and without a new checkpoint."""
-    return int(cast(Any, connection.hget(f"rq:job:{entry}", "splatmill_lost")) or 0)
+    return int(cast(Any, connection.hget(rq_keys.record(entry), "splatmill_lost")) or 0)
 
 
 def drop(connection: redis.Redis, lease: Lease) -> None:
     """Delete a lease and RQ's record of its entry, which cannot be read. The reaper enqueues its job anew."""
     with connection.pipeline() as pipe:
-        pipe.delete(f"rq:job:{lease.entry}")
-        pipe.zrem(key(), lease.member)
+        pipe.delete(rq_keys.record(lease.entry))
+        pipe.zrem(rq_keys.STARTED, lease.member)
         pipe.execute()
 
 
@@ -182,19 +176,19 @@ def drop_unheld(connection: redis.Redis, entry: str) -> bool:
 
     Return whether it was deleted. The reaper then enqueues its job anew.
     """
-    return bool(connection.eval(_DROP_UNHELD, 2, key(), f"rq:job:{entry}", entry))
+    return bool(connection.eval(_DROP_UNHELD, 2, rq_keys.STARTED, rq_keys.record(entry), entry))
 
 
 def held(connection: redis.Redis) -> list[Lease]:
     """Return all leases, also the expired ones. A member of another form is removed and logged."""
-    return _leases(connection, cast(list[bytes], connection.zrange(key(), 0, -1)))
+    return _leases(connection, cast(list[bytes], connection.zrange(rq_keys.STARTED, 0, -1)))
 
 
 def owners(connection: redis.Redis, held_leases: Sequence[Lease]) -> list[str | None]:
     """Return the name of the worker that holds each of these leases; None where its record has expired."""
     with connection.pipeline(transaction=False) as pipe:
         for lease in held_leases:
-            pipe.hget(f"rq:execution:{lease.member}", "worker_name")
+            pipe.hget(rq_keys.execution(lease.member), "worker_name")
         return [name.decode() if name is not None else None for name in pipe.execute()]
 
 
@@ -202,7 +196,7 @@ def running(connection: redis.Redis) -> dict[str, float]:
     """Return, by name of worker, for how many seconds the attempts that are leased have run."""
     with connection.pipeline(transaction=False) as pipe:
         for lease in held(connection):
-            pipe.hmget(f"rq:execution:{lease.member}", "worker_name", "created_at")
+            pipe.hmget(rq_keys.execution(lease.member), "worker_name", "created_at")
         replies = cast(list[list[bytes | None]], pipe.execute())
     now = connection.time()[0]
     return {worker.decode(): max(0.0, now - float(since)) for worker, since in replies if worker and since}
@@ -216,10 +210,11 @@ def requeue(connection: redis.Redis, lease: Lease, *, if_expired: bool) -> Reque
     """
     answer = connection.eval(
         _REQUEUE,
-        4,
-        key(),
-        f"rq:job:{lease.entry}",
-        f"rq:queue:{TRAIN}",
+        5,
+        rq_keys.STARTED,
+        rq_keys.record(lease.entry),
+        rq_keys.execution(lease.member),
+        rq_keys.ARRIVALS,
         keys.TOTALS,
         lease.member,
         lease.entry,
@@ -249,7 +244,7 @@ class Reclaim:
         """Requeue what has expired, and return what became of each. Raises redis.RedisError."""
         if not self._trusted():
             return []
-        members = cast(list[bytes], self._connection.eval(_EXPIRED, 1, key(), LEASE))
+        members = cast(list[bytes], self._connection.eval(_EXPIRED, 1, rq_keys.STARTED, LEASE))
         found: list[tuple[Lease, Requeued]] = []
         for lease in _leases(self._connection, members):
             became = requeue(self._connection, lease, if_expired=True)
@@ -286,7 +281,7 @@ def _leases(connection: redis.Redis, members: list[bytes]) -> list[Lease]:
         try:
             split_rq_id(entry)
         except ValueError:
-            if connection.zrem(key(), member):
+            if connection.zrem(rq_keys.STARTED, member):
                 log.warning(
                     "removed %r from the leases, because it is not '<job>-<generation>:<execution>'", member
                 )

@@ -6,8 +6,7 @@ Each begins by sorting what has arrived, and returns first the entries that it r
 from string import Template
 
 from splatmill.backplane import keys, totals
-from splatmill.backplane.queue import leases
-from splatmill.backplane.queue.entries import TRAIN
+from splatmill.backplane.queue import rq_keys
 from splatmill.schema import DEFAULT_OWNER
 
 _BELLS = 100
@@ -16,6 +15,7 @@ _BELLS = 100
 _BEGIN = Template(
     """
 local inbox, leases = '${inbox}', '${leases}'
+local records, executions = '${records}', '${executions}'
 local places, turns, counters, arrived = '${places}', '${turns}', '${counters}', '${arrived}'
 
 local function now()
@@ -63,16 +63,18 @@ local foreign = {}
 while redis.call('LLEN', inbox) > 0 do  -- a Redis that refuses writes refuses to pop from an empty list as well
   local entry = redis.call('LPOP', inbox)
   local job = string.match(entry, '^(.+)%-%d+$$')
-  if job then queue_up(entry, job, redis.call('HDEL', 'rq:job:' .. entry, 'splatmill_front') == 1)
+  if job then queue_up(entry, job, redis.call('HDEL', records .. entry, 'splatmill_front') == 1)
   else
-    redis.call('DEL', 'rq:job:' .. entry)
+    redis.call('DEL', records .. entry)
     foreign[#foreign + 1] = entry
   end
 end
 """
 ).substitute(
-    inbox=f"rq:queue:{TRAIN}",
-    leases=leases.key(),
+    inbox=rq_keys.ARRIVALS,
+    leases=rq_keys.STARTED,
+    records=rq_keys.RECORD,
+    executions=rq_keys.EXECUTION,
     places=keys.PLACES,
     turns=keys.TURNS,
     counters=keys.COUNTERS,
@@ -108,15 +110,15 @@ for _, owner in ipairs(redis.call('ZRANGE', turns, 0, -1)) do
     redis.call('HDEL', places, entry)
     local since = redis.call('ZSCORE', arrived, entry)
     redis.call('ZREM', arrived, entry)
-    local record = 'rq:job:' .. entry
+    local record = records .. entry
     if redis.call('HGET', record, 'status') == 'queued' then
       local second = math.floor(now())
       local member = entry .. ':' .. ARGV[2]
       redis.call('ZADD', turns, redis.call('HINCRBY', counters, 'turn', 1), owner)
       redis.call('ZADD', leases, second + ARGV[3], member)
-      redis.call('HSET', 'rq:execution:' .. member, 'id', ARGV[2], 'created_at', second, 'last_heartbeat', second,
+      redis.call('HSET', executions .. member, 'id', ARGV[2], 'created_at', second, 'last_heartbeat', second,
                  'worker_name', ARGV[1])
-      redis.call('EXPIRE', 'rq:execution:' .. member, ARGV[3])
+      redis.call('EXPIRE', executions .. member, ARGV[3])
       redis.call('HSET', record, 'status', 'started', 'worker_name', ARGV[1])
       if since then observe(line, now() - tonumber(since)) end
       return {foreign, entry, line}
@@ -136,9 +138,9 @@ WITHDRAW = (
     _BEGIN
     + """
 local removed = leave(ARGV[1])
-if removed == 1 and redis.call('EXISTS', 'rq:job:' .. ARGV[1]) == 1 then
-  redis.call('HSET', 'rq:job:' .. ARGV[1], 'status', 'canceled')
-  redis.call('EXPIRE', 'rq:job:' .. ARGV[1], ARGV[2])
+if removed == 1 and redis.call('EXISTS', records .. ARGV[1]) == 1 then
+  redis.call('HSET', records .. ARGV[1], 'status', 'canceled')
+  redis.call('EXPIRE', records .. ARGV[1], ARGV[2])
 end
 return {foreign, removed}
 """
@@ -149,8 +151,8 @@ HAND_BACK = (
     _BEGIN
     + """
 if redis.call('ZREM', leases, ARGV[1]) == 0 then return {foreign, 0} end
-redis.call('DEL', 'rq:execution:' .. ARGV[1])
-redis.call('HSET', 'rq:job:' .. ARGV[2], 'status', 'queued', 'worker_name', '')
+redis.call('DEL', executions .. ARGV[1])
+redis.call('HSET', records .. ARGV[2], 'status', 'queued', 'worker_name', '')
 queue_up(ARGV[2], string.match(ARGV[2], '^(.+)%-%d+$'), true)
 return {foreign, 1}
 """

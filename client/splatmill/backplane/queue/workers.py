@@ -6,8 +6,8 @@ from datetime import UTC, datetime
 from typing import cast
 
 import redis
-from rq.worker_registration import REDIS_WORKER_KEYS
 
+from splatmill.backplane.queue import rq_keys
 from splatmill.backplane.queue.lines import LINES, Line
 
 _LINES_FIELD = "splatmill_lines"
@@ -50,7 +50,7 @@ def spare(free: int) -> dict[str, str]:
 
 def listening(connection: redis.Redis) -> list[WorkerRecord]:
     """Return the workers that listen or work, by name."""
-    return recorded(connection, cast(set[bytes], connection.smembers(REDIS_WORKER_KEYS)))
+    return recorded(connection, cast(set[bytes], connection.smembers(rq_keys.WORKERS)))
 
 
 def recorded(connection: redis.Redis, names: Iterable[bytes]) -> list[WorkerRecord]:
