@@ -21,7 +21,7 @@ REDIS ?= $(shell command -v redis-server valkey-server | head -n 1)
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: help install demo quick test redis fresh coverage check mutants wheels docs screenshots pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
+.PHONY: FORCE help install demo quick test redis fresh coverage check mutants wheels docs screenshots pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -119,8 +119,12 @@ $(VENV)/.prerequisites:
 	@$(PYTHON) -m venv $(VENV)
 	@touch $@
 
+# The installed worker lists its modules: after one was added or moved it is installed anew.
+$(VENV)/.modules: $(VENV)/.prerequisites FORCE
+	@find worker/splatmill_worker -name '*.py' | sort > $@.now; if cmp -s $@.now $@; then rm $@.now; else mv $@.now $@; fi
+
 # The worker is built without isolation, so that worker/build keeps what is compiled: another build compiles only what has changed.
-$(VENV)/.installed: $(VENV)/.prerequisites $(PARTS) $(KERNELS)
+$(VENV)/.installed: $(VENV)/.prerequisites $(VENV)/.modules $(PARTS) $(KERNELS)
 	$(BIN)/python -m pip install -q $(PIP_ARGS) -U pip
 	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --group build -e ./client -e './server[embedded]'
 	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --no-build-isolation -e ./worker
