@@ -56,12 +56,28 @@ def straightened(photo: Image.Image) -> Image.Image:
     return Image.fromarray(np.stack(planes, axis=-1).astype(np.uint8))
 
 
+def exposed(stops: float) -> Change:
+    """As the same camera takes it with a longer exposure, clipped at white."""
+
+    def change(photo: Image.Image) -> Image.Image:
+        srgb = np.asarray(photo, np.float64) / 255.0
+        light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4) * 2.0**stops
+        light = np.clip(light, 0.0, 1.0)
+        srgb = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
+        return Image.fromarray(np.round(srgb * 255.0).astype(np.uint8))
+
+    return change
+
+
 CHANGES: dict[str, Change] = {
     "half the size": lambda photo: photo.resize((120, 90), Image.Resampling.LANCZOS),
     "a thumbnail": lambda photo: photo.resize((64, 48), Image.Resampling.BICUBIC),
     "strongly compressed": compressed(15),
     "brighter": lambda photo: ImageEnhance.Brightness(photo).enhance(1.2),
     "darker": lambda photo: ImageEnhance.Brightness(photo).enhance(0.6),
+    "twice as bright, clipped": lambda photo: ImageEnhance.Brightness(photo).enhance(2.0),
+    "exposed two stops longer": exposed(2.0),
+    "exposed three stops shorter": exposed(-3.0),
     "more contrast": lambda photo: ImageEnhance.Contrast(photo).enhance(1.4),
     "without colours": lambda photo: photo.convert("L").convert("RGB"),
     "a quarter turn": lambda photo: photo.transpose(Image.Transpose.ROTATE_90),

@@ -6,6 +6,7 @@ Not proven here: how well a scene trains on what is left.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,10 @@ from splatmill.schema import TrainOptions
 from splatmill_worker.images import overlays
 from splatmill_worker.pipeline.capture import honest_split, split_views
 from splatmill_worker.scene import Camera, Scene, View, viewmat_of
+from splatmill_worker.synthetic import photograph
+from splatmill_worker.synthetic import still_life as built_in
 from tests.support import still_life
+from tests.worker.images.test_copies import compressed, exposed
 
 OPTIONS = TrainOptions()
 
@@ -70,8 +74,10 @@ def test_a_burst_of_a_held_out_photo_is_not_trained_on(
     assert "1 photo is not trained on" in parts.warnings[0]
 
 
-def test_a_step_beside_a_held_out_photo_is_trained_on(scene: Scene) -> None:
-    views = (*scene.views, beside(scene.views[0], "00b.png", 0.03))
+def test_a_step_beside_a_held_out_photo_is_trained_on(scene: Scene, tmp_path: Path) -> None:
+    step = replace(beside(scene.views[0], "00b.png", 0.03), image=tmp_path / "00b.png")
+    Image.fromarray(photograph(built_in(0), step.camera, samples=1)[0]).save(step.image)
+    views = (*scene.views, step)
     parts = honest_split(replace(scene, views=views, point_views=None), OPTIONS)
     assert "00b.png" in names(parts.training)
 
@@ -87,6 +93,64 @@ def test_a_smaller_copy_with_its_own_camera_is_used_once(scene: Scene, tmp_path:
     parts = honest_split(replace(scene, views=(*smaller, *scene.views), point_views=None), OPTIONS)
     assert (names(parts.training), names(parts.held_out)) == tuple(map(names, split_views(scene, OPTIONS)))
     assert dict(parts.left_out) == {f"web/{v.name}": f"it shows the same as {v.name}" for v in scene.views}
+
+
+def enlarged(photo: Image.Image) -> Image.Image:
+    width, height = photo.size
+    return photo.crop((3, 3, width - 3, height - 3)).resize(photo.size, Image.Resampling.LANCZOS)
+
+
+def vignetted(photo: Image.Image) -> Image.Image:
+    y, x = np.mgrid[-1:1:72j, -1:1:96j]
+    return Image.fromarray((np.asarray(photo) * (1.0 - 0.15 * (x * x + y * y))[..., None]).astype(np.uint8))
+
+
+COPIES: dict[str, tuple[Callable[[Image.Image], Image.Image], float]] = {
+    "exposed three stops longer": (exposed(3.0), 0.0),
+    "exposed two stops shorter": (exposed(-2.0), 0.0),
+    "compressed strongly": (compressed(25), 0.0),
+    "cropped and enlarged": (enlarged, 0.0),
+    "exposed longer, cropped and enlarged": (lambda photo: enlarged(exposed(1.5)(photo)), 0.0),
+    "with darker corners": (vignetted, 0.0),
+    "exposed longer, with a camera of its own": (exposed(1.5), 0.02),
+    "exposed shorter, with a camera of its own": (exposed(-2.0), 0.02),
+    "compressed, with a camera of its own": (compressed(60), 0.02),
+}
+
+
+@pytest.mark.parametrize(("change", "moved"), COPIES.values(), ids=COPIES.keys())
+@pytest.mark.parametrize("original", [3, 0], ids=["of a training photo", "of a held-out photo"])
+def test_one_copy_with_a_given_camera_is_found_by_its_content(
+    scene: Scene, tmp_path: Path, original: int, change: Callable[[Image.Image], Image.Image], moved: float
+) -> None:
+    view = scene.views[original]
+    copy = replace(beside(view, f"{view.name[:2]}_b.png", moved), image=tmp_path / "copy.png")
+    change(Image.open(view.image).convert("RGB")).save(copy.image)
+    parts = honest_split(replace(scene, views=(*scene.views, copy), point_views=None), OPTIONS)
+    assert (names(parts.training), names(parts.held_out)) == tuple(map(names, split_views(scene, OPTIONS)))
+    assert parts.left_out == ((copy.name, f"it shows the same as {view.name}"),)
+    assert f"{copy.name}, a copy of {view.name}" in parts.warnings[0]
+
+
+@pytest.mark.parametrize("held", ["00.png", "copy.png"])
+def test_a_brighter_copy_across_a_given_split_is_not_trained_on(
+    scene: Scene, tmp_path: Path, held: str
+) -> None:
+    copy = replace(beside(scene.views[0], "copy.png", 0.02), image=tmp_path / "copy.png")
+    exposed(1.0)(Image.open(scene.views[0].image).convert("RGB")).save(copy.image)
+    views = (*scene.views, copy)
+    options = TrainOptions(test_views=(held,))
+    parts = honest_split(replace(scene, views=views, point_views=None), options)
+    other = ({"00.png", "copy.png"} - {held}).pop()
+    assert names(parts.held_out) == [held]
+    assert parts.left_out == ((other, f"it is nearly the same as {held}, which is held out"),)
+
+
+def test_a_test_photo_of_the_data_set_keeps_its_side(scene: Scene) -> None:
+    test = replace(scene.views[3], name="a.png", split="test")
+    parts = honest_split(replace(scene, views=(*scene.views, test), point_views=None), OPTIONS)
+    assert names(parts.held_out) == ["a.png"]
+    assert parts.left_out == (("03.png", "it is nearly the same as a.png, which is held out"),)
 
 
 def test_a_copy_of_a_given_test_photo_is_not_trained_on(scene: Scene) -> None:
@@ -113,7 +177,7 @@ def line(count: int, step: float) -> Scene:
 
 
 def test_of_a_slow_video_fewer_frames_are_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splatmill_worker.pipeline.capture.same_photos", lambda scene, test: {})
+    monkeypatch.setattr("splatmill_worker.pipeline.capture.same_photos", lambda scene: {})
     parts = honest_split(line(128, 0.0006), OPTIONS)
     assert 1 < len(parts.held_out) < 16
     places = np.array([view.camera.center[0] for view in parts.training])
@@ -124,7 +188,7 @@ def test_of_a_slow_video_fewer_frames_are_held_out(monkeypatch: pytest.MonkeyPat
 
 
 def test_photos_from_one_place_are_kept_with_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splatmill_worker.pipeline.capture.same_photos", lambda scene, test: {})
+    monkeypatch.setattr("splatmill_worker.pipeline.capture.same_photos", lambda scene: {})
     scene = line(16, 0.00001)
     parts = honest_split(scene, OPTIONS)
     assert (parts.training, parts.held_out) == split_views(scene, OPTIONS)

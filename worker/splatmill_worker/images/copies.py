@@ -1,7 +1,8 @@
 """Finds photos that are copies of others: resized, compressed again, brightened, turned, cropped or undistorted.
 
-All of it works on small grey pictures (`SMALL_SIDE`). Two of them are aligned by an affine map with a radial term and a
-change of brightness. What a copy shows agrees everywhere after that: a turntable's still background alone does not.
+All of it works on small grey pictures (`SMALL_SIDE`). One of two is brought to the tones of the other, so that
+exposure, gain and tone curves count for nothing, and is aligned with it by an affine map with a radial term. What a
+copy shows agrees everywhere after that: a turntable's still background alone does not.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ GRID = 16
 """Sides of the pictures that are compared with all others, pixels."""
 
 ALIKE = 0.95
-"""Correlation of those from which two photos are aligned; few of a capture without copies reach it."""
+"""Correlation of the ranks of their pixels from which two photos are aligned; few of a capture without copies reach
+it."""
 
 ALIKE_CROPPED = 0.4
 """The same for photos of two sizes, of which one may be a part of the other, and for those with one name."""
@@ -40,6 +42,9 @@ the grids of two sizes differ by that. A slow video moves by more from one kept 
 ALIKE_ALIGNED = 0.9
 """Correlation of two aligned pictures below which their blocks are not compared."""
 
+ALIKE_AT_PLACE = 0.8
+"""The same where the cameras of both are at one place: the light may then fall off to the corners of one."""
+
 CLIPPED = 5, 250
 """Grey levels outside which a photo may be clipped: a brightened copy shows less there."""
 
@@ -51,6 +56,10 @@ MOST_CROPPED = 0.3
 
 DIFFERS = 0.25
 """Share of the variance of a block that the other photo does not explain, from which it shows something else there."""
+
+MOST_DIFFERING = 0.15
+"""Share of the blocks that may differ where the cameras of both photos are at one place: compression leaves plain
+blocks with little of the original."""
 
 NOISE = 25.0
 """Variance in squared grey levels that compression alone produces."""
@@ -142,15 +151,30 @@ def warning(originals: Sequence[tuple[str, str]]) -> list[str]:
     ]
 
 
-def is_copy(picture: SmallPicture, kept: SmallPicture, turns: int = 0) -> bool:
+def is_copy(picture: SmallPicture, kept: SmallPicture, turns: int = 0, *, one_place: bool = False) -> bool:
     """Whether `picture`, turned by so many quarter turns, shows what `kept` shows, or a part of it in fewer pixels.
 
     A photo whose lines were straightened is a copy too, where both have one name in two folders.
+
+    one_place: whether the cameras of both are known to be at one place. A part of a photo is then a copy in any size,
+        since nothing but a crop or a zoom enlarges what is seen from there.
     """
     turned = picture if not turns else _turned(picture, turns)
     first, second = _same_size(turned.grey, kept.grey)
     straightened = _same_stem(picture.name, kept.name)
-    smaller = picture.pixels < kept.pixels and (picture.width, picture.height) != (kept.width, kept.height)
+    fewer = picture.pixels < kept.pixels and (picture.width, picture.height) != (kept.width, kept.height)
+    # A crop changes the ranks of levels, and an exposure changes more than brightness and contrast.
+    tones = (_same_tones(first, second), (first.astype(np.float32), second.astype(np.float32)))
+    return any(_shows_same(*each, fewer, straightened, one_place) for each in tones)
+
+
+def _shows_same(first: Grey, second: Grey, fewer: bool, straightened: bool, one_place: bool) -> bool:
+    """Whether two pictures of one size show the same: `is_copy` for one reading of their tones.
+
+    fewer: whether the first has fewer pixels. straightened: whether its lines may be straightened.
+    """
+    smaller = one_place or fewer
+    alike, most = (ALIKE_AT_PLACE, MOST_DIFFERING) if one_place else (ALIKE_ALIGNED, 0.0)
     moved = _Motion.none()
     for factor in LEVELS:
         level = tuple(_reduced(each, factor) for each in (first, second))
@@ -158,13 +182,13 @@ def is_copy(picture: SmallPicture, kept: SmallPicture, turns: int = 0) -> bool:
         # A pixel of the level more than SAME: coarse levels are exact to a small part of one.
         if not (straightened or smaller) and moved.length(first.shape) > SAME + 0.25 * factor / SMALL_SIDE:
             return False
-        if not _correlation(level[0], *moved.sampled(level[1])) >= ALIKE_ALIGNED:
+        if not _correlation(level[0], *moved.sampled(level[1])) >= alike:
             return False
     if moved.length(first.shape) > SAME:
         inside = smaller and moved.is_part(first.shape)
         if not inside and not (straightened and moved.is_straightening(first.shape)):
             return False
-    return _agrees(first, *moved.sampled(second))
+    return _differing(first, *moved.sampled(second)) <= most
 
 
 @dataclass(frozen=True)
@@ -222,7 +246,9 @@ def _likely(pictures: Sequence[SmallPicture]) -> dict[int, list[tuple[int, int]]
         return {}
     grids = np.stack(
         [
-            np.asarray(Image.fromarray(each.grey).resize((GRID, GRID), Image.Resampling.HAMMING), np.float32)
+            np.asarray(
+                Image.fromarray(_ranks(each.grey)[each.grey]).resize((GRID, GRID), Image.Resampling.HAMMING)
+            )
             for each in pictures
         ]
     )
@@ -260,15 +286,32 @@ def _turned(picture: SmallPicture, turns: int) -> SmallPicture:
     return replace(picture, width=width, height=height, grey=np.rot90(picture.grey, turns))
 
 
-def _same_size(first: Bytes, second: Bytes) -> tuple[Grey, Grey]:
+def _same_size(first: Bytes, second: Bytes) -> tuple[Bytes, Bytes]:
     """Both pictures at the size of the first, or of the second where that is smaller."""
     height, width = min(first.shape, second.shape)
-    resized = (
-        Image.fromarray(np.ascontiguousarray(each)).resize((width, height), Image.Resampling.HAMMING)
+    one, two = (
+        np.asarray(
+            Image.fromarray(np.ascontiguousarray(each)).resize((width, height), Image.Resampling.HAMMING)
+        )
         for each in (first, second)
     )
-    one, two = (np.asarray(each, np.float32) for each in resized)
     return one, two
+
+
+def _same_tones(first: Bytes, second: Bytes) -> tuple[Grey, Grey]:
+    """Both pictures, the one with fewer clipped pixels in the tones of the other: levels of one rank become equal."""
+    if _unclipped(first).sum() < _unclipped(second).sum():
+        second, first = _same_tones(second, first)
+        return first, second
+    ranks, present = _ranks(second), np.bincount(second.ravel(), minlength=256) > 0
+    levels = np.interp(_ranks(first), ranks[present], np.flatnonzero(present)).astype(np.float32)
+    return levels[first], second.astype(np.float32)
+
+
+def _ranks(picture: Bytes) -> Grey:
+    """The share of the pixels, 0 to 1, that are darker than each level 0 to 255, with half of those of that level."""
+    counts = np.bincount(picture.ravel(), minlength=256)
+    return ((np.cumsum(counts) - 0.5 * counts) / picture.size).astype(np.float32)
 
 
 def _reduced(picture: Grey, factor: int) -> Grey:
@@ -321,10 +364,11 @@ def _correlation(first: Grey, second: Grey, known: npt.NDArray[np.bool_]) -> flo
     return float(between / max(np.sqrt(a * b), 1e-9))
 
 
-def _agrees(first: Grey, second: Grey, known: npt.NDArray[np.bool_]) -> bool:
-    """Whether each block of both pictures shows the same, up to its brightness and contrast."""
+def _differing(first: Grey, second: Grey, known: npt.NDArray[np.bool_]) -> float:
+    """The share of the blocks that show something else in the other picture, up to their brightness and contrast."""
     height, width = first.shape
     counted = known & _unclipped(first)
+    compared = differing = 0
     for top in range(0, height, BLOCK):
         for left in range(0, width, BLOCK):
             block = slice(top, top + BLOCK), slice(left, left + BLOCK)
@@ -334,9 +378,9 @@ def _agrees(first: Grey, second: Grey, known: npt.NDArray[np.bool_]) -> bool:
             (a, between), (_, b) = np.cov(first[block][some], second[block][some])
             least = min(a, b)
             unexplained = 1.0 - between * between / max(a * b, 1e-9)
-            if not unexplained * least <= DIFFERS * (least + NOISE):
-                return False
-    return True
+            compared += 1
+            differing += not unexplained * least <= DIFFERS * (least + NOISE)
+    return differing / max(compared, 1)
 
 
 def _unclipped(picture: Grey) -> npt.NDArray[np.bool_]:

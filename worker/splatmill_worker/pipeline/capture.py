@@ -129,14 +129,18 @@ def honest_split(scene: Scene, options: TrainOptions) -> Split:
     instead of every 8th, and so on; where even that does not help, all are kept and a warning says what that means.
     Raises as `split_views` does.
     """
-    copies = same_photos(scene, options.test_views or ())
+    named = set(options.test_views or ())
+    held = named | ({view.name for view in scene.views if view.split == "test"} if not named else set())
+    same = same_photos(scene)
+    # A copy on the other side of the split is a near copy below.
+    copies = {name: original for name, original in same.items() if (name in held) == (original in held)}
     chosen = replace(scene, views=tuple(view for view in scene.views if view.name not in copies))
     left_out = [(name, f"it shows the same as {original}") for name, original in copies.items()]
     warnings = copies_warning(list(copies.items()))
     step = options.holdout
     while True:
         train, test = split_views(chosen, options.model_copy(update={"holdout": step}))
-        near = near_copies(scene, test, train)
+        near = near_copies(scene, test, train, same)
         given = options.test_views is not None or any(view.split == "test" for view in test)
         if len(near) <= MOST_NEAR * len(train) or given or len(test) < 2:
             break

@@ -2,11 +2,12 @@
 
 What makes a held-out photo a test is that it was taken from another place. So two photos are near copies when the scene
 hardly shifts between their places, apart from how the camera was turned, and one shows most of what the other shows.
+Photos are copies when their content is the same (`images.copies`); from one place, less of it suffices.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -22,6 +23,13 @@ between any two photos of captures around a thing."""
 OVERLAP = 0.8
 """Share of what a held-out photo shows that its near copy shows as well."""
 
+ONE_PLACE = PARALLAX / 3.0
+"""Shift up to which two photos were taken from one place: a third of what slow steps leave between two frames."""
+
+BESIDE = 0.05
+"""Shift up to which photos are compared by content: cameras that were recovered for each of two copies differ by less,
+and round a thing that looks alike from several sides, photos differ by more."""
+
 POINTS = 200
 """Points of the scene whose shift is measured, for each held-out photo."""
 
@@ -33,32 +41,40 @@ NEARBY = 8.0
 the view shifts the middle of a photo little."""
 
 
-def near_copies(scene: Scene, held_out: Sequence[View], training: Sequence[View]) -> dict[str, str]:
-    """The held-out photo of which each of some training photos is a near copy, by their names."""
+def near_copies(
+    scene: Scene, held_out: Sequence[View], training: Sequence[View], copies: Mapping[str, str]
+) -> dict[str, str]:
+    """The held-out photo of which each of some training photos is a near copy, by their names.
+
+    copies: pairs of `same_photos`.
+    """
     found: dict[str, str] = {}
-    for view, other in _near(scene, held_out, training):
+    for view, other, _ in _pairs(scene, held_out, training, PARALLAX):
         found.setdefault(other.name, view.name)
+    held, trained = ({view.name for view in views} for views in (held_out, training))
+    for copy, original in copies.items():
+        for one, another in ((copy, original), (original, copy)):
+            if one in trained and another in held:
+                found.setdefault(one, another)
     return found
 
 
-def same_photos(scene: Scene, test: Collection[str]) -> dict[str, str]:
-    """The photo of which each of some photos is a copy, resized for example, by their names.
+def same_photos(scene: Scene) -> dict[str, str]:
+    """The photo of which each of some photos is a copy, resized or brightened for example, by their names.
 
-    test: names of photos to hold out. A copy of one of them among the others is a near copy, and not named here.
+    Of all that are copies of one another, the original is the same: the one with the most pixels.
     """
-    held = {view.name for view in scene.views if view.split == "test"} | set(test)
     ranked = sorted(scene.views, key=lambda view: (-view.camera.width * view.camera.height, view.name))
     rank = {view.name: index for index, view in enumerate(ranked)}
     small: dict[str, SmallPicture] = {}
     found: dict[str, str] = {}
-    for view, other in _near(scene, ranked, ranked):
-        later = rank[other.name] > rank[view.name] and (view.name in held) == (other.name in held)
-        if not later or view.name in found or other.name in found:
+    for view, other, shift in _pairs(scene, ranked, ranked, BESIDE):
+        if rank[other.name] < rank[view.name] or view.name in found or other.name in found:
             continue
         for each in (view, other):
             if each.name not in small:
                 small[each.name] = small_picture(each)
-        if is_copy(small[other.name], small[view.name]):
+        if is_copy(small[other.name], small[view.name], one_place=shift <= ONE_PLACE):
             found[other.name] = view.name
     return found
 
@@ -69,35 +85,47 @@ def small_picture(view: View) -> SmallPicture:
     return SmallPicture(view.name, view.camera.width, view.camera.height, small_grey(photo))
 
 
-def _near(scene: Scene, views: Sequence[View], others: Sequence[View]) -> Iterator[tuple[View, View]]:
-    """The pairs of one of `views` and one of `others`, which was taken from nearly the same place."""
+def _pairs(
+    scene: Scene, views: Sequence[View], others: Sequence[View], most: float
+) -> Iterator[tuple[View, View, float]]:
+    """The pairs of one of `views` and one of `others` of which one shows most of the other, and the shift of the scene
+    between their places, which is at most `most`."""
     if not scene.views:
         return
     centers = np.array([view.camera.center for view in others]).reshape(-1, 3)
     observed = _observed(scene)
     target = looked_at(scene.centers, np.array([view.camera.axis for view in scene.views]))
-    for view in views:
-        camera = view.camera
+
+    def shown(view: View) -> Float:
         points = observed[view.name]
         if len(points) < LEAST_POINTS:
-            points = _plane(view, float(np.linalg.norm(target - camera.center)))
-        here = camera.project(points)
-        points = points[here.inside]
+            points = _plane(view, float(np.linalg.norm(target - view.camera.center)))
+        return points[view.camera.project(points).inside]
+
+    points_of = {view.name: shown(view) for view in {id(view): view for view in (*views, *others)}.values()}
+    for view in views:
+        camera = view.camera
+        points = points_of[view.name]
         if not len(points):
             continue
-        depth = float(np.median(here.depths[here.inside]))
-        reach = NEARBY * PARALLAX * max(camera.width, camera.height) / camera.fx * depth
+        depth = float(np.median(camera.project(points).depths))
+        reach = NEARBY * most * max(camera.width, camera.height) / camera.fx * depth
         for index in np.flatnonzero(np.linalg.norm(centers - camera.center, axis=1) <= reach).tolist():
-            if others[index] is not view and _is_near(view, others[index], points):
-                yield view, others[index]
+            other = others[index]
+            if other is view or not (shift := _shift(view, other, points)) <= most:
+                continue
+            both = ((other, points), (view, points_of[other.name]))
+            if any(len(seen) and each.camera.project(seen).inside.mean() >= OVERLAP for each, seen in both):
+                yield view, other, shift
 
 
-def _is_near(view: View, other: View, points: Float) -> bool:
+def _shift(view: View, other: View, points: Float) -> float:
+    """The median shift of points of one photo from its place to that of the other, as a share of the longer side."""
     camera = view.camera
     here, there = camera.project(points), camera.moved_to(other.camera.center).project(points)
     shift = np.hypot(there.columns - here.columns, there.rows - here.rows) / max(camera.width, camera.height)
     shift[np.isnan(shift)] = np.inf  # behind the other place
-    return bool(np.median(shift) <= PARALLAX and other.camera.project(points).inside.mean() >= OVERLAP)
+    return float(np.median(shift))
 
 
 def _observed(scene: Scene) -> dict[str, Float]:
