@@ -8,6 +8,7 @@ from splatmill.data_sets import CAMERA_PROGRAMS, MAX_DEPTH, OTHER_CAMERAS, PLACE
 from splatmill.schema.files.formats import MODEL_FORMATS
 from splatmill.schema.files.masks import MASK_BEGINNINGS, MASK_ENDINGS, MASK_FOLDERS
 from splatmill.schema.files.names import MAX_PART_BYTES, MAX_PARTS
+from splatmill.schema.files.other_pictures import OTHER_FOLDERS, UNUSED
 from splatmill.schema.files.outputs import OUTPUT_MARKS, OUTPUT_MEDIA
 from splatmill.schema.files.photos import (
     ARCHIVE_SUFFIXES,
@@ -21,6 +22,7 @@ from splatmill_worker.images import guarded, mask_levels, overlay, prepare
 from splatmill_worker.images.archives import archive, zip_names
 from splatmill_worker.images.colors import PRIMARIES, TRANSFERS
 from splatmill_worker.images.lens import PINHOLE_MODELS
+from splatmill_worker.images.no_photo import TRAITS
 from splatmill_worker.readers.colmap_files import MODELS
 from splatmill_worker.scene import MIN_SHOWN
 from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam, triangulation
@@ -114,6 +116,19 @@ def _photos() -> list[str]:
         ),
         f"""Results of Splatmill among the photos are not read as photos: the files {choices(OUTPUT_MEDIA)} in a folder
         with two of {choices(OUTPUT_MARKS)}.""",
+        "### Pictures that are no photos\n",
+        table(
+            ["what", "folders, in either case", "by their pixels"],
+            [
+                [what, choices(f"{name}/" for name in names), TRAITS.get(what, "")]
+                for what, names in OTHER_FOLDERS.items()
+            ],
+        ),
+        f"""Without cameras, pictures in folders of {", ".join(UNUSED)} are not used where photos lie beside
+        them, and a sentence names them; masks are used, and thumbnails compared with the photos. If all pictures lie in
+        such folders, or PATH is one, both readings are named and nothing is trained. The job fails too, whatever
+        the folder is called, if all pictures are of these kinds by their pixels. A picture with a single channel of 16
+        bits among photos in colour is left out.""",
     ]
 
 
@@ -164,7 +179,9 @@ def _cameras() -> list[str]:
         in it, where N is a number, and what is in brackets may be missing. `images` is needed beside `cameras`,
         both as `.bin` or both as `.txt`; `points3D` may be missing. Of several models, up to
         {colmap_model.MOST_MODELS}, the one with the most of the photos is used, and a warning names the others.
-        Text may have a byte-order mark, any line ends, and names with spaces.
+        Text may have a byte-order mark, any line ends, and names with spaces. Names that are not UTF-8 are read in the
+        one of the encodings of zips in which the most of them are photos, and a warning says in which; where two lead
+        to different photos, the job fails and names both.
 
         In `transforms.json`, a frame or the document has {fields}. `camera_angle_x` and `camera_angle_y` may stand for
         the focal lengths; a size that is missing is that of the photo. `transform_matrix` is from camera to world, 4 x

@@ -20,6 +20,7 @@ import pytest
 from PIL import Image, ImageFilter
 from playwright.sync_api import Locator, Page, Request, expect
 
+from splatmill.errors import NothingToUpload
 from splatmill.schema import MIN_PHOTOS, describe_options
 from splatmill.transfer.local_capture import find_files
 from splatmill_worker.images.prepare import prepare
@@ -146,6 +147,9 @@ TREES = {
     "results": "a.jpg splat/model.ply splat/report.json splat/preview.jpg splat/report.png splat/own.jpg preview.jpg",
     "results of a video": "walk.mp4 out/model.ply out/report.json out/orbit.mp4 out/cameras.zip out/cameras.json",
     "only masks": "mask/a.jpg mask/b.jpg",
+    "only maps": "scan/depth/a.png scan/Normals/a.png",
+    "maps beside photos": "rgb/a.jpg depth/a.png depth/b.png confidence/a.png thumbs/a.jpg",
+    "maps beside photos with cameras": "rgb/a.jpg depth/a.png transforms.json",
     "colmap": "images/a.jpg sparse/0/cameras.bin sparse/0/images.bin sparse/0/project.ini sparse/1/cameras.bin",
     "colmap in its root": "images/a.jpg cameras.txt images.txt points3D.txt frames.txt",
     "colmap of nerfstudio": "images/a.jpg colmap/sparse/0/cameras.bin colmap/sparse/0/points3D.bin transforms.json",
@@ -174,22 +178,51 @@ TREES = {
 }
 
 
+TRANSFORMS = {
+    "masks that frames name": json.dumps(
+        {
+            "ply_file_path": "./points.ply",
+            "frames": [
+                {"file_path": "images/a.jpg", "mask_path": "sam/obj_0.png"},
+                None,
+                {"file_path": "images/b.jpg", "mask_path": ".\\images\\obj_1.png"},
+            ],
+        }
+    ),
+    "photos that frames name": json.dumps(
+        {"frames": [{"file_path": "images/a.jpg"}, {"file_path": "more/b.jpg"}]}
+    ),
+}
+TREES |= {
+    "masks that frames name": "set/images/a.jpg set/images/b.jpg set/images/obj_1.png set/sam/obj_0.png "
+    "set/sam/other.png set/points.ply set/transforms.json",
+    "photos that frames name": "images/a.jpg more/b.jpg more/c.jpg transforms.json",
+}
+
+
 def test_files_are_sorted_as_by_the_command_line(page: Page, tmp_path: Path) -> None:
     opened(page)
-    script = """async (paths) => {
+    script = """async ([paths, texts]) => {
+      const { documentsIn } = await import("/page/any/new/documents.js");
       const { sort } = await import("/page/any/new/kinds.js");
       const { remarks } = await import("/page/any/new/remarks.js");
       const { accepted } = await (await fetch("/v1/info")).json();
-      const sorted = sort(paths, accepted);
-      return { ...sorted, remarks: remarks(sorted, accepted) };
+      const given = Object.entries(texts).map(([path, text]) => ({ path, file: new File([text], path) }));
+      const sorted = sort(paths, accepted, await documentsIn(given));
+      return { ...sorted, others: [], remarks: remarks(sorted, accepted) };
     }"""
     for title, names in TREES.items():
         root = tmp_path / title
         for name in names.split():
             (root / name).parent.mkdir(parents=True, exist_ok=True)
-            (root / name).write_bytes(b"x")
+            (root / name).write_text(TRANSFORMS.get(title, "x"))
+        texts = {name: TRANSFORMS[title] for name in names.split() if title in TRANSFORMS and "json" in name}
+        here = page.evaluate(script, [names.split(), texts])
+        if here["problem"] is not None:
+            with pytest.raises(NothingToUpload, match=re.escape(here["problem"])):
+                find_files(root)
+            continue
         found = find_files(root)
-        here = page.evaluate(script, names.split())
         listed = [(file["role"], file["name"], file["path"]) for file in here["files"]]
         assert listed == [
             (file.role.value, file.name, file.path.relative_to(root).as_posix()) for file in found.files

@@ -21,6 +21,8 @@ from splatmill.data_sets import (
 from splatmill.errors import NothingToUpload
 from splatmill.schema.files.masks import masks_beside, without_mask_folder
 from splatmill.schema.files.names import UnsafeName, safe_name, storable_name
+from splatmill.schema.files.other_pictures import beside_photos, kind_of_folder, no_photos
+from splatmill.schema.files.other_pictures import remarks as other_remarks
 from splatmill.schema.files.outputs import own_outputs
 from splatmill.schema.files.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES, VIDEO_SUFFIXES, unread
 from splatmill.schema.quantities import counted, listed
@@ -126,12 +128,14 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     (`splatmill.schema.files.masks`), or where frames name them; poses are `transforms*.json`, the `.ply` files of
     points that they name, and COLMAP models. All of this may lie some folders down: see `data_sets.find_cameras`.
     Hidden files and folders are ignored. Videos and zip archives are used only where there are no photos. Pictures in
-    a folder of results are no photos (`splatmill.schema.files.outputs`).
+    a folder of results are no photos (`splatmill.schema.files.outputs`), and neither are those in a folder of depth
+    maps, for example, if no cameras are given (`splatmill.schema.files.other_pictures`).
 
     A file whose name the service does not accept gets another one, or is left out. What is no regular file, or cannot
     be read, is left out too (`data_sets.walk`).
 
-    Raises NothingToUpload where the path does not exist, cannot be read or holds none of these.
+    Raises NothingToUpload where the path does not exist, cannot be read, holds none of these, or is a folder of masks
+    or the like itself.
     """
     root = Path(path).expanduser()
     if not root.is_dir() and (reason := unreadable_file(root)) is not None:
@@ -164,6 +168,15 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     for name in _named(documents, "mask_path", cameras.top).intersection(pictures).difference(masks):
         masks[name] = name.removeprefix(photo_root if name.startswith(photo_root) else top)
     poses = _poses(cameras, names)
+    others: dict[str, str] = {}
+    if not poses:
+        inside = [name for name in pictures if name.startswith(photo_root)]
+        said = no_photos(inside)
+        if not photo_root and not any(map(kind_of_folder, inside)):
+            said = no_photos([f"{root.resolve().name}/{name}" for name in inside])
+        if said:
+            raise NothingToUpload(said)
+        others = beside_photos(inside)
     points = _named(documents, "ply_file_path", cameras.top).intersection(names)
     poses |= {name: name.removeprefix(cameras.top) for name in points if _suffix(name) == ".ply"}
     files: list[LocalFile] = []
@@ -175,7 +188,7 @@ def find_files(path: str | os.PathLike[str]) -> Found:
         try:
             if name in masks:
                 files.append(_local(Role.masks, masks[name], root / name))
-            elif name.startswith(photo_root) and _is_image(name):
+            elif name.startswith(photo_root) and _is_image(name) and name not in others:
                 files.append(_local(Role.images, name.removeprefix(photo_root), root / name))
             else:
                 ignored.append(name)
@@ -204,7 +217,7 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     beside = [name for name in ignored if _suffix(name) in VIDEO_SUFFIXES + ARCHIVE_SUFFIXES]
     if beside:
         remarks.append(f"Videos and zips are not used where there are photos: {listed(beside)}.")
-    remarks += _cameras_beside(root, cameras)
+    remarks += other_remarks(others) + _cameras_beside(root, cameras)
     return replace(found, top=cameras.top, outputs=tuple(sorted(outputs)), remarks=tuple(remarks))
 
 
@@ -247,7 +260,8 @@ def _around(path: Path) -> tuple[Path, list[str]]:
                 *(each for each in top.iterdir() if each.name.lower() == "images" and each.is_dir()),
             ]
             if top != path.resolve() and any(_is_image(name) for each in inside for name in os.listdir(each)):
-                return top, [f"{path.name} is a part of a data set. The folder around it is taken: {top}."]
+                own = path.resolve().relative_to(top).as_posix()
+                return top, [f"{own} is a part of a data set. The folder around it is taken: {top}."]
     except OSError:
         pass  # whoever reads the path says so
     return path, []

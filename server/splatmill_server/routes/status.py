@@ -46,6 +46,7 @@ from splatmill.schema import (
     WorkerInfo,
     describe_options,
 )
+from splatmill.schema.files.other_pictures import OTHER_FOLDERS, UNUSED
 from splatmill_server.access.caller import Caller, Who
 from splatmill_server.access.permission import needs
 from splatmill_server.answers.docs_page import CONTENT_SECURITY_POLICY, docs_page
@@ -93,6 +94,8 @@ def get_info(service: Shared, who: Who) -> Info:
             mask_folders=list(MASK_FOLDERS),
             mask_endings=list(MASK_ENDINGS),
             mask_beginnings=list(MASK_BEGINNINGS),
+            other_folders={what: list(names) for what, names in OTHER_FOLDERS.items()},
+            unused_folders=list(UNUSED),
             output_marks=list(OUTPUT_MARKS),
             output_media=list(OUTPUT_MEDIA),
             unread=[Unread(**asdict(kind)) for kind in UNREAD_KINDS],

@@ -93,11 +93,6 @@ def test_masks_of_a_data_set_some_folders_down(tmp_path: Path) -> None:
     assert find_files(tmp_path).ignored == ("masks/other.png",)
 
 
-def test_pictures_that_all_lie_in_a_folder_of_masks_are_photos(tmp_path: Path) -> None:
-    tree(tmp_path, "mask/a.jpg", "mask/b.jpg")
-    assert roles(tmp_path)[Role.images] == ["mask/a.jpg", "mask/b.jpg"]
-
-
 def test_masks_lie_beside_photos(tmp_path: Path):
     tree(
         tmp_path,

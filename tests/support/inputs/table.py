@@ -90,6 +90,28 @@ def masked(form: str, hidden: float = 0.25, size: tuple[int, int] = (64, 48), wh
     return make
 
 
+def maps(form: str, depth: bool = False, beside: bool = False) -> Make:
+    """Discs, white on black, or as depths of 16 bits; with photos beside them or alone."""
+
+    def make(folder: Path) -> None:
+        if beside:
+            plain(folder)
+        y, x = np.mgrid[:48, :64]
+        for seed in range(4):
+            disc = (x - 32 - 3 * seed) ** 2 + (y - 24) ** 2 < 200
+            path = folder / form.format(seed)
+            path.parent.mkdir(exist_ok=True)
+            Image.fromarray((1000 + 7 * x + 500 * disc).astype(np.uint16) if depth else disc).save(path)
+
+    return make
+
+
+def of_code_page(folder: Path) -> None:
+    names = [f"Снимок {k:02}.jpg" for k in range(COUNT)]
+    photos(folder / "images", names)
+    model(folder / "sparse/0", dict(enumerate(names)), lambda text: text.encode("cp1251"))
+
+
 def colmap(folder: Path, top: str = "") -> None:
     photos(folder / top / "images")
     model(folder / top / "sparse/0")
@@ -231,6 +253,10 @@ EXAMPLES: tuple[Example, ...] = (
         "used with a remark",
     ),
     Example("Photos", "nothing but a text", alone("notes.txt"), "refused"),
+    Example("Photos", "depth maps in a folder depth", maps("depth/{}.png", True, True), "used with a remark"),
+    Example("Photos", "nothing but depth maps of 16 bits", maps("{}.png", True), "refused"),
+    Example("Masks", "nothing but a folder masks", maps("masks/{}.png"), "refused"),
+    Example("Masks", "nothing but masks, whatever they are called", maps("{}.png"), "refused"),
     Example("Masks", "masks/NAME.PNG", masked("masks/{}.PNG"), "used"),
     Example("Masks", "NAME_mask.png beside the photos", masked("{}_mask.png"), "used"),
     Example("Masks", "masks that hide nine tenths", masked("masks/{}.png", 0.9), "used with a remark"),
@@ -260,6 +286,7 @@ EXAMPLES: tuple[Example, ...] = (
     Example("Cameras", "two data sets side by side", two_sets, "refused"),
     Example("Cameras", "photos in another case than the model", renamed_case, "used"),
     Example("Cameras", "the photos in images_2 and images_4", two_sizes, "used with a remark"),
+    Example("Cameras", "names of a model in the code page 1251", of_code_page, "used with a remark"),
     Example("Cameras", "one photo without a camera", no_camera, "used with a remark"),
     Example("Cameras", "a model of photos with other names", other_names, "refused"),
     Example(

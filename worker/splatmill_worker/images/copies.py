@@ -301,8 +301,7 @@ def _same_size(first: Bytes, second: Bytes) -> tuple[Bytes, Bytes]:
 def _same_tones(first: Bytes, second: Bytes) -> tuple[Grey, Grey]:
     """Both pictures, the one with fewer clipped pixels in the tones of the other: levels of one rank become equal."""
     if _unclipped(first).sum() < _unclipped(second).sum():
-        second, first = _same_tones(second, first)
-        return first, second
+        return _same_tones(second, first)[::-1]
     ranks, present = _ranks(second), np.bincount(second.ravel(), minlength=256) > 0
     levels = np.interp(_ranks(first), ranks[present], np.flatnonzero(present)).astype(np.float32)
     return levels[first], second.astype(np.float32)
@@ -383,7 +382,7 @@ def _differing(first: Grey, second: Grey, known: npt.NDArray[np.bool_]) -> float
     return differing / max(compared, 1)
 
 
-def _unclipped(picture: Grey) -> npt.NDArray[np.bool_]:
+def _unclipped(picture: Grey | Bytes) -> npt.NDArray[np.bool_]:
     return (picture >= CLIPPED[0]) & (picture <= CLIPPED[1])
 
 

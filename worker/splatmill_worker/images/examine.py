@@ -24,6 +24,7 @@ from splatmill_worker.images.decode import (
     upright_size,
     whole,
 )
+from splatmill_worker.images.no_photo import Kind, kind_of
 from splatmill_worker.images.photo_colors import PhotoColors
 from splatmill_worker.wording import plain
 
@@ -54,6 +55,7 @@ class Picture:
     projection: of a panorama, by its XMP.
     closed: whether it has the shape and the edges of a panorama of 360 by 180 degrees.
     alpha: its smallest and largest alpha.
+    kind: what it seems to be, if no photo.
     small: the grey picture at low resolution, upright, of `copies.small_grey`.
     """
 
@@ -66,6 +68,7 @@ class Picture:
     projection: str | None = None
     closed: bool = False
     alpha: transparency.Extent = (255, 255)
+    kind: Kind = ""
 
 
 def examine(path: Path, name: str) -> Picture | str:
@@ -89,18 +92,20 @@ def examine(path: Path, name: str) -> Picture | str:
                 if image.format == "JPEG" and not wide:
                     # This decodes at the smallest DCT scale that suffices, and still reads the whole file.
                     image.draft(None, (SMALL_SIDE, SMALL_SIDE))
+                mode = image.mode
                 with guarded.room(image):
                     photo = whole(image, name)
                     check_numbers(image, name)
                 closed = wide and _is_closed(photo)
                 alpha = transparency.extent(photo)
+                kind = kind_of(mode, photo)
                 small = small_grey(photo)
                 small = small if turn is None else np.asarray(Image.fromarray(small).transpose(turn))
     except UnusablePicture as error:
         return error.reason + (GIVE if error.reason == guarded.UNKNOWN else "")
     except OSError as error:
         return f"it cannot be read: {plain(error)}"
-    return Picture(width, height, found, several, colors, small, projection, closed, alpha)
+    return Picture(width, height, found, several, colors, small, projection, closed, alpha, kind)
 
 
 def _is_closed(photo: Image.Image) -> bool:

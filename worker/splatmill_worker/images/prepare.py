@@ -15,11 +15,12 @@ from PIL import Image
 
 from splatmill.data_sets import MAX_DEPTH, unread_cameras
 from splatmill.schema.files.masks import masks_beside, paired, without_mask_folder
+from splatmill.schema.files.other_pictures import beside_photos
 from splatmill.schema.files.outputs import own_outputs
 from splatmill.schema.files.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES, unread, unread_kind
 from splatmill.schema.quantities import counted
 from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
-from splatmill_worker.images import copies, exif, mask_levels, overlays, photo_colors, transparency
+from splatmill_worker.images import copies, exif, mask_levels, no_photo, overlays, photo_colors, transparency
 from splatmill_worker.images.archives import archive, unpacked_room
 from splatmill_worker.images.copies import SmallPicture
 from splatmill_worker.images.decoding import decoders
@@ -62,6 +63,7 @@ class UsablePhoto:
     colors: how its colours become sRGB, as `PhotoColors.remark` says it.
     closed: whether it has the shape and the edges of a panorama of 360 by 180 degrees.
     alpha: its smallest and largest alpha.
+    kind: what it seems to be, if no photo.
     """
 
     name: str
@@ -77,6 +79,7 @@ class UsablePhoto:
     colors: str = ""
     closed: bool = False
     alpha: transparency.Extent = (255, 255)
+    kind: no_photo.Kind = ""
 
 
 @dataclass(frozen=True)
@@ -145,7 +148,8 @@ def prepare(
     masks: folder of the masks, if there is one; others may lie among the photos (`splatmill.schema.files.masks`).
     on_progress: called as ("images", files examined, files in all, name of the file).
 
-    Raises Refusal for a mask that is too large to be decoded, for masks that hide all of every photo, and for archives
+    Raises Refusal for a mask that is too large to be decoded, for masks that hide all of every photo, where no picture
+    is a photo by its pixels (`images.no_photo`), and for archives
     and videos that together exceed `archive.Allowance`, CaptureIncomplete when a file is neither used nor skipped, and
     Cancelled.
     """
@@ -156,6 +160,9 @@ def prepare(
     outputs = own_outputs(name for name, _, _ in found.files)
     found.skipped += [(name, "it is a result of Splatmill, not a photo") for name in sorted(outputs)]
     found.files = [file for file in found.files if file[0] not in outputs]
+    others = beside_photos(name for name, _, _ in found.files)
+    found.skipped += [(name, f"it lies in a folder of {what}") for name, what in others.items()]
+    found.files = [file for file in found.files if file[0] not in others]
     beside = {name: path for name, path, _ in found.files}
     own_masks = _own_masks(found)
     mask_files = {inner: beside[name] for name, inner in own_masks.items()}
@@ -192,6 +199,8 @@ def prepare(
         name, reason = found.skipped[0]
         raise UnusablePicture("decoder_ended", name, f"no photo is left; of this one: {reason}")
     ordered = sorted(photos.values(), key=lambda photo: photo.name)
+    no_photo.check({photo.name: photo.kind for photo in ordered})
+    ordered = _without_depth(ordered, found)
     originals = copies.copies([small[photo.name] for photo in ordered])
     copied = [(ordered[copy].name, ordered[original].name) for copy, original in originals.items()]
     ordered = _without_copies(ordered, originals, found)
@@ -277,6 +286,17 @@ def _without_copies(photos: list[UsablePhoto], originals: dict[int, int], found:
             kept[original] = _with_mask(kept[original], mask, found)
         found.skipped.append((photos[copy].name, f"it shows the same as {photos[original].name}"))
     return list(kept.values())
+
+
+def _without_depth(photos: list[UsablePhoto], found: _Found) -> list[UsablePhoto]:
+    """The photos without pictures of a single channel of 16 bits, where others have colours of 8 bits."""
+    kept = [photo for photo in photos if photo.kind != "depth maps"]
+    skipped = [photo for photo in photos if photo.kind == "depth maps"]
+    found.skipped += [
+        (photo.name, "it has a single channel of 16 bits, as depth maps have, which other photos have not")
+        for photo in skipped
+    ]
+    return kept
 
 
 def _picture(photo: UsablePhoto, small: dict[str, SmallPicture], at_least: tuple[int, int]) -> Image.Image:
@@ -430,6 +450,7 @@ def _inspect(name: str, path: Path, sequence: str | None) -> tuple[UsablePhoto, 
         colors=found.colors,
         closed=found.closed,
         alpha=found.alpha,
+        kind=found.kind,
     )
     has_tags = found.exif.make is not None or found.exif.model is not None
     return photo, SmallPicture(name, found.width, found.height, found.small, has_tags)

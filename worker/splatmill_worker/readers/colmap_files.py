@@ -98,7 +98,7 @@ def read(folder: Path) -> Arrays:
             raise ValueError(f"{file.name} has {size} bytes; at most {MAX_FILE_BYTES} are read.")
         if size == 0 and stem != "points3D":
             raise ValueError(
-                f"The COLMAP model in {folder.name}/ has no {file.name}, or an empty one. "
+                f"{which(folder)} has no {file.name}, or an empty one. "
                 "Give the files cameras and images, both as .bin or both as .txt; points3D is not required."
             )
         try:
@@ -109,6 +109,24 @@ def read(folder: Path) -> Arrays:
         except (struct.error, ValueError, OverflowError) as error:
             raise ValueError(f"{file.name} could not be read: {plain(error)}.") from error
     return arrays
+
+
+def place(folder: Path) -> str:
+    """The folder of a model as users know it: `sparse/0`, `colmap/sparse` or `0`; "" for the data set's own."""
+    parts = folder.parts
+    end = len(parts)
+    begin = end - 1 if parts[-1:] and parts[-1].isdecimal() else end
+    for name in ("sparse", "colmap"):
+        if begin and parts[begin - 1].lower() == name:
+            begin -= 1
+        else:
+            break
+    return "/".join(parts[begin:end])
+
+
+def which(folder: Path) -> str:
+    """The model in a folder, as the subject of a sentence."""
+    return f"The COLMAP model in {place(folder)}" if place(folder) else "The COLMAP model"
 
 
 def _file(folder: Path, name: str) -> Path:
@@ -239,7 +257,7 @@ def _images_txt(path: Path) -> Arrays:
     for line, number, *words in _lines(path, 9, skipping=True):
         pose, camera = [float(word) for word in words[:7]], words[7]
         name = line.split(None, 9)[9].strip(" \t\r\n") if len(words) > 8 else ""
-        images.add(int(number), pose, int(camera), name.encode())
+        images.add(int(number), pose, int(camera), name.encode("utf-8", "surrogateescape"))
     return images.arrays()
 
 
@@ -262,15 +280,17 @@ def _points_txt(path: Path) -> Arrays:
 def _lines(path: Path, least: int, *, skipping: bool = False) -> Iterator[list[str]]:
     """Each line of a text file, and its words, of which there are `least` or more; comments are left out.
 
-    The text is UTF-8, or has a byte-order mark; lines end as on any system. A byte that is no UTF-8 becomes U+FFFD.
+    The text is UTF-8, or has a byte-order mark; lines end as on any system. Bytes that are no UTF-8 become
+    surrogates.
 
     skipping: leave out the line of features behind each. Raises ValueError for a line with fewer words, and for a
     longer one than MAX_LINE_BYTES.
     """
     with path.open("rb") as file:
-        encoding = "utf-16" if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
+        wide = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    encoding, errors = ("utf-16", "replace") if wide else ("utf-8-sig", "surrogateescape")
     number, due = 0, False
-    with path.open(encoding=encoding, errors="replace") as lines:
+    with path.open(encoding=encoding, errors=errors) as lines:
         while text := lines.readline(MAX_LINE_BYTES):
             number += 1
             if due and not _names_image(text):

@@ -60,6 +60,14 @@ class Accepted(Response):
     mask_beginnings: list[str] = Field(
         default_factory=list, description="What precedes the name of a photo in that of a mask."
     )
+    other_folders: dict[str, list[str]] = Field(
+        default_factory=dict,
+        description="What lies in folders that hold no photos, with the names, in lower case, of these.",
+    )
+    unused_folders: list[str] = Field(
+        default_factory=list,
+        description="Those of `other_folders` of which no use is made where photos lie beside them.",
+    )
     output_marks: list[str] = Field(
         default_factory=list,
         description="Names of files of which a folder with results of Splatmill holds two at least.",

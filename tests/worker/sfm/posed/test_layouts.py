@@ -96,8 +96,8 @@ def test_the_model_with_most_photos_is_used_and_the_others_named(
     scene = loaded(tmp_path)
     check(scene, {NAMES[k]: k for k in range(3, COUNT)})
     (warning,) = scene.warnings
-    assert f"/{larger} is used, with 9 photos" in warning
-    assert f"/{1 - larger} has 3 of the photos" in warning
+    assert f"{larger} is used, with 9 photos" in warning
+    assert f"{1 - larger} has 3 of the photos" in warning
 
 
 def test_photos_that_the_capture_lacks_do_not_count(tmp_path: Path) -> None:
@@ -114,7 +114,7 @@ def test_a_broken_model_among_several_is_named(tmp_path: Path) -> None:
     scene = loaded(tmp_path)
     check(scene, ALL)
     assert "sparse/0 is not used: cameras.txt could not be read" in scene.warnings[0].replace(
-        "The COLMAP model in 0/ could not be read: ", ""
+        "The COLMAP model in sparse/0 could not be read: ", ""
     )
 
 

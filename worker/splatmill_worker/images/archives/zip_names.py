@@ -83,15 +83,16 @@ def decode(archive: zipfile.ZipFile) -> str:
     for entry, raw in unmarked.items():
         entry.filename = raw.decode(chosen)
     first = names[0]
-    said = f"The zip does not say how its names are encoded. They are read as {_label(chosen)}: {first.decode(chosen)}"
+    said = f"The zip does not say how its names are encoded. They are read as {label(chosen)}: {first.decode(chosen)}"
     if by_cameras:
         return f"{said}, as the cameras name them."
     others = [each for each in [*fitting, *possible] if first.decode(each) != first.decode(chosen)]
-    other = f"; as {_label(others[0])}, this is {first.decode(others[0])}" if others else ""
+    other = f"; as {label(others[0])}, this is {first.decode(others[0])}" if others else ""
     return f"{said}{other}. If that is wrong, pack the files with a program that writes UTF-8."
 
 
-def _label(encoding: str) -> str:
+def label(encoding: str) -> str:
+    """An encoding and what it is for, as a part of a sentence."""
     return f"{encoding} ({ENCODINGS[encoding][0]})"
 
 

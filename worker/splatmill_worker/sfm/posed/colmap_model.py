@@ -13,8 +13,10 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.lens import lens_of, pinhole, without_distortion
+from splatmill_worker.readers.colmap_files import place
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
 from splatmill_worker.sfm.posed import model_files
+from splatmill_worker.sfm.posed.encodings import decoded
 from splatmill_worker.sfm.posed.files import ImageFiles, missing, none_usable, readings
 from splatmill_worker.sfm.posed.model_files import GivenModel, ModelPoints
 from splatmill_worker.sfm.posed.one_camera import one_for_each
@@ -34,7 +36,8 @@ def load(folder: Path, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
     Cameras are scaled to the size of the files. Raises ValueError when the model cannot be read, and when none of its
     photos is among the files.
     """
-    return scene_of_given(model_files.read(folder), files, notes)
+    model, remarks = decoded(model_files.read(folder), files)
+    return _with(scene_of_given(model, files, notes), remarks)
 
 
 def load_largest(folders: Sequence[Path], files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
@@ -49,12 +52,12 @@ def load_largest(folders: Sequence[Path], files: ImageFiles, notes: tuple[str, .
         raise ValueError(
             f"The capture has {len(folders)} COLMAP models; at most {MOST_MODELS} are read. Give one of them."
         )
-    best: tuple[int, Path, GivenModel] | None = None
+    best: tuple[int, Path, GivenModel, tuple[str, ...]] | None = None
     said: dict[Path, str] = {}
     faults: list[ValueError] = []
     for folder in folders:
         try:
-            model = model_files.read(folder)
+            model, remarks = decoded(model_files.read(folder), files)
         except ValueError as error:
             faults.append(error)
             said[folder] = f"{_shown(folder)} is not used: {error}"
@@ -62,11 +65,11 @@ def load_largest(folders: Sequence[Path], files: ImageFiles, notes: tuple[str, .
         count = len({path for image in model.images.values() if (path := _path(files, image.name))})
         said[folder] = f"{_shown(folder)} has {count} of the photos."
         if best is None or count > best[0]:
-            best = count, folder, model
+            best = count, folder, model, remarks
     if best is None:
         raise faults[0]
-    count, folder, model = best
-    scene = scene_of_given(model, files, notes)
+    count, folder, model, remarks = best
+    scene = _with(scene_of_given(model, files, notes), remarks)
     others = (sentence for other, sentence in said.items() if other != folder)
     which = f"Of {len(folders)} COLMAP models, {_shown(folder)} is used, with {count} photos, because it has the most."
     return replace(scene, warnings=(*scene.warnings, " ".join((which, *others))))
@@ -83,7 +86,11 @@ def _instead(files: ImageFiles) -> str:
 
 
 def _shown(folder: Path) -> str:
-    return f"{folder.parent.name}/{folder.name}"
+    return place(folder) or "the one beside the photos"
+
+
+def _with(scene: Scene, warnings: tuple[str, ...]) -> Scene:
+    return replace(scene, warnings=(*scene.warnings, *warnings))
 
 
 def scene_of_given(model: GivenModel, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:

@@ -63,7 +63,10 @@ class ModelPoints:
 
 @dataclass(frozen=True)
 class GivenImage:
-    """A photo of a given model: its name, its camera, and its world-to-camera matrix [4,4]."""
+    """A photo of a given model: its name, its camera, and its world-to-camera matrix [4,4].
+
+    In a name that is not UTF-8, other bytes are surrogates: see `encodings.decoded`.
+    """
 
     name: str
     camera: pycolmap.Camera
@@ -88,16 +91,17 @@ def read(folder: Path) -> GivenModel:
     Raises ValueError, naming the file or the entry, when a file is missing, too large, damaged or contradicts another,
     and when a camera or a pose is not valid.
     """
-    arrays = decoders.call_once(colmap_files.read, folder, check=_arrays, fault=_fault)
+    which = colmap_files.which(folder)
+
+    def fault(code: str, name: str, reason: str) -> Exception:
+        message = f"{which} could not be read: {reason}."
+        if code != "decoder_ended":
+            return ValueError(message)
+        return Refusal(code, message, advice="Restart the job, or remove the poses.")
+
+    arrays = decoders.call_once(colmap_files.read, folder, check=_arrays, fault=fault)
     images, faulty = _images(arrays, _cameras(arrays))
     return GivenModel(images, _points(arrays), faulty)
-
-
-def _fault(code: str, name: str, reason: str) -> Exception:
-    message = f"The COLMAP model in {name}/ could not be read: {reason}."
-    if code != "decoder_ended":
-        return ValueError(message)
-    return Refusal(code, message, advice="Restart the job, or remove the poses.")
 
 
 def _arrays(answer: Any) -> Arrays:
@@ -169,7 +173,7 @@ def _images(
     """
     images: dict[int, GivenImage] = {}
     faulty: list[tuple[str, str]] = []
-    names = arrays["image_names"].tobytes().decode("utf-8", "replace").split("\0")[:-1]
+    names = arrays["image_names"].tobytes().decode("utf-8", "surrogateescape").split("\0")[:-1]
     for number, of, pose, name in zip(
         arrays["image_ids"].tolist(),
         arrays["image_cameras"].tolist(),

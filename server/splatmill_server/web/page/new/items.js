@@ -13,6 +13,7 @@ import { verdicts } from "./verdicts.js";
  * @property {import("./kinds.js").Role | null} role null for a file that is not used
  * @property {string} name in the capture
  * @property {"photo" | "video" | "archive" | "mask" | "pose" | "ignored"} kind
+ * @property {boolean} named whether it is a mask that a frame of a transforms file names
  * @property {boolean} left whether a person has left it out
  * @property {string | null} digest
  * @property {"waiting" | "read" | "unreadable" | "unchecked"} state
@@ -40,6 +41,8 @@ export class Items {
     this.limits = { minSide: accepted.min_photo_side, maxPixels };
     /** @type {Map<string, Item>} */
     this.byPath = new Map();
+    /** @type {import("./documents.js").Documents} */
+    this.documents = new Map();
     this.count = 0;
     /** @type {string | null} why the files cannot be one capture */
     this.problem = null;
@@ -68,15 +71,17 @@ export class Items {
    * Add files; returns the new ones. A file that was given before is not added again; another one under the same path gets
    * a path of its own, because phones call each photo image.jpg.
    * @param {import("./given.js").Given[]} given
+   * @param {import("./documents.js").Documents} documents the transforms files among them
    */
-  add(given) {
+  add(given, documents) {
+    for (const [path, document] of documents) this.documents.set(path, document);
     const added = [];
     for (const { path, file } of given) {
       const free = this.free(path, file);
       if (free === null) continue;
       /** @type {Item} */
       const item = {
-        id: ++this.count, path: free, file, role: null, name: free, kind: "ignored", left: false, digest: null, state: "waiting", width: 0, height: 0,
+        id: ++this.count, path: free, file, role: null, name: free, kind: "ignored", named: false, left: false, digest: null, state: "waiting", width: 0, height: 0,
         measures: null, levels: null, thumbnail: null, lost: null, inside: null, verdict: { kind: "waiting", text: "" }, stored: false, problem: null,
       };
       this.byPath.set(free, item);
@@ -101,12 +106,14 @@ export class Items {
   clear() {
     for (const item of this.all) if (item.thumbnail) URL.revokeObjectURL(item.thumbnail);
     this.byPath.clear();
+    this.documents.clear();
   }
 
   /** Decide again what each file is; more files may change that. */
   sort() {
-    const sorted = sort(this.byPath.keys(), this.accepted);
+    const sorted = sort(this.byPath.keys(), this.accepted, this.documents);
     this.problem = sorted.problem;
+    for (const item of this.all) item.named = sorted.named.has(item.path);
     this.said = [...places(sorted), ...remarks(sorted, this.accepted)];
     const order = new Map(sorted.files.map(({ path, role, name }) => [path, { role, name }]));
     const before = this.byPath;

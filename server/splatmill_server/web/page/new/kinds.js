@@ -1,6 +1,8 @@
 // Which of the given files are photos, masks, poses, videos or archives, and the names they get in the capture. The rules
 // are those of the command line (client/splatmill/transfer/local_capture.py and data_sets.py); a test compares the two.
 
+import { hasPhotosBeside, named } from "./documents.js";
+
 /** @typedef {"images" | "masks" | "poses"} Role */
 
 /**
@@ -13,6 +15,8 @@
  * @property {string[]} mask_folders in lower case
  * @property {string[]} mask_endings
  * @property {string[]} mask_beginnings
+ * @property {Record<string, string[]>} other_folders names in lower case of folders without photos, by what they hold
+ * @property {string[]} unused_folders those of them that are not used beside photos
  * @property {string[]} output_marks
  * @property {string[]} output_media
  * @property {{what: string, suffixes: string[], advice: string}[]} unread
@@ -26,6 +30,8 @@
  * @property {{role: Role, name: string, path: string}[]} files
  * @property {string[]} ignored paths
  * @property {string | null} problem why the files cannot be read as one capture
+ * @property {Set<string>} named paths of masks that frames of transforms files name
+ * @property {Map<string, string>} others paths of pictures that are no photos, with what they are
  * @property {string[]} outputs paths of pictures, videos and zips that are results of Splatmill
  * @property {string} top folder of the data set, with a slash at its end, where it is not the given one
  */
@@ -45,7 +51,10 @@ const KEYFRAMES = ["keyframes/corrected_cameras/", "keyframes/cameras/"];
 export const MAX_DEPTH = 4;
 
 /** Folders that say what lies in them, so their name is kept where everything lies in one folder. */
-const TELLING = ["images", "masks", "mask", "segmentation", "segmentations", "sparse", "colmap", "keyframes"];
+const TELLING = [
+  "images", "sparse", "colmap", "keyframes", "masks", "mask", "segmentation", "segmentations", "depth", "depths", "depth_maps", "depthmaps", "normals",
+  "normal_maps", "normalmaps", "confidence", "confidences", "confidence_maps", "semantic", "semantics", "semantic_maps", "thumbnail", "thumbnails", "thumbs",
+];
 
 /** The suffix of a path in lower case, with its dot. @param {string} path */
 export function suffix(path) {
@@ -58,9 +67,10 @@ export function suffix(path) {
  * Sort paths, relative to the folder that was given, into the files of a capture and those that are ignored.
  * @param {Iterable<string>} paths
  * @param {Accepted} accepted
+ * @param {import("./documents.js").Documents} documents those of the transforms files that can be read
  * @returns {Sorted}
  */
-export function sort(paths, accepted) {
+export function sort(paths, accepted, documents = new Map()) {
   const shown = [...paths].filter((path) => !isHidden(path)).sort(byCodePoint);
   const outputs = ownOutputs(shown, accepted);
   const seen = shown.filter((path) => !outputs.has(path));
@@ -69,17 +79,32 @@ export function sort(paths, accepted) {
   const cameras = camerasIn(seen);
   // Cameras in a folder without photos are those of the photos around it.
   const top = seen.some((path) => path.startsWith(cameras.top) && isPhoto(path)) ? cameras.top : "";
-  const photoRoot = seen.some((path) => path.startsWith(`${top}images/`) && isPhoto(path)) ? `${top}images/` : top;
-  const masks = masksIn(seen.filter((path) => path.startsWith(top) && isPhoto(path)), top, photoRoot, accepted);
+  const read = cameras.transforms.flatMap((path) => documents.get(path) ?? []);
+  const pictures = seen.filter((path) => path.startsWith(top) && isPhoto(path));
+  let photoRoot = pictures.some((path) => path.startsWith(`${top}images/`)) ? `${top}images/` : top;
+  const photos = named(read, "file_path", cameras.top);
+  if (hasPhotosBeside(pictures.filter((path) => photos.has(path)), photoRoot)) photoRoot = top;
+  const masks = masksIn(pictures, top, photoRoot, accepted);
+  const drawn = named(read, "mask_path", cameras.top);
+  for (const path of pictures) {
+    if (drawn.has(path) && !masks.has(path)) masks.set(path, path.slice((path.startsWith(photoRoot) ? photoRoot : top).length));
+  }
   const poses = namesOf(cameras, seen);
+  const points = named(read, "ply_file_path", cameras.top);
+  for (const path of seen) if (points.has(path) && suffix(path) === ".ply") poses.set(path, path.slice(cameras.top.length));
   /** @type {Sorted} */
-  const found = { files: [], ignored: [], problem: cameras.problem, outputs: [], top: cameras.top };
+  const found = { files: [], ignored: [], problem: cameras.problem, named: new Set([...drawn].filter((path) => masks.has(path))), others: new Map(), outputs: [], top: cameras.top };
+  if (!poses.size) {
+    const inside = seen.filter((path) => path.startsWith(photoRoot) && isPhoto(path));
+    found.problem ??= noPhotos(inside, accepted);
+    found.others = besidePhotos(inside, accepted);
+  }
   for (const path of seen) {
     const pose = poses.get(path);
     const mask = masks.get(path);
     if (pose !== undefined) found.files.push({ role: "poses", name: pose, path });
     else if (mask !== undefined) found.files.push({ role: "masks", name: mask, path });
-    else if (path.startsWith(photoRoot) && isPhoto(path)) {
+    else if (path.startsWith(photoRoot) && isPhoto(path) && !found.others.has(path)) {
       found.files.push({ role: "images", name: path.slice(photoRoot.length), path });
     } else found.ignored.push(path);
   }
@@ -100,13 +125,36 @@ export function sort(paths, accepted) {
 export function withoutTop(paths) {
   const top = paths[0]?.split("/")[0];
   const common = paths.length > 0 && paths.every((path) => path.startsWith(`${top}/`));
-  return common && !TELLING.includes(top) ? withoutTop(paths.map((path) => path.slice(top.length + 1))) : paths;
+  return common && !TELLING.includes(top.toLowerCase()) ? withoutTop(paths.map((path) => path.slice(top.length + 1))) : paths;
 }
 
 /** @param {string} path */
 function isHidden(path) {
   const parts = path.split("/");
   return parts.some((part) => part.startsWith(".")) || parts.slice(0, -1).some((part) => part.startsWith("__MACOSX"));
+}
+
+/** What a file is by the folders in its path. @param {string} path @param {Accepted} accepted */
+function kindOfFolder(path, accepted) {
+  for (const folder of path.toLowerCase().split("/").slice(0, -1)) {
+    for (const [what, folders] of Object.entries(accepted.other_folders)) if (folders.includes(folder)) return what;
+  }
+  return null;
+}
+
+/** A sentence where all pictures lie in folders that hold no photos. @param {string[]} paths @param {Accepted} accepted */
+function noPhotos(paths, accepted) {
+  const kinds = [...new Set(paths.map((path) => kindOfFolder(path, accepted)))].sort();
+  if (!paths.length || kinds.includes(null)) return null;
+  const which = paths.length > 1 ? `All ${paths.length} pictures lie` : "The only picture lies";
+  return `${which} in a folder of ${kinds.join(" or ")} by its name, such as ${paths[0]}. Give the photos; if these are the photos, give their folder another name.`;
+}
+
+/** Pictures in folders of maps beside photos, with what they are. @param {string[]} paths @param {Accepted} accepted */
+function besidePhotos(paths, accepted) {
+  const kinds = paths.map((path) => /** @type {const} */ ([path, kindOfFolder(path, accepted)]));
+  if (kinds.every(([, kind]) => kind !== null)) return new Map();
+  return new Map(kinds.flatMap(([path, kind]) => (kind !== null && accepted.unused_folders.includes(kind) ? [[path, kind]] : [])));
 }
 
 /**

@@ -5,6 +5,7 @@ import { byId, h } from "../dom.js";
 import { ago, bytes, count, number } from "../format.js";
 import { estimateOf } from "./estimate.js";
 import { Gallery } from "./gallery.js";
+import { documentsIn } from "./documents.js";
 import { chosen, dropped } from "./given.js";
 import { Items } from "./items.js";
 import { suffix } from "./kinds.js";
@@ -87,7 +88,7 @@ function wireGiving() {
     zone.classList.remove("over");
     if (!event.dataTransfer) return;
     try {
-      take(await dropped(event.dataTransfer));
+      await take(await dropped(event.dataTransfer));
     } catch (error) {
       notify(/** @type {Error} */ (error));
     }
@@ -117,10 +118,11 @@ function wireTools() {
 }
 
 /** @param {import("./given.js").Given[]} given */
-function take(given) {
+async function take(given) {
+  const documents = await documentsIn(given);
   if (!given.length) return notify("Nothing was found in what you dropped.", "warning");
   if (start.busy) return notify("Files are being sent. Pause first to give more.", "warning");
-  const added = items.add(given);
+  const added = items.add(given, documents);
   for (const item of added) {
     if (item.kind === "archive") void items.open(item).then(redraw);
     looking.add(item.id, item.file, item.kind, suffix(item.path));

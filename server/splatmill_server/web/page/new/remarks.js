@@ -12,7 +12,7 @@ const MOST_HIDDEN = 0.5;
  * @param {import("./kinds.js").Accepted} accepted
  * @returns {string[]}
  */
-export function remarks({ files, ignored }, accepted) {
+export function remarks({ files, ignored, others }, accepted) {
   const said = [];
   const read = new Map(accepted.unread.flatMap((kind) => kind.suffixes.map((ending) => [ending, kind])));
   /** @type {Map<import("./kinds.js").Accepted["unread"][0], string[]>} */
@@ -27,6 +27,11 @@ export function remarks({ files, ignored }, accepted) {
   if (!files.some(({ role }) => role === "poses")) said.push(...unreadCameras(ignored, accepted));
   const beside = ignored.filter((path) => [...accepted.videos, ...accepted.archives].includes(suffix(path)));
   if (beside.length) said.push(`Videos and zips are not used where there are photos: ${beside.join(", ")}.`);
+  for (const what of accepted.unused_folders) {
+    const paths = [...others].filter(([, kind]) => kind === what).map(([path]) => path);
+    const more = paths.length > 1 ? ` and ${paths.length - 1} more` : "";
+    if (paths.length) said.push(`${paths.length === 1 ? "1 picture is" : `${paths.length} pictures are`} taken for ${what} by the name of the folder and not used: ${paths[0]}${more}.`);
+  }
   return said;
 }
 
@@ -64,7 +69,7 @@ const SHOWN = 128;
 
 /**
  * Sentences about masks that belong to no photo, about masks of two labels, and about those that hide all or most.
- * @param {{name: string, levels: Uint32Array | null}[]} masks
+ * @param {{name: string, named: boolean, levels: Uint32Array | null}[]} masks named: by a frame
  * @param {string[]} photos names
  * @param {import("./kinds.js").Accepted} accepted
  * @returns {string[]}
@@ -73,7 +78,7 @@ export function onMasks(masks, photos, accepted) {
   const said = [];
   const last = (/** @type {string} */ name) => name.slice(name.lastIndexOf("/") + 1).toLowerCase();
   const known = new Set(photos.flatMap((name) => [last(name), stem(last(name))]));
-  const used = masks.filter(({ name }) => [stem(last(name)), ...unmarked(stem(last(name)), accepted)].some((form) => known.has(form)));
+  const used = masks.filter(({ name, named }) => named || [stem(last(name)), ...unmarked(stem(last(name)), accepted)].some((form) => known.has(form)));
   const unused = masks.filter((mask) => !used.includes(mask)).map(({ name }) => name).sort();
   if (unused.length) {
     const are = unused.length === 1 ? "1 mask belongs" : `${unused.length} masks belong`;
