@@ -378,6 +378,24 @@ def test_sixteen_bits_are_read_as_eight(suffix: str, codec: str, tmp_path: Path)
     assert (np.asarray(decode.decode(tmp_path / f"g.{suffix}")) == chart()[..., 0]).all()
 
 
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_a_fine_ramp_of_sixteen_bits_is_neither_banded_nor_clipped(suffix: str, tmp_path: Path) -> None:
+    ramp = np.tile(np.linspace(0, 65535, 4096).round().astype(np.uint16), (16, 1))
+    deep = np.stack([ramp] * 3, axis=-1)
+    encoder: Any = av.CodecContext.create("png" if suffix == "png" else "tiff", "w")
+    encoder.width, encoder.height = ramp.shape[1], ramp.shape[0]
+    encoder.pix_fmt, encoder.time_base = ("rgb48be" if suffix == "png" else "rgb48le"), Fraction(1, 1)
+    frame = av.VideoFrame.from_ndarray(deep, format="rgb48le").reformat(format=encoder.pix_fmt)
+    (tmp_path / f"a.{suffix}").write_bytes(b"".join(bytes(packet) for packet in encoder.encode(frame)))
+    Image.fromarray(ramp).save(tmp_path / f"g.{suffix}")
+    for values in (
+        read(tmp_path / f"a.{suffix}")[..., 1],
+        np.asarray(decode.decode(tmp_path / f"g.{suffix}")),
+    ):
+        assert np.abs(values[8] - ramp[8] / 257.0).max() < 1.0
+        assert len(np.unique(values[8])) == 256
+
+
 def test_photos_that_come_with_cameras_are_named_too(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     frames = []
