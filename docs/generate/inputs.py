@@ -99,11 +99,11 @@ def _photos() -> list[str]:
         """Colours are brought to sRGB with 8 bits per channel. A photo is read by its ICC profile, or else by its tags,
         the chunks sRGB, gAMA and cHRM of PNG, or EXIF (Adobe RGB, other primaries, a power); in a PNG, cICP comes
         first. A video is read by its tags. PQ and HLG are converted by one rule, which
-        [Photographing](photographing.md#what-can-be-given) has. Photos of 10 or 16 bits are reduced to 8 before that, by
-        less than one level: a photo in PQ then has steps of two levels, and one in linear light has bands in its
-        shadows, of up to 13. Of a photo with a gain map, the SDR picture is used. CMYK and LAB are converted too. Grey floating-point
-        numbers are taken as sRGB from 0 to 1, and left out if they reach further; coloured ones are refused, since they
-        may be linear light as well. The report says what was converted or assumed.""",
+        [Photographing](photographing.md#what-can-be-given) has. Photos of 10 or 16 bits are reduced to 8 before that,
+        by less than one level: a photo in PQ then has steps of two levels, and one in linear light has bands in its
+        shadows, of up to 13. Of a photo with a gain map, the SDR picture is used. CMYK and LAB are converted too. Grey
+        floating-point numbers are taken as sRGB from 0 to 1, and left out if they reach further; coloured ones are
+        refused, since they may be linear light as well. The report says what was converted or assumed.""",
         "### Zips\n",
         f"""{choices(ARCHIVE_SUFFIXES)} files hold photos or a whole data set. All zips and videos of a capture together
         hold up to {archive.MAX_ENTRIES:,} files. A zip in a zip is not unpacked.

@@ -79,7 +79,7 @@ export function sort(paths, accepted, documents = new Map()) {
   const cameras = camerasIn(seen);
   // Cameras in a folder without photos are those of the photos around it.
   const top = seen.some((path) => path.startsWith(cameras.top) && isPhoto(path)) ? cameras.top : "";
-  const read = cameras.transforms.flatMap((path) => documents.get(path) ?? []);
+  const read = [...documents].filter(([path]) => cameras.transforms.includes(path)).map(([, document]) => document);
   const pictures = seen.filter((path) => path.startsWith(top) && isPhoto(path));
   let photoRoot = pictures.some((path) => path.startsWith(`${top}images/`)) ? `${top}images/` : top;
   const photos = named(read, "file_path", cameras.top);
