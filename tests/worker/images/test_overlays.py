@@ -1,6 +1,6 @@
 """Proves what is found to stand still in photos, and masked: logos, watermarks, time codes, bars and dashboards, opaque
-and transparent, at several places; and that a scene alone, few photos, a slow camera and things that turn before a
-plain background have nothing masked.
+and transparent, at several places; and that a scene alone, few photos, a slow camera, a level circle and things that
+turn before a plain background have nothing masked.
 
 Not proven here: that digits which change are masked beside those that stay.
 """
@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw
 
 from splatmill_worker.images.overlay import MIN_PHOTOS
 from splatmill_worker.images.prepare import Prepared, prepare
-from splatmill_worker.synthetic import orbit, photograph, still_life
+from splatmill_worker.synthetic import look_at, orbit, photograph, still_life
 
 WIDTH, HEIGHT = 320, 240
 Draw = Callable[[Image.Image, int], Image.Image]
@@ -146,6 +146,20 @@ def test_a_scene_alone_has_nothing_masked(tmp_path: Path, change: Draw) -> None:
     assert [photo.mask for photo in result.photos] == [None] * 16
     assert result.overlays == ()
     assert result.warnings == ()
+
+
+def test_a_rim_and_a_horizon_that_stay_on_a_level_circle_are_not_masked(tmp_path: Path) -> None:
+    life = still_life(0)
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for k in range(24):
+        turn = 0.75 * 2.0 * np.pi * k / 24
+        eye = 3.7 * np.array([np.cos(turn) * np.cos(0.5), np.sin(turn) * np.cos(0.5), np.sin(0.5)])
+        camera = look_at(eye, np.array([0.0, 0.0, 0.25]), WIDTH, HEIGHT, 262.5)
+        Image.fromarray(photograph(life, camera, samples=1)[0]).save(folder / f"{k:02d}.png")
+    result = prepare(folder, None, tmp_path / "work")
+    assert result.overlays == ()
+    assert [photo.mask for photo in result.photos] == [None] * 24
 
 
 def test_few_photos_have_nothing_masked(tmp_path: Path) -> None:

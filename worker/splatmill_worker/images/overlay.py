@@ -25,6 +25,10 @@ MOST_PHOTOS = 64
 COHERENT = 0.5
 """Coherence from which an edge never moves. On photos of a scene hardly a pixel has as much."""
 
+CERTAIN = 0.75
+"""Coherence that a tenth of the edges of an overlay have at least. Round what turns on a level circle, a rim or the
+horizon stays as well, but what lies on both sides of it differs from photo to photo."""
+
 PARTLY = 0.3
 """Coherence down to which pixels beside such edges belong to them, as those of digits that change."""
 
@@ -120,7 +124,7 @@ def still(count: int, picture: Callable[[int, int], Grey]) -> Still | None:
     coherence, strength, mean = _coherence(stack)
     edges = (coherence >= COHERENT) & (np.hypot(*mean) >= EDGE) & ~_grown(region, MARGIN)
     edges = _large(edges & ~_silhouettes(spread <= CONSTANT, region), MIN_EDGE_PIXELS)
-    edges = _of_both_directions(edges, mean)
+    edges = _certain(_of_both_directions(edges, mean), coherence)
     if edges.any() and _rest_moves(coherence, strength, edges) and _holds(edges, chosen, picture):
         region |= _covered(edges, coherence, mean, spread)
     if not region.any():
@@ -241,6 +245,16 @@ def _of_both_directions(edges: Region, mean: Grey) -> Region:
         own = part & edges
         along = (mean[:, own] ** 2).sum(axis=1)
         if along.min() >= PARALLEL * along.max():
+            kept |= own
+    return kept
+
+
+def _certain(edges: Region, coherence: Grey) -> Region:
+    """The groups of edges of which a tenth is certain not to move."""
+    kept = np.zeros_like(edges)
+    for part in _parts(_grown(edges, GAP)):
+        own = part & edges
+        if np.quantile(coherence[own], 0.9) >= CERTAIN:
             kept |= own
     return kept
 
