@@ -119,14 +119,14 @@ def run(
         photos = _load_photos(cameras, loading_size(options, task.kernels), stages)
         with stages.measured("plan"):
             first = _first_gaussians(task, cameras, photos)
-            facts, light = _measure_facts(task, cameras, photos, first)
+            facts = _measure_facts(task, cameras, photos, first)
             plan = _make_plan(task, facts, revise)
         emit(PlanEvent(plan=plan.as_dict()))
         if plan.image_size < max(facts.width, facts.height):
             del photos  # both sizes at once would be the most memory that photos ever take
             photos = _load_photos(cameras, plan.image_size, stages)
-        if plan.exposure and light is not None:
-            photos = photos.relit(light)
+        if plan.exposure and facts.light is not None:
+            photos = photos.relit(facts.light)
         engine = open_engine(_seeded(first, cameras, photos, plan), plan.kernels)
         training = _train(task, cameras, engine, photos, plan)
     except Cancelled:
@@ -327,19 +327,19 @@ def _doubt_message(start: GivenModel) -> str:
     )
 
 
-def _measure_facts(task: Task, cameras: Cameras, photos: Photos, first: First) -> tuple[Facts, Light | None]:
-    """What can be measured before training: the scene, how fast this machine trains it, and the photos' light."""
+def _measure_facts(task: Task, cameras: Cameras, photos: Photos, first: First) -> Facts:
+    """What can be measured before training: the scene, its photos, and how fast this machine trains it."""
     pixels = photos.training[0].full.rgb[..., 0].numel()
     most = resolved(pixels, len(photos.training)) if first.model is None else 0
     speed = probe(open_engine(first.gaussians, task.kernels), photos.training, most=most)
-    facts, light = measure(cameras.world, photos.training, len(photos.held_out), speed)
+    facts = measure(cameras.world, photos.training, len(photos.held_out), speed)
     facts = replace(facts, start=first.model)
     if isinstance(first.hull, Hull):
         facts = replace(facts, hull_points=len(first.hull.points))
     elif first.hull is not None:
         facts = replace(facts, no_hull=first.hull.reason)
     card = describe() if task.kernels == "gpu" else None
-    return (facts if card is None else replace(facts, memory_available=card.free_bytes)), light
+    return facts if card is None else replace(facts, memory_available=card.free_bytes)
 
 
 def _make_plan(task: Task, facts: Facts, revise: Revise) -> Plan:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,14 +15,15 @@ import pytest
 import torch
 
 from splatmill_worker.scene import Lens, Normalization, PointViews, Scene
-from splatmill_worker.splat.plan.facts import Facts, halving_loss, measure
+from splatmill_worker.splat.plan.facts import halving_loss, measure
 from splatmill_worker.splat.views import TrainingView
 from tests.support import still_life
 from tests.support.training import sparse_scene
 
 
-def facts(world: Scene, views: list[TrainingView]) -> Facts:
-    return measure(world, views, 0, None)[0]
+def facts(world: Scene, views: list[TrainingView], held_out: int = 0) -> SimpleNamespace:
+    """The facts as the report has them."""
+    return SimpleNamespace(**measure(world, views, held_out, None).as_dict())
 
 
 def darkened(views: list[TrainingView], gains: tuple[float, float, float]) -> None:
@@ -164,7 +166,7 @@ def test_equal_exposures_agree_and_unequal_ones_do_not() -> None:
 
 def test_geometry_is_measured() -> None:
     scene, views = tracked(np.ones(len(still_life.scene().views)))
-    seen, _ = measure(scene, views, 2, None)
+    seen = facts(scene, views, 2)
     assert seen.view_angle is not None
     assert 20.0 < seen.view_angle < 180.0
     assert seen.distance_ratio is not None

@@ -85,7 +85,7 @@ def planned(
     """
     options = TrainOptions(image_size=small.longest, steps=steps, max_gaussians=most)
     first = _first(small, seed)
-    facts, _ = measure(small.world, small.training, len(small.held_out), None)
+    facts = measure(small.world, small.training, len(small.held_out), None)
     plan = replace(revised(decide(facts, options, "cpu"), changes), seed=seed)
     gaussians = first.most_opaque(plan.max_gaussians)
     if plan.initial == "points":

@@ -126,6 +126,7 @@ def _schedule(
     reasons: Reasons,
 ) -> Schedule:
     steps = capacity.steps
+    shell = None if facts.coverage is None else facts.coverage.shell_distance
     schedule = Schedule(
         budget=capacity.budget,
         resolution=_resolution(steps, image_size, reasons),
@@ -135,7 +136,7 @@ def _schedule(
         densify_until=0.7,
         opacity_decay=OPACITY_DECAY if densify else 1.0,
         # Half way to the shell, so that all of the shell is spared and most of the scene is not.
-        decay_within=0.5 * facts.shell_distance if needs.far_shell and facts.shell_distance else None,
+        decay_within=0.5 * shell if needs.far_shell and shell else None,
         annealing=_annealing(facts, options, steps, reasons),
         dropout=_dropout(facts, steps, reasons),
         expected_steps=steps,
@@ -159,7 +160,7 @@ def _degree(facts: Facts, options: TrainOptions, reasons: Reasons) -> int:
     if options.sh_degree is not None:
         reasons.option("sh_degree")
         return options.sh_degree
-    angle = facts.view_angle
+    angle = None if facts.geometry is None else facts.geometry.view_angle
     if angle is None:
         reasons.chosen["sh_degree"] = "The angles between the views of a point are not known."
         return 3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,40 @@ class Speed:
 
 
 @dataclass(frozen=True)
+class Geometry:
+    """From where the points are seen; without stereo points.
+
+    view_angle: median over points of the largest angle between two views of the point, degrees; None without points.
+    distance_ratio: largest over smallest footprint of a pixel on the same point, 90th percentile over points.
+    """
+
+    view_angle: float | None
+    distance_ratio: float
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Which part of the photos' area shows points.
+
+    sightings: median number of points that a photo shows.
+    sky_share: share of the photos' area that looks like sky and shows no point, 0 to 1.
+    gap_share: share of the photos' area, sky excluded, with no point in or beside it, 0 to 1.
+    gap_points: number of Gaussians that would fill the gaps.
+    shell_points: number of Gaussians of the far shell.
+    shell_distance: distance from the origin to the nearest Gaussian of the far shell, in units of the world.
+    extent: radius around the cameras that holds nine points in ten, over the radius of the cameras.
+    """
+
+    sightings: float
+    sky_share: float
+    gap_share: float
+    gap_points: int
+    shell_points: int
+    shell_distance: float | None
+    extent: float
+
+
+@dataclass(frozen=True)
 class Facts:
     """What is measured of a scene and of this machine before the plan is made. None: it cannot be measured here.
 
@@ -60,32 +94,19 @@ class Facts:
     masked: number of photos with a mask.
     distorted: number of photos, held-out ones included, whose lens distortion was removed.
     halving_loss: median RMS difference between a photo and its half-size copy enlarged again, grey levels of 255.
-    exposure_spread: robust standard deviation of the photos' exposures, natural logarithm.
-    view_angle: median over points of the largest angle between two views of the point, degrees; without stereo points.
-    distance_ratio: largest over smallest footprint of a pixel on the same point, 90th percentile over points.
     reprojection: median reprojection error, pixels; without stereo points.
     memory_available: memory that this process can still use, or free memory of the GPU for the gpu kernels, bytes.
+    light: exposure and white balance of the photos; None where too few show the same points.
+    geometry: None where it is not known which photos show which points.
+    coverage: None without enough points, or where photos are transparent.
     speed: training time of this machine; None where it was not probed.
     start: the model that training starts from; None without one.
-    tint_spread: as exposure_spread, of red over green or blue over green, whichever spreads more.
-    light_tail: departure of a photo's exposure or white balance from what the photos around it predict, natural
-        logarithm; nine photos in ten depart less.
-    light_error: median standard error of the photos' exposures, natural logarithm.
-    light_unseen: share of the variance of smooth light that the photos around do not predict, because they are too far
-        away, 0 to 1.
     lens_residual: largest displacement of a pixel by lens distortion, pixels.
     alignment: length of the mean viewing direction: 1 where all photos look the same way; of those that look level, 2
         over pi where they look evenly over half a turn, and 0 over a whole turn.
-    sightings: median number of points that a photo shows.
-    sky_share: share of the photos' area that looks like sky and shows no point, 0 to 1.
-    gap_share: share of the photos' area, sky excluded, with no point in or beside it, 0 to 1.
-    gap_points: number of Gaussians that would fill the gaps.
-    shell_points: number of Gaussians of the far shell.
-    shell_distance: distance from the origin to the nearest Gaussian of the far shell, in units of the world.
     hull_points: number of points on the visual hull of transparent photos; None where training does not start from one.
     no_hull: why the outlines of transparent photos give no hull to start from, a sentence; None where none was carved.
     no_points: why a posed scene has no points, a sentence; None where it has some.
-    extent: radius around the cameras that holds nine points in ten, over the radius of the cameras.
     """
 
     views: int
@@ -99,26 +120,15 @@ class Facts:
     masked: int
     distorted: int
     halving_loss: float
-    exposure_spread: float | None
-    view_angle: float | None
-    distance_ratio: float | None
     reprojection: float | None
     memory_available: int
+    light: Light | None = None
+    geometry: Geometry | None = None
+    coverage: Coverage | None = None
     speed: Speed | None = None
     start: GivenModel | None = None
-    tint_spread: float | None = None
-    light_tail: float | None = None
-    light_error: float | None = None
-    light_unseen: float | None = None
     lens_residual: float | None = None
     alignment: float | None = None
-    sightings: float | None = None
-    sky_share: float | None = None
-    gap_share: float | None = None
-    gap_points: int = 0
-    shell_points: int = 0
-    shell_distance: float | None = None
-    extent: float | None = None
     no_points: str | None = None
     hull_points: int | None = None
     no_hull: str | None = None
@@ -129,22 +139,33 @@ class Facts:
         return self.width * self.height
 
     def as_dict(self) -> dict[str, Any]:
-        """The facts as plain values, for the report."""
-        return asdict(self)
+        """The facts as plain values, for the report: those of light, geometry and coverage beside the others."""
+        values = asdict(replace(self, light=None))
+        del values["light"]
+        absent: dict[str, dict[str, Any]] = {
+            "geometry": {each.name: None for each in fields(Geometry)},
+            "coverage": {each.name: None for each in fields(Coverage)} | {"gap_points": 0, "shell_points": 0},
+        }
+        for part, nothing in absent.items():
+            values |= values.pop(part) or nothing
+        return values | {
+            "exposure_spread": self.light and self.light.spread,
+            "tint_spread": self.light and self.light.tint_spread,
+            "light_tail": self.light and self.light.tail,
+            "light_error": self.light and self.light.error,
+            "light_unseen": self.light and self.light.unseen,
+        }
 
 
-def measure(
-    scene: Scene, views: Sequence[TrainingView], held_out: int, speed: Speed | None
-) -> tuple[Facts, Light | None]:
-    """Facts of `scene`, whose training photos are `views` in the same world, of any origin and unit, and their light.
+def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: Speed | None) -> Facts:
+    """Facts of `scene`, whose training photos are `views` in the same world, of any origin and unit.
 
     held_out: number of held-out photos. speed: of this machine; None where it was not probed.
     """
     sizes = np.array([[view.full.camera.width, view.full.camera.height] for view in views])
     width, height = (int(value) for value in np.median(sizes, axis=0))
     seen = Observations.of(scene, views)
-    light = None if seen is None else compared(seen, views)
-    facts = Facts(
+    return Facts(
         views=len(views),
         held_out=held_out,
         width=width,
@@ -156,22 +177,18 @@ def measure(
         masked=sum(view.full.mask is not None for view in views),
         distorted=sum(view.lens is not None for view in scene.views),
         halving_loss=float(np.median([halving_loss(view.full.rgb) for view in views])),
-        exposure_spread=None if light is None else light.spread,
-        tint_spread=None if light is None else light.tint_spread,
-        light_tail=None if light is None else light.tail,
-        light_error=None if light is None else light.error,
-        light_unseen=None if light is None else light.unseen,
+        light=None if seen is None else compared(seen, views),
+        geometry=None
+        if seen is None
+        else Geometry(seen.view_angle(_own_points(scene)), seen.distance_ratio()),
+        coverage=_coverage(scene, views),
         alignment=_alignment(views),
-        view_angle=None if seen is None else seen.view_angle(_own_points(scene)),
-        distance_ratio=None if seen is None else seen.distance_ratio(),
         reprojection=_reprojection(scene, max(width, height)),
         lens_residual=_lens_residual(scene, max(width, height)),
         memory_available=memory.available(),
         speed=speed,
         no_points=scene.facts.get("no_points"),
-        **_coverage(scene, views),
     )
-    return facts, light
 
 
 def halving_loss(rgb: torch.Tensor) -> float:
@@ -192,21 +209,20 @@ def _alignment(views: Sequence[TrainingView]) -> float | None:
     return float(np.linalg.norm(np.mean([view.full.camera.viewmat[2, :3] for view in views], axis=0)))
 
 
-def _coverage(scene: Scene, views: Sequence[TrainingView]) -> dict[str, Any]:
-    """The fields of Facts on coverage by points; none without enough points, or where photos are transparent."""
+def _coverage(scene: Scene, views: Sequence[TrainingView]) -> Coverage | None:
     if len(scene.points) < ENOUGH_POINTS or any(view.full.alpha is not None for view in views):
-        return {}
+        return None
     cells = cells_of(scene, views)
     shell, _ = shell_points(cells, scene.points)
-    return {
-        "sightings": float(np.median([len(grid.points) for grid in cells])),
-        "sky_share": sky_share(cells),
-        "gap_share": gap_share(cells),
-        "gap_points": len(gap_points(cells)[0]),
-        "shell_points": len(shell),
-        "shell_distance": float(np.linalg.norm(shell, axis=1).min()) if len(shell) else None,
-        "extent": _extent(scene, views),
-    }
+    return Coverage(
+        sightings=float(np.median([len(grid.points) for grid in cells])),
+        sky_share=sky_share(cells),
+        gap_share=gap_share(cells),
+        gap_points=len(gap_points(cells)[0]),
+        shell_points=len(shell),
+        shell_distance=float(np.linalg.norm(shell, axis=1).min()) if len(shell) else None,
+        extent=_extent(scene, views),
+    )
 
 
 def _extent(scene: Scene, views: Sequence[TrainingView]) -> float:

@@ -61,7 +61,9 @@ def needs_of(
         reasons.chosen["pose_refinement"] += (
             " Held-out cameras are not corrected: fitting them to their photos would flatter the score."
         )
-    return Needs(far_shell, gaps, poses, far_shell * facts.shell_points + gaps * facts.gap_points)
+    covered = facts.coverage
+    added = 0 if covered is None else far_shell * covered.shell_points + gaps * covered.gap_points
+    return Needs(far_shell, gaps, poses, added)
 
 
 def _check_seeds(facts: Facts, options: TrainOptions) -> None:
@@ -79,7 +81,7 @@ def _check_seeds(facts: Facts, options: TrainOptions) -> None:
                 f"{name}=on is for opaque photos, and {facts.transparent} of these are transparent. "
                 f"Set {name} to auto."
             )
-        if facts.sightings is None:
+        if facts.coverage is None:
             raise ValueError(
                 f"{name}=on needs points of the reconstruction that the photos show, and this scene has too few. "
                 f"Set {name} to auto."
@@ -105,36 +107,38 @@ def _far_shell(facts: Facts) -> tuple[bool, str]:
         return False, "The given model is kept as it is."
     if facts.transparent:
         return False, f"{facts.transparent} photos are transparent, so nothing stands behind the scene."
-    if facts.sky_share is None:
+    if facts.coverage is None:
         return False, "There are too few points to tell how far the scene extends."
-    seen = f"{100 * facts.sky_share:.0f} % of the photos look like sky"
+    seen = f"{100 * facts.coverage.sky_share:.0f} % of the photos look like sky"
     to_one_side = facts.alignment is None or facts.alignment > HALF_TURN
-    if facts.views < FEW_VIEWS and facts.sky_share < MUCH_SKY and to_one_side:
+    if facts.views < FEW_VIEWS and facts.coverage.sky_share < MUCH_SKY and to_one_side:
         return (
             False,
             f"{seen}, and {facts.views} photos to one side are too few to tell whether anything else is as far away.",
         )
     return (
         True,
-        f"{facts.shell_points} Gaussians stand on a far shell behind the scene, for what shows through its holes and "
-        f"for sky; {seen}.",
+        f"{facts.coverage.shell_points} Gaussians stand on a far shell behind the scene, for what shows through its "
+        f"holes and for sky; {seen}.",
     )
 
 
 def _gaps(facts: Facts) -> tuple[bool, str]:
     if facts.start is not None:
         return False, "The given model is kept as it is."
-    if facts.gap_share is None:
+    if facts.coverage is None:
         if facts.transparent:
             return (
                 False,
                 f"{facts.transparent} photos are transparent, so a place without points may be empty.",
             )
         return False, "There are too few points to tell where points are missing."
-    seen = f"{100 * facts.gap_share:.0f} % of what the photos show has no point near it"
-    if facts.sightings is not None:
-        seen += f" (median of {facts.sightings:.0f} points per photo)"
-    if facts.gap_share < MANY_GAPS:
+    covered = facts.coverage
+    seen = (
+        f"{100 * covered.gap_share:.0f} % of what the photos show has no point near it "
+        f"(median of {covered.sightings:.0f} points per photo)"
+    )
+    if covered.gap_share < MANY_GAPS:
         return False, f"Only {seen}."
     if facts.views < FEW_VIEWS:
         return False, f"{seen}, but {facts.views} photos are too few to correct guessed depths."
@@ -143,7 +147,10 @@ def _gaps(facts: Facts) -> tuple[bool, str]:
             f"{seen}, but the photos look over more than half a turn, so that those of one side would look through "
             "what is guessed from the other."
         )
-    return True, f"{seen}: {facts.gap_points} Gaussians are added there, at the depth of the nearest points."
+    return (
+        True,
+        f"{seen}: {covered.gap_points} Gaussians are added there, at the depth of the nearest points.",
+    )
 
 
 def _poses(facts: Facts, kernels: Kernels, scale: float) -> tuple[bool, str]:

@@ -113,7 +113,7 @@ def decide_exposure(facts: Facts, options: TrainOptions, reasons: Reasons) -> bo
 
     Raises ValueError where an option asks for it and the light of the photos cannot be compared.
     """
-    if options.exposure is Switch.on and facts.light_tail is None:
+    if options.exposure is Switch.on and facts.light is None:
         raise ValueError(
             "exposure=on needs points that several photos show, since their colours tell how the light differs, and "
             "this scene has too few. Set exposure to auto."
@@ -122,18 +122,18 @@ def decide_exposure(facts: Facts, options: TrainOptions, reasons: Reasons) -> bo
 
 
 def _exposure(facts: Facts) -> tuple[bool, str]:
-    tail, error = facts.light_tail, facts.light_error
-    if tail is None or error is None:
+    if facts.light is None:
         return (
             False,
             "The photos' exposures cannot be compared: it is not known which photos show the same points.",
         )
+    tail, error = facts.light.tail, facts.light.error
     seen = f"One photo in ten departs by {100 * tail:.1f} % or more from the light of the photos around it"
     if not tail >= LIGHT_DEPARTS:
         return False, f"{seen}; exposures are corrected from {100 * LIGHT_DEPARTS:.1f} %."
     if not tail >= CERTAIN * error:
         return False, f"{seen}, which an error of {100 * error:.1f} % of their exposures may explain."
-    if facts.light_unseen is None or facts.light_unseen > LIGHT_UNSEEN:
+    if facts.light.unseen > LIGHT_UNSEEN:
         return False, (
             f"{seen}, but the photos are too far apart to tell a change of exposure from light that changes with the "
             "direction of view."
@@ -149,9 +149,9 @@ def decide_antialias(facts: Facts, options: TrainOptions, reasons: Reasons) -> b
 def _antialias(facts: Facts) -> tuple[bool, str]:
     if facts.start is not None and facts.start.antialiased is not None:
         return facts.start.antialiased, "The file of the given model says how the model is drawn."
-    ratio = facts.distance_ratio
-    if ratio is None:
+    if facts.geometry is None:
         return False, "The distances from which points are seen are not known."
+    ratio = facts.geometry.distance_ratio
     if ratio > DISTANCES_DIFFER:
         return True, (
             f"One point in ten is seen from distances that differ by a factor of {ratio:.1f} or more, so Gaussians are "
