@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 
-from splatmill_worker.pipeline import job
+from splatmill_worker.pipeline import training as stage
 from splatmill_worker.splat.engine.open import gaussians_of
 from splatmill_worker.splat.plan import probe
 from splatmill_worker.splat.train.disagreement import Disagreement
@@ -40,7 +40,7 @@ def switches(instead: Any) -> dict[str, Switch]:
 
 def test_every_replaced_function_is_there_and_comes_back(instead: Any, switches: dict[str, Switch]) -> None:
     assert "cleaned" in switches
-    before = probe.grown, job.train
+    before = probe.grown, stage.train
     for switch in switches.values():
         for name, ours in switch.instead.items():
             theirs = inspect.signature(pkgutil.resolve_name(name)).parameters.values()
@@ -53,10 +53,10 @@ def test_every_replaced_function_is_there_and_comes_back(instead: Any, switches:
             pass
     with instead.applied(switches["probe-of-the-start"].instead):
         assert probe.grown is instead.not_grown
-    assert (probe.grown, job.train) == before
+    assert (probe.grown, stage.train) == before
     unknown = (
-        {"splatmill_worker.pipeline.job.trained": "not_grown"},
-        {"splatmill_worker.pipeline.job.train": "not_there"},
+        {"splatmill_worker.pipeline.training.trained": "not_grown"},
+        {"splatmill_worker.pipeline.training.train": "not_there"},
     )
     for functions in unknown:
         with pytest.raises(AttributeError), instead.applied(functions):
@@ -130,7 +130,7 @@ def test_a_cleaned_model_is_the_one_that_is_scored(instead: Any, monkeypatch: py
             self.keep = torch.arange(gaussians.count) % 2 == 0
             keep.append(self.keep)
 
-    whole = job.train(training.first_engine(), views, held_out, plan, extent=1.1)
+    whole = stage.train(training.first_engine(), views, held_out, plan, extent=1.1)
     monkeypatch.setattr(instead, "clean", Half)
     cleaned = instead.trained_and_cleaned(engine, views, held_out, plan, extent=1.1)
     assert cleaned.gaussians.count == int(keep[0].sum()) < whole.gaussians.count

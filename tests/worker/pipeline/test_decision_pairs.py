@@ -22,7 +22,7 @@ from splatmill.schema import Event, Report, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.errors import Refusal
 from splatmill_worker.images.load import Photo, load_views
-from splatmill_worker.pipeline import job
+from splatmill_worker.pipeline import photos
 from splatmill_worker.scene import Lens, PointViews, Scene, View
 from splatmill_worker.sfm.posed.written import model_of
 from splatmill_worker.splat.formats import ply
@@ -187,7 +187,7 @@ def test_photos_are_held_at_one_size_at_a_time(
         alive.extend(weakref.ref(photo.rgb) for photo in photos)
         return photos
 
-    monkeypatch.setattr(job, "load_views", watched)
+    monkeypatch.setattr(photos, "load_views", watched)
     run(folder, tmp_path, {"image_size": "halved", "exposure": "on"})
     (_, first), (_, second), (size, third), (_, fourth) = counts
     assert (first, second) == (0, COUNT - 2)

@@ -120,7 +120,7 @@ def _loaded(capture: Path, size: int) -> tuple[Any, list[Any], list[Any], Any]:
 def _ours(capture: Path, size: int, seconds: float, seed: int) -> Iterator[Row]:
     from splatmill.schema import TrainOptions
     from splatmill_worker.kernels.gpu import device
-    from splatmill_worker.pipeline.job import EXTENT
+    from splatmill_worker.pipeline.training import EXTENT
     from splatmill_worker.splat.engine.open import open_engine
     from splatmill_worker.splat.plan.decide import decide
     from splatmill_worker.splat.plan.facts import measure
@@ -144,7 +144,7 @@ def _ours(capture: Path, size: int, seconds: float, seed: int) -> Iterator[Row]:
 def _theirs(capture: Path, size: int, steps: int, seed: int) -> Iterator[Row]:
     import _gsplat
 
-    from splatmill_worker.pipeline.job import EXTENT
+    from splatmill_worker.pipeline.training import EXTENT
     from splatmill_worker.splat.evaluate import evaluate
 
     _, views, held_out, first = _loaded(capture, size)

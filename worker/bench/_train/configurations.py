@@ -125,7 +125,7 @@ CONFIGURATIONS = {
     ),
     "cleaned": Configuration(
         "Gaussians that the photos do not support are removed at the end",
-        instead={"splatmill_worker.pipeline.job.train": "trained_and_cleaned"},
+        instead={"splatmill_worker.pipeline.training.train": "trained_and_cleaned"},
     ),
 }
 """The switches by name. A name never changes its meaning, since measured rows refer to it."""

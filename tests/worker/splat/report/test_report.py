@@ -19,7 +19,7 @@ from splatmill_worker.splat.evaluate import Score, ViewScore
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan import facts
 from splatmill_worker.splat.report.export import Exported, ExportWorld
-from splatmill_worker.splat.report.report import FinishedTraining, PlannedScene, plain, write_report
+from splatmill_worker.splat.report.report import PlannedScene, plain, write_report
 from splatmill_worker.splat.train.curve import CurvePoint
 from splatmill_worker.splat.train.disagreement import Disagreement
 from splatmill_worker.splat.train.loop import Trained
@@ -64,8 +64,11 @@ def report_of(
     report = write_report(
         out,
         PlannedScene(scene, measured, plan(20), held_out),
-        FinishedTraining(result, Exported(5, world), {"sfm": 3.0}, ["said before."]),
+        result,
+        Exported(5, world),
         lambda target, _: torch.full((*target.rgb.shape[:2], 3), 0.5),
+        seconds={"sfm": 3.0},
+        warnings=["said before."],
     )
     assert json.loads((out / "report.json").read_text()) == report
     return report

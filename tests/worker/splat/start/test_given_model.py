@@ -19,7 +19,7 @@ import torch
 from splatmill.schema import Event, LogEvent, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.errors import Refusal
-from splatmill_worker.pipeline import job
+from splatmill_worker.pipeline import first_gaussians
 from splatmill_worker.splat.formats import ply, registry
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.start.points import from_points
@@ -114,7 +114,7 @@ def test_a_model_larger_than_allowed_keeps_its_most_opaque_part(trained: Path, t
 def test_a_model_that_the_job_cannot_hold_is_reduced_and_the_user_told(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(job, "LEAST_ASSESSED", 400)
+    monkeypatch.setattr(first_gaussians, "LEAST_ASSESSED", 400)
     count = ply.read(trained / "poses" / "m.ply").gaussians.count
     outcome, events = run(trained, tmp_path, start="m.ply", max_gaussians=500, steps=20)
     assert report_of(outcome)["facts"]["start"]["gaussians"] == 500

@@ -19,7 +19,7 @@ from _rows import Row
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.pipeline.job import EXTENT
+from splatmill_worker.pipeline.training import EXTENT
 from splatmill_worker.splat.plan.rates import RateSchedule
 from splatmill_worker.synthetic import look_at
 

@@ -63,24 +63,6 @@ class PlannedScene:
     held_out: Sequence[TrainingView]
 
 
-@dataclass(frozen=True)
-class FinishedTraining:
-    """A training whose model is written.
-
-    trained: its result.
-    exported: the files of the model.
-    seconds: wall time by stage, over all attempts; "train" and "evaluate" are added from `trained`.
-    warnings: what was warned of on the way, one sentence each.
-    time_lapse: the snapshots that the model keeps, in order: file, step, seconds and Gaussians of each.
-    """
-
-    trained: Trained
-    exported: Exported
-    seconds: Mapping[str, float]
-    warnings: Sequence[str]
-    time_lapse: Sequence[Mapping[str, Any]] = ()
-
-
 _FOLDERS = re.compile(r"""(?<=['"])/(?:[^'"/]+/)+|(?<![\w.:/'"-])/(?:[^\s/'"]+/)+""")
 """The folders of an absolute path, which may hold spaces where it is quoted."""
 
@@ -89,13 +71,25 @@ FORMAT = 1
 
 
 def write_report(
-    out: Path, planned: PlannedScene, finished: FinishedTraining, render: Renderer
+    out: Path,
+    planned: PlannedScene,
+    trained: Trained,
+    exported: Exported,
+    render: Renderer,
+    *,
+    seconds: Mapping[str, float],
+    warnings: Sequence[str],
+    time_lapse: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
     """Write report.json, report.png and report.html into the folder `out`; returns the report.
 
+    exported: the files of the model.
     render: renders the trained scene, for the pictures of the views that it shows worst.
+    seconds: wall time by stage, over all attempts; "train" and "evaluate" are added from `trained`.
+    warnings: what was warned of on the way, one sentence each.
+    time_lapse: the snapshots that the model keeps, in order: file, step, seconds and Gaussians of each.
     """
-    trained, plan, offset = finished.trained, planned.plan, finished.exported.world.offset
+    plan, offset = planned.plan, exported.world.offset
     if planned.scene.facts.get("cameras_contradicted"):
         # The cameras or the lens are wrong: photos disagree for that, even if it looks like another light.
         unexplained = tuple(each._replace(reason=None) for each in trained.disagreements)
@@ -104,10 +98,10 @@ def write_report(
         {
             "format": FORMAT,
             "curve": [asdict(point) for point in trained.curve],
-            "result": _result(trained, finished.exported.gaussians),
+            "result": _result(trained, exported.gaussians),
             "seconds": {
                 "sfm": 0.0,
-                **finished.seconds,
+                **seconds,
                 "train": trained.seconds,
                 "evaluate": trained.evaluate_seconds,
             },
@@ -119,16 +113,16 @@ def write_report(
                 *({"photo": name, "why": reason} for name, reason in planned.scene.left_out),
                 *(
                     {"what": f"the held-out photo {name} beside the model", "why": reason}
-                    for name, reason in finished.exported.left_out
+                    for name, reason in exported.left_out
                 ),
                 {"what": "lpips", "why": NO_LPIPS},
             ],
             "misfits": _misfits(trained),
-            "warnings": finished.warnings,
+            "warnings": warnings,
             "facts": planned.facts.as_dict(),
             "sfm": planned.scene.facts,
             "frame": _frame(planned.scene.frame),
-            "time_lapse": finished.time_lapse,
+            "time_lapse": time_lapse,
             "offset": offset.tolist() if offset.any() else None,
             "peak_memory": peak_memory(),
             "versions": versions(plan.kernels),
@@ -140,8 +134,8 @@ def write_report(
     worst = _worst_views(planned, trained, render)
     named = page.Disagreeing(disagreeing.named(trained), disagreeing.marked(trained))
     hidden = _hidden(planned, trained)
-    warnings = [*report["warnings"], *_unplaced(planned.scene), *(row["why"] for row in report["misfits"])]
-    text = page.render(report, warnings, out / "report.png", worst, named, hidden)
+    shown = [*report["warnings"], *_unplaced(planned.scene), *(row["why"] for row in report["misfits"])]
+    text = page.render(report, shown, out / "report.png", worst, named, hidden)
     atomic_write(out / "report.html", text)
     return report
 

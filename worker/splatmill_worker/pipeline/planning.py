@@ -1,0 +1,107 @@
+"""The third stage: what is measured of the photos and of this machine, and the plan that follows from it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from splatmill_worker.errors import Refusal
+from splatmill_worker.kernels.gpu.device import describe
+from splatmill_worker.pipeline.cameras import Cameras
+from splatmill_worker.pipeline.first_gaussians import First, first_gaussians
+from splatmill_worker.pipeline.job import Job
+from splatmill_worker.pipeline.photos import Photos, load_photos
+from splatmill_worker.pipeline.stage_times import Stages
+from splatmill_worker.splat.engine.open import open_engine
+from splatmill_worker.splat.plan.capacity import resolved
+from splatmill_worker.splat.plan.decide import decide
+from splatmill_worker.splat.plan.facts import Facts, measure
+from splatmill_worker.splat.plan.photos import loading_size
+from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.plan.plan_file import read_plan, write_plan
+from splatmill_worker.splat.plan.probe import probe
+from splatmill_worker.splat.start.hull import Hull
+
+Revise = Callable[[Plan], Plan]
+
+
+@dataclass(frozen=True)
+class Planned:
+    """What is known and decided before training.
+
+    first: the Gaussians that it may start from.
+    facts: what was measured.
+    plan: what was decided.
+    photos: at the size of the plan, and in the light that it decides on; None where they are to be loaded smaller.
+    """
+
+    first: First
+    facts: Facts
+    plan: Plan
+    photos: Photos | None
+
+
+def plan_training(job: Job, cameras: Cameras, revise: Revise, stages: Stages) -> Planned:
+    """Load the photos, measure, and decide.
+
+    Photos of another size than the plan's are freed on return: both sizes at once would be the most memory that photos
+    ever take.
+    """
+    with stages.measured("load"):
+        photos = load_photos(cameras, loading_size(job.options, job.kernels))
+    with stages.measured("plan"):
+        first = first_gaussians(job, cameras, photos)
+        facts = _measure_facts(job, cameras, photos, first)
+        plan = _make_plan(job, facts, revise)
+    smaller = plan.image_size < max(facts.width, facts.height)
+    return Planned(first, facts, plan, None if smaller else _in_light(photos, facts, plan))
+
+
+def planned_photos(cameras: Cameras, planned: Planned, stages: Stages) -> Photos:
+    """The photos as the plan wants them, loaded anew where it decides on a smaller size."""
+    if planned.photos is not None:
+        return planned.photos
+    with stages.measured("load"):
+        return _in_light(load_photos(cameras, planned.plan.image_size), planned.facts, planned.plan)
+
+
+def _in_light(photos: Photos, facts: Facts, plan: Plan) -> Photos:
+    """The photos, relit if the plan says so."""
+    return photos.relit(facts.light) if plan.exposure and facts.light is not None else photos
+
+
+def _measure_facts(job: Job, cameras: Cameras, photos: Photos, first: First) -> Facts:
+    """What can be measured before training: the scene, its photos, and how fast this machine trains it."""
+    pixels = photos.training[0].full.rgb[..., 0].numel()
+    most = resolved(pixels, len(photos.training)) if first.model is None else 0
+    speed = probe(open_engine(first.gaussians, job.kernels), photos.training, most=most)
+    facts = measure(cameras.world, photos.training, len(photos.held_out), speed)
+    facts = replace(facts, start=first.model)
+    if isinstance(first.hull, Hull):
+        facts = replace(facts, hull_points=len(first.hull.points))
+    elif first.hull is not None:
+        facts = replace(facts, no_hull=first.hull.reason)
+    card = describe() if job.kernels == "gpu" else None
+    return facts if card is None else replace(facts, memory_available=card.free_bytes)
+
+
+def _make_plan(job: Job, facts: Facts, revise: Revise) -> Plan:
+    """The plan that an earlier attempt stored for the same options; else a new one, which is stored.
+
+    Raises Refusal for an option that cannot be followed with this scene or these kernels.
+    """
+    stored = job.workdir / "plan.json"
+    kept = read_plan(stored, job.options)
+    if kept is not None:
+        return kept
+    try:
+        plan = revise(decide(facts, job.options, job.kernels))
+    except ValueError as error:
+        raise Refusal(
+            "option_out_of_range", str(error), advice="Change the option and start again."
+        ) from error
+    # A checkpoint of another plan cannot be resumed.
+    shutil.rmtree(job.checkpoints, ignore_errors=True)
+    write_plan(stored, job.options, plan)
+    return plan
